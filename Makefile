@@ -1,0 +1,46 @@
+# Needs Python 3.11 or newer, pip and make; everything else goes into .venv.
+PYTHON ?= $(firstword $(foreach p,python3 python python3.14 python3.13 python3.12 python3.11,\
+	$(shell $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(p))))
+BIN := .venv/bin
+ENVIRONMENT := .venv/.installed
+
+.PHONY: demo test lint bench docs coverage lock clean
+
+demo: $(ENVIRONMENT)  ## identify a model from a simulated log; writes out/demo/report.html
+	$(BIN)/python examples/demo.py
+
+test: lint docs  ## everything that must hold
+	$(BIN)/pytest -q
+
+lint: $(ENVIRONMENT)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+
+bench: $(ENVIRONMENT)  ## measured figures; each benchmark prints its table
+	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
+
+docs: $(ENVIRONMENT)
+	$(BIN)/mkdocs build --strict --quiet --site-dir out/site
+
+coverage: $(ENVIRONMENT)
+	$(BIN)/pytest -q --cov --cov-report=term
+
+lock: $(ENVIRONMENT)  ## pin every dependency anew
+	$(BIN)/pip-compile --quiet --all-extras --strip-extras --upgrade --no-emit-index-url --no-emit-trusted-host \
+		--no-emit-find-links --no-annotate --no-header --output-file requirements.lock pyproject.toml
+
+clean:
+	rm -rf .venv out dist build .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis .coverage
+
+# The stamp is written last: an installation that was interrupted is tried again.
+$(ENVIRONMENT): pyproject.toml requirements.lock | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e ".[dev]"
+	@touch $@
+
+# A Python without ensurepip (a distribution's, without its venv package) lends the environment its own pip.
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed and none was found; name one: make PYTHON=/path/to/python3 $(MAKECMDGOALS)" >&2; exit 1; }
+	@if $(PYTHON) -c 'import ensurepip' 2>/dev/null; then $(PYTHON) -m venv .venv; \
+	else $(PYTHON) -m venv --without-pip .venv && $(PYTHON) -m pip --python $@ install --quiet pip; fi

@@ -1,0 +1,5 @@
+"""``python -m diransac`` is the command ``diransac``."""
+
+from diransac.cli import main
+
+main()

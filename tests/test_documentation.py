@@ -1,0 +1,120 @@
+r"""What README.md, docs/ and examples/ show is run, so that they cannot lie.
+
+A page runs from top to bottom in a folder of its own, with ``examples/`` inside and the real logs in
+``../shared/data``:
+
+- every ``python`` block, in one namespace a page; a block whose first line is a comment that names a file
+  (``# rover.py``) is written to that file as well;
+- in every ``console`` block, each ``$ diransac ...`` and ``$ python ...`` line, continued over ``\``
+  at a line's end. Lines of `NOT_RUN` are shown only. Any other command belongs into a ``text`` block, as does what cannot run.
+"""
+
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SHARED = REPOSITORY.parent / "shared"
+PAGES = [page for page in (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))) if page.is_file()]
+EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
+NOT_RUN = {"cd", "git", "make", "pip"}
+LANGUAGES = {"", "python", "console", "text", "toml", "json", "yaml", "csv", "mermaid"}
+
+
+@dataclass(frozen=True)
+class Block:
+    """One fenced block: the language and what follows it on the fence, the body, and the body's first line number."""
+
+    info: str
+    body: str
+    line: int
+
+
+def blocks(text: str) -> Iterator[Block]:
+    """Every fenced block of a page, in order."""
+    for match in re.finditer(r"^( *)```([^\n`]*)\n(.*?)^\1```[ ]*$", text, re.DOTALL | re.MULTILINE):
+        indent, info, body = match.groups()
+        line = text.count("\n", 0, match.start(3)) + 1
+        yield Block(info.strip(), re.sub(f"^{indent}", "", body, flags=re.MULTILINE), line)
+
+
+def commands(body: str) -> list[list[str]]:
+    """Every ``$`` line of a console block, split as a shell does; what the commands print is skipped."""
+    joined = re.sub(r"\\\n", " ", body)
+    return [shlex.split(line[2:], comments=True) for line in joined.splitlines() if line.startswith("$ ")]
+
+
+def run_command(command: list[str], folder: Path) -> None:
+    """Run one command line of a page in a process of its own; its message is the failure's."""
+    program, *arguments = command
+    if program in NOT_RUN:
+        return
+    assert program in {"diransac", "python"}, f"{shlex.join(command)}: this cannot be run; show it in a text block"
+    prefix = [sys.executable] if program == "python" else [sys.executable, "-m", "diransac"]
+    done = subprocess.run([*prefix, *arguments], cwd=folder, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, f"{shlex.join(command)}: exit code {done.returncode}\n{done.stdout}{done.stderr}"
+
+
+def run_python(block: Block, page: Path, folder: Path, namespace: dict[str, object]) -> None:
+    """Run one Python block, with the page's own line numbers in a traceback."""
+    named = re.match(r"# ([\w-]+\.py)\n", block.body)
+    if named:
+        (folder / named[1]).write_text(block.body)
+    exec(compile("\n" * (block.line - 1) + block.body, str(page), "exec"), namespace)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Build a page's working directory: it looks like a checkout that has the real logs beside it."""
+    checkout = tmp_path / "main"
+    checkout.mkdir()
+    (checkout / "examples").symlink_to(REPOSITORY / "examples")
+    if SHARED.is_dir():
+        (tmp_path / "shared").symlink_to(SHARED)
+    monkeypatch.chdir(checkout)
+    return checkout
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_page_runs_as_it_is_shown(page: Path, folder: Path):
+    namespace: dict[str, object] = {"__name__": "__page__"}
+    for block in blocks(page.read_text()):
+        if "../shared/" in block.body and block.info in {"python", "console"} and not SHARED.is_dir():
+            pytest.skip(f"{page.name} NOT CHECKED from line {block.line} on: {SHARED} is missing")
+        if block.info == "python":
+            run_python(block, page, folder, namespace)
+        if block.info == "console":
+            for command in commands(block.body):
+                run_command(command, folder)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_page_marks_every_block_with_a_plain_language(page: Path):
+    found = blocks(page.read_text())
+    odd = {f"line {block.line - 1}: {block.info!r}" for block in found if block.info not in LANGUAGES}
+    assert not odd, f"{page.name}: mark blocks with one of {sorted(LANGUAGES)}; text is for what cannot run"
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
+def test_example_runs(example: Path, folder: Path):
+    run_command(["python", str(example)], folder)
+
+
+def test_blocks_are_found_with_their_lines_and_without_their_indent():
+    page = "text\n\n```python\na = 1\n```\n- item\n\n"
+    page += "  ```console\n  $ diransac models \\\n      --json  # all\n  servo-axis\n  ```\n"
+    first, second = blocks(page)
+    assert first == Block("python", "a = 1\n", 4)
+    assert (second.info, second.line) == ("console", 9)
+    assert commands(second.body) == [["diransac", "models", "--json"]]
+
+
+def test_a_command_that_cannot_run_is_refused(tmp_path: Path):
+    with pytest.raises(AssertionError, match="text block"):
+        run_command(["curl", "example.org"], tmp_path)
