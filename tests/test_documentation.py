@@ -6,7 +6,8 @@ A page runs from top to bottom in a folder of its own, with ``examples/`` inside
 - every ``python`` block, in one namespace a page; a block whose first line is a comment that names a file
   (``# rover.py``) is written to that file as well;
 - in every ``console`` block, each ``$ diransac ...`` and ``$ python ...`` line, continued over ``\``
-  at a line's end. Lines of `NOT_RUN` are shown only. Any other command belongs into a ``text`` block, as does what cannot run.
+  at a line's end. Lines of `NOT_RUN` are shown only. Any other command belongs into a
+  ``text`` block, as does what cannot run.
 """
 
 import re
