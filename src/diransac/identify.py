@@ -1,0 +1,218 @@
+"""The one entry: a model and a log in, a `Result` out, whatever the method."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac import prepare
+from diransac.consensus import Diransac, InlierBiasedDiransac, Score, Variant
+from diransac.errors import DiransacError, IdentificationError, LogError, SettingsError
+from diransac.estimators import BoundEstimator, Estimator, OrdinaryLeastSquares, TotalLeastSquares, as_estimator
+from diransac.evaluation import Scoring, Simulation, choose_scoring, judged_signals
+from diransac.log import Log
+from diransac.model import Model
+from diransac.nonlinear import NonlinearLeastSquares
+from diransac.observations import Observations, observe
+from diransac.result import LogSummary, Result
+from diransac.sampling import sample_rows
+from diransac.search import Hypothesis, Outcome, Progress, search
+from diransac.settings import Settings
+from diransac.uncertainty import N_BLOCKS, jackknife_covariance
+
+__all__ = ["METHODS", "identify"]
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+_ESTIMATORS: dict[str, Callable[[], Estimator]] = {
+    "ols": OrdinaryLeastSquares,
+    "tls": TotalLeastSquares,
+    "nls": NonlinearLeastSquares,
+}
+_VARIANTS: dict[str, Callable[[Settings], Variant]] = {
+    "diransac": lambda settings: Diransac(),
+    "i-diransac": lambda settings: InlierBiasedDiransac(settings.acceptance_weights),
+}
+METHODS = (*_ESTIMATORS, *_VARIANTS)
+
+
+def identify(
+    model: Model,
+    log: Log,
+    method: str = "i-diransac",
+    *,
+    seed: int = 0,
+    settings: Settings | None = None,
+    estimator: Any = None,
+    differentiate: bool = False,
+    bandwidth: float | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Parameters of ``model`` from ``log``.
+
+    Parameters
+    ----------
+    method : "ols", "tls", "nls" (least squares of the whole log: ordinary, total, nonlinear), "diransac", "i-diransac"
+    seed : sample k of a RANSAC method depends on (seed, k) alone
+    settings : `Settings`; those of a search are ignored by the least-squares methods, those of the simulation serve
+        the fit error and the inliers of every method
+    estimator : inside a RANSAC method, `OrdinaryLeastSquares()` (default; `NonlinearLeastSquares()` where the model is
+        not affine in its parameters), another of ours, or any scikit-learn linear regressor
+    differentiate : derive the velocities and accelerations that the log lacks, and filter both sides of the equations
+        alike; the identification is then repeated at half and twice the bandwidth, for ``result.sensitivity``
+    bandwidth : of that filter, Hz; None: chosen from the log
+    progress : called with (samples drawn, max_iterations, score of the stored hypothesis)
+
+    Raises LogError: the log cannot serve; SettingsError: an argument has no meaning; ModelError: a linear method meets a
+    model that is not affine in its parameters; IdentificationError: the log does not determine the parameters, or no
+    hypothesis was accepted.
+    References: Dimmig et al. 2023, Algorithm 1.
+    """
+    _check_arguments(model, log, method, estimator, seed)
+    settings = Settings() if settings is None else settings
+    task = _Task(model, log, method, seed, settings, _estimator(model, method, estimator))
+    if not differentiate:
+        if bandwidth is not None:
+            raise SettingsError("bandwidth is given without differentiate=True, which alone uses it")
+        return task.run(log, progress)
+    derived = prepare.differentiate(log, model, bandwidth)
+    result = task.run(derived, progress)
+    return task.with_sensitivity(result, derived)
+
+
+def _check_arguments(model: object, log: object, method: object, estimator: object, seed: object) -> None:
+    if not isinstance(model, Model):
+        raise SettingsError(f"model is {model!r}; give a dr.Model, such as dr.models.planar_rotorcraft()")
+    if not isinstance(log, Log):
+        raise SettingsError(f"log is a {type(log).__name__}; give a dr.Log, such as dr.read_log(path)")
+    if method not in METHODS:
+        raise SettingsError(f'there is no method "{method}"; there are {", ".join(METHODS)}')
+    if estimator is not None and method not in _VARIANTS:
+        raise SettingsError(f'estimator serves the RANSAC methods; method "{method}" is an estimator itself')
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
+        raise SettingsError(f"seed is {seed!r}; give a whole number")
+
+
+def _estimator(model: Model, method: str, candidate: Any) -> Estimator:
+    if candidate is not None:
+        return as_estimator(candidate)
+    if method in _ESTIMATORS:
+        return _ESTIMATORS[method]()
+    return NonlinearLeastSquares() if model.nonlinear_parameters else OrdinaryLeastSquares()
+
+
+@dataclass(frozen=True)
+class _Task:
+    """One identification, apart from how its log is prepared."""
+
+    model: Model
+    given: Log
+    method: str
+    seed: int
+    settings: Settings
+    estimator: Estimator
+
+    def run(self, log: Log, progress: Progress | None = None) -> Result:
+        """Identify from a prepared log."""
+        observations = observe(self.model, log, judged_signals(self.model, log, self.settings))
+        bound = self.estimator.bind(observations)
+        if not bound.well_defined([np.arange(bound.n_rows)])[0]:
+            raise IdentificationError(self._undetermined(log, bound.undetermined()))
+        scoring = choose_scoring(observations, self.settings)
+        simulation = self._simulation(observations, scoring)
+        outcome = self._estimate(bound, simulation, progress)
+        best = outcome.best
+        assert best is not None
+        score, inliers = best.score, np.zeros(len(observations), dtype=bool)
+        if simulation is not None:
+            score, inliers = simulation.scores(best.parameters[None])[0], simulation.inlier_mask(best.parameters)
+        rows = np.sort(best.rows)
+        return Result(
+            model=self.model,
+            parameters=dict(zip(self.model.parameters, best.parameters.tolist(), strict=True)),
+            covariance=jackknife_covariance(bound, rows),
+            degrees_of_freedom=max(1, min(N_BLOCKS, len(rows)) - 1),
+            inliers=self._on_given_log(observations, inliers),
+            inlier_fraction=score.inlier_fraction,
+            fit_error=score.error,
+            method=self.method,
+            estimator=type(self.estimator).__name__,
+            seed=int(self.seed),
+            settings=self.settings,
+            iterations=outcome.iterations,
+            evaluated=outcome.evaluated,
+            stop_reason=outcome.stop_reason,
+            skipped=dict(outcome.skipped),
+            violations=self._violations(best.parameters),
+            log=LogSummary(
+                self.given.source, self.given.fingerprint, float(self.given.time[0]), self.given.dt, len(self.given)
+            ),
+            preparation=tuple(log.history),
+            notes=(*observations.notes, *scoring.notes),
+        )
+
+    def _variant(self) -> Variant:
+        """The variant that searches; least squares is judged by I-DIRANSAC's error, eq. (2)."""
+        return _VARIANTS.get(self.method, _VARIANTS["i-diransac"])(self.settings)
+
+    def _simulation(self, observations: Observations, scoring: Scoring) -> Simulation | None:
+        """What judges hypotheses; None where a least-squares method meets a log that nothing can be simulated from."""
+        try:
+            return Simulation(observations, scoring, self.settings, self._variant())
+        except LogError:
+            if self.method in _VARIANTS:
+                raise
+            return None
+
+    def _estimate(self, bound: BoundEstimator, simulation: Simulation | None, progress: Progress | None) -> Outcome:
+        if simulation is None or self.method not in _VARIANTS:
+            rows = np.arange(bound.n_rows)
+            best = Hypothesis(bound.fit([rows])[0], rows, Score(np.nan, np.nan))
+            return Outcome(best, evaluated=1, stop_reason="whole log fitted")
+        if bound.n_rows < self.settings.sample_size:
+            raise LogError(
+                f"{self.given.source}: {bound.n_rows} usable rows are fewer than sample_size = "
+                f"{self.settings.sample_size}; give a longer log or a smaller sample_size"
+            )
+        return search(self._variant(), self.settings, bound, simulation, sample_rows, self.seed, progress)
+
+    def _violations(self, parameters: FloatArray) -> tuple[str, ...]:
+        pairs = zip(self.model.parameters.items(), parameters, strict=True)
+        return tuple(name for (name, bounds), x in pairs if not bounds.admits(x))
+
+    def _undetermined(self, log: Log, indices: tuple[int, ...]) -> str:
+        names = [list(self.model.parameters)[i] for i in indices] or list(self.model.parameters)
+        return (
+            f"{log.source}: the log does not determine {', '.join(names)}: the motion that would show "
+            f"{'it' if len(names) == 1 else 'them'} is missing or moves with another; record a livelier motion, or fix "
+            "parameters in the model"
+        )
+
+    def _on_given_log(self, observations: Observations, inliers: BoolArray) -> BoolArray:
+        """Inliers ``(N,)`` over the rows of the log that the user gave."""
+        begin = observations.log.time[observations.offset]
+        first = round(float(begin - self.given.time[0]) / self.given.dt)
+        mask = np.zeros(len(self.given), dtype=bool)
+        mask[first : first + len(inliers)] = inliers
+        return mask
+
+    def with_sensitivity(self, result: Result, derived: Log) -> Result:
+        """The result with each parameter's relative change at half and twice the differentiating bandwidth."""
+        bandwidth = float(derived.history[-1]["bandwidth"])
+        changes = [self._change(result, bandwidth * factor) for factor in (0.5, 2.0)]
+        pairs = {n: (changes[0][n], changes[1][n]) for n in result.parameters}
+        return dataclasses.replace(result, sensitivity=pairs)
+
+    def _change(self, result: Result, bandwidth: float) -> dict[str, float]:
+        """Relative change of each parameter at another bandwidth; NaN where nothing was identified there."""
+        try:
+            other = self.run(prepare.differentiate(self.given, self.model, bandwidth)).parameters
+        except DiransacError:
+            return dict.fromkeys(result.parameters, np.nan)
+        return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}

@@ -1,0 +1,30 @@
+"""The built-in models; ``builtin(name)`` finds one by the name that users type."""
+
+from collections.abc import Callable
+
+from diransac.errors import ModelError
+from diransac.model import Model
+from diransac.models.double_pendulum import double_pendulum
+from diransac.models.planar_rotorcraft import planar_rotorcraft
+from diransac.models.servo_axis import servo_axis
+from diransac.models.underwater_vehicle import underwater_vehicle
+
+__all__ = ["BUILTIN", "builtin", "double_pendulum", "planar_rotorcraft", "servo_axis", "underwater_vehicle"]
+
+BUILTIN: dict[str, Callable[[], Model]] = {
+    "planar-rotorcraft": planar_rotorcraft,
+    "servo-axis": servo_axis,
+    "underwater-vehicle": underwater_vehicle,
+    "double-pendulum": double_pendulum,
+}
+
+
+def builtin(name: str) -> Model:
+    """The built-in model of that name, ``planar-rotorcraft`` or ``planar_rotorcraft``.
+
+    Raises ModelError: there is none; it lists those there are.
+    """
+    key = name.replace("_", "-")
+    if key not in BUILTIN:
+        raise ModelError(f'there is no built-in model "{name}"; there are {", ".join(BUILTIN)}, or give file.py[:name]')
+    return BUILTIN[key]()

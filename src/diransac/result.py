@@ -1,0 +1,242 @@
+"""What an identification found, and how: printed as a table, saved as JSON."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac.atomic import write_text
+from diransac.errors import DiransacError, ResultError, SettingsError
+from diransac.model import Model
+from diransac.settings import Settings
+
+__all__ = ["LogSummary", "Result"]
+
+BoolArray = npt.NDArray[np.bool_]
+FloatArray = npt.NDArray[np.float64]
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class LogSummary:
+    """Which log it was: how messages name it, SHA-256, first time (s), sampling time (s), rows."""
+
+    source: str
+    fingerprint: str
+    start: float
+    dt: float
+    n_rows: int
+
+
+@dataclass(frozen=True)
+class Result:
+    """Parameters of a model with everything that is needed to judge and repeat them.
+
+    Parameters
+    ----------
+    model : the model, equations included
+    parameters : name -> estimate, in the parameter's unit
+    covariance : (n_p, n_p)   by a jackknife over stretches of time; infinite where the log cannot tell
+    degrees_of_freedom : of that covariance, for intervals
+    inliers : (N,)   over the rows of the log that was given
+    inlier_fraction : of the rows that count
+    fit_error : eq. (2) of the returned parameters (its square sibling for DIRANSAC); NaN where nothing could be
+        simulated, infinite where the simulation diverged
+    method, estimator, seed, settings : how it was made
+    iterations : k, samples drawn; evaluated : hypotheses looked at, refits included
+    stop_reason : why the search ended; skipped : hypotheses that went no further, by reason
+    violations : names of the parameters outside their bounds (never with a RANSAC method)
+    log : which log it was; preparation : what was done to it, in order; notes : what was found on the way
+    sensitivity : name -> relative change at half and at twice the differentiating filter's bandwidth
+    """
+
+    model: Model
+    parameters: Mapping[str, float]
+    covariance: FloatArray
+    degrees_of_freedom: int
+    inliers: BoolArray
+    inlier_fraction: float
+    fit_error: float
+    method: str
+    estimator: str
+    seed: int
+    settings: Settings
+    iterations: int
+    evaluated: int
+    stop_reason: str
+    skipped: Mapping[str, int]
+    violations: tuple[str, ...]
+    log: LogSummary
+    preparation: tuple[Mapping[str, Any], ...] = ()
+    notes: tuple[str, ...] = ()
+    sensitivity: Mapping[str, tuple[float, float]] | None = None
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard error of each parameter in its unit; see `uncertainty.jackknife_covariance` for what it covers."""
+        return dict(zip(self.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """``(low, high)`` of each parameter, by Student's t.
+
+        Raises SettingsError: the level is not between 0 and 1.
+        """
+        from scipy.special import stdtrit
+
+        if not 0.0 < level < 1.0:
+            raise SettingsError(f"level is {level}; give a number between 0 and 1, such as 0.95")
+        width = float(stdtrit(self.degrees_of_freedom, 0.5 + level / 2.0))
+        errors = self.standard_errors
+        return {n: (x - width * errors[n], x + width * errors[n]) for n, x in self.parameters.items()}
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter."""
+        return {n: x.unit for n, x in self.model.parameters.items()}
+
+    @property
+    def inlier_times(self) -> FloatArray:
+        """Log time of every inlier, s."""
+        return self.log.start + self.log.dt * np.flatnonzero(self.inliers)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, ready for JSON; `from_dict` reads it back."""
+        return {
+            "format": _FORMAT,
+            "method": self.method,
+            "estimator": self.estimator,
+            "seed": self.seed,
+            "parameters": dict(self.parameters),
+            "units": self.units,
+            "standard_errors": {n: _encode(x) for n, x in self.standard_errors.items()},
+            "intervals_95": {n: [_encode(x) for x in pair] for n, pair in self.intervals().items()},
+            "covariance": [[_encode(x) for x in row] for row in self.covariance],
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "inlier_fraction": _encode(self.inlier_fraction),
+            "fit_error": _encode(self.fit_error),
+            "iterations": self.iterations,
+            "evaluated": self.evaluated,
+            "stop_reason": self.stop_reason,
+            "skipped": dict(self.skipped),
+            "violations": list(self.violations),
+            "notes": list(self.notes),
+            "sensitivity": _encode_pairs(self.sensitivity),
+            "preparation": [dict(step) for step in self.preparation],
+            "log": vars(self.log).copy(),
+            "settings": self.settings.to_dict(),
+            "inliers": base64.b64encode(np.packbits(self.inliers).tobytes()).decode(),
+            "model": self.model.to_dict(),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Result:
+        """The result that `to_dict` wrote.
+
+        Raises ResultError: the data are of another format, or damaged.
+        """
+        if not isinstance(data, Mapping) or data.get("format") != _FORMAT:
+            raise ResultError(f"this is no diransac result of format {_FORMAT}; identify again")
+        try:
+            return cls._from_checked(data)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ResultError(f"the result is damaged: {type(error).__name__} at {error}; identify again") from error
+
+    @classmethod
+    def _from_checked(cls, data: Mapping[str, Any]) -> Result:
+        model = Model.from_dict(data["model"])
+        log = LogSummary(**data["log"])
+        packed = np.frombuffer(base64.b64decode(data["inliers"]), dtype=np.uint8)
+        values = model.parameter_vector(data["parameters"])
+        pairs = data["sensitivity"]
+        return cls(
+            model=model,
+            parameters=dict(zip(model.parameters, values.tolist(), strict=True)),
+            covariance=np.array([[_decode(x) for x in row] for row in data["covariance"]]).reshape(model.n_p, model.n_p),
+            degrees_of_freedom=int(data["degrees_of_freedom"]),
+            inliers=np.unpackbits(packed, count=log.n_rows).astype(bool),
+            inlier_fraction=_decode(data["inlier_fraction"]),
+            fit_error=_decode(data["fit_error"]),
+            settings=Settings.from_dict(data["settings"]),
+            violations=tuple(data["violations"]),
+            notes=tuple(data["notes"]),
+            preparation=tuple(data["preparation"]),
+            sensitivity=None if pairs is None else {n: (_decode(a), _decode(b)) for n, (a, b) in pairs.items()},
+            log=log,
+            **{k: data[k] for k in ("method", "estimator", "seed", "iterations", "evaluated", "stop_reason", "skipped")},
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write JSON, whole or not at all.
+
+        Raises ResultError: it cannot be written there.
+        """
+        try:
+            write_text(path, json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
+        except OSError as error:
+            raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> Result:
+        """The result that `save` wrote.
+
+        Raises ResultError: there is no such file, or it holds no result; it names the file.
+        """
+        try:
+            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
+        except OSError as error:
+            raise ResultError(f"{path}: cannot be read: {error.strerror}") from error
+        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise ResultError(f"{path}: is no JSON: {error}") from error
+        except DiransacError as error:
+            raise ResultError(f"{path}: {error}") from error
+
+    def __str__(self) -> str:
+        return "\n".join([self._headline(), *self._table(), self._summary(), *self._warnings()])
+
+    def _headline(self) -> str:
+        seconds = self.log.dt * (self.log.n_rows - 1)
+        rate = 1.0 / self.log.dt
+        return f"{self.model.name} by {self.method} from {self.log.source} ({seconds:.4g} s at {rate:.4g} Hz)"
+
+    def _table(self) -> list[str]:
+        rows = [("parameter", "estimate", "95 % interval", "unit")]
+        for name, (low, high) in self.intervals().items():
+            interval = f"{low:.5g} .. {high:.5g}" if np.isfinite(high - low) else "the log cannot tell"
+            rows.append((name, f"{self.parameters[name]:.6g}", interval, self.units[name]))
+        widths = [max(len(row[i]) for row in rows) for i in range(4)]
+        return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+    def _summary(self) -> str:
+        parts = [f"fit error {self.fit_error:.4g}", f"inliers {100.0 * self.inlier_fraction:.1f} %"]
+        if self.iterations:
+            skipped = ", ".join(f"{n} {reason}" for reason, n in self.skipped.items())
+            parts.append(f"{self.iterations} samples, {self.stop_reason}")
+            parts.append(f"{self.evaluated} hypotheses" + (f" ({skipped})" if skipped else ""))
+        return "; ".join(parts)
+
+    def _warnings(self) -> list[str]:
+        lines = [f"! {n} = {self.parameters[n]:.6g} is outside its bounds" for n in self.violations]
+        for name, (half, double) in (self.sensitivity or {}).items():
+            lines.append(f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice")
+        return lines + [f"  {note}" for note in self.notes]
+
+
+def _encode(x: float) -> float | str:
+    """JSON has no infinity and no NaN."""
+    return float(x) if np.isfinite(x) else str(float(x))
+
+
+def _decode(x: float | str) -> float:
+    return float(x)
+
+
+def _encode_pairs(pairs: Mapping[str, tuple[float, float]] | None) -> dict[str, list[float | str]] | None:
+    return None if pairs is None else {n: [_encode(x) for x in pair] for n, pair in pairs.items()}

@@ -1,0 +1,65 @@
+"""Samples without replacement, in which sample ``k`` depends on ``(seed, k)`` alone.
+
+Sample ``k`` is the beginning of a pseudo-random permutation of the rows that ``(seed, k)`` keys.  No state is carried from
+one sample to the next, a sample is extended by reading on, and integers alone are involved, so every machine draws
+the same.
+
+References: Luby and Rackoff 1988 (a Feistel network of random round functions is a random permutation); Black and Rogaway
+2002 (cycle walking to a domain of any size); Steele, Lea, Flood 2014 (the SplitMix64 mixer); Salmon et al. 2011
+(counter-based random numbers).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["sample_rows"]
+
+IntArray = npt.NDArray[np.int64]
+_Words = npt.NDArray[np.uint64]
+
+_ROUNDS = 8
+_GOLDEN = 0x9E3779B97F4A7C15
+
+
+def sample_rows(seed: int, iterations: npt.ArrayLike, n_rows: int, start: int, stop: int) -> IntArray:
+    """Places ``start`` to ``stop`` of the keyed permutations of ``range(n_rows)``.
+
+    Parameters
+    ----------
+    seed : any integer
+    iterations : (n,)   k of each sample
+    n_rows : length of the permutation
+    start, stop : places read, ``0 <= start <= stop <= n_rows``
+
+    Returns (n, stop - start): row ``i`` holds distinct rows of the log, and no place read elsewhere repeats them.
+    """
+    k = np.atleast_1d(np.asarray(iterations, dtype=np.uint64))
+    key = _mix(_mix(np.array([seed % 2**64], dtype=np.uint64)) + k)[:, None]
+    values = np.broadcast_to(np.arange(start, stop, dtype=np.uint64), (len(k), stop - start))
+    half = np.uint64(max(1, -(-(n_rows - 1).bit_length() // 2)))
+    keys = np.broadcast_to(key, values.shape)
+    permuted = _feistel(values, keys, half)
+    outside = permuted >= n_rows
+    while outside.any():
+        permuted[outside] = _feistel(permuted[outside], keys[outside], half)
+        outside = permuted >= n_rows
+    return permuted.astype(np.int64)
+
+
+def _feistel(values: _Words, key: _Words, half: np.uint64) -> _Words:
+    """A keyed permutation of ``range(2^(2 half))``, element by element."""
+    low = np.uint64((1 << int(half)) - 1)
+    left, right = values >> half, values & low
+    for r in range(_ROUNDS):
+        word = _mix(key + _mix(right + np.uint64((r + 1) * _GOLDEN % 2**64)))
+        left, right = right, left ^ (word & low)
+    return (left << half) | right
+
+
+def _mix(x: _Words) -> _Words:
+    """SplitMix64's finalizer, a bijection of 64-bit words."""
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))

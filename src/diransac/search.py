@@ -1,0 +1,216 @@
+"""Algorithm 1: random minimal samples, simulated over the whole log, judged by consensus, refitted to their inliers.
+
+Samples do not depend on what was found so far, so hypotheses are fitted and simulated a batch at a time
+("speculate"); their scores are then walked in order exactly as the algorithm says ("replay"), and only a chain of
+refits runs on its own.  The answer is that of the sequential algorithm, whatever the batch size.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac.consensus import Score, Variant
+from diransac.errors import IdentificationError
+from diransac.estimators import BoundEstimator
+from diransac.settings import Settings
+
+__all__ = ["Evaluator", "Hypothesis", "Outcome", "Progress", "search"]
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+Sampler = Callable[[int, IntArray, int, int, int], IntArray]
+Progress = Callable[[int, int, Score], None]
+
+_FIRST_BATCH = 16
+
+
+class Evaluator(Protocol):
+    """What simulates hypotheses over the whole log."""
+
+    def admits(self, parameters: FloatArray) -> BoolArray:
+        """Preliminary test of ``(n, n_p)`` parameters: the model's bounds."""
+
+    def scores(self, parameters: FloatArray) -> list[Score]:
+        """Error and inlier fraction of every hypothesis ``(n, n_p)``."""
+
+    def inliers(self, parameters: FloatArray) -> IntArray:
+        """Usable rows that are inliers of one hypothesis ``(n_p,)``, ascending."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Parameters ``(n_p,)``, the usable rows that they were fitted to, and their score."""
+
+    parameters: FloatArray
+    rows: IntArray
+    score: Score
+
+
+@dataclass
+class Outcome:
+    """What a search found.
+
+    Parameters
+    ----------
+    best : the stored hypothesis; None while nothing was accepted
+    iterations : k, samples drawn
+    evaluated : hypotheses looked at, refits included
+    skipped : hypotheses that went no further, by reason
+    stop_reason : why it ended
+    """
+
+    best: Hypothesis | None = None
+    iterations: int = 0
+    evaluated: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+    stop_reason: str = ""
+
+    @property
+    def score(self) -> Score:
+        """Score of the stored hypothesis; infinite error and no inliers while there is none."""
+        return Score() if self.best is None else self.best.score
+
+
+def search(
+    variant: Variant,
+    settings: Settings,
+    estimator: BoundEstimator,
+    evaluator: Evaluator,
+    sampler: Sampler,
+    seed: int,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Algorithm 1 in the given variant.
+
+    Parameters
+    ----------
+    sampler : ``(seed, iterations, n_rows, start, stop) -> rows``, as `sampling.sample_rows`
+    progress : called with (k, max_iterations, score of the stored hypothesis) after every batch
+
+    Raises IdentificationError: the whole log is not well-defined, or nothing was ever accepted.
+    References: Dimmig et al. 2023, Algorithm 1.
+    """
+    outcome = Outcome()
+    for batch in _batches(settings):
+        drawn = _speculate(batch, settings, estimator, evaluator, sampler, seed)
+        for hypothesis in drawn:
+            if variant.is_finished(outcome.score, settings.stop_inlier_fraction):
+                break
+            outcome.iterations += 1
+            _replay(hypothesis, outcome, variant, settings, estimator, evaluator)
+        if progress is not None:
+            progress(outcome.iterations, settings.max_iterations, outcome.score)
+        if variant.is_finished(outcome.score, settings.stop_inlier_fraction):
+            break
+    if outcome.best is None:
+        raise IdentificationError(_nothing_accepted(outcome))
+    finished = variant.is_finished(outcome.score, settings.stop_inlier_fraction)
+    outcome.stop_reason = "inlier fraction reached" if finished else "iteration limit reached"
+    return outcome
+
+
+def _batches(settings: Settings) -> Iterator[IntArray]:
+    """Iterations in batches that grow from a few, because many searches stop early, to ``batch_size``."""
+    start, size = 0, min(_FIRST_BATCH, settings.batch_size)
+    while start < settings.max_iterations:
+        stop = min(start + size, settings.max_iterations)
+        yield np.arange(start, stop)
+        start, size = stop, min(2 * size, settings.batch_size)
+
+
+def _speculate(
+    batch: IntArray,
+    settings: Settings,
+    estimator: BoundEstimator,
+    evaluator: Evaluator,
+    sampler: Sampler,
+    seed: int,
+) -> list[Hypothesis | None]:
+    """The hypothesis of every sample in the batch, None where it fails the preliminary test."""
+    samples: list[IntArray] = list(sampler(seed, batch, estimator.n_rows, 0, settings.sample_size))
+    for i in np.flatnonzero(~estimator.well_defined(samples)):
+        samples[i] = _grow(samples[i], batch[i : i + 1], estimator, sampler, seed)
+    parameters = estimator.fit(samples)
+    admitted = np.flatnonzero(evaluator.admits(parameters))
+    scores = dict(zip(admitted, evaluator.scores(parameters[admitted]), strict=True)) if len(admitted) else {}
+    return [Hypothesis(parameters[i], s, scores[i]) if i in scores else None for i, s in enumerate(samples)]
+
+
+def _grow(sample: IntArray, k: IntArray, estimator: BoundEstimator, sampler: Sampler, seed: int) -> IntArray:
+    """The sample with as many more random observations as make it well-defined (lines 6-10).
+
+    Adding an observation never lowers the smallest eigenvalue, so the least number is found by bisection.
+    """
+    rest = sampler(seed, k, estimator.n_rows, len(sample), estimator.n_rows)[0]
+    whole = np.concatenate([sample, rest])
+    low, high = len(sample), len(whole)
+    if not estimator.well_defined([whole])[0]:
+        raise IdentificationError("the whole log is not well-defined: it does not determine the parameters")
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if estimator.well_defined([whole[:middle]])[0] else (middle, high)
+    return whole[:high]
+
+
+def _replay(
+    hypothesis: Hypothesis | None,
+    outcome: Outcome,
+    variant: Variant,
+    settings: Settings,
+    estimator: BoundEstimator,
+    evaluator: Evaluator,
+) -> None:
+    """One sample and the chain of refits that it starts (lines 13-34)."""
+    used: set[bytes] = set()
+    while True:
+        outcome.evaluated += 1
+        if hypothesis is None:
+            outcome.skipped["out of bounds"] += 1
+            return
+        used.add(np.sort(hypothesis.rows).tobytes())
+        stored = _judge(hypothesis, outcome, variant)
+        if stored is None or settings.refit == "none" or not variant.refits(stored=stored):
+            return
+        inliers = evaluator.inliers(hypothesis.parameters)
+        if inliers.tobytes() in used or not estimator.well_defined([inliers])[0]:
+            return
+        limit = outcome.iterations >= settings.max_iterations
+        if limit or variant.is_finished(outcome.score, settings.stop_inlier_fraction):
+            return
+        hypothesis = _refit(inliers, estimator, evaluator)
+
+
+def _judge(hypothesis: Hypothesis, outcome: Outcome, variant: Variant) -> bool | None:
+    """Whether a hypothesis was stored; None where it does not even improve (lines 19-23)."""
+    score = hypothesis.score
+    if not variant.improves(score, outcome.score):
+        outcome.skipped["diverged" if np.isinf(score.error) else "no improvement"] += 1
+        return None
+    if not variant.accepts(score, outcome.score):
+        outcome.skipped["diverged" if np.isinf(score.error) else "not accepted"] += 1
+        return False
+    outcome.best = hypothesis
+    return True
+
+
+def _refit(inliers: IntArray, estimator: BoundEstimator, evaluator: Evaluator) -> Hypothesis | None:
+    """The hypothesis of an inlier set, None where it fails the preliminary test."""
+    parameters = estimator.fit([inliers])
+    if not evaluator.admits(parameters)[0]:
+        return None
+    return Hypothesis(parameters[0], inliers, evaluator.scores(parameters)[0])
+
+
+def _nothing_accepted(outcome: Outcome) -> str:
+    counts: Sequence[str] = [f"{n} {reason}" for reason, n in outcome.skipped.most_common()]
+    return (
+        f"no hypothesis was accepted in {outcome.iterations} samples ({', '.join(counts)}); check units and signs of the "
+        "inputs, widen the parameter bounds or the inlier thresholds, or clean the log"
+    )

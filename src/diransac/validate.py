@@ -1,0 +1,202 @@
+"""How well a plant predicts a log that it was not identified from: open-loop simulation at several horizons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac.errors import LogError, SettingsError
+from diransac.log import Log
+from diransac.model import Model
+from diransac.observations import Observations, observe
+from diransac.simulate import rollouts
+
+__all__ = ["Scores", "Validation", "validate"]
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+_NICE = (1.0, 2.0, 5.0)
+
+
+class HasParameters(Protocol):
+    """A `Plant` or a `Result`."""
+
+    @property
+    def model(self) -> Model:
+        """Equations of motion."""
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """Their parameters."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Open-loop prediction at one horizon, by signal.
+
+    Parameters
+    ----------
+    horizon : s after which the simulation restarts from the measured state; infinite: never
+    windows : simulations that were scored
+    diverged : of them, those that became infinite; they leave every score infinitely bad
+    rmse : root of the mean squared error, the signal's unit
+    fit_percent : ``100 (1 - |y - y_sim| / |y - mean(y)|)``
+    r_squared : ``1 - sum (y - y_sim)^2 / sum (y - mean(y))^2``
+    """
+
+    horizon: float
+    windows: int
+    diverged: int
+    rmse: Mapping[str, float]
+    fit_percent: Mapping[str, float]
+    r_squared: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Scores at several horizons, shortest first; ``rmse`` and its siblings are those of the horizon that was asked for.
+
+    Parameters
+    ----------
+    source : how messages name the log
+    units : unit of each signal
+    asked : index of the horizon that was asked for; the whole log if none was
+    notes : what was found in the log
+    """
+
+    source: str
+    units: Mapping[str, str]
+    horizons: tuple[Scores, ...]
+    asked: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def rmse(self) -> Mapping[str, float]:
+        """Root mean squared error of each signal, in its unit."""
+        return self.horizons[self.asked].rmse
+
+    @property
+    def fit_percent(self) -> Mapping[str, float]:
+        """``100 (1 - |y - y_sim| / |y - mean(y)|)`` of each signal."""
+        return self.horizons[self.asked].fit_percent
+
+    @property
+    def r_squared(self) -> Mapping[str, float]:
+        """Coefficient of determination of each signal."""
+        return self.horizons[self.asked].r_squared
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, ready for JSON (a figure that is not finite becomes null)."""
+        rows = [{k: _finite(x) for k, x in vars(scores).items()} for scores in self.horizons]
+        top = {k: rows[self.asked][k] for k in ("horizon", "rmse", "fit_percent", "r_squared")}
+        return {"log": self.source, **top, "units": dict(self.units), "horizons": rows, "notes": list(self.notes)}
+
+    def __str__(self) -> str:
+        header = ["signal", "unit"]
+        for scores in self.horizons:
+            label = "whole log" if np.isinf(scores.horizon) else f"{scores.horizon:g} s"
+            header += [f"RMSE {label}", "fit %", "R^2"]
+        rows = [header]
+        for name in self.rmse:
+            row = [name, self.units[name]]
+            for s in self.horizons:
+                row += [f"{s.rmse[name]:.4g}", f"{s.fit_percent[name]:.1f}", f"{s.r_squared[name]:.4f}"]
+            rows.append(row)
+        widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
+        return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+
+
+def validate(
+    plant: HasParameters, log: Log, horizon: float | None = None, *, integrator: str = "rk4", substeps: int = 1
+) -> Validation:
+    """Open-loop prediction of a log by a plant (a `Plant`, or a `Result`).
+
+    Parameters
+    ----------
+    horizon : s; the simulation restarts from the measured state after each.  None: two that suit the log's length.  The
+        whole log from its first row is always scored, too
+    integrator, substeps : as in `Settings`
+
+    The first row of a window, where the state is the measured one, is not scored.
+    Raises LogError: the log lacks an input or an initial state; SettingsError: a horizon shorter than a sample.
+    """
+    observations = observe(plant.model, log, pointwise=False)
+    parameters = plant.model.parameter_vector(plant.parameters)
+    engine = rollouts(plant.model, observations.signals, integrator=integrator, substeps=substeps)
+    span = (len(observations) - 1) * log.dt
+    if horizon is not None and not log.dt <= horizon:
+        raise SettingsError(f"horizon is {horizon} s; give at least one sample, {log.dt:g} s")
+    wanted = [horizon] if horizon is not None else sorted({_nice(span / 50.0), _nice(span / 10.0)})
+    lengths = [round(h / log.dt) for h in wanted if round(h / log.dt) >= 1 and h < span]
+    scores = [_score(engine, observations, parameters, n * log.dt, n) for n in lengths]
+    scores.append(_score(engine, observations, parameters, np.inf, len(observations) - 1))
+    asked = 0 if horizon is not None else len(scores) - 1
+    units = {n: plant.model.units[n] for n in observations.signals}
+    return Validation(log.source, units, tuple(scores), asked, observations.notes)
+
+
+def _score(engine: Any, observations: Observations, parameters: FloatArray, horizon: float, steps: int) -> Scores:
+    """Scores of windows of so many steps, one after another."""
+    starts, states = _starts(observations, steps)
+    valid = observations.valid
+    errors = engine.errors(
+        np.tile(parameters, (len(starts), 1)),
+        states,
+        observations.inputs,
+        observations.measured,
+        np.ones_like(valid),
+        observations.log.dt,
+        start_rows=starts,
+        n_rows=steps + 1,
+    )[:, 1:]
+    rows = starts[:, None] + np.arange(1, steps + 1)
+    measured = observations.measured[rows]
+    present = np.isfinite(measured)
+    diverged = (~np.isfinite(errors) & present).any(axis=(1, 2))
+    squared = np.where(present, np.where(np.isfinite(errors), np.square(errors), np.inf), 0.0).sum(axis=(0, 1))
+    count = present.sum(axis=(0, 1))
+    mean = np.where(present, measured, 0.0).sum(axis=(0, 1)) / np.maximum(count, 1)
+    spread = np.where(present, np.square(measured - mean), 0.0).sum(axis=(0, 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rmse, ratio = np.sqrt(squared / count), squared / spread
+    by_name = (
+        dict(zip(observations.signals, x.tolist(), strict=True))
+        for x in (rmse, 100.0 * (1.0 - np.sqrt(ratio)), 1.0 - ratio)
+    )
+    return Scores(horizon, len(starts), int(diverged.sum()), *by_name)
+
+
+def _starts(observations: Observations, steps: int) -> tuple[IntArray, FloatArray]:
+    """Rows at which windows start, and the measured states there; a window whose state is incomplete is left out.
+
+    Raises LogError: no window is left.
+    """
+    model = observations.model
+    base = observations.initial_state("first")
+    starts = np.arange(0, len(observations) - steps, steps)
+    states = np.tile(base, (len(starts), 1))
+    for i, name in enumerate(model.state):
+        if name in observations.signals:
+            states[:, i] = observations.column(name)[starts]
+    matter = [i for i, n in enumerate(model.state) if n in model.states_behind(observations.signals)]
+    whole = np.isfinite(states[:, matter]).all(axis=1)
+    if not whole.any():
+        raise LogError(f"{observations.log.source}: no window of {steps} steps starts at a complete state; found NaN in each")
+    return starts[whole], np.nan_to_num(states[whole])
+
+
+def _nice(seconds: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above ``seconds``."""
+    decade = 10.0 ** np.floor(np.log10(seconds))
+    return float(max(x * decade for x in _NICE if x * decade <= seconds * (1.0 + 1e-9)))
+
+
+def _finite(x: Any) -> Any:
+    if isinstance(x, Mapping):
+        return {k: _finite(v) for k, v in x.items()}
+    return x if not isinstance(x, float) or np.isfinite(x) else None
