@@ -1,0 +1,19 @@
+"""A small compiler: expression graph -> typed instructions -> LLVM -> machine code on eight lanes at a time.
+
+| file | what it holds |
+|---|---|
+| `graph.py` | the graph of a CasADi SX function: each value once, products fused into sums, invariants marked |
+| `vectors.py` | arithmetic on eight float64 lanes, over llvmlite's IR builder |
+| `vector_math.py` | sin, exp, pow and the like, of such vectors |
+| `operations.py` | the vector form of every operation, in one table; emits a graph by it |
+| `machine_code.py` | LLVM module -> callable machine code; threads |
+| `map_loop.py`, `row_map.py` | one function over many rows |
+| `time_loop.py` | the time loop of a simulation; `diransac.simulate` is its face |
+
+LLVM is loaded when something is first compiled.
+"""
+
+from diransac.kernel.machine_code import Target
+from diransac.kernel.row_map import Map, compile_map
+
+__all__ = ["Map", "Target", "compile_map"]

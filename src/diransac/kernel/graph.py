@@ -1,0 +1,214 @@
+"""Expression graph of a CasADi SX function, as a list of instructions that a code generator can walk.
+
+Equal sub-expressions are one instruction. A product that is used once, by a sum or a difference, is fused with it; what
+depends on invariant inputs alone is marked, to be computed once instead of in every step. All of it is decided on the
+whole graph, never on the outputs that a caller happens to want, so every use of a graph computes the same bits.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+import casadi as ca
+
+from diransac.errors import ModelError
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable
+
+__all__ = ["Graph", "Instruction", "read_graph"]
+
+
+@dataclass(frozen=True, slots=True)
+class Instruction:
+    """One operation on the results of earlier instructions.
+
+    Attributes
+    ----------
+    operation : CasADi's name without `OP_`, or one of `FMA` x y + z, `FMS` x y - z, `FNMA` z - x y
+    operands : positions of the instructions whose results it takes
+    constant : the bits of a CONST
+    source : of an INPUT, the argument of the function and the element of it, column by column, zeros included
+    """
+
+    operation: str
+    operands: tuple[int, ...] = ()
+    constant: bytes = b""
+    source: tuple[int, int] = (-1, -1)
+
+    @property
+    def value(self) -> float:
+        """Number that a CONST stands for."""
+        return float(struct.unpack("<d", self.constant)[0])
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Instructions in an order in which they can run.
+
+    Attributes
+    ----------
+    instructions : each refers to earlier ones only
+    outputs : for each output of the function, the instruction that gives each of its elements, column by column
+    invariant : of each instruction, whether it depends on constants and invariant inputs alone
+    """
+
+    instructions: tuple[Instruction, ...]
+    outputs: tuple[tuple[int, ...], ...]
+    invariant: tuple[bool, ...]
+
+    def needed(self, wanted: Iterable[int], known: Collection[int] = ()) -> frozenset[int]:
+        """Return `wanted` and all that they depend on, without what is known already."""
+        alive = set(wanted).difference(known)
+        for position in range(len(self.instructions) - 1, -1, -1):
+            if position in alive:
+                alive.update(k for k in self.instructions[position].operands if k not in known)
+        return frozenset(alive)
+
+
+@dataclass
+class _Builder:
+    """Collects instructions; one that is there already is used again."""
+
+    instructions: list[Instruction] = field(default_factory=list)
+    positions: dict[Instruction, int] = field(default_factory=dict)
+
+    def add(self, instruction: Instruction) -> int:
+        """Return the position of the instruction."""
+        position = self.positions.setdefault(instruction, len(self.instructions))
+        if position == len(self.instructions):
+            self.instructions.append(instruction)
+        return position
+
+    def constant(self, value: float) -> int:
+        """Return the position of a constant."""
+        return self.add(Instruction("CONST", constant=struct.pack("<d", value)))
+
+
+def read_graph(function: ca.Function, invariant_inputs: Collection[int] = (), *, reciprocals: bool = False) -> Graph:
+    """Expression graph of an SX function, with products fused into sums.
+
+    Parameters
+    ----------
+    function : CasADi SX function
+    invariant_inputs : arguments of it that stay the same in all that is computed in one go
+    reciprocals : divide by an invariant as `x * (1 / p)`, so that the loop only multiplies. The quotient may differ in
+        its last two bits, and where `|p|` lies outside 2**-1022 .. 2**1022 its reciprocal over- or underflows
+
+    Raises ModelError: an operation that has no vector form here, by name.
+    """
+    if not function.is_a("SXFunction"):
+        raise ModelError(
+            f"function {function.name()!r} cannot be compiled: it is a {function.class_name()}, "
+            "not an expression of SX symbols; expand it: Function.expand()."
+        )
+    instructions, outputs = _read(function)
+    graph = _marked(instructions, outputs, frozenset(invariant_inputs))
+    if reciprocals:
+        graph = _with_reciprocals(graph, frozenset(invariant_inputs))
+    return _fused(graph, frozenset(invariant_inputs))
+
+
+@cache
+def _operation_names() -> dict[int, str]:
+    """CasADi's names of its operations."""
+    return {getattr(ca, name): name.removeprefix("OP_") for name in dir(ca) if name.startswith("OP_")}
+
+
+def _read(function: ca.Function) -> tuple[list[Instruction], list[list[int]]]:
+    """Instructions of a function, each value once, and the dense outputs."""
+    builder = _Builder()
+    elements_in = [_dense_elements(function.sparsity_in(k)) for k in range(function.n_in())]
+    elements_out = [_dense_elements(function.sparsity_out(k)) for k in range(function.n_out())]
+    zero = builder.constant(0.0)
+    outputs = [[zero] * function.numel_out(k) for k in range(function.n_out())]
+    register: dict[int, int] = {}
+    for k in range(function.n_instructions()):
+        name = _operation_names()[function.instruction_id(k)]
+        sources, targets = function.instruction_input(k), function.instruction_output(k)
+        if name == "OUTPUT":
+            outputs[targets[0]][elements_out[targets[0]][targets[1]]] = register[sources[0]]
+        elif name == "INPUT":
+            element = elements_in[sources[0]][sources[1]]
+            register[targets[0]] = builder.add(Instruction("INPUT", source=(sources[0], element)))
+        elif name == "CONST":
+            register[targets[0]] = builder.constant(function.instruction_constant(k))
+        else:
+            _refuse(name, function)
+            register[targets[0]] = builder.add(Instruction(name, tuple(register[i] for i in sources)))
+    return builder.instructions, outputs
+
+
+def _dense_elements(sparsity: ca.Sparsity) -> list[int]:
+    """Position of each structural non-zero in the dense matrix, column by column."""
+    rows, columns = sparsity.get_triplet()
+    return [row + column * sparsity.size1() for row, column in zip(rows, columns, strict=True)]
+
+
+def _refuse(name: str, function: ca.Function) -> None:
+    """Raise where an operation has no vector form."""
+    if name == "CALL":
+        raise ModelError(
+            f"function {function.name()!r} cannot be compiled: it calls another function (operation CALL), an "
+            "interpolant for example; write it as an expression, or expand it: Function.expand()."
+        )
+    if name == "PARAMETER":
+        free = ", ".join(str(symbol) for symbol in function.free_sx())
+        raise ModelError(
+            f"function {function.name()!r} cannot be compiled: {free} is a symbol that is none of its arguments "
+            "(operation PARAMETER); make it an argument or a number."
+        )
+
+
+def _marked(instructions: list[Instruction], outputs: Iterable[Iterable[int]], inputs: frozenset[int]) -> Graph:
+    """Graph whose instructions know whether they depend on invariant inputs alone."""
+    invariant: list[bool] = []
+    for instruction in instructions:
+        fixed = instruction.source[0] in inputs if instruction.operation == "INPUT" else True
+        invariant.append(fixed and all(invariant[k] for k in instruction.operands))
+    return Graph(tuple(instructions), tuple(tuple(row) for row in outputs), tuple(invariant))
+
+
+def _with_reciprocals(graph: Graph, inputs: frozenset[int]) -> Graph:
+    """Graph whose divisions by an invariant are products with its reciprocal."""
+    builder = _Builder()
+    moved: list[int] = []
+    for instruction in graph.instructions:
+        operands = tuple(moved[k] for k in instruction.operands)
+        copy = replace(instruction, operands=operands)
+        if instruction.operation == "DIV":
+            dividend, divisor = instruction.operands
+            if graph.invariant[divisor] and not graph.invariant[dividend]:
+                reciprocal = builder.add(Instruction("INV", (operands[1],)))
+                copy = Instruction("MUL", (operands[0], reciprocal))
+        moved.append(builder.add(copy))
+    return _marked(builder.instructions, [[moved[k] for k in row] for row in graph.outputs], inputs)
+
+
+def _fused(graph: Graph, inputs: frozenset[int]) -> Graph:
+    """Graph whose sums take in a product that nothing else uses; its rounding is saved."""
+    uses = Counter(k for instruction in graph.instructions for k in instruction.operands)
+    uses.update(k for row in graph.outputs for k in row)
+    fused = [_fuse(graph, uses, position) for position in range(len(graph.instructions))]
+    return _marked(fused, graph.outputs, inputs)
+
+
+def _fuse(graph: Graph, uses: Counter[int], position: int) -> Instruction:
+    """Fuse a sum or difference with its first operand, else its second, if that is a product fit for it."""
+    instruction = graph.instructions[position]
+    if instruction.operation not in ("ADD", "SUB"):
+        return instruction
+    names = {"ADD": ("FMA", "FMA"), "SUB": ("FMS", "FNMA")}[instruction.operation]
+    for side, name in enumerate(names):
+        factor = instruction.operands[side]
+        product = graph.instructions[factor]
+        # A product that waits outside the loop costs nothing inside it: fusing would only occupy a register more.
+        waits = graph.invariant[factor] and not graph.invariant[position]
+        if product.operation in ("MUL", "SQ") and uses[factor] == 1 and not waits:
+            x, y = product.operands * 2 if product.operation == "SQ" else product.operands
+            return Instruction(name, (x, y, instruction.operands[1 - side]))
+    return instruction

@@ -1,0 +1,120 @@
+"""From LLVM's intermediate representation to machine code, and running it on several threads."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from diransac.errors import SettingsError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Sequence
+
+__all__ = ["LANES", "MachineCode", "Target", "compile_function", "run_blocks"]
+
+LANES = 8
+"""Lanes of a vector, on every processor: what is computed never depends on the width of the machine."""
+
+CHUNKS_PER_THREAD = 4
+
+LLVM: TypeAlias = Any
+"""Something of llvmlite, which has no types."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A processor to generate code for.
+
+    Attributes
+    ----------
+    cpu : LLVM's name of it
+    features : LLVM's list of its features, such as `+avx2,-avx512f`
+    """
+
+    cpu: str
+    features: str = ""
+
+    @staticmethod
+    @cache
+    def host() -> Target:
+        """Return the processor that this runs on, its full register width included."""
+        binding = _binding()
+        features = binding.get_host_cpu_features()
+        features["prefer-256-bit"] = False
+        return Target(binding.get_host_cpu_name(), features.flatten())
+
+
+@dataclass(frozen=True)
+class MachineCode:
+    """A compiled function; it can be called as long as this lives.
+
+    Attributes
+    ----------
+    call : takes what its signature says; releases Python's lock while it runs
+    engine : owns the memory
+    """
+
+    call: Callable[..., None]
+    engine: LLVM
+
+
+@cache
+def _binding() -> LLVM:
+    """LLVM, set up for this processor; loaded when first asked for."""
+    from llvmlite import binding
+
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    return binding
+
+
+def compile_function(module: LLVM, name: str, signature: Collection[str], target: Target | None = None) -> MachineCode:
+    """Compile one function of an LLVM module, optimised, to machine code.
+
+    Parameters
+    ----------
+    module : llvmlite `ir.Module`
+    name : the function
+    signature : kind of each argument, `pointer`, `integer` (64 bits) or `number` (float64)
+    target : processor to compile for; this one by default
+    """
+    binding = _binding()
+    target = target or Target.host()
+    parsed = binding.parse_assembly(str(module))
+    triple = binding.Target.from_default_triple()
+    machine = triple.create_target_machine(cpu=target.cpu, features=target.features, opt=3)
+    tuning = binding.create_pipeline_tuning_options(speed_level=2)
+    passes = binding.create_pass_builder(machine, tuning)
+    passes.getModulePassManager().run(parsed, passes)
+    engine = binding.create_mcjit_compiler(parsed, machine)
+    engine.finalize_object()
+    kinds = {"pointer": ctypes.c_void_p, "integer": ctypes.c_int64, "number": ctypes.c_double}
+    prototype = ctypes.CFUNCTYPE(None, *(kinds[kind] for kind in signature))
+    return MachineCode(prototype(engine.get_function_address(name)), engine)
+
+
+def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: int, threads: int) -> None:
+    """Call a compiled loop for blocks 0 .. n_blocks - 1, on several threads if there are several blocks.
+
+    Raises SettingsError: fewer than one thread.
+    """
+    if threads < 1:
+        raise SettingsError(f"threads is {threads}, but at least 1 has to run.")
+    if threads == 1 or n_blocks == 1:
+        call(*arguments, 0, n_blocks)
+        return
+    edges = np.linspace(0, n_blocks, min(n_blocks, threads * CHUNKS_PER_THREAD) + 1).astype(int).tolist()
+    work = _pool(os.getpid(), threads).map(lambda first, end: call(*arguments, first, end), edges[:-1], edges[1:])
+    list(work)
+
+
+@lru_cache(maxsize=4)
+def _pool(_process: int, threads: int) -> ThreadPoolExecutor:
+    """Threads of this process, made when first needed; a forked process makes its own."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="diransac")

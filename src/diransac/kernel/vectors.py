@@ -1,0 +1,231 @@
+"""Eight float64 lanes at a time: llvmlite's IR builder with vector types.
+
+Nothing here knows about models. Every method emits instructions whose lanes are independent and correctly rounded (no
+fast-math flags), so a lane's bits depend neither on its neighbours nor on the width of the machine's registers.
+"""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from llvmlite import ir
+
+from diransac.kernel.machine_code import LANES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+__all__ = ["Cell", "Loop", "Value", "Vectors"]
+
+Value: TypeAlias = Any
+"""An LLVM value: a vector of numbers, of 64-bit integers or of conditions, or a scalar (llvmlite has no types)."""
+
+DOUBLE = ir.DoubleType()
+INTEGER = ir.IntType(64)
+BIT = ir.IntType(1)
+BYTE = ir.IntType(8)
+POINTER = ir.PointerType()
+NUMBERS = ir.VectorType(DOUBLE, LANES)
+INTEGERS = ir.VectorType(INTEGER, LANES)
+CONDITIONS = ir.VectorType(BIT, LANES)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A mutable variable of the emitted code; LLVM keeps it in a register."""
+
+    address: Value
+    type: Value
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A loop being emitted: its counter, and the block to branch to in order to leave it."""
+
+    index: Value
+    leave: Value
+
+
+class Vectors:
+    """Emits arithmetic on vectors of eight lanes at the end of a builder's block."""
+
+    def __init__(self, builder: Value) -> None:
+        self.builder = builder
+        self._memory: dict[tuple[str, Value], Value] = {}
+
+    def once(self, name: str, operand: Value, emit: Callable[[], Value]) -> Value:
+        """`emit()`, or what it gave before for the same name and operand: sin and cos share their work."""
+        key = (name, operand)
+        if key not in self._memory:
+            self._memory[key] = emit()
+        return self._memory[key]
+
+    # Constants -----------------------------------------------------------------------------------------------------
+    def number(self, value: float) -> Value:
+        """Return the constant in every lane."""
+        return ir.Constant(NUMBERS, [ir.Constant(DOUBLE, float(value))] * LANES)
+
+    def integer(self, value: int) -> Value:
+        """Return the 64-bit integer constant in every lane."""
+        return ir.Constant(INTEGERS, [ir.Constant(INTEGER, value)] * LANES)
+
+    # Arithmetic ----------------------------------------------------------------------------------------------------
+    def add(self, x: Value, y: Value) -> Value:
+        """Return x + y."""
+        return self.builder.fadd(x, y)
+
+    def sub(self, x: Value, y: Value) -> Value:
+        """Return x - y."""
+        return self.builder.fsub(x, y)
+
+    def mul(self, x: Value, y: Value) -> Value:
+        """Return x y."""
+        return self.builder.fmul(x, y)
+
+    def div(self, x: Value, y: Value) -> Value:
+        """Return x / y."""
+        return self.builder.fdiv(x, y)
+
+    def neg(self, x: Value) -> Value:
+        """Return -x."""
+        return self.builder.fneg(x)
+
+    def fma(self, x: Value, y: Value, z: Value) -> Value:
+        """Return x y + z, rounded once."""
+        return self.intrinsic("fma", x, y, z)
+
+    def intrinsic(self, name: str, *operands: Value) -> Value:
+        """Return LLVM's `llvm.<name>` of vectors."""
+        return self.builder.call(self._declared(f"llvm.{name}.v{LANES}f64", NUMBERS, len(operands)), operands)
+
+    def libm(self, name: str, *operands: Value) -> Value:
+        """Return the C library's function of every lane, one lane after the other."""
+        function = self._declared(name, DOUBLE, len(operands))
+        result = ir.Constant(NUMBERS, ir.Undefined)
+        for lane in range(LANES):
+            scalars = [self.lane(operand, lane) for operand in operands]
+            result = self.with_lane(result, self.builder.call(function, scalars), lane)
+        return result
+
+    def _declared(self, name: str, kind: Value, n_operands: int) -> Value:
+        """Return a function from elsewhere, declared once in the module."""
+        module = self.builder.module
+        known = module.globals.get(name)
+        return known or ir.Function(module, ir.FunctionType(kind, [kind] * n_operands), name)
+
+    # Conditions ----------------------------------------------------------------------------------------------------
+    def compare(self, relation: str, x: Value, y: Value) -> Value:
+        """Return `x relation y`, false where either is NaN, except that NaN differs from everything."""
+        emit = self.builder.fcmp_unordered if relation == "!=" else self.builder.fcmp_ordered
+        return emit(relation, x, y)
+
+    def is_condition(self, x: Value) -> bool:
+        """Whether a value holds conditions rather than numbers."""
+        return bool(x.type == CONDITIONS)
+
+    def is_nan(self, x: Value) -> Value:
+        """Return where x is NaN."""
+        return self.builder.fcmp_unordered("uno", x, x)
+
+    def select(self, condition: Value, x: Value, y: Value) -> Value:
+        """Return x where the condition holds, else y."""
+        return self.builder.select(condition, x, y)
+
+    def both(self, x: Value, y: Value) -> Value:
+        """Return the logical and of conditions, or the bitwise one of integers."""
+        return self.builder.and_(x, y)
+
+    def either(self, x: Value, y: Value) -> Value:
+        """Return the logical or of conditions, or the bitwise one of integers."""
+        return self.builder.or_(x, y)
+
+    def negate(self, condition: Value) -> Value:
+        """Return the logical not."""
+        return self.builder.not_(condition)
+
+    def count(self, total: Value, condition: Value) -> Value:
+        """Return integers that grow by one where the condition holds."""
+        return self.builder.sub(total, self.builder.sext(condition, INTEGERS))
+
+    def any_lane(self, condition: Value) -> Value:
+        """Return one bit: whether the condition holds in some lane."""
+        mask = self.builder.bitcast(condition, ir.IntType(LANES))
+        return self.builder.icmp_unsigned("!=", mask, ir.Constant(ir.IntType(LANES), 0))
+
+    # Bits ----------------------------------------------------------------------------------------------------------
+    def bits(self, x: Value) -> Value:
+        """Return the 64 bits of each number as an integer."""
+        return self.builder.bitcast(x, INTEGERS)
+
+    def from_bits(self, x: Value) -> Value:
+        """Return the numbers whose bits these integers are."""
+        return self.builder.bitcast(x, NUMBERS)
+
+    # Lanes and memory ----------------------------------------------------------------------------------------------
+    def lane(self, x: Value, lane: int) -> Value:
+        """Return one lane as a scalar."""
+        return self.builder.extract_element(x, ir.Constant(INTEGER, lane))
+
+    def with_lane(self, x: Value, scalar: Value, lane: int) -> Value:
+        """Return the vector with one lane replaced."""
+        return self.builder.insert_element(x, scalar, ir.Constant(INTEGER, lane))
+
+    def join(self, scalars: list[Value]) -> Value:
+        """Return the vector of these eight scalars."""
+        result = ir.Constant(ir.VectorType(scalars[0].type, LANES), ir.Undefined)
+        for lane, scalar in enumerate(scalars):
+            result = self.with_lane(result, scalar, lane)
+        return result
+
+    def splat(self, scalar: Value) -> Value:
+        """Return the scalar in every lane."""
+        kind = ir.VectorType(scalar.type, LANES)
+        undefined = ir.Constant(kind, ir.Undefined)
+        first = self.with_lane(undefined, scalar, 0)
+        zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+        return self.builder.shuffle_vector(first, undefined, zeros)
+
+    def load(self, base: Value, index: Value, kind: Value) -> Value:
+        """Load a scalar, or a vector that starts, at element `index` of an array."""
+        element = kind.element if isinstance(kind, ir.VectorType) else kind
+        address = self.builder.gep(base, [index], source_etype=element)
+        return self.builder.load(address, typ=kind, align=1 if element == BYTE else 8)
+
+    def store(self, value: Value, base: Value, index: Value) -> None:
+        """Store a scalar or a vector at element `index` of an array of float64 or int64."""
+        address = self.builder.gep(base, [index], source_etype=INTEGER)
+        self.builder.store(value, address, align=8)
+
+    # Control -------------------------------------------------------------------------------------------------------
+    def cell(self, value: Value) -> Cell:
+        """Return a new variable that holds the value."""
+        with self.builder.goto_entry_block():
+            address = self.builder.alloca(value.type)
+        self.builder.store(value, address)
+        return Cell(address, value.type)
+
+    def get(self, cell: Cell) -> Value:
+        """Return what a variable holds."""
+        return self.builder.load(cell.address, typ=cell.type)
+
+    def set(self, cell: Cell, value: Value) -> None:
+        """Let a variable hold another value."""
+        self.builder.store(value, cell.address)
+
+    @contextmanager
+    def repeat(self, first: Value, end: Value) -> Iterator[Loop]:
+        """Emit what is inside once, to run with every index from `first` to before `end`."""
+        builder = self.builder
+        index = self.cell(first)
+        test, body, leave = (builder.append_basic_block(name) for name in ("test", "body", "leave"))
+        builder.branch(test)
+        builder.position_at_end(test)
+        counter = self.get(index)
+        builder.cbranch(builder.icmp_signed("<", counter, end), body, leave)
+        builder.position_at_end(body)
+        yield Loop(counter, leave)
+        self.set(index, builder.add(counter, ir.Constant(INTEGER, 1)))
+        builder.branch(test)
+        builder.position_at_end(leave)

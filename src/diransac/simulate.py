@@ -1,0 +1,441 @@
+"""Many rollouts of a model at once, scored against a log on the way.
+
+Observation `j` is the state at `t_j`; then the input `u_j` is held to `t_{j+1}`; the acceleration at `t_j` is the one
+under `u_j`. The integrators are written here, once, as expressions; `time_loop.py` turns them into machine code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diransac.errors import ModelError, SettingsError
+from diransac.kernel.graph import read_graph
+from diransac.kernel.machine_code import LANES, MachineCode, Target, compile_function, run_blocks
+
+if TYPE_CHECKING:
+    from diransac.kernel.time_loop import Keep, Plan
+
+__all__ = ["INTEGRATORS", "Rollouts", "Scores", "inlier_mask", "rollouts"]
+
+Floats = NDArray[np.float64]
+Dynamics = Callable[[ca.SX], ca.SX]
+"""State -> its derivative, with inputs and parameters held."""
+
+
+class Simulated(Protocol):
+    """What a model offers to be simulated."""
+
+    name: str
+    dynamics: ca.Function
+    signals: Sequence[str]
+    quaternions: Sequence[Sequence[int]]
+    n_q: int
+    n_v: int
+    n_u: int
+    n_p: int
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How well each rollout agrees with a log.
+
+    Attributes
+    ----------
+    sum_squares : (n_lanes, n_signals)   sum over valid rows of squared errors, each signal's unit squared; infinite in
+        every signal where the rollout diverged
+    inlier_count : (n_lanes,)   valid rows in which enough signals are near; rows from a divergence on are not
+    diverged : (n_lanes,)   whether some state or acceleration became infinite or NaN
+    """
+
+    sum_squares: Floats
+    inlier_count: NDArray[np.int64]
+    diverged: NDArray[np.bool_]
+
+
+def rollouts(
+    model: Simulated,
+    signals: Sequence[str] | None = None,
+    *,
+    integrator: str = "rk4",
+    substeps: int = 1,
+    target: Target | None = None,
+) -> Rollouts:
+    """Compiled rollouts of a model; the same ones again for the same equations and options.
+
+    Parameters
+    ----------
+    model : its `dynamics` is an SX function (x, u, p) -> (dx/dt, accelerations), and its `signals` name x and the
+        accelerations
+    signals : those that are compared with measurements, in the order of their columns; all by default
+    integrator : `rk4`, `euler` or `semi-implicit-euler` (velocities first, then coordinates with the new velocities)
+    substeps : integration steps from one row to the next
+    target : processor to compile for; this one by default
+
+    Raises SettingsError: an unknown signal or integrator, or no sub-step.
+    Raises ModelError: the dynamics hold an operation that cannot be compiled.
+    """
+    names = tuple(model.signals)
+    scored = names if signals is None else tuple(signals)
+    missing = [name for name in scored if name not in names]
+    if missing or len(set(scored)) < len(scored):
+        raise SettingsError(
+            f"signals {', '.join(scored)} cannot be scored: each must be one of model {model.name!r}, once; "
+            f"it has {', '.join(names)}."
+        )
+    if integrator not in INTEGRATORS:
+        raise SettingsError(f"integrator {integrator!r} is unknown; choose one of {', '.join(INTEGRATORS)}.")
+    if substeps < 1:
+        raise SettingsError(f"substeps is {substeps}, but a row takes at least 1 integration step.")
+    if not model.dynamics.is_a("SXFunction"):
+        raise ModelError(f"the dynamics of model {model.name!r} are not made of SX symbols; expand them: .expand().")
+    quaternions = tuple(tuple(int(k) for k in four) for four in model.quaternions)
+    sizes = (model.n_q, model.n_v, model.n_u, model.n_p)
+    return _rollouts(
+        _Equations(model.dynamics.serialize(), sizes, names, quaternions), scored, integrator, substeps, target
+    )
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """A model's equations of motion, as a value: equal ones are compiled once.
+
+    Attributes
+    ----------
+    dynamics : (x, u, p) -> (dx/dt, accelerations), serialised
+    sizes : of coordinates, velocities, inputs and parameters
+    signals : names of the states and accelerations
+    quaternions : positions in q
+    """
+
+    dynamics: str
+    sizes: tuple[int, int, int, int]
+    signals: tuple[str, ...]
+    quaternions: tuple[tuple[int, ...], ...]
+
+
+@lru_cache(maxsize=64)
+def _rollouts(
+    equations: _Equations, signals: tuple[str, ...], integrator: str, substeps: int, target: Target | None
+) -> Rollouts:
+    """Rollouts by value of what defines them."""
+    return Rollouts(equations, signals, integrator, substeps, target)
+
+
+# Integrators ---------------------------------------------------------------------------------------------------------
+def _euler(_dynamics: Dynamics, x: ca.SX, h: ca.SX, slope: ca.SX, _n_q: int) -> ca.SX:
+    """X + h dx/dt, order 1."""
+    return x + h * slope
+
+
+def _semi_implicit_euler(dynamics: Dynamics, x: ca.SX, h: ca.SX, slope: ca.SX, n_q: int) -> ca.SX:
+    """v+ = v + h a(q, v), q+ = q + h dq/dt(q, v+), order 1."""
+    v = x[n_q:] + h * slope[n_q:]
+    return ca.vertcat(x[:n_q] + h * dynamics(ca.vertcat(x[:n_q], v))[:n_q], v)
+
+
+def _rk4(dynamics: Dynamics, x: ca.SX, h: ca.SX, slope: ca.SX, _n_q: int) -> ca.SX:
+    """The classical Runge-Kutta step, order 4."""
+    second = dynamics(x + h / 2 * slope)
+    third = dynamics(x + h / 2 * second)
+    fourth = dynamics(x + h * third)
+    return x + h / 6 * (slope + fourth + 2 * (second + third))
+
+
+INTEGRATORS = {"rk4": _rk4, "euler": _euler, "semi-implicit-euler": _semi_implicit_euler}
+"""One step of each integrator: (dynamics, x, h, dx/dt at x, n_q) -> x after h seconds."""
+
+
+def _plan(equations: _Equations, signals: tuple[str, ...], integrator: str, substeps: int) -> Plan:
+    """Expressions of one row, as graphs."""
+    from diransac.kernel.time_loop import PARAMETER, STEP, Plan
+
+    function = ca.Function.deserialize(equations.dynamics)
+    n_q, n_v, n_u, n_p = equations.sizes
+    x, u = ca.SX.sym("x", n_q + n_v), ca.SX.sym("u", n_u)
+    p, h = ca.SX.sym("p", n_p), ca.SX.sym("h")
+    slope, acceleration = function(x, u, p)
+    after = INTEGRATORS[integrator](lambda state: function(state, u, p)[0], x, h, slope, n_q)
+    after = _normalised(after, equations.quaternions)
+    step, further_step = (
+        read_graph(ca.Function("step", [x, u, p, h], results), (PARAMETER, STEP), reciprocals=True)
+        for results in ([after, ca.vertcat(x, acceleration)], [after])
+    )
+    return Plan(
+        step=step,
+        further_step=further_step,
+        substeps=substeps,
+        n_states=n_q + n_v,
+        n_inputs=n_u,
+        n_signals=len(equations.signals),
+        scored=tuple(equations.signals.index(name) for name in signals),
+        quaternions=_scored_quaternions(equations, signals),
+    )
+
+
+def _normalised(x: ca.SX, quaternions: Sequence[Sequence[int]]) -> ca.SX:
+    """Return the state with every quaternion scaled to length one."""
+    elements = ca.vertsplit(x)
+    for four in quaternions:
+        scale = 1 / ca.sqrt(ca.sumsqr(ca.vertcat(*(elements[k] for k in four))))
+        for k in four:
+            elements[k] = elements[k] * scale
+    return ca.vertcat(*elements)
+
+
+def _scored_quaternions(equations: _Equations, signals: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
+    """Positions among the scored signals of the quaternions that are scored whole."""
+    named = [[equations.signals[k] for k in four] for four in equations.quaternions]
+    return tuple(tuple(signals.index(name) for name in four) for four in named if set(four) <= set(signals))
+
+
+# Running -------------------------------------------------------------------------------------------------------------
+class Rollouts:
+    """Rollouts of one model, integrator and choice of scored signals; made by `rollouts`.
+
+    A lane is one rollout: its parameters, its initial state, and with `start_rows` a window of the log of its own. What
+    a lane gives depends on nothing but its own data: not on the other lanes, their number, `threads`, or what is kept.
+
+    Common parameters
+    -----------------
+    parameters : (n_lanes, n_p)   each parameter's unit
+    initial_states : (n_x,) or (n_lanes, n_x)   coordinates, then velocities
+    inputs : (n_log, n_u)   held from each row to the next
+    measured : (n_log, n_s)   in the order of `signals`; NaN is allowed where `valid` is false
+    valid : (n_log,)   rows that count; the others are simulated through
+    dt : s   from row to row
+    start_rows : (n_lanes,)   row at which each lane starts; row 0 by default
+    n_rows : rows that a lane simulates; all of the log by default, required with `start_rows`
+    threads : how many blocks of lanes run at a time
+    """
+
+    def __init__(
+        self, equations: _Equations, signals: tuple[str, ...], integrator: str, substeps: int, target: Target | None
+    ) -> None:
+        self.signals = signals
+        self._equations = equations
+        self._substeps = substeps
+        self._target = target
+        self._plan = _plan(equations, signals, integrator, substeps)
+        self._code: dict[tuple[Keep, bool], MachineCode] = {}
+        self._lock = Lock()
+
+    def score(
+        self,
+        parameters: ArrayLike,
+        initial_states: ArrayLike,
+        inputs: ArrayLike,
+        measured: ArrayLike,
+        valid: ArrayLike,
+        dt: float,
+        thresholds: ArrayLike,
+        min_inlier_signals: int,
+        *,
+        start_rows: ArrayLike | None = None,
+        n_rows: int | None = None,
+        threads: int = 1,
+    ) -> Scores:
+        """Sums of squared errors and inlier counts of every lane; nothing is stored row by row.
+
+        The squares are added row after row, so `errors` reproduces the sums exactly.
+
+        Parameters
+        ----------
+        thresholds : (n_s,)   a signal is near where `|error| < threshold`; 0 switches it off
+        min_inlier_signals : near signals that make a row an inlier
+
+        Raises SettingsError: an array of the wrong shape, a window outside the log, a time step that isn't positive.
+        """
+        from diransac.kernel.time_loop import Keep
+
+        task = self._task(parameters, initial_states, inputs, dt, start_rows, n_rows)
+        task.measure(measured, valid, len(self.signals))
+        task.limit(thresholds, min_inlier_signals)
+        sums = np.empty((len(self.signals), task.n_padded))
+        counts = np.empty((2, task.n_padded), np.int64)
+        self._run(Keep.SCORES, task, {"sums": sums, "counts": counts}, threads)
+        n = task.n_lanes
+        return Scores(sums[:, :n].T.copy(), counts[0, :n].copy(), counts[1, :n] != 0)
+
+    def errors(
+        self,
+        parameters: ArrayLike,
+        initial_states: ArrayLike,
+        inputs: ArrayLike,
+        measured: ArrayLike,
+        valid: ArrayLike,
+        dt: float,
+        *,
+        start_rows: ArrayLike | None = None,
+        n_rows: int | None = None,
+        threads: int = 1,
+    ) -> Floats:
+        """Simulated less measured, (n_lanes, n_rows, n_s), NaN from a divergence on; the ones that `score` sums.
+
+        A quaternion's sign is ignored: its four simulated numbers change sign where that brings them nearer.
+        """
+        from diransac.kernel.time_loop import Keep
+
+        task = self._task(parameters, initial_states, inputs, dt, start_rows, n_rows)
+        task.measure(measured, valid, len(self.signals))
+        series = np.empty((task.n_lanes, task.n_rows, len(self.signals)))
+        self._run(Keep.ERRORS, task, {"series": series}, threads)
+        return series
+
+    def trajectories(
+        self,
+        parameters: ArrayLike,
+        initial_states: ArrayLike,
+        inputs: ArrayLike,
+        dt: float,
+        *,
+        start_rows: ArrayLike | None = None,
+        n_rows: int | None = None,
+        threads: int = 1,
+    ) -> Floats:
+        """All signals of the model, (n_lanes, n_rows, n_signals): states, accelerations; NaN from a divergence on."""
+        from diransac.kernel.time_loop import Keep
+
+        task = self._task(parameters, initial_states, inputs, dt, start_rows, n_rows)
+        series = np.empty((task.n_lanes, task.n_rows, len(self._equations.signals)))
+        self._run(Keep.SIGNALS, task, {"series": series}, threads)
+        return series
+
+    def _task(
+        self,
+        parameters: ArrayLike,
+        initial_states: ArrayLike,
+        inputs: ArrayLike,
+        dt: float,
+        start_rows: ArrayLike | None,
+        n_rows: int | None,
+    ) -> _Task:
+        """Check and arrange what every kind of run takes."""
+        n_q, n_v, n_u, n_p = self._equations.sizes
+        if not (np.isfinite(dt) and dt > 0):
+            raise SettingsError(f"dt is {dt}, but the time from row to row must be positive seconds.")
+        p = _array("parameters", parameters, (None, n_p))
+        x = np.asarray(initial_states, np.float64)
+        x = _array("initial_states", np.broadcast_to(x, (len(p), n_q + n_v)) if x.ndim == 1 else x, (len(p), n_q + n_v))
+        u = _array("inputs", inputs, (None, n_u))
+        return _Task(p, x, u, dt / self._substeps, start_rows, n_rows)
+
+    def _run(self, keep: Keep, task: _Task, results: dict[str, NDArray[Any]], threads: int) -> None:
+        """Run the time loop over all blocks of lanes."""
+        if task.n_lanes:
+            code = self._compiled(keep, task.start_rows is not None)
+            run_blocks(code.call, task.arguments(results), task.n_padded // LANES, threads)
+
+    def _compiled(self, keep: Keep, windows: bool) -> MachineCode:
+        """Machine code of a variant of the time loop, compiled when first needed."""
+        from diransac.kernel.time_loop import ARGUMENTS, emit_time_loop
+
+        with self._lock:
+            if (keep, windows) not in self._code:
+                module = emit_time_loop(self._plan, keep, windows=windows)
+                self._code[keep, windows] = compile_function(module, "time_loop", ARGUMENTS.values(), self._target)
+            return self._code[keep, windows]
+
+
+class _Task:
+    """Arrays of one run, arranged as the time loop reads them."""
+
+    def __init__(
+        self, p: Floats, x: Floats, u: Floats, step: float, start_rows: ArrayLike | None, n_rows: int | None
+    ) -> None:
+        self.n_lanes, self.n_padded = len(p), -(-len(p) // LANES) * LANES
+        self.parameters, self.initial_states = _padded(p, self.n_padded), _padded(x, self.n_padded)
+        self.inputs = u
+        self.step = step
+        self.n_rows = len(u) if n_rows is None else int(n_rows)
+        self.start_rows = None if start_rows is None else self._windows(start_rows, n_rows)
+        self.measured = self.thresholds = np.empty(0)
+        self.valid = np.empty(0, np.bool_)
+        self.min_inlier_signals = 0
+        if not 1 <= self.n_rows <= len(u):
+            raise SettingsError(f"n_rows is {self.n_rows}, but the log has {len(u)} rows.")
+
+    def _windows(self, start_rows: ArrayLike, n_rows: int | None) -> NDArray[np.int64]:
+        """Starts of the lanes' windows, padded."""
+        starts = np.asarray(start_rows)
+        if n_rows is None:
+            raise SettingsError("start_rows is given without n_rows; say how many rows each window has.")
+        if starts.shape != (self.n_lanes,) or starts.dtype.kind not in "iu":
+            raise SettingsError(f"start_rows must be one integer a lane, {self.n_lanes} in all; found {starts.shape}.")
+        if self.n_lanes and (starts.min() < 0 or starts.max() + self.n_rows > len(self.inputs)):
+            raise SettingsError(
+                f"windows of {self.n_rows} rows starting at rows {starts.min()} to {starts.max()} do not lie in the "
+                f"log's {len(self.inputs)} rows."
+            )
+        return _padded(starts.astype(np.int64), self.n_padded)
+
+    def measure(self, measured: ArrayLike, valid: ArrayLike, n_signals: int) -> None:
+        """Take what the rollouts are compared with."""
+        self.measured = _array("measured", measured, (len(self.inputs), n_signals))
+        self.valid = np.ascontiguousarray(valid)
+        if self.valid.shape != (len(self.inputs),) or self.valid.dtype != np.bool_:
+            raise SettingsError(f"valid must be {len(self.inputs)} Booleans, one a row; found {self.valid.shape}.")
+        if not np.isfinite(self.measured.sum()) and not np.isfinite(self.measured[self.valid]).all():
+            raise SettingsError("measured holds a NaN or an infinity in a valid row; mark such rows as not valid.")
+
+    def limit(self, thresholds: ArrayLike, min_inlier_signals: int) -> None:
+        """Take what makes a row an inlier."""
+        self.thresholds = _array("thresholds", thresholds, (self.measured.shape[-1],))
+        self.min_inlier_signals = int(min_inlier_signals)
+
+    def arguments(self, results: dict[str, NDArray[Any]]) -> list[Any]:
+        """Arguments of the time loop, but for the range of blocks; the arrays must outlive the call."""
+        from diransac.kernel.time_loop import ARGUMENTS
+
+        values = vars(self) | results
+        pointers = [name for name, kind in ARGUMENTS.items() if kind == "pointer"]
+        numbers = [self.step, self.min_inlier_signals, self.n_lanes, self.n_padded, self.n_rows]
+        return [None if (array := values.get(name)) is None else array.ctypes.data for name in pointers] + numbers
+
+
+def inlier_mask(
+    errors: Floats, valid: NDArray[np.bool_], thresholds: ArrayLike, min_inlier_signals: int
+) -> NDArray[np.bool_]:
+    """Which rows `Rollouts.score` counts as inliers, from `Rollouts.errors`.
+
+    Parameters
+    ----------
+    errors : (n_lanes, n_rows, n_s)   each signal's unit
+    valid : (n_rows,) or (n_lanes, n_rows)   rows that count
+    thresholds : (n_s,)   each signal's unit
+    min_inlier_signals : near signals that make a row an inlier
+
+    Returns
+    -------
+    (n_lanes, n_rows)
+    """
+    near = np.abs(errors) < np.asarray(thresholds)
+    alive = np.logical_and.accumulate(~np.isnan(errors).all(axis=-1) | ~valid, axis=-1)
+    return np.asarray((near.sum(axis=-1) >= min_inlier_signals) & alive & valid)
+
+
+def _array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Floats:
+    """Contiguous float64 array of the shape, None being any length."""
+    array = np.ascontiguousarray(values, np.float64)
+    fits = array.ndim == len(shape) and all(
+        want in (None, found) for want, found in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        wanted = " x ".join("any" if length is None else str(length) for length in shape)
+        raise SettingsError(f"{name} has shape {array.shape}, but {wanted} is needed.")
+    return array
+
+
+def _padded(lanes: NDArray[Any], n_padded: int) -> NDArray[Any]:
+    """Lanes on the last axis, the last one repeated to fill whole vectors."""
+    if not len(lanes):
+        return lanes.T
+    padding = np.repeat(lanes[-1:], n_padded - len(lanes), axis=0)
+    return np.ascontiguousarray(np.concatenate([lanes, padding]).T)
