@@ -52,7 +52,9 @@ def _weighted_sum(errors: FloatArray, weights: FloatArray) -> FloatArray:
 class Variant(Protocol):
     """The parts in which DIRANSAC and I-DIRANSAC differ."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What users call it."""
 
     def errors(self, sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
         """Model-fit error of every hypothesis."""

@@ -80,8 +80,10 @@ def check_names(label: str, model: Model) -> None:
     groups = (model.coordinates, model.velocities, model.accelerations, model.inputs, model.parameters)
     names = [n for group in groups for n in group]
     for name in names:
-        if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name) or name.startswith("__"):
-            raise ModelError(f"{label}: {name!r} cannot name a signal or parameter; use letters, digits and underscores")
+        if not str(name).isidentifier() or keyword.iskeyword(name) or name.startswith("__"):
+            raise ModelError(
+                f"{label}: {name!r} cannot name a signal or parameter; use letters, digits and underscores"
+            )
         if name == "t":
             raise ModelError(f'{label}: the name "t" is kept for time; choose another')
         if names.count(name) > 1:
@@ -109,7 +111,9 @@ def check_kinematics(label: str, kinematics: ca.Function) -> None:
     """Raises ModelError: not one rate per coordinate, or a NaN constant in one."""
     n = kinematics.size1_in(0)
     if kinematics.size1_out(0) != n:
-        raise ModelError(f"{label}: kinematics return {kinematics.numel_out(0)} rates; return one for each of {n} coordinates")
+        raise ModelError(
+            f"{label}: kinematics return {kinematics.numel_out(0)} rates; return one for each of {n} coordinates"
+        )
     for i, _ in _nan_outputs(kinematics):
         raise ModelError(f"{label}: kinematics {i + 1} of {n} contains NaN; use casadi's functions, not Python's math")
 
@@ -160,7 +164,7 @@ class Probe:
         return J0, r0 - J0 @ z0
 
     def is_affine(self, argument: str, values: FloatArray) -> bool:
-        """Whether ``r = J z + c`` at every point where ``r`` is finite, with the argument's ``values (n, n_points)``."""
+        """Whether ``r = J z + c`` wherever ``r`` is finite, with ``values (n, n_points)`` of the argument ``z``."""
         symbols = [ca.SX.sym(n, self.residual.size1_in(i)) for i, n in enumerate(_ARGUMENTS)]
         k = _ARGUMENTS.index(argument)
         J, c = self.affine_parts(argument, symbols)
@@ -194,7 +198,9 @@ def affine_in_acceleration(
     Raises ModelError: the residuals are not affine in ``a``, or cannot be evaluated.
     """
     if not np.isfinite(np.array(probe.residual(*probe.points))).all(axis=0).any():
-        raise ModelError(f"{label}: the equations are not finite at any of {_N_POINTS} random points; check roots and logarithms")
+        raise ModelError(
+            f"{label}: the equations are not finite at any of {_N_POINTS} random points; check roots and logarithms"
+        )
     if not probe.is_affine("a", probe.points[2]):
         raise ModelError(
             f"{label}: the equations are not affine in the accelerations {', '.join(accelerations)}; "
@@ -222,7 +228,9 @@ def mass_matrix_sign(label: str, probe: Probe, mass_matrix: ca.Function, acceler
     if len(M) == 0 or (values[:, -1] <= _SINGULAR * values[:, 0]).all():
         loose = np.abs(vectors[:, -1]).max(axis=0, initial=0.0) > 1e-6
         names = [x for x, l in zip(accelerations, loose, strict=True) if l] or list(accelerations)
-        raise ModelError(f"{label}: the mass matrix dr/da is singular; the equations do not determine {', '.join(names)}")
+        raise ModelError(
+            f"{label}: the mass matrix dr/da is singular; the equations do not determine {', '.join(names)}"
+        )
     if not np.allclose(M, M.transpose(0, 2, 1), rtol=1e-9, atol=1e-12 * np.abs(M).max()):
         return 0
     eigenvalues = np.linalg.eigvalsh(M)
@@ -256,7 +264,9 @@ def _is_curved(both: ca.Function, others: Sequence[FloatArray], start: FloatArra
     r_along, _ = evaluate(along)
     _, slope_across = evaluate(across)
     step = along[i] - start[i]
-    leaves = np.abs(r_along - r - slope * step) > _TOLERANCE * (np.abs(r_along) + np.abs(r) + np.abs(slope * step) + 1.0)
+    leaves = np.abs(r_along - r - slope * step) > _TOLERANCE * (
+        np.abs(r_along) + np.abs(r) + np.abs(slope * step) + 1.0
+    )
     turns = np.abs(slope_across - slope) > _TOLERANCE * (np.abs(slope_across) + np.abs(slope) + 1.0)
     return bool(leaves.any() or turns.any())
 

@@ -7,15 +7,18 @@ the order of its rows: no result depends on how many hypotheses are fitted at a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from diransac.errors import IdentificationError, SettingsError
-from diransac.observations import Observations
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from diransac.observations import Observations
 
 __all__ = [
     "BoundEstimator",
@@ -72,7 +75,8 @@ class _SumsEstimator:
 
     def fit(self, W: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:
         """Parameters ``(n_p,)`` from ``W (..., n_p)`` and ``b (...)``."""
-        return self._bind(*_flat(W, b)).fit_all()
+        bound = self._bind(*_flat(W, b))
+        return bound.fit([np.arange(bound.n_rows)])[0]
 
     def well_defined(self, W: npt.ArrayLike, b: npt.ArrayLike) -> bool:
         """Whether ``W (..., n_p)``, ``b (...)`` determine the parameters, with the columns scaled by their own RMS."""
@@ -114,7 +118,7 @@ class TotalLeastSquares(_SumsEstimator):
 
     def solve(self, gram: FloatArray) -> FloatArray:
         """Eigenvector of the smallest eigenvalue of ``[W b]^T [W b]``."""
-        finite = np.isfinite(gram).all(axis=(-2, -1), keepdims=True)
+        finite = np.all(np.isfinite(gram), axis=(-2, -1), keepdims=True)
         _, vectors = np.linalg.eigh(np.where(finite, gram, np.eye(gram.shape[-1])))
         smallest = np.where(finite[..., 0], vectors[..., :, 0], np.nan)
         last = smallest[..., -1:]
@@ -123,7 +127,7 @@ class TotalLeastSquares(_SumsEstimator):
 
 
 class _BoundSums:
-    """Blocks of ``[W b]^T [W b]``, ``(N, n_p + 1, n_p + 1)``, in columns of unit RMS, as rows of their upper triangle."""
+    """Blocks of ``[W b]^T [W b]`` in columns of unit RMS, the upper triangle of each observation's in a row."""
 
     def __init__(self, estimator: _SumsEstimator, W: FloatArray, b: FloatArray) -> None:
         self._estimator = estimator
@@ -139,13 +143,10 @@ class _BoundSums:
 
     def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
         gram = self._gram(row_sets)[:, :-1, :-1]
-        return smallest_eigenvalue(gram) > self._estimator.min_eigenvalue
+        return np.asarray(smallest_eigenvalue(gram) > self._estimator.min_eigenvalue)
 
     def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
         return self._unscale(self._estimator.solve(self._gram(row_sets)))
-
-    def fit_all(self) -> FloatArray:
-        return self.fit([np.arange(self.n_rows)])[0]
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
         return self._unscale(self._estimator.solve(self._gram([rows]) - self._gram(groups)))
@@ -156,7 +157,7 @@ class _BoundSums:
 
     def _unscale(self, scaled: FloatArray) -> FloatArray:
         with np.errstate(divide="ignore", invalid="ignore"):
-            return scaled * self._scale[-1] / self._scale[:-1]
+            return np.asarray(scaled * self._scale[-1] / self._scale[:-1])
 
     def _gram(self, row_sets: Sequence[IntArray]) -> FloatArray:
         """Sums ``(n_sets, n_p + 1, n_p + 1)``, each in the order of its rows."""
@@ -165,6 +166,19 @@ class _BoundSums:
         i, j = self._upper
         gram[:, i, j] = gram[:, j, i] = sums
         return gram
+
+
+class LinearRegressor(Protocol):
+    """What scikit-learn's linear regressors share."""
+
+    def fit(self, X: FloatArray, y: FloatArray) -> Self:
+        """Fit coefficients."""
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
+        """Settings by name."""
+
+    def set_params(self, **params: object) -> Self:
+        """Change settings."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +193,7 @@ class ScikitLearnEstimator:
     Raises SettingsError: the regressor cannot be fitted without an intercept.
     """
 
-    regressor: Any
+    regressor: LinearRegressor
     min_eigenvalue: float = _MIN_EIGENVALUE
 
     def __post_init__(self) -> None:
@@ -226,7 +240,7 @@ class _BoundScikitLearn:
         return np.asarray(holder.coef_, dtype=float).reshape(n_p)
 
 
-def _without_intercept(regressor: Any) -> Any:
+def _without_intercept(regressor: LinearRegressor) -> LinearRegressor:
     """A clone that fits no intercept and draws the same random numbers each time."""
     from sklearn.base import clone
     from sklearn.linear_model import LinearRegression
@@ -241,21 +255,23 @@ def _without_intercept(regressor: Any) -> Any:
     elif "estimator" in known and known["estimator"] is None:
         changes["estimator"] = LinearRegression(fit_intercept=False)
     else:
-        raise SettingsError(f"{type(regressor).__name__} cannot be fitted without an intercept; give a linear regressor")
+        raise SettingsError(
+            f"{type(regressor).__name__} cannot be fitted without an intercept; give a linear regressor"
+        )
     if "random_state" in known and known["random_state"] is None:
         changes["random_state"] = 0
-    return fresh.set_params(**changes)
+    return cast("LinearRegressor", fresh.set_params(**changes))
 
 
-def as_estimator(candidate: Any) -> Estimator:
+def as_estimator(candidate: object) -> Estimator:
     """The estimator itself, or a scikit-learn regressor wrapped as one.
 
     Raises SettingsError: it is neither.
     """
     if hasattr(candidate, "bind") and not isinstance(candidate, type):
-        return candidate  # type: ignore[no-any-return]
+        return cast("Estimator", candidate)
     if hasattr(candidate, "fit") and hasattr(candidate, "get_params") and not isinstance(candidate, type):
-        return ScikitLearnEstimator(candidate)
+        return ScikitLearnEstimator(cast("LinearRegressor", candidate))
     raise SettingsError(
         f"estimator is {candidate!r}; give dr.OrdinaryLeastSquares(), dr.TotalLeastSquares(), "
         "dr.NonlinearLeastSquares() or a scikit-learn linear regressor"
@@ -265,12 +281,12 @@ def as_estimator(candidate: Any) -> Estimator:
 def column_scale(columns: FloatArray) -> FloatArray:
     """RMS ``(n,)`` of the columns of ``(N, r, n)``."""
     flat = columns.reshape(-1, columns.shape[-1])
-    return np.sqrt(np.square(flat).mean(axis=0))
+    return np.asarray(np.sqrt(np.square(flat).mean(axis=0)))
 
 
 def smallest_eigenvalue(gram: FloatArray) -> FloatArray:
     """Smallest eigenvalue of each ``(..., n, n)``; -inf where it is not finite."""
-    finite = np.isfinite(gram).all(axis=(-2, -1))
+    finite = np.all(np.isfinite(gram), axis=(-2, -1))
     values = np.linalg.eigvalsh(np.where(finite[..., None, None], gram, 0.0))[..., 0]
     return np.where(finite, values, -np.inf)
 
@@ -283,9 +299,9 @@ def loose_parameters(gram: FloatArray, min_eigenvalue: float) -> tuple[int, ...]
 
 
 def solve_definite(A: FloatArray, g: FloatArray) -> FloatArray:
-    """``A^-1 g`` for symmetric positive definite ``A (..., n, n)``, by LDL^T without pivoting; NaN where it breaks down.
+    """``A^-1 g`` for symmetric positive definite ``A (..., n, n)``, by LDL^T; NaN where it breaks down.
 
-    Written out over the leading axes: the same bits for every batch and on every machine, which LAPACK does not promise.
+    Written out over the leading axes: the same bits for every batch and on every machine, as LAPACK does not promise.
     """
     A, x = A.copy(), g.copy()
     n = A.shape[-1]
@@ -304,7 +320,7 @@ def solve_definite(A: FloatArray, g: FloatArray) -> FloatArray:
 
 
 def _flat(W: npt.ArrayLike, b: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """``(n, 1, n_p)`` and ``(n, 1)``.  Raises IdentificationError: the shapes do not match, or a value is not finite."""
+    """``(n, 1, n_p)`` and ``(n, 1)``.  Raises IdentificationError: shapes do not match, or a value is not finite."""
     W, b = np.asarray(W, dtype=float), np.asarray(b, dtype=float)
     if W.ndim < 2 or W.shape[:-1] != b.shape:
         raise IdentificationError(f"W {W.shape} and b {b.shape} do not match; give W (..., n_p) and b (...)")

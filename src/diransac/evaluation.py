@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from diransac.consensus import Score, Variant
 from diransac.errors import LogError, SettingsError
-from diransac.log import Log
-from diransac.model import Model
-from diransac.observations import Observations
-from diransac.settings import Settings
-from diransac.simulate import rollouts
+from diransac.simulate import inlier_mask, rollouts
+
+if TYPE_CHECKING:
+    from diransac.log import Log
+    from diransac.model import Model
+    from diransac.observations import Observations
+    from diransac.settings import Settings
 
 __all__ = ["Scoring", "Simulation", "choose_scoring", "judged_signals"]
 
@@ -97,9 +101,7 @@ class Simulation:
         names = [n for n, j in zip(observations.signals, judged, strict=True) if j]
         self._observations, self._variant, self._scoring = observations, variant, scoring
         self._weights, self._thresholds = scoring.weights[judged], scoring.thresholds[judged]
-        self._rollouts = rollouts(
-            observations.model, names, integrator=settings.integrator, substeps=settings.substeps
-        )
+        self._rollouts = rollouts(observations.model, names, integrator=settings.integrator, substeps=settings.substeps)
         self._log_arrays = (
             observations.initial_state(settings.initial_state),
             observations.inputs,
@@ -107,12 +109,12 @@ class Simulation:
             observations.valid,
             observations.log.dt,
         )
-        self._threads = settings.threads
+        self._threads = settings.threads or len(os.sched_getaffinity(0))
 
     def admits(self, parameters: FloatArray) -> BoolArray:
         """Preliminary test of ``(n, n_p)`` parameters: every one within its bounds."""
         bounds = self._observations.model.parameters.values()
-        return np.logical_and.reduce([x.admits(parameters[:, i]) for i, x in enumerate(bounds)])
+        return np.asarray(np.all([x.admits(parameters[:, i]) for i, x in enumerate(bounds)], axis=0))
 
     def scores(self, parameters: FloatArray) -> list[Score]:
         """Error and inlier fraction of every hypothesis ``(n, n_p)``."""
@@ -126,10 +128,8 @@ class Simulation:
 
     def inlier_mask(self, parameters: FloatArray) -> BoolArray:
         """Inliers ``(N,)`` of one hypothesis over all rows; a row that does not count is none (section III.D)."""
-        errors = self._rollouts.errors(parameters[None], *self._log_arrays, threads=1)[0]
-        with np.errstate(invalid="ignore"):
-            signals = (np.abs(errors) < self._thresholds).sum(axis=1)
-        return (signals >= self._scoring.min_inlier_signals) & self._observations.valid
+        errors = self._rollouts.errors(parameters[None], *self._log_arrays)[0]
+        return inlier_mask(errors, self._observations.valid, self._thresholds, self._scoring.min_inlier_signals)
 
     def inliers(self, parameters: FloatArray) -> IntArray:
         """Usable rows that are inliers of one hypothesis ``(n_p,)``, ascending."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +24,9 @@ from diransac.search import Hypothesis, Outcome, Progress, search
 from diransac.settings import Settings
 from diransac.uncertainty import N_BLOCKS, jackknife_covariance
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
 __all__ = ["METHODS", "identify"]
 
 FloatArray = npt.NDArray[np.float64]
@@ -36,7 +38,7 @@ _ESTIMATORS: dict[str, Callable[[], Estimator]] = {
     "nls": NonlinearLeastSquares,
 }
 _VARIANTS: dict[str, Callable[[Settings], Variant]] = {
-    "diransac": lambda settings: Diransac(),
+    "diransac": lambda _: Diransac(),
     "i-diransac": lambda settings: InlierBiasedDiransac(settings.acceptance_weights),
 }
 METHODS = (*_ESTIMATORS, *_VARIANTS)
@@ -49,7 +51,7 @@ def identify(
     *,
     seed: int = 0,
     settings: Settings | None = None,
-    estimator: Any = None,
+    estimator: object = None,
     differentiate: bool = False,
     bandwidth: float | None = None,
     progress: Progress | None = None,
@@ -64,14 +66,14 @@ def identify(
         the fit error and the inliers of every method
     estimator : inside a RANSAC method, `OrdinaryLeastSquares()` (default; `NonlinearLeastSquares()` where the model is
         not affine in its parameters), another of ours, or any scikit-learn linear regressor
-    differentiate : derive the velocities and accelerations that the log lacks, and filter both sides of the equations
-        alike; the identification is then repeated at half and twice the bandwidth, for ``result.sensitivity``
+    differentiate : derive the velocities and accelerations that the log lacks, and filter both sides of the
+        equations alike; the identification is then repeated at half and twice the bandwidth, for ``result.sensitivity``
     bandwidth : of that filter, Hz; None: chosen from the log
     progress : called with (samples drawn, max_iterations, score of the stored hypothesis)
 
-    Raises LogError: the log cannot serve; SettingsError: an argument has no meaning; ModelError: a linear method meets a
-    model that is not affine in its parameters; IdentificationError: the log does not determine the parameters, or no
-    hypothesis was accepted.
+    Raises LogError: the log cannot serve; SettingsError: an argument has no meaning; ModelError: a linear method meets
+    a model that is not affine in its parameters; IdentificationError: the log does not determine the parameters, or
+    no hypothesis was accepted.
     References: Dimmig et al. 2023, Algorithm 1.
     """
     _check_arguments(model, log, method, estimator, seed)
@@ -99,7 +101,7 @@ def _check_arguments(model: object, log: object, method: object, estimator: obje
         raise SettingsError(f"seed is {seed!r}; give a whole number")
 
 
-def _estimator(model: Model, method: str, candidate: Any) -> Estimator:
+def _estimator(model: Model, method: str, candidate: object) -> Estimator:
     if candidate is not None:
         return as_estimator(candidate)
     if method in _ESTIMATORS:

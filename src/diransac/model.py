@@ -61,7 +61,7 @@ class Parameter:
         """Whether each value is finite and within the bounds (``PreliminaryTest`` of Algorithm 1, line 15)."""
         x = np.asarray(values, dtype=float)
         inside = np.isfinite(x) & (x >= self.lower) & (x <= self.upper)
-        return inside & (x > 0.0) if self.positive else inside
+        return np.asarray(inside & (x > 0.0) if self.positive else inside)
 
 
 class Model:
@@ -103,7 +103,10 @@ class Model:
             raise ModelError(f'model "{name}": {given} without {missing}; give both, or neither')
         q, v, a, u, p = self._symbols()
         residual = derivation.call_user(
-            self._label, "equations", equations, *(Symbols(self._label, kind, s) for kind, s in self._by_kind(q, v, a, u, p))
+            self._label,
+            "equations",
+            equations,
+            *(Symbols(self._label, kind, s) for kind, s in self._by_kind(q, v, a, u, p)),
         )
         self.residual = ca.Function("residual", [q, v, a, u, p], [residual], list("qvaup"), ["r"])
         self.kinematics: ca.Function | None = None
@@ -225,10 +228,10 @@ class Model:
         rates, accelerations = self.dynamics(x, u, p)
         feeds = np.array(ca.DM(ca.jacobian_sparsity(ca.vertcat(x, accelerations), x), 1), dtype=bool)
         wanted = set(signals)
-        matter = feeds[[n in wanted for n in self.signals]].any(axis=0)
+        matter = np.any(feeds[[n in wanted for n in self.signals]], axis=0)
         flows = np.array(ca.DM(ca.jacobian_sparsity(rates, x), 1), dtype=bool)
         for _ in self.state:
-            matter = matter | flows[matter].any(axis=0)
+            matter = matter | np.any(flows[matter], axis=0)
         return tuple(n for n, m in zip(self.state, matter, strict=True) if m)
 
     @cached_property
@@ -246,8 +249,8 @@ class Model:
         """
         if self.nonlinear_parameters:
             raise ModelError(
-                f"{self._label}: the equations are not affine in {', '.join(self.nonlinear_parameters)}, so there is "
-                'no linear regression W p = b; use a RANSAC method or method="nls", which fit by nonlinear least squares'
+                f"{self._label}: the equations are not affine in {', '.join(self.nonlinear_parameters)}, so there is no "
+                'linear regression W p = b; use method="nls", or a RANSAC method: they fit by nonlinear least squares'
             )
         q, v, a, u, p = self._symbols()
         W, r0 = self._probe.affine_parts("p", (q, v, a, u, p))
@@ -265,7 +268,7 @@ class Model:
 
     @cached_property
     def linearization(self) -> ca.Function:
-        """Function ``(x, u, p) -> (A (n_x, n_x), B (n_x, n_u))``: ``d x_dot = A dx + B du``, implicit in ``M da = -dr``."""
+        """Function ``(x, u, p) -> (A (n_x, n_x), B (n_x, n_u))`` of ``d x_dot = A dx + B du``, by ``M da = -dr``."""
         q, v, a, u, p = self._symbols()
         x = ca.vertcat(q, v)
         r = self.residual(q, v, a, u, p)
@@ -274,7 +277,9 @@ class Model:
         solved = ca.substitute(solved, a, self.dynamics(x, u, p)[1])
         q_dot = v if self.kinematics is None else self.kinematics(q, v)
         upper = ca.horzcat(ca.jacobian(q_dot, x), ca.SX(self.n_q, self.n_u))
-        A, B = ca.horzsplit(ca.densify(ca.vertcat(upper, solved)), [0, self.n_q + self.n_v, self.n_q + self.n_v + self.n_u])
+        A, B = ca.horzsplit(
+            ca.densify(ca.vertcat(upper, solved)), [0, self.n_q + self.n_v, self.n_q + self.n_v + self.n_u]
+        )
         return ca.Function("linearization", [x, u, p], ca.cse([A, B]), ["x", "u", "p"], ["A", "B"])
 
     def _solve_mass(self, q: ca.SX, v: ca.SX, u: ca.SX, p: ca.SX, rhs: ca.SX) -> ca.SX:
@@ -295,7 +300,9 @@ class Model:
         Raises ModelError: a name is missing, unknown, or its value is not finite.
         """
         if set(parameters) != set(self.parameters):
-            raise ModelError(f"{self._label}: parameters are {', '.join(self.parameters)}; found {', '.join(parameters)}")
+            raise ModelError(
+                f"{self._label}: parameters are {', '.join(self.parameters)}; found {', '.join(parameters)}"
+            )
         values = np.array([parameters[n] for n in self.parameters], dtype=float)
         if not np.isfinite(values).all():
             bad = [n for n, x in zip(self.parameters, values, strict=True) if not np.isfinite(x)]

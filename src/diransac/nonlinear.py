@@ -6,16 +6,21 @@ of the parameters, and their error vanishes wherever that function does; an acce
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
 from diransac.estimators import BoundEstimator, loose_parameters, smallest_eigenvalue, solve_definite
-from diransac.model import Model, Parameter
-from diransac.observations import Observations
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from diransac.kernel import Map
+    from diransac.model import Model, Parameter
+    from diransac.observations import Observations
 
 __all__ = ["NonlinearLeastSquares"]
 
@@ -24,7 +29,13 @@ BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
 _START_DECADES = 3.0
+_ROWS_FOR_STARTS = 100
+_ROWS_FOR_WHOLE = 2000
+_CONVERGED = 1e-14
+# Marquardt's damping at the start, and its bounds.
 _DAMPING = (1e-3, 1e-12, 1e12)
+# Bounds of the logarithm of a positive parameter that has none of its own: 1e-12 to 1e12.
+_LOG_BOUND = 27.6
 
 
 @dataclass(frozen=True)
@@ -69,60 +80,67 @@ class _BoundNonlinear:
         self._chart = _Chart(tuple(model.parameters.values()))
         self._evaluate = _compiled(model, known)
         self.n_rows = len(self._state)
-        everything = np.arange(self.n_rows)
-        self._whole = self._fit_one(everything[:: max(1, self.n_rows // 2000)])
-        _, J = self._errors(everything[None], self._chart.to_free(self._whole)[None])
-        J = J[0].reshape(self.n_rows, len(known), -1)
+        self._n_p = model.n_p
+        self._starts = self._chart.starts(settings.n_starts)
+        everything = np.arange(self.n_rows)[None]
+        whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // _ROWS_FOR_WHOLE)]))
+        self._starts = np.vstack([whole, self._starts])
+        J = self._errors(everything, whole)[1].reshape(self.n_rows, len(known), -1)
         scale = np.sqrt(np.square(J).mean(axis=(0, 1)))
         J = J / np.where(scale > 0.0, scale, 1.0)
         self._blocks = np.einsum("nri,nrj->nij", J, J)
 
     def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
         gram = np.array([self._blocks[rows].sum(axis=0) for rows in row_sets])
-        return smallest_eigenvalue(gram) > self._settings.min_eigenvalue
+        return np.asarray(smallest_eigenvalue(gram) > self._settings.min_eigenvalue)
 
     def undetermined(self) -> tuple[int, ...]:
         return loose_parameters(self._blocks.sum(axis=0), self._settings.min_eigenvalue)
 
     def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
-        return np.array([self._fit_one(rows) for rows in row_sets]).reshape(len(row_sets), -1)
+        fits = np.empty((len(row_sets), self._n_p))
+        for length in {len(rows) for rows in row_sets}:
+            places = [i for i, rows in enumerate(row_sets) if len(rows) == length]
+            fits[places] = self._fit_equal(np.array([row_sets[i] for i in places]))
+        return fits
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        return self.fit([np.setdiff1d(rows, group) for group in groups])
+        start = self._chart.to_free(self._fit_equal(rows[None]))
+        kept = [np.setdiff1d(rows, group)[None] for group in groups]
+        return np.array([self._chart.to_parameters(self._descend(x, start)[0][0]) for x in kept])
 
-    def _fit_one(self, rows: IntArray) -> FloatArray:
-        """Parameters ``(n_p,)`` from one set of rows: the best of the followed starts."""
-        starts = self._chart.starts(self._settings.n_starts)
-        if hasattr(self, "_whole"):
-            starts = np.vstack([self._chart.to_free(self._whole), starts])
-        few = rows[:: max(1, len(rows) // 100)]
-        costs = self._costs(np.broadcast_to(few, (len(starts), len(few))), starts)
-        best = np.argsort(costs, kind="stable")[: self._settings.n_followed]
-        lanes = np.broadcast_to(rows, (len(best), len(rows)))
-        free, costs = self._descend(lanes, starts[best])
-        return self._chart.to_parameters(free[int(np.argmin(costs))])
+    def _fit_equal(self, rows: IntArray) -> FloatArray:
+        """Parameters ``(B, n_p)`` from row sets ``(B, n)``: each from the best of its followed starts."""
+        starts, (n_sets, n) = self._starts, rows.shape
+        few = rows[:, :: max(1, n // _ROWS_FOR_STARTS)]
+        every = np.tile(np.arange(len(starts)), n_sets)
+        costs = self._costs(np.repeat(few, len(starts), axis=0), starts[every]).reshape(n_sets, -1)
+        best = np.argsort(costs, axis=1, kind="stable")[:, : self._settings.n_followed]
+        free, costs = self._descend(np.repeat(rows, best.shape[1], axis=0), starts[best.reshape(-1)])
+        winner = np.argmin(costs.reshape(n_sets, -1), axis=1)
+        return self._chart.to_parameters(free.reshape(n_sets, -1, self._n_p)[np.arange(n_sets), winner])
 
     def _descend(self, rows: IntArray, free: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Levenberg-Marquardt on every lane at once; a lane that gains nothing more stays where it is."""
-        damping = np.full(len(free), _DAMPING[0])
+        """Levenberg-Marquardt on every lane, each until it gains nothing more: free coordinates and sums of squares."""
+        free, damping, active = free.copy(), np.full(len(free), _DAMPING[0]), np.arange(len(free))
         errors, J = self._errors(rows, free)
         costs = np.square(errors).sum(axis=1)
         for _ in range(self._settings.max_steps):
-            H = np.einsum("bni,bnj->bij", J, J)
-            slope = np.einsum("bni,bn->bi", J, errors)
+            H = np.einsum("bni,bnj->bij", J[active], J[active])
+            slope = np.einsum("bni,bn->bi", J[active], errors[active])
             diagonal = np.einsum("bii->bi", H)
-            H = H + (damping[:, None] * (diagonal + 1e-12))[:, :, None] * np.eye(free.shape[1])
-            trial = self._chart.clip(free - np.nan_to_num(solve_definite(H, slope)))
-            trial_errors, trial_J = self._errors(rows, trial)
+            H = H + (damping[active, None] * (diagonal + 1e-12))[:, :, None] * np.eye(self._n_p)
+            trial = self._chart.clip(free[active] - np.nan_to_num(solve_definite(H, slope)))
+            trial_errors, trial_J = self._errors(rows[active], trial)
             trial_costs = np.square(trial_errors).sum(axis=1)
-            gained = trial_costs < costs
-            stalled = np.where(gained, costs - trial_costs <= 1e-14 * costs, damping >= _DAMPING[2])
-            free = np.where(gained[:, None], trial, free)
-            errors = np.where(gained[:, None], trial_errors, errors)
-            J = np.where(gained[:, None, None], trial_J, J)
-            costs = np.where(gained, trial_costs, costs)
-            damping = np.clip(np.where(gained, damping / 10.0, damping * 4.0), *_DAMPING[1:])
-            if stalled.all():
+            gain = costs[active] - trial_costs
+            better = gain > 0.0
+            going = np.where(better, gain > _CONVERGED * costs[active], damping[active] < _DAMPING[2])
+            damping[active] = np.clip(damping[active] * np.where(better, 0.1, 4.0), *_DAMPING[1:])
+            to = active[better]
+            free[to], errors[to], J[to], costs[to] = (x[better] for x in (trial, trial_errors, trial_J, trial_costs))
+            active = active[going]
+            if not len(active):
                 break
         return free, costs
 
@@ -152,8 +170,8 @@ class _Chart:
         lower = np.array([x.lower for x in parameters])
         upper = np.array([x.upper for x in parameters])
         with np.errstate(divide="ignore"):
-            self._lower = np.where(self._log, np.log(np.maximum(lower, 1e-300)), lower)
-            self._upper = np.where(self._log, np.log(np.maximum(upper, 1e-300)), upper)
+            self._lower = np.where(self._log, np.maximum(np.log(np.maximum(lower, 0.0)), -_LOG_BOUND), lower)
+            self._upper = np.where(self._log, np.minimum(np.log(np.maximum(upper, 0.0)), _LOG_BOUND), upper)
 
     def to_parameters(self, free: FloatArray) -> FloatArray:
         return np.where(self._log, np.exp(np.where(self._log, free, 0.0)), free)
@@ -169,25 +187,26 @@ class _Chart:
         return np.clip(free, self._lower, self._upper)
 
     def starts(self, n: int) -> FloatArray:
-        """Points ``(n, n_p)``: six decades about 1 where a side is open, the bounds where both are given."""
+        """Points ``(n, n_p)``: over the bounds where both are given, else over six decades about 1 on the open side."""
         rng = np.random.default_rng(20231003)
         shape = (n, len(self._log))
-        decades = _START_DECADES * np.log(10.0) * rng.uniform(-1.0, 1.0, shape)
-        sizes, signs = np.exp(decades), rng.choice([-1.0, 1.0], shape)
+        spread = _START_DECADES * np.log(10.0)
+        sizes, signs = np.exp(rng.uniform(-spread, spread, shape)), rng.choice([-1.0, 1.0], shape)
         lower, upper = np.isfinite(self._lower), np.isfinite(self._upper)
         points = np.where(lower, self._lower + sizes, np.where(upper, self._upper - sizes, signs * sizes))
-        points = np.where(self._log, decades, points)
+        low = np.where(self._log, np.maximum(self._lower, -spread), self._lower)
+        high = np.where(self._log, np.minimum(self._upper, spread), self._upper)
+        low, high = (np.where(low < high, x, bound) for x, bound in ((low, self._lower), (high, self._upper)))
         both = lower & upper
-        span = np.where(both, self._upper, 1.0) - np.where(both, self._lower, 0.0)
-        inside = np.where(both, self._lower, 0.0) + rng.uniform(0.0, 1.0, shape) * span
-        return self.clip(np.where(both, inside, points))
+        low, high = np.where(both, low, 0.0), np.where(both, high, 1.0)
+        return self.clip(np.where(both, low + rng.uniform(0.0, 1.0, shape) * (high - low), points))
 
 
-def _compiled(model: Model, known: Sequence[int]) -> Callable[..., tuple[FloatArray, FloatArray]]:
+def _compiled(model: Model, known: Sequence[int]) -> Map:
     """Accelerations ``(N, r)`` and ``da/dp (N, n_p r)``, column by column, of rows of (x, u, p)."""
     from diransac.kernel import compile_map
 
     x, u, p = (ca.SX.sym(n, model.dynamics.size1_in(i)) for i, n in enumerate("xup"))
     a = model.dynamics(x, u, p)[1][list(known)]
     function = ca.Function("accelerations", [x, u, p], ca.cse([a, ca.densify(ca.jacobian(a, p))]))
-    return compile_map(function)  # type: ignore[no-any-return]
+    return compile_map(function)

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from diransac import prepare
 from diransac.errors import LogError, SettingsError
-from diransac.log import Log
-from diransac.model import Model
 from diransac.units import conversion, same_unit
+
+if TYPE_CHECKING:
+    from diransac.log import Log
+    from diransac.model import Model
 
 __all__ = ["Observations", "observe"]
 
@@ -165,19 +168,21 @@ def observe(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: bool
     inputs, held = _held_inputs(model, log)
     measured = np.column_stack([log[n] for n in signals])
     critical = [i for i, n in enumerate(signals) if n in needed or n in also]
-    valid = np.isfinite(measured[:, critical]).all(axis=1) & np.isfinite(inputs).all(axis=1)
+    valid = np.all(np.isfinite(np.hstack([measured[:, critical], inputs])), axis=1)
     if not valid.any():
-        raise LogError(f"{log.source}: no row has a value in every signal in use ({', '.join(used)}); found NaN in each")
+        raise LogError(
+            f"{log.source}: no row has a value in every signal in use ({', '.join(used)}); found NaN in each"
+        )
     offset = int(np.argmax(valid))
     notes = [*log.notes, *_row_notes(valid, held)]
-    return Observations(
-        model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], tuple(notes)
-    )
+    return Observations(model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], tuple(notes))
 
 
 def _raise_missing(model: Model, log: Log, name: str) -> None:
     derivable = name in model.velocities or name in model.accelerations
-    hint = "pass --differentiate to estimate velocities and accelerations" if derivable else "name its column with --map"
+    hint = (
+        "pass --differentiate to estimate velocities and accelerations" if derivable else "name its column with --map"
+    )
     found = ", ".join(("t", *log.names))
     raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}.')
 
@@ -216,7 +221,7 @@ def _row_notes(valid: BoolArray, held: int) -> list[str]:
 
 
 def _spread(values: FloatArray) -> float:
-    """Robust standard deviation: the MAD's; where half the samples rest at one value, the central 80 %'s; else the plain one."""
+    """Standard deviation by the MAD; where half the samples rest at one value, by the central 80 %."""
     values = values[np.isfinite(values)]
     if len(values) == 0:
         return 0.0

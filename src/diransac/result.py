@@ -105,7 +105,7 @@ class Result:
     @property
     def inlier_times(self) -> FloatArray:
         """Log time of every inlier, s."""
-        return self.log.start + self.log.dt * np.flatnonzero(self.inliers)
+        return np.asarray(self.log.start + self.log.dt * np.flatnonzero(self.inliers))
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON; `from_dict` reads it back."""
@@ -137,7 +137,7 @@ class Result:
         }
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Result:
+    def from_dict(cls, data: object) -> Result:
         """The result that `to_dict` wrote.
 
         Raises ResultError: the data are of another format, or damaged.
@@ -159,7 +159,9 @@ class Result:
         return cls(
             model=model,
             parameters=dict(zip(model.parameters, values.tolist(), strict=True)),
-            covariance=np.array([[_decode(x) for x in row] for row in data["covariance"]]).reshape(model.n_p, model.n_p),
+            covariance=np.array([[_decode(x) for x in row] for row in data["covariance"]]).reshape(
+                model.n_p, model.n_p
+            ),
             degrees_of_freedom=int(data["degrees_of_freedom"]),
             inliers=np.unpackbits(packed, count=log.n_rows).astype(bool),
             inlier_fraction=_decode(data["inlier_fraction"]),
@@ -170,7 +172,9 @@ class Result:
             preparation=tuple(data["preparation"]),
             sensitivity=None if pairs is None else {n: (_decode(a), _decode(b)) for n, (a, b) in pairs.items()},
             log=log,
-            **{k: data[k] for k in ("method", "estimator", "seed", "iterations", "evaluated", "stop_reason", "skipped")},
+            **{
+                k: data[k] for k in ("method", "estimator", "seed", "iterations", "evaluated", "stop_reason", "skipped")
+            },
         )
 
     def save(self, path: str | Path) -> None:
@@ -225,7 +229,9 @@ class Result:
     def _warnings(self) -> list[str]:
         lines = [f"! {n} = {self.parameters[n]:.6g} is outside its bounds" for n in self.violations]
         for name, (half, double) in (self.sensitivity or {}).items():
-            lines.append(f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice")
+            lines.append(
+                f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice"
+            )
         return lines + [f"  {note}" for note in self.notes]
 
 

@@ -1,11 +1,11 @@
 """Samples without replacement, in which sample ``k`` depends on ``(seed, k)`` alone.
 
-Sample ``k`` is the beginning of a pseudo-random permutation of the rows that ``(seed, k)`` keys.  No state is carried from
-one sample to the next, a sample is extended by reading on, and integers alone are involved, so every machine draws
+Sample ``k`` is the beginning of a pseudo-random permutation of the rows that ``(seed, k)`` keys.  No state is carried
+from one sample to the next, a sample is extended by reading on, and integers alone are involved, so every machine draws
 the same.
 
-References: Luby and Rackoff 1988 (a Feistel network of random round functions is a random permutation); Black and Rogaway
-2002 (cycle walking to a domain of any size); Steele, Lea, Flood 2014 (the SplitMix64 mixer); Salmon et al. 2011
+References: Luby and Rackoff 1988 (a Feistel network of random round functions is a random permutation); Black and
+Rogaway 2002 (cycle walking to a domain of any size); Steele, Lea, Flood 2014 (the SplitMix64 mixer); Salmon et al. 2011
 (counter-based random numbers).
 """
 

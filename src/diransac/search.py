@@ -10,15 +10,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from diransac.consensus import Score, Variant
 from diransac.errors import IdentificationError
-from diransac.estimators import BoundEstimator
-from diransac.settings import Settings
+
+if TYPE_CHECKING:
+    from diransac.estimators import BoundEstimator
+    from diransac.settings import Settings
 
 __all__ = ["Evaluator", "Hypothesis", "Outcome", "Progress", "search"]
 
@@ -139,7 +141,7 @@ def _speculate(
         samples[i] = _grow(samples[i], batch[i : i + 1], estimator, sampler, seed)
     parameters = estimator.fit(samples)
     admitted = np.flatnonzero(evaluator.admits(parameters))
-    scores = dict(zip(admitted, evaluator.scores(parameters[admitted]), strict=True)) if len(admitted) else {}
+    scores = dict(zip(admitted.tolist(), evaluator.scores(parameters[admitted]), strict=True)) if len(admitted) else {}
     return [Hypothesis(parameters[i], s, scores[i]) if i in scores else None for i, s in enumerate(samples)]
 
 
@@ -211,6 +213,6 @@ def _refit(inliers: IntArray, estimator: BoundEstimator, evaluator: Evaluator) -
 def _nothing_accepted(outcome: Outcome) -> str:
     counts: Sequence[str] = [f"{n} {reason}" for reason, n in outcome.skipped.most_common()]
     return (
-        f"no hypothesis was accepted in {outcome.iterations} samples ({', '.join(counts)}); check units and signs of the "
-        "inputs, widen the parameter bounds or the inlier thresholds, or clean the log"
+        f"no hypothesis was accepted in {outcome.iterations} samples ({', '.join(counts)}); check units and signs of "
+        "the inputs, widen the parameter bounds or the inlier thresholds, or clean the log"
     )

@@ -146,5 +146,7 @@ def _by_name(name: str, values: object, lower: float) -> dict[str, float]:
         raise SettingsError(f"{name} is {dict(values)!r}; give a number for each signal") from error
     for signal, x in numbers.items():
         if not np.isfinite(x) or x < lower:
-            raise SettingsError(f"{name}: {signal} is {x}; give a finite number" + (" of at least 0" if lower == 0.0 else ""))
+            raise SettingsError(
+                f"{name}: {signal} is {x}; give a finite number" + (" of at least 0" if lower == 0.0 else "")
+            )
     return numbers

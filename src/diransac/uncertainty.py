@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 
-from diransac.estimators import BoundEstimator
+if TYPE_CHECKING:
+    from diransac.estimators import BoundEstimator
 
 __all__ = ["N_BLOCKS", "jackknife_covariance"]
 
@@ -16,7 +19,7 @@ N_BLOCKS = 30
 
 
 def jackknife_covariance(estimator: BoundEstimator, rows: IntArray) -> FloatArray:
-    """Covariance ``(n_p, n_p)`` of an estimate from ``rows``, by leaving out each of 30 stretches of time in turn.
+    """Covariance ``(n_p, n_p)`` of an estimate from ``rows``, by leaving out 30 stretches of time in turn.
 
     Residuals of a real machine are correlated over many samples, which the textbook formula takes for information; a
     stretch of time that is left out takes its correlation with it.  What it cannot show is a bias that every stretch
@@ -27,8 +30,8 @@ def jackknife_covariance(estimator: BoundEstimator, rows: IntArray) -> FloatArra
     rows : (n,)   usable rows that the estimate was fitted to, ascending
 
     Returns infinite variances where leaving out a stretch leaves a parameter undetermined.
-    References: Künsch 1989, "The jackknife and the bootstrap for general stationary observations"; Busing, Meijer, van der
-    Leeden 1999, "Delete-m jackknife for unequal m".
+    References: Künsch 1989, "The jackknife and the bootstrap for general stationary observations"; Busing, Meijer, van
+    der Leeden 1999, "Delete-m jackknife for unequal m".
     """
     groups = [g for g in np.array_split(rows, min(N_BLOCKS, len(rows))) if len(g)]
     fits = estimator.fit_without(groups, rows)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from diransac.errors import LogError, SettingsError
-from diransac.log import Log
-from diransac.model import Model
 from diransac.observations import Observations, observe
-from diransac.simulate import rollouts
+from diransac.simulate import Rollouts, rollouts
+
+if TYPE_CHECKING:
+    from diransac.log import Log
+    from diransac.model import Model
 
 __all__ = ["Scores", "Validation", "validate"]
 
@@ -59,7 +61,7 @@ class Scores:
 
 @dataclass(frozen=True)
 class Validation:
-    """Scores at several horizons, shortest first; ``rmse`` and its siblings are those of the horizon that was asked for.
+    """Scores at several horizons, shortest first; ``rmse`` and the like are those of the horizon that was asked for.
 
     Parameters
     ----------
@@ -140,7 +142,7 @@ def validate(
     return Validation(log.source, units, tuple(scores), asked, observations.notes)
 
 
-def _score(engine: Any, observations: Observations, parameters: FloatArray, horizon: float, steps: int) -> Scores:
+def _score(engine: Rollouts, observations: Observations, parameters: FloatArray, horizon: float, steps: int) -> Scores:
     """Scores of windows of so many steps, one after another."""
     starts, states = _starts(observations, steps)
     valid = observations.valid
@@ -148,7 +150,7 @@ def _score(engine: Any, observations: Observations, parameters: FloatArray, hori
         np.tile(parameters, (len(starts), 1)),
         states,
         observations.inputs,
-        observations.measured,
+        np.nan_to_num(observations.measured),
         np.ones_like(valid),
         observations.log.dt,
         start_rows=starts,
@@ -186,7 +188,9 @@ def _starts(observations: Observations, steps: int) -> tuple[IntArray, FloatArra
     matter = [i for i, n in enumerate(model.state) if n in model.states_behind(observations.signals)]
     whole = np.isfinite(states[:, matter]).all(axis=1)
     if not whole.any():
-        raise LogError(f"{observations.log.source}: no window of {steps} steps starts at a complete state; found NaN in each")
+        raise LogError(
+            f"{observations.log.source}: no window of {steps} steps starts at a complete state; found NaN in each"
+        )
     return starts[whole], np.nan_to_num(states[whole])
 
 
@@ -196,7 +200,7 @@ def _nice(seconds: float) -> float:
     return float(max(x * decade for x in _NICE if x * decade <= seconds * (1.0 + 1e-9)))
 
 
-def _finite(x: Any) -> Any:
+def _finite(x: object) -> object:
     if isinstance(x, Mapping):
         return {k: _finite(v) for k, v in x.items()}
     return x if not isinstance(x, float) or np.isfinite(x) else None

@@ -11,7 +11,7 @@ __all__ = ["double_pendulum"]
 def double_pendulum(
     upper_length: float = 0.3, gravity: float = 9.81, gear_ratio: float = 6.0, friction_steepness: float = 100.0
 ) -> Model:
-    """``M(q) q'' + c(q, q') + g(q) + f(q') = tau`` with the nine combinations of inertia and friction that motion shows.
+    """``M(q) q'' + c(q, q') + g(q) + f(q') = tau`` in the nine parameters that motion shows.
 
     Parameters
     ----------

@@ -9,7 +9,11 @@ __all__ = ["planar_rotorcraft"]
 
 
 def planar_rotorcraft(arm_length: float = 0.177, gravity: float = 9.81) -> Model:
-    """``m x'' = -T sin(theta) - C |T| x' cos(theta)``, ``m (z'' + g) = T cos(theta) - C |T| z' sin(theta)``, ``I theta'' = L M``.
+    """Two rotors in the vertical plane, with induced drag.
+
+    ``m x'' = -T sin(theta) - C |T| x' cos(theta)``
+    ``m (z'' + g) = T cos(theta) - C |T| z' sin(theta)``
+    ``I theta'' = L M``
 
     Parameters
     ----------
