@@ -1,0 +1,282 @@
+"""`Log`: what it holds, what it refuses, what it writes."""
+
+import copy
+import os
+import pickle
+
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from diransac.errors import LogError
+from diransac.log import Log
+from diransac.readers import read_log
+
+
+def example(n=100, dt=0.01, **signals):
+    t = np.arange(n) * dt
+    return Log.from_arrays(t, signals or {"x": np.sin(t), "u": np.cos(t)}, {"x": "m"}, 'log "a.csv"')
+
+
+def test_signals_are_found_by_name():
+    log = example()
+    assert np.array_equal(log["x"], np.sin(log.time))
+    assert log.names == ("x", "u")
+    assert "x" in log
+    assert "t" not in log
+    assert "y" not in log
+    assert len(log) == 100
+    assert log.dt == pytest.approx(0.01, rel=1e-12)
+    assert log.units == {"x": "m"}
+    assert "100 rows at 100 Hz" in repr(log)
+
+
+def test_a_missing_signal_is_named_with_what_was_found():
+    with pytest.raises(LogError, match=r'log "a.csv": signal "theta_ddot" is missing; found t, x, u$'):
+        example()["theta_ddot"]
+
+
+def test_arrays_are_copied_and_read_only():
+    t, x = np.arange(5.0), np.ones(5)
+    log = Log.from_arrays(t, {"x": x})
+    x[0] = t[0] = -7.0
+    assert log["x"][0] == 1.0
+    assert log.time[0] == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        log["x"][0] = 2.0
+    with pytest.raises(TypeError):
+        log.signals["y"] = x
+
+
+def test_integers_and_booleans_become_floats():
+    log = Log.from_arrays([0, 1, 2], {"n": [1, 2, 3], "on": [True, False, True], "gap": [1, None, 3]})
+    assert log["n"].dtype == log["on"].dtype == log["gap"].dtype == np.float64
+    assert np.isnan(log["gap"][1])
+
+
+@pytest.mark.parametrize(
+    ("time", "message"),
+    [
+        ([0.0], "at least 2 rows; found 1"),
+        ([0.0, 1.0, np.nan, 3.0], "time is nan at row 2"),
+        ([0.0, 1.0, np.inf, 3.0], "time is inf at row 2"),
+        ([0.0, 1.0, 1.0, 2.0], "time 1 s repeats at row 2; remove the duplicate"),
+        ([0.0, 1.0, 1.0, 1.0], r"repeats at row 2 \(and 1 more rows like it\)"),
+        ([0.0, 2.0, 1.0, 3.0], "time runs backwards at row 2: 1 s follows 2 s; sort"),
+        ([0.0, 1.0, 2.0, 5.0, 6.0], r"1 gap, the longest after t = 2 s \(row 2\) is 3 s long, the usual interval 1 s"),
+        ([0.0, 1.0, 2.3, 3.0, 4.0], r"most uneven interval after t = 1 s \(row 1\) is 1.3 s long"),
+    ],
+)
+def test_a_time_that_cannot_be_used_is_refused_with_the_place(time, message):
+    with pytest.raises(LogError, match=message):
+        Log.from_arrays(time, {"x": np.zeros(len(time))})
+
+
+@pytest.mark.parametrize(
+    ("signals", "message"),
+    [
+        ({"x": [1.0, 2.0]}, '"x" has 2 rows, the time has 3'),
+        ({"x": [[1.0, 2.0, 3.0]]}, r'"x" has shape \(1, 3\)'),
+        ({"x": ["1", "two", "3"]}, '"x" is not numeric'),
+        ({"x": [1.0, "two", 3.0]}, '"x" is not numeric'),
+        ({"x": [1j, 2.0, 3.0]}, '"x" is not numeric'),
+        ({"t": [1.0, 2.0, 3.0]}, '"t" is the time'),
+        ({"": [1.0, 2.0, 3.0]}, "cannot name a signal"),
+        ({3: [1.0, 2.0, 3.0]}, "3 cannot name a signal"),
+    ],
+)
+def test_signals_that_cannot_be_used_are_refused(signals, message):
+    with pytest.raises(LogError, match=message):
+        Log.from_arrays([0.0, 1.0, 2.0], signals)
+
+
+def test_a_unit_for_no_signal_is_refused():
+    with pytest.raises(LogError, match='a unit is given for "y"; found x'):
+        Log.from_arrays([0, 1], {"x": [0, 1]}, {"y": "m"})
+
+
+def test_a_clock_that_ticks_in_whole_nanoseconds_is_silent():
+    n = np.arange(1000)
+    log = Log.from_arrays(n * 1e-3 + 2.4e-8 * (n % 2), {"x": n})
+    assert log.notes == ()
+
+
+def test_small_jitter_is_said_with_size_and_place():
+    t = np.arange(100) * 0.01
+    t[40] += 0.001
+    (note,) = Log.from_arrays(t, {"x": t}).notes
+    assert "10.0% of a sample (at t = 0.39 s)" in note
+
+
+def test_missing_and_infinite_samples_are_said_once_for_all_signals_that_share_them():
+    x = np.arange(10.0)
+    x[[3, 5]] = np.nan
+    y = np.where(np.arange(10) == 7, np.inf, 0.0)
+    notes = Log.from_arrays(np.arange(10), {"x": x, "z": x, "y": y}).notes
+    assert notes == (
+        '"x", "z" are NaN in 2 of 10 rows, first at t = 3 s',
+        '"y" is infinite in 1 of 10 rows, first at t = 7 s',
+    )
+
+
+def test_check_passes_what_can_be_squared_and_summed():
+    x = np.array([1.0, np.nan, -1e149])
+    Log.from_arrays([0, 1, 2], {"x": x, "y": [np.inf, 1, 2]}).check(["x"])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([np.nan] * 3, 'log "a.csv": signal "x" is NaN in every row'),
+        ([1.0, -np.inf, 2.0], r'log "a.csv": signal "x" is infinite at row 1 \(t = 0.01 s\)'),
+        ([1.0, 2.0, -1e160], r'log "a.csv": signal "x" is -1e\+160 at row 2 .* square overflows'),
+    ],
+)
+def test_check_names_signal_and_row(values, message):
+    with pytest.raises(LogError, match=message):
+        example(3, x=values).check(["x"])
+
+
+# ---------------------------------------------------------------------- parts
+
+
+def test_slices_by_row_and_by_time_agree():
+    log = example()
+    by_row, by_time = log[20:41], log.between(0.2, 0.4)
+    assert len(by_row) == 21
+    assert by_row.fingerprint == by_time.fingerprint
+    assert by_time.time[0] == log.time[20]
+    assert by_time.history == ({"step": "cut", "start": log.time[20], "end": log.time[40], "rows": 21},)
+
+
+def test_split_parts_make_the_whole():
+    log = example()
+    first, second = log.split(0.7)
+    assert len(first) == 70
+    assert np.array_equal(np.concatenate([first["u"], second["u"]]), log["u"])
+
+
+@pytest.mark.parametrize("part", [lambda x: x[3:4], lambda x: x.between(5.0, 6.0), lambda x: x.split(0.0)])
+def test_a_part_without_two_rows_is_refused(part):
+    with pytest.raises(LogError, match="2 rows"):
+        part(example())
+
+
+# ---------------------------------------------------------------------- identity
+
+
+def test_fingerprint_tells_names_times_and_samples_apart_but_not_column_order():
+    t, x, y = np.arange(4.0), np.ones(4), np.array([0.0, np.nan, 2.0, 3.0])
+    one = Log.from_arrays(t, {"x": x, "y": y}).fingerprint
+    assert Log.from_arrays(t, {"y": -(-y), "x": x}).fingerprint == one
+    others = [
+        Log.from_arrays(t, {"x": y, "y": x}),
+        Log.from_arrays(t + 1, {"x": x, "y": y}),
+        Log.from_arrays(t, {"x": np.nextafter(x, 2), "y": y}),
+        Log.from_arrays(t, {"x": x}),
+    ]
+    assert len({one, *(other.fingerprint for other in others)}) == 5
+
+
+@pytest.mark.parametrize("clone", [lambda x: pickle.loads(pickle.dumps(x)), copy.deepcopy])
+def test_a_log_survives_pickling(clone):
+    log = example()[5:50]
+    other = clone(log)
+    assert other.fingerprint == log.fingerprint
+    assert (other.history, other.notes, other.source) == (log.history, log.notes, log.source)
+    assert (other.units, other.unusable) == (log.units, log.unusable)
+    assert not other["x"].flags.writeable
+
+
+# ---------------------------------------------------------------------- frames
+
+
+@pytest.mark.parametrize("frame", [pl.DataFrame, pd.DataFrame])
+def test_frames_give_signals_units_and_notes(frame):
+    log = Log.from_frame(
+        frame({"time": [0.0, 0.1, 0.2], "theta [deg]": [1, 2, 3], "mode": ["a", "b", "c"]}), time="time"
+    )
+    assert log.names == ("theta",)
+    assert log.units == {"theta": "deg"}
+    assert log.notes == ("column \"mode\" is left out: it is not numeric: row 0 holds 'a'",)
+    with pytest.raises(LogError, match='signal "mode" is not numeric: row 0 holds'):
+        log["mode"]
+
+
+def test_missing_values_of_frames_are_nan():
+    for frame in (
+        pl.DataFrame({"t": [0, 1, 2], "x": [1, None, 3], "on": [True, None, False]}),
+        pd.DataFrame({"t": [0, 1, 2], "x": pd.array([1, None, 3], dtype="Int64"), "on": [True, None, False]}),
+    ):
+        log = Log.from_frame(frame)
+        assert np.array_equal(log["x"], [1.0, np.nan, 3.0], equal_nan=True)
+        assert np.array_equal(log["on"], [1.0, np.nan, 0.0], equal_nan=True)
+
+
+def test_a_frame_without_its_time_column_is_refused():
+    with pytest.raises(LogError, match='no time column "t"; found a, b'):
+        Log.from_frame(pl.DataFrame({"a": [0, 1], "b": [0, 1]}))
+
+
+def test_a_frame_with_two_columns_of_one_name_is_refused():
+    with pytest.raises(LogError, match="two columns have one name"):
+        Log.from_frame(pd.DataFrame(np.zeros((3, 3)), columns=["t", "x", "x"]))
+
+
+# ---------------------------------------------------------------------- writing
+
+ENDINGS = [".csv", ".csv.gz", ".parquet", ".npz"]
+any_float = st.floats(width=64)
+names = st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), min_size=1, max_size=8).filter(
+    lambda name: name != "t" and "[" not in name
+)
+
+
+@given(
+    ending=st.sampled_from(ENDINGS),
+    signals=st.dictionaries(names, st.lists(any_float, min_size=3, max_size=3), min_size=1, max_size=4),
+    start=st.floats(-1e6, 1e6),
+)
+def test_every_number_reads_back_exactly(tmp_path_factory, ending, signals, start):
+    path = tmp_path_factory.mktemp("round_trip") / f"a{ending}"
+    log = Log.from_arrays(start + np.arange(3), signals)
+    log.write(path)
+    back = read_log(path)
+    assert back.fingerprint == log.fingerprint
+    assert back.names == log.names
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_same_log_gives_the_same_bytes_and_nothing_else(tmp_path, ending):
+    paths = [tmp_path / "one" / f"a{ending}", tmp_path / "two" / f"a{ending}"]
+    for path in paths:
+        path.parent.mkdir()
+        example().write(path)
+        assert list(path.parent.iterdir()) == [path]
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_failed_write_leaves_the_existing_file(tmp_path, ending, monkeypatch):
+    path = tmp_path / f"a{ending}"
+    path.write_bytes(b"precious")
+
+    def refuse(self, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.replace", refuse)
+    with pytest.raises(LogError, match="cannot write .* No space left"):
+        example().write(path)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    assert path.read_bytes() == b"precious"
+
+
+def test_an_unknown_ending_or_folder_is_refused(tmp_path):
+    with pytest.raises(LogError, match=r"use one of .csv, .csv.gz, .parquet, .npz"):
+        example().write(tmp_path / "a.xlsx")
+    with pytest.raises(LogError, match="No such file or directory"):
+        example().write(tmp_path / "nowhere" / "a.csv")
+    assert os.listdir(tmp_path) == []
