@@ -1,0 +1,23 @@
+"""The command line: parse, call, print."""
+
+import sys
+from types import TracebackType
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the command line of this process, and end the process with its exit code."""
+    if "--debug" not in sys.argv:
+        sys.excepthook = _say_that_it_is_our_fault
+    from diransac.cli.commands import app
+
+    app()
+
+
+def _say_that_it_is_our_fault(kind: type[BaseException], error: BaseException, _: TracebackType | None) -> None:
+    """One line for an error that nobody foresaw."""
+    if issubclass(kind, KeyboardInterrupt):
+        print("interrupted", file=sys.stderr)  # noqa: T201  before there is a command line to print with
+        sys.exit(130)
+    print(f"internal error: {kind.__name__}: {error}; --debug shows where. Please report it", file=sys.stderr)  # noqa: T201

@@ -1,0 +1,147 @@
+"""The commands themselves: parse, call, print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from diransac.cli import screen
+from diransac.cli.arguments import load_model, names
+from diransac.cli.group import Group, grouped
+from diransac.cli.options import (
+    Derivation,
+    JsonFlag,
+    LogFile,
+    MethodName,
+    ModelName,
+    OptionalModelName,
+    Output,
+    Preparation,
+    Report,
+    Search,
+    known_method,
+)
+from diransac.cli.outputs import staged
+from diransac.cli.views import Equations, ModelList, compare_methods
+from diransac.identify import METHODS, identify
+from diransac.inspection import inspect
+from diransac.report import write_report
+from diransac.result import Result
+from diransac.validate import validate
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    cls=Group,
+    name="diransac",
+    help="Turn a messy log of a moving machine into a dynamical model, and say how far it can be trusted.",
+    invoke_without_command=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+
+@app.callback()
+def _diransac(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    _debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error, after any command.")] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as version_of
+
+        typer.echo(f"diransac {version_of('diransac')}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        context.fail(f"Give a command: {', '.join(sorted(command.name or '' for command in app.registered_commands))}.")
+
+
+@app.command("identify")
+@grouped
+def _identify(
+    file: LogFile,
+    model: ModelName,
+    search: Search,
+    derivation: Derivation,
+    preparation: Preparation,
+    method: MethodName = "i-diransac",
+    output: Output = None,
+    report: Report = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Identify the parameters of a model from a log."""
+    arguments = search.arguments() | derivation.arguments()
+    with staged([output, report], inputs=[file]) as (saved, page):
+        plant, log = load_model(model), preparation.read(file)
+        with screen.bar(method) as progress:
+            result = identify(plant, log, method, progress=progress, **arguments)
+        if output:
+            result.save(saved)
+        if report:
+            write_report(result, log, page)
+    screen.show(result, as_json)
+
+
+@app.command("compare")
+@grouped
+def _compare(
+    file: LogFile,
+    model: ModelName,
+    search: Search,
+    derivation: Derivation,
+    preparation: Preparation,
+    methods: Annotated[str, typer.Option(metavar="NAME,...", help="Which, in this order.")] = ",".join(METHODS),
+    report: Report = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Identify by every method from one log, side by side."""
+    wanted = [known_method(name) for name in names(methods)]
+    arguments = search.arguments() | derivation.arguments()
+    with staged([report], inputs=[file]) as (page,):
+        plant, log = load_model(model), preparation.read(file)
+        comparison = compare_methods(plant, log, wanted, arguments)
+        if report:
+            write_report(list(comparison.results.values()), log, page)
+    screen.show(comparison, as_json)
+
+
+@app.command("validate")
+@grouped
+def _validate(
+    model: Annotated[Path, typer.Argument(metavar="MODEL.json", help="What identify saved.")],
+    file: LogFile,
+    derivation: Derivation,
+    preparation: Preparation,
+    horizon: Annotated[float | None, typer.Option(metavar="S", help="Restart the simulation after so long.")] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Predict another log with an identified model, open loop."""
+    result = Result.load(model)
+    log = derivation.derive(preparation.read(file), result.model)
+    screen.show(validate(result, log, horizon), as_json)
+
+
+@app.command("inspect")
+@grouped
+def _inspect(
+    file: LogFile,
+    preparation: Preparation,
+    model: OptionalModelName = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Show what a log holds, what is odd about it, and what is missing for a model."""
+    plant = None if model is None else load_model(model)
+    screen.show(inspect(preparation.read_uneven(file), plant), as_json)
+
+
+@app.command("models")
+def _models(
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME|FILE.py[:NAME]", help="Show the equations of one.")
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """List the built-in models, or show the equations of one."""
+    screen.show(ModelList() if name is None else Equations(load_model(name)), as_json)

@@ -1,0 +1,88 @@
+"""How every command ends, and how commands share options."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn, get_type_hints
+
+import typer
+from typer.core import TyperGroup
+
+from diransac.errors import DiransacError
+
+__all__ = ["Group", "grouped"]
+
+INTERRUPTED = 130
+MAX_LINES = 3
+UsageError: type[Any] = typer.BadParameter.__mro__[1]
+
+
+class Group(TyperGroup):
+    """Commands that end with 0, 1 (it could not be done), 2 (wrong usage) or 130 (Ctrl-C), and a short message."""
+
+    def main(self, args: Sequence[str] | None = None, *positional: Any, **extra: Any) -> NoReturn:
+        """Run the command line; ``--debug`` is understood wherever it stands."""
+        given = list(sys.argv[1:] if args is None else args)
+        words = [word for word in given if word != "--debug"]
+        extra["standalone_mode"] = False
+        try:
+            code = super().main(words, *positional, **extra)
+        except UsageError as error:
+            where = error.ctx.command_path if error.ctx else "diransac"
+            code = _say(f"{error.format_message()}\nSee '{where} --help'.", 2)
+        except (DiransacError, OSError) as error:
+            if words != given:
+                raise
+            code = _say(_message(error), 1)
+        except (KeyboardInterrupt, typer.Abort):
+            code = INTERRUPTED
+        if code == INTERRUPTED:
+            typer.echo("interrupted", err=True)
+        sys.exit(code or 0)
+
+
+def _message(error: DiransacError | OSError) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return str(error)
+
+
+def _say(message: str, code: int) -> int:
+    """Print a message of a few lines on stderr; the exit code."""
+    lines = [line for line in message.splitlines() if line.strip()]
+    typer.echo("\n".join([f"error: {lines[0]}" if lines else "error", *lines[1:MAX_LINES]]), err=True)
+    return code
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose dataclass parameters are options of their own, one for each field."""
+    signature = inspect.signature(command, eval_str=True)
+    groups: dict[str, Any] = {
+        n: p.annotation for n, p in signature.parameters.items() if dataclasses.is_dataclass(p.annotation)
+    }
+    plain = [p.replace(kind=p.KEYWORD_ONLY) for n, p in signature.parameters.items() if n not in groups]
+    options = [option for group in groups.values() for option in _options(group)]
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{field.name: values.pop(field.name) for field in dataclasses.fields(group)})
+        command(**values)
+
+    run.__signature__ = signature.replace(parameters=[*plain, *options])  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in (*plain, *options)}
+    del run.__wrapped__
+    return run
+
+
+def _options(group: Any) -> list[inspect.Parameter]:
+    hints = get_type_hints(group, include_extras=True)
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    return [
+        inspect.Parameter(field.name, keyword, default=field.default, annotation=hints[field.name])
+        for field in dataclasses.fields(group)
+    ]

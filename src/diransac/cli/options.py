@@ -1,0 +1,149 @@
+"""The options that several commands share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from diransac import prepare
+from diransac.cli.arguments import load_settings, names, numbers, pairs
+from diransac.errors import LogError
+from diransac.identify import METHODS
+from diransac.log import Log
+from diransac.model import Model
+from diransac.readers import read_log
+
+__all__ = [
+    "Derivation",
+    "JsonFlag",
+    "LogFile",
+    "MethodName",
+    "ModelName",
+    "OptionalModelName",
+    "Output",
+    "Preparation",
+    "Report",
+    "Search",
+    "known_method",
+]
+
+
+def known_method(name: str) -> str:
+    """The name itself.  Raises typer.BadParameter: no method goes by it."""
+    if name not in METHODS:
+        raise typer.BadParameter(f"there is no method {name!r}; there are {', '.join(METHODS)}")
+    return name
+
+
+def _rate(text: str | None) -> str | float | None:
+    """Hz, or the word ``median``.  Raises typer.BadParameter: it is neither."""
+    if text is None or text == "median":
+        return text
+    try:
+        return float(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"--resample: {text!r} is no rate; give a number in Hz, or median") from error
+
+
+_LOG_HELP = "CSV(.gz), Parquet, NPZ or MAT: time t in seconds and one column a signal."
+_MODEL = typer.Option("--model", metavar="NAME|FILE.py[:NAME]", help="A built-in model, or one of yours.")
+
+LogFile = Annotated[Path, typer.Argument(metavar="LOG", help=_LOG_HELP)]
+ModelName = Annotated[str, _MODEL]
+OptionalModelName = Annotated[str | None, _MODEL]
+MethodName = Annotated[str, typer.Option("--method", callback=known_method, help=f"One of {', '.join(METHODS)}.")]
+Output = Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE.json", help="Where to save the result.")]
+Report = Annotated[Path | None, typer.Option("--report", metavar="FILE.html", help="Where to write a page to look at.")]
+JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")]
+
+
+def _option(*names: str, metavar: str | None = None, help: str) -> Any:  # noqa: A002  typer's own word
+    """An option on the preparation of the log."""
+    return typer.Option(*names, metavar=metavar, help=help, rich_help_panel="Preparation of the log, in this order")
+
+
+@dataclass(frozen=True)
+class Search:
+    """How to search."""
+
+    seed: Annotated[int, typer.Option(help="The same seed gives the same answer.")] = 0
+    settings: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Settings by name.")] = None
+    assignments: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="One setting, such as sample_size=50; repeatable."),
+    ] = None
+
+    def arguments(self) -> dict[str, Any]:
+        """What `diransac.identify` is called with.  Raises SettingsError: a setting is unknown or has no meaning."""
+        return {"seed": self.seed, "settings": load_settings(self.settings, self.assignments or ())}
+
+
+@dataclass(frozen=True)
+class Derivation:
+    """How signals come about that the log lacks."""
+
+    differentiate: Annotated[
+        bool, typer.Option("--differentiate", help="Derive the velocities and accelerations that the log lacks.")
+    ] = False
+    bandwidth: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Bandwidth of that filter; chosen from the log if not given.")
+    ] = None
+
+    def arguments(self) -> dict[str, Any]:
+        """What `diransac.identify` is called with."""
+        return {"differentiate": self.differentiate, "bandwidth": self.bandwidth}
+
+    def derive(self, log: Log, model: Model) -> Log:
+        """The log with what it lacks, if that is wanted.  Raises LogError: it cannot be derived."""
+        return prepare.differentiate(log, model, self.bandwidth) if self.differentiate else log
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What is done to a log before it is used."""
+
+    rename: Annotated[
+        list[str] | None,
+        _option("--map", metavar="NEW=OLD,...", help="Columns to rename: position=q_m,t=t_s."),
+    ] = None
+    scale: Annotated[
+        list[str] | None,
+        _option("--scale", metavar="NAME=FACTOR,...", help="Signals to multiply, by their new names."),
+    ] = None
+    resample: Annotated[
+        str | None,
+        _option("--resample", metavar="HZ|median", help="Resample at a uniform rate; median: the clock's usual one."),
+    ] = None
+    start: Annotated[float | None, _option("--from", metavar="S", help="Leave out what comes before.")] = None
+    stop: Annotated[float | None, _option("--until", metavar="S", help="Leave out what comes after.")] = None
+    despike: Annotated[
+        str | None, _option("--despike", metavar="all|NAME,...", help="Signals to take spikes out of.")
+    ] = None
+    shift: Annotated[
+        list[str] | None, _option("--shift", metavar="NAME=S,...", help="Signals to move later in time: thrust=0.02.")
+    ] = None
+
+    def read(self, file: Path) -> Log:
+        """The log of a file, prepared.  Raises LogError: it cannot be read, or not be prepared like that."""
+        rename, scale = pairs("--map", self.rename or ()), numbers("--scale", self.scale or ())
+        delays, rate = numbers("--shift", self.shift or ()), _rate(self.resample)
+        log = read_log(file, rename=rename, scale=scale, resample=rate)
+        if self.start is not None or self.stop is not None:
+            log = log.between(-inf if self.start is None else self.start, inf if self.stop is None else self.stop)
+        if self.despike is not None:
+            log = prepare.despike(log, None if self.despike == "all" else names(self.despike))
+        return prepare.shift(log, delays) if delays else log
+
+    def read_uneven(self, file: Path) -> Log:
+        """As `read`, but a log whose clock is uneven is resampled at its usual rate, and says so."""
+        try:
+            return self.read(file)
+        except LogError as error:
+            if self.resample is not None:
+                raise
+            log = replace(self, resample="median").read(file)
+            return replace(log, notes=(f"resampled, because: {error}", *log.notes))

@@ -1,0 +1,59 @@
+"""Files that a command writes: checked before the long work, complete or not there at all after it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from diransac.errors import ResultError
+
+__all__ = ["staged"]
+
+
+@contextmanager
+def staged(outputs: Sequence[Path | None], inputs: Sequence[Path] = ()) -> Iterator[list[Path]]:
+    """Temporary files beside the outputs that are asked for; they replace them together once the block has succeeded.
+
+    Parameters
+    ----------
+    outputs : where to write; a None has a temporary file of no meaning, which is never asked for
+    inputs : files that the command reads, none of which may be written
+
+    Raises ResultError: an output's folder is missing or closed to us, it is no ordinary file, or an input.
+    """
+    targets = [None if path is None else _checked(path, inputs) for path in outputs]
+    named = [path for path in targets if path is not None]
+    if len(set(named)) < len(named):
+        raise ResultError(f'two outputs go to "{named[0]}"; give each a file of its own')
+    drafts = [Path() if path is None else _draft(path) for path in targets]
+    try:
+        yield drafts
+        for draft, target in zip(drafts, targets, strict=True):
+            if target is not None:
+                if target.exists():
+                    draft.chmod(target.stat().st_mode)
+                draft.replace(target)
+    finally:
+        for draft, target in zip(drafts, targets, strict=True):
+            if target is not None:
+                draft.unlink(missing_ok=True)
+
+
+def _draft(target: Path) -> Path:
+    """A name beside the target that keeps its ending, which chooses the format."""
+    return target.with_name(f".{os.getpid()}-{target.name}")
+
+
+def _checked(path: Path, inputs: Sequence[Path]) -> Path:
+    target = path.resolve()
+    if target.exists() and not target.is_file():
+        raise ResultError(f'output "{path}" is not an ordinary file; give the name of a file')
+    if not target.parent.is_dir():
+        raise ResultError(f'output "{path}": the folder "{target.parent}" does not exist; make it first')
+    if not os.access(target.parent, os.W_OK | os.X_OK) or (target.exists() and not os.access(target, os.W_OK)):
+        raise ResultError(f'output "{path}" cannot be written: permission denied; choose another folder')
+    if target in {source.resolve() for source in inputs}:
+        raise ResultError(f'output "{path}" is a file that this command reads; give it another name')
+    return target

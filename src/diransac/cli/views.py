@@ -1,0 +1,133 @@
+"""What commands show that no other part of the package prints: methods side by side, and models."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from diransac.cli.screen import bar
+from diransac.errors import DiransacError
+from diransac.identify import identify
+from diransac.log import Log
+from diransac.model import Model, Parameter
+from diransac.models import BUILTIN
+from diransac.result import Result
+from diransac.text_table import aligned
+
+__all__ = ["Comparison", "Equations", "ModelList", "compare_methods"]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Several methods on one log: what each found and how long it took (s), or why it refused."""
+
+    model: Model
+    log: Log
+    results: Mapping[str, Result]
+    seconds: Mapping[str, float]
+    refusals: Mapping[str, str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Results and refusals by method."""
+        found = {name: result.to_dict() | {"seconds": self.seconds[name]} for name, result in self.results.items()}
+        refused = {name: {"refused": reason} for name, reason in self.refusals.items()}
+        return {"model": self.model.name, "log": self.log.source, "methods": found | refused}
+
+    def __str__(self) -> str:
+        units = [f"{name} [{parameter.unit}]" for name, parameter in self.model.parameters.items()]
+        rows = [["method", *units, "fit error", "inliers", "samples", "seconds"]]
+        rows += [self._row(name, result) for name, result in self.results.items()]
+        lines = [f"{self.model.name} from {self.log.source}", *aligned(rows)]
+        lines += [f"{name}: {reason}" for name, reason in self.refusals.items()]
+        if "diransac" in self.results:
+            lines.append("diransac's fit error is a mean square, the others' a root mean square, eq. (2)")
+        return "\n".join(lines)
+
+    def _row(self, name: str, result: Result) -> list[str]:
+        errors = result.standard_errors
+        outside = {n: "!" if n in result.violations else "" for n in result.parameters}
+        estimates = [f"{x:.5g} ± {errors[n]:.2g}{outside[n]}" for n, x in result.parameters.items()]
+        inliers = f"{100.0 * result.inlier_fraction:.1f} %"
+        return [
+            name,
+            *estimates,
+            f"{result.fit_error:.4g}",
+            inliers,
+            str(result.iterations),
+            f"{self.seconds[name]:.2f}",
+        ]
+
+
+def compare_methods(model: Model, log: Log, methods: Sequence[str], arguments: Mapping[str, Any]) -> Comparison:
+    """Identify by each method with the same arguments.
+
+    Raises DiransacError: the first refusal, where every method refuses.
+    """
+    results, seconds, refusals = {}, {}, {}
+    first: DiransacError | None = None
+    for method in methods:
+        begin = time.perf_counter()
+        try:
+            with bar(method) as progress:
+                results[method] = identify(model, log, method, progress=progress, **arguments)
+        except DiransacError as error:
+            refusals[method] = str(error)
+            first = first or error
+        seconds[method] = time.perf_counter() - begin
+    if first is not None and not results:
+        raise first
+    return Comparison(model, log, results, seconds, refusals)
+
+
+@dataclass(frozen=True)
+class ModelList:
+    """Every built-in model, a line each."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `Equations` shows of each model, by name."""
+        return {name: Equations(make()).to_dict() for name, make in BUILTIN.items()}
+
+    def __str__(self) -> str:
+        rows = [["model", "coordinates", "inputs", "parameters"]]
+        for name, make in BUILTIN.items():
+            model = make()
+            rows.append([name, *(", ".join(group) for group in (model.coordinates, model.inputs, model.parameters))])
+        return "\n".join(aligned(rows))
+
+
+@dataclass(frozen=True)
+class Equations:
+    """One model: its signals, its parameters with their bounds, its equations."""
+
+    model: Model
+
+    def to_dict(self) -> dict[str, Any]:
+        """Names, units, bounds (null: none) and equations."""
+        model = self.model
+        parameters = {name: vars(parameter).copy() for name, parameter in model.parameters.items()}
+        return {
+            "name": model.name,
+            "signals": {name: model.units[name] for name in model.signals},
+            "inputs": model.inputs,
+            "parameters": parameters,
+            "required": list(model.required_signals),
+            "nonlinear": list(model.nonlinear_parameters),
+            "equations": list(model.equations_text()),
+        }
+
+    def __str__(self) -> str:
+        model = self.model
+        signals = [["signal", "unit", ""]]
+        signals += [[name, model.units[name], "predicted"] for name in model.signals]
+        signals += [[name, unit, "input"] for name, unit in model.inputs.items()]
+        rows = [["parameter", "unit", "bounds"]]
+        rows += [[name, parameter.unit, _bounds(parameter)] for name, parameter in model.parameters.items()]
+        return "\n".join([model.name, *aligned(signals), "", *aligned(rows), "", *model.equations_text()])
+
+
+def _bounds(parameter: Parameter) -> str:
+    low = "0 <" if parameter.positive else f"{parameter.lower:g} <=" if parameter.lower > -float("inf") else ""
+    high = f"<= {parameter.upper:g}" if parameter.upper < float("inf") else ""
+    return " ".join(part for part in (low, "value" if low or high else "any", high) if part)
