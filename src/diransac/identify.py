@@ -140,6 +140,7 @@ class _Task:
             parameters=dict(zip(self.model.parameters, best.parameters.tolist(), strict=True)),
             covariance=jackknife_covariance(bound, rows),
             degrees_of_freedom=max(1, min(N_BLOCKS, len(rows)) - 1),
+            fitted_rows=len(rows),
             inliers=self._on_given_log(observations, inliers),
             inlier_fraction=score.inlier_fraction,
             fit_error=score.error,

@@ -23,6 +23,7 @@ BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
 
 _FORMAT = 1
+_PLAIN = ("method", "estimator", "seed", "fitted_rows", "iterations", "evaluated", "stop_reason", "skipped")
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class Result:
     covariance : (n_p, n_p)   by a jackknife over stretches of time; infinite where the log cannot tell
     degrees_of_freedom : of that covariance, for intervals
     inliers : (N,)   over the rows of the log that was given
+    fitted_rows : observations that the parameters were fitted to: a sample, or a set of inliers
     inlier_fraction : of the rows that count
     fit_error : eq. (2) of the returned parameters (its square sibling for DIRANSAC); NaN where nothing could be
         simulated, infinite where the simulation diverged
@@ -62,6 +64,7 @@ class Result:
     parameters: Mapping[str, float]
     covariance: FloatArray
     degrees_of_freedom: int
+    fitted_rows: int
     inliers: BoolArray
     inlier_fraction: float
     fit_error: float
@@ -120,6 +123,7 @@ class Result:
             "intervals_95": {n: [_encode(x) for x in pair] for n, pair in self.intervals().items()},
             "covariance": [[_encode(x) for x in row] for row in self.covariance],
             "degrees_of_freedom": self.degrees_of_freedom,
+            "fitted_rows": self.fitted_rows,
             "inlier_fraction": _encode(self.inlier_fraction),
             "fit_error": _encode(self.fit_error),
             "iterations": self.iterations,
@@ -173,7 +177,7 @@ class Result:
             sensitivity=None if pairs is None else {n: (_decode(a), _decode(b)) for n, (a, b) in pairs.items()},
             log=log,
             **{
-                k: data[k] for k in ("method", "estimator", "seed", "iterations", "evaluated", "stop_reason", "skipped")
+                k: data[k] for k in _PLAIN
             },
         )
 
@@ -213,13 +217,14 @@ class Result:
     def _table(self) -> list[str]:
         rows = [("parameter", "estimate", "95 % interval", "unit")]
         for name, (low, high) in self.intervals().items():
-            interval = f"{low:.5g} .. {high:.5g}" if np.isfinite(high - low) else "the log cannot tell"
+            interval = f"{low:.5g} .. {high:.5g}" if np.isfinite(high - low) else "unknown"
             rows.append((name, f"{self.parameters[name]:.6g}", interval, self.units[name]))
         widths = [max(len(row[i]) for row in rows) for i in range(4)]
         return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
     def _summary(self) -> str:
         parts = [f"fit error {self.fit_error:.4g}", f"inliers {100.0 * self.inlier_fraction:.1f} %"]
+        parts.append(f"fitted to {self.fitted_rows} rows")
         if self.iterations:
             skipped = ", ".join(f"{n} {reason}" for reason, n in self.skipped.items())
             parts.append(f"{self.iterations} samples, {self.stop_reason}")
