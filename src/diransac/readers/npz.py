@@ -23,7 +23,7 @@ def read_npz(data: bytes, source: str) -> Table:
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
-    except zipfile.BadZipFile as error:
+    except (zipfile.BadZipFile, NotImplementedError) as error:
         raise LogError(f"{source}: it is not an NPZ file, or is cut off ({error})") from error
     check_unique(archive.namelist(), source)
     arrays = {}
