@@ -16,6 +16,7 @@ from diransac.atomic import write_text
 from diransac.errors import DiransacError, ResultError, SettingsError
 from diransac.model import Model
 from diransac.settings import Settings
+from diransac.text_table import aligned
 
 __all__ = ["LogSummary", "Result"]
 
@@ -219,8 +220,7 @@ class Result:
         for name, (low, high) in self.intervals().items():
             interval = f"{low:.5g} .. {high:.5g}" if np.isfinite(high - low) else "unknown"
             rows.append((name, f"{self.parameters[name]:.6g}", interval, self.units[name]))
-        widths = [max(len(row[i]) for row in rows) for i in range(4)]
-        return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+        return aligned(rows)
 
     def _summary(self) -> str:
         parts = [f"fit error {self.fit_error:.4g}", f"inliers {100.0 * self.inlier_fraction:.1f} %"]

@@ -11,15 +11,20 @@ Rogaway 2002 (cycle walking to a domain of any size); Steele, Lea, Flood 2014 (t
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 __all__ = ["sample_rows"]
 
 IntArray = npt.NDArray[np.int64]
 _Words = npt.NDArray[np.uint64]
 
-_ROUNDS = 8
+_ROUNDS = 6
 _GOLDEN = 0x9E3779B97F4A7C15
 
 
@@ -36,25 +41,25 @@ def sample_rows(seed: int, iterations: npt.ArrayLike, n_rows: int, start: int, s
     Returns (n, stop - start): row ``i`` holds distinct rows of the log, and no place read elsewhere repeats them.
     """
     k = np.atleast_1d(np.asarray(iterations, dtype=np.uint64))
-    key = _mix(_mix(np.array([seed % 2**64], dtype=np.uint64)) + k)[:, None]
+    key = _mix(_mix(np.array([seed % 2**64], dtype=np.uint64)) + k)
+    round_keys = [_mix(key + np.uint64(r * _GOLDEN % 2**64))[:, None] for r in range(1, _ROUNDS + 1)]
     values = np.broadcast_to(np.arange(start, stop, dtype=np.uint64), (len(k), stop - start))
     half = np.uint64(max(1, -(-(n_rows - 1).bit_length() // 2)))
-    keys = np.broadcast_to(key, values.shape)
-    permuted = _feistel(values, keys, half)
-    outside = permuted >= n_rows
-    while outside.any():
-        permuted[outside] = _feistel(permuted[outside], keys[outside], half)
-        outside = permuted >= n_rows
+    permuted = _feistel(values, round_keys, half)
+    outside = np.nonzero(permuted >= n_rows)
+    while len(outside[0]):
+        walked = _feistel(permuted[outside], [x[outside[0], 0] for x in round_keys], half)
+        permuted[outside] = walked
+        outside = tuple(index[walked >= n_rows] for index in outside)
     return permuted.astype(np.int64)
 
 
-def _feistel(values: _Words, key: _Words, half: np.uint64) -> _Words:
+def _feistel(values: _Words, round_keys: Sequence[_Words], half: np.uint64) -> _Words:
     """A keyed permutation of ``range(2^(2 half))``, element by element."""
     low = np.uint64((1 << int(half)) - 1)
     left, right = values >> half, values & low
-    for r in range(_ROUNDS):
-        word = _mix(key + _mix(right + np.uint64((r + 1) * _GOLDEN % 2**64)))
-        left, right = right, left ^ (word & low)
+    for key in round_keys:
+        left, right = right, left ^ (_mix(right + key) & low)
     return (left << half) | right
 
 

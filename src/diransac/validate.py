@@ -12,6 +12,7 @@ import numpy.typing as npt
 from diransac.errors import LogError, SettingsError
 from diransac.observations import Observations, observe
 from diransac.simulate import Rollouts, rollouts
+from diransac.text_table import aligned
 
 if TYPE_CHECKING:
     from diransac.log import Log
@@ -109,8 +110,7 @@ class Validation:
             for s in self.horizons:
                 row += [f"{s.rmse[name]:.4g}", f"{s.fit_percent[name]:.1f}", f"{s.r_squared[name]:.4f}"]
             rows.append(row)
-        widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
-        return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+        return "\n".join(aligned(rows))
 
 
 def validate(
