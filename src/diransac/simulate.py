@@ -131,7 +131,7 @@ def _rollouts(
 
 # Integrators ---------------------------------------------------------------------------------------------------------
 def _euler(_dynamics: Dynamics, x: ca.SX, h: ca.SX, slope: ca.SX, _n_q: int) -> ca.SX:
-    """X + h dx/dt, order 1."""
+    """Explicit Euler: x + h dx/dt, order 1."""
     return x + h * slope
 
 
@@ -356,7 +356,7 @@ class _Task:
         self.step = step
         self.n_rows = len(u) if n_rows is None else int(n_rows)
         self.start_rows = None if start_rows is None else self._windows(start_rows, n_rows)
-        self.measured = self.thresholds = np.empty(0)
+        self.measured = self.squared_thresholds = np.empty(0)
         self.valid = np.empty(0, np.bool_)
         self.min_inlier_signals = 0
         if not 1 <= self.n_rows <= len(u):
@@ -387,7 +387,8 @@ class _Task:
 
     def limit(self, thresholds: ArrayLike, min_inlier_signals: int) -> None:
         """Take what makes a row an inlier."""
-        self.thresholds = _array("thresholds", thresholds, (self.measured.shape[-1],))
+        with np.errstate(over="ignore", under="ignore"):
+            self.squared_thresholds = np.square(_array("thresholds", thresholds, (self.measured.shape[-1],)))
         self.min_inlier_signals = int(min_inlier_signals)
 
     def arguments(self, results: dict[str, NDArray[Any]]) -> list[Any]:

@@ -4,7 +4,7 @@
 |---|---|
 | `graph.py` | the graph of a CasADi SX function: each value once, products fused into sums, invariants marked |
 | `vectors.py` | arithmetic on eight float64 lanes, over llvmlite's IR builder |
-| `vector_math.py` | sin, exp, pow and the like, of such vectors |
+| `angles.py`, `exponentials.py` | sin, atan2, exp, pow and the like, of such vectors |
 | `operations.py` | the vector form of every operation, in one table; emits a graph by it |
 | `machine_code.py` | LLVM module -> callable machine code; threads |
 | `map_loop.py`, `row_map.py` | one function over many rows |

@@ -88,6 +88,16 @@ class _Builder:
         """Return the position of a constant."""
         return self.add(Instruction("CONST", constant=struct.pack("<d", value)))
 
+    def operation(self, name: str, operands: tuple[int, ...]) -> int:
+        """Return the position of an operation; a square, double or reciprocal is the product or ratio that it is."""
+        if name == "SQ":
+            return self.add(Instruction("MUL", operands * 2))
+        if name == "TWICE":
+            return self.add(Instruction("MUL", (self.constant(2.0), *operands)))
+        if name == "INV":
+            return self.add(Instruction("DIV", (self.constant(1.0), *operands)))
+        return self.add(Instruction(name, operands))
+
 
 def read_graph(function: ca.Function, invariant_inputs: Collection[int] = (), *, reciprocals: bool = False) -> Graph:
     """Expression graph of an SX function, with products fused into sums.
@@ -139,7 +149,7 @@ def _read(function: ca.Function) -> tuple[list[Instruction], list[list[int]]]:
             register[targets[0]] = builder.constant(function.instruction_constant(k))
         else:
             _refuse(name, function)
-            register[targets[0]] = builder.add(Instruction(name, tuple(register[i] for i in sources)))
+            register[targets[0]] = builder.operation(name, tuple(register[i] for i in sources))
     return builder.instructions, outputs
 
 
@@ -183,7 +193,7 @@ def _with_reciprocals(graph: Graph, inputs: frozenset[int]) -> Graph:
         if instruction.operation == "DIV":
             dividend, divisor = instruction.operands
             if graph.invariant[divisor] and not graph.invariant[dividend]:
-                reciprocal = builder.add(Instruction("INV", (operands[1],)))
+                reciprocal = builder.operation("INV", (operands[1],))
                 copy = Instruction("MUL", (operands[0], reciprocal))
         moved.append(builder.add(copy))
     return _marked(builder.instructions, [[moved[k] for k in row] for row in graph.outputs], inputs)
@@ -208,7 +218,6 @@ def _fuse(graph: Graph, uses: Counter[int], position: int) -> Instruction:
         product = graph.instructions[factor]
         # A product that waits outside the loop costs nothing inside it: fusing would only occupy a register more.
         waits = graph.invariant[factor] and not graph.invariant[position]
-        if product.operation in ("MUL", "SQ") and uses[factor] == 1 and not waits:
-            x, y = product.operands * 2 if product.operation == "SQ" else product.operands
-            return Instruction(name, (x, y, instruction.operands[1 - side]))
+        if product.operation == "MUL" and uses[factor] == 1 and not waits:
+            return Instruction(name, (*product.operands, instruction.operands[1 - side]))
     return instruction

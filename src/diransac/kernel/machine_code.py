@@ -90,8 +90,16 @@ def compile_function(module: LLVM, name: str, signature: Collection[str], target
     triple = binding.Target.from_default_triple()
     machine = triple.create_target_machine(cpu=target.cpu, features=target.features, opt=3)
     tuning = binding.create_pipeline_tuning_options(speed_level=2)
-    passes = binding.create_pass_builder(machine, tuning)
-    passes.getModulePassManager().run(parsed, passes)
+    builder = binding.create_pass_builder(machine, tuning)
+    passes = binding.create_new_function_pass_manager()
+    passes.add_sroa_pass()
+    passes.add_instruction_combine_pass()
+    passes.add_simplify_cfg_pass()
+    passes.add_loop_rotate_pass()
+    passes.add_instruction_combine_pass()
+    for f in parsed.functions:
+        if not f.is_declaration:
+            passes.run(f, builder)
     engine = binding.create_mcjit_compiler(parsed, machine)
     engine.finalize_object()
     kinds = {"pointer": ctypes.c_void_p, "integer": ctypes.c_int64, "number": ctypes.c_double}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from diransac.errors import ModelError
-from diransac.kernel import vector_math as vm
+from diransac.kernel import angles, exponentials
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
@@ -51,20 +51,17 @@ OPERATIONS: dict[str, Operation] = {
     "FMS": Operation(lambda v, x, y, z: v.fma(x, y, v.neg(z)), "nnn"),
     "FNMA": Operation(lambda v, x, y, z: v.fma(v.neg(x), y, z), "nnn"),
     "NEG": Operation(lambda v, x: v.neg(x)),
-    "SQ": Operation(lambda v, x: v.mul(x, x)),
-    "TWICE": Operation(lambda v, x: v.add(x, x)),
-    "INV": Operation(lambda v, x: v.div(v.number(1.0), x)),
     "SQRT": Operation(lambda v, x: v.intrinsic("sqrt", x)),
-    "FABS": Operation(lambda v, x: v.intrinsic("fabs", x)),
+    "FABS": Operation(lambda v, x: v.absolute(x)),
     "FLOOR": Operation(lambda v, x: v.intrinsic("floor", x)),
     "CEIL": Operation(lambda v, x: v.intrinsic("ceil", x)),
-    "SIGN": Operation(vm.sign),
+    "SIGN": Operation(lambda v, x: v.sign(x)),
     "COPYSIGN": Operation(lambda v, x, y: v.intrinsic("copysign", x, y), "nn"),
-    "FMIN": Operation(vm.smaller, "nn"),
-    "FMAX": Operation(vm.larger, "nn"),
+    "FMIN": Operation(lambda v, x, y: v.smaller(x, y), "nn"),
+    "FMAX": Operation(lambda v, x, y: v.larger(x, y), "nn"),
     "FMOD": Operation(lambda v, x, y: v.libm("fmod", x, y), "nn"),
     "REMAINDER": Operation(lambda v, x, y: v.libm("remainder", x, y), "nn"),
-    "HYPOT": Operation(vm.hypot, "nn"),
+    "HYPOT": Operation(angles.hypot, "nn"),
     # conditions
     "LT": Operation(lambda v, x, y: v.compare("<", x, y), "nn", "c"),
     "LE": Operation(lambda v, x, y: v.compare("<=", x, y), "nn", "c"),
@@ -75,30 +72,30 @@ OPERATIONS: dict[str, Operation] = {
     "OR": Operation(lambda v, x, y: v.either(x, y), "cc", "c"),
     "IF_ELSE_ZERO": Operation(lambda v, c, x: v.select(c, x, v.number(0.0)), "cn"),
     # exponentials
-    "EXP": Operation(vm.exp),
-    "EXPM1": Operation(vm.expm1),
-    "LOG": Operation(vm.log),
-    "LOG1P": Operation(vm.log1p),
-    "POW": Operation(vm.power, "nn"),
-    "CONSTPOW": Operation(vm.power, "nn"),
-    "SINH": Operation(vm.sinh),
-    "COSH": Operation(vm.cosh),
-    "TANH": Operation(vm.tanh),
-    "ASINH": Operation(vm.asinh),
-    "ACOSH": Operation(vm.acosh),
-    "ATANH": Operation(vm.atanh),
+    "EXP": Operation(exponentials.exp),
+    "EXPM1": Operation(exponentials.expm1),
+    "LOG": Operation(exponentials.log),
+    "LOG1P": Operation(exponentials.log1p),
+    "POW": Operation(exponentials.power, "nn"),
+    "CONSTPOW": Operation(exponentials.power, "nn"),
+    "SINH": Operation(exponentials.sinh),
+    "COSH": Operation(exponentials.cosh),
+    "TANH": Operation(exponentials.tanh),
+    "ASINH": Operation(exponentials.asinh),
+    "ACOSH": Operation(exponentials.acosh),
+    "ATANH": Operation(exponentials.atanh),
     "ERF": Operation(lambda v, x: v.libm("erf", x)),
-    "ERFINV": Operation(vm.erfinv),
+    "ERFINV": Operation(exponentials.erfinv),
     # angles
-    "SIN": Operation(vm.sin),
-    "COS": Operation(vm.cos),
-    "TAN": Operation(vm.tan),
-    "ASIN": Operation(vm.asin),
-    "ACOS": Operation(vm.acos),
-    "ATAN": Operation(vm.atan),
-    "ATAN2": Operation(vm.atan2, "nn"),
+    "SIN": Operation(angles.sin),
+    "COS": Operation(angles.cos),
+    "TAN": Operation(angles.tan),
+    "ASIN": Operation(angles.asin),
+    "ACOS": Operation(angles.acos),
+    "ATAN": Operation(angles.atan),
+    "ATAN2": Operation(angles.atan2, "nn"),
 }
-"""Vector form of every operation of an expression graph, by CasADi's name for it."""
+"""Vector form of every operation of an expression graph, by CasADi's name for it; FMA, FMS and FNMA are ours."""
 
 
 def evaluate(

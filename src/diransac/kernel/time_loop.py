@@ -30,7 +30,7 @@ ARGUMENTS = {
     "inputs": "pointer",  # (n_log, n_u) float64
     "measured": "pointer",  # (n_log, n_s) float64
     "valid": "pointer",  # (n_log,) bytes, 0 or 1
-    "thresholds": "pointer",  # (n_s,) float64
+    "squared_thresholds": "pointer",  # (n_s,) float64
     "start_rows": "pointer",  # (n_padded,) int64, read where lanes have windows of their own
     "sums": "pointer",  # (n_s, n_padded) float64, written by Keep.SCORES
     "counts": "pointer",  # (2, n_padded) int64, written by Keep.SCORES: inliers, and 1 where the lane diverged
@@ -254,9 +254,10 @@ class _TimeLoop:
         n_inside = v.integer(0)
         for k, (error, total) in enumerate(zip(self._errors(simulated, lanes, row), self.sums, strict=True)):
             counted = v.select(valid, error, v.number(0.0))
-            v.set(total, v.add(v.get(total), v.mul(counted, counted)))
-            threshold = v.splat(v.load(self.arguments["thresholds"], _integer(k), DOUBLE))
-            n_inside = v.count(n_inside, v.compare("<", v.intrinsic("fabs", error), threshold))
+            square = v.mul(counted, counted)
+            v.set(total, v.add(v.get(total), square))
+            bound = v.splat(v.load(self.arguments["squared_thresholds"], _integer(k), DOUBLE))
+            n_inside = v.count(n_inside, v.compare("<", square, bound))
         enough = self.builder.icmp_signed(">=", n_inside, v.splat(self.arguments["min_inlier_signals"]))
         inlier = v.both(v.both(enough, valid), alive)
         v.set(self.inliers, v.count(v.get(self.inliers), inlier))

@@ -15,7 +15,7 @@ from llvmlite import ir
 from diransac.kernel.machine_code import LANES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
 __all__ = ["Cell", "Loop", "Value", "Vectors"]
 
@@ -96,6 +96,36 @@ class Vectors:
         """Return x y + z, rounded once."""
         return self.intrinsic("fma", x, y, z)
 
+    def absolute(self, x: Value) -> Value:
+        """Return |x|."""
+        return self.intrinsic("fabs", x)
+
+    def polynomial(self, x: Value, coefficients: Sequence[float]) -> Value:
+        """Return a polynomial by Horner's rule, its highest power first."""
+        result = self.number(coefficients[0])
+        for coefficient in coefficients[1:]:
+            result = self.fma(result, x, self.number(coefficient))
+        return result
+
+    def sign(self, x: Value) -> Value:
+        """Return -1, 1, or x where that is zero or NaN."""
+        zero = self.number(0.0)
+        negative = self.select(self.compare("<", x, zero), self.number(-1.0), x)
+        return self.select(self.compare(">", x, zero), self.number(1.0), negative)
+
+    def smaller(self, x: Value, y: Value) -> Value:
+        """Return the smaller operand; the other one where one is NaN."""
+        return self.select(self.either(self.compare("<", x, y), self.is_nan(y)), x, y)
+
+    def larger(self, x: Value, y: Value) -> Value:
+        """Return the larger operand; the other one where one is NaN."""
+        return self.select(self.either(self.compare(">", x, y), self.is_nan(y)), x, y)
+
+    def clamped(self, x: Value, lowest: float, highest: float) -> Value:
+        """Return x within bounds; NaN stays."""
+        x = self.select(self.compare("<", x, self.number(lowest)), self.number(lowest), x)
+        return self.select(self.compare(">", x, self.number(highest)), self.number(highest), x)
+
     def intrinsic(self, name: str, *operands: Value) -> Value:
         """Return LLVM's `llvm.<name>` of vectors."""
         return self.builder.call(self._declared(f"llvm.{name}.v{LANES}f64", NUMBERS, len(operands)), operands)
@@ -163,6 +193,34 @@ class Vectors:
         """Return the numbers whose bits these integers are."""
         return self.builder.bitcast(x, NUMBERS)
 
+    def lowest_bit(self, x: Value) -> Value:
+        """Return the condition that an integer is odd."""
+        return self.builder.trunc(x, CONDITIONS)
+
+    def has_bits(self, x: Value, mask: int) -> Value:
+        """Return where an integer shares a bit with the mask."""
+        return self.builder.icmp_unsigned("!=", self.both(x, self.integer(mask)), self.integer(0))
+
+    def sign_bit(self, x: Value) -> Value:
+        """Return where the sign of x is minus, zeros included."""
+        return self.builder.icmp_signed("<", self.bits(x), self.integer(0))
+
+    def add_integers(self, x: Value, y: Value) -> Value:
+        """Return x + y, modulo 2**64."""
+        return self.builder.add(x, y)
+
+    def exclusive_or(self, x: Value, y: Value) -> Value:
+        """Return the bits that differ."""
+        return self.builder.xor(x, y)
+
+    def shift_left(self, x: Value, places: int) -> Value:
+        """Return x 2**places, modulo 2**64."""
+        return self.builder.shl(x, self.integer(places))
+
+    def shift_right(self, x: Value, places: int) -> Value:
+        """Return x / 2**places of integers without sign, rounded down."""
+        return self.builder.lshr(x, self.integer(places))
+
     # Lanes and memory ----------------------------------------------------------------------------------------------
     def lane(self, x: Value, lane: int) -> Value:
         """Return one lane as a scalar."""
@@ -213,6 +271,23 @@ class Vectors:
     def set(self, cell: Cell, value: Value) -> None:
         """Let a variable hold another value."""
         self.builder.store(value, cell.address)
+
+    def call_aside(self, name: str, emit: Callable[..., Value], *operands: Value) -> Value:
+        """Return `emit(vectors, *operands)`, run as a function of its own that the module holds once: for what is rare.
+
+        Parameters
+        ----------
+        name : of the function; the same name means the same `emit`
+        """
+        function = self.builder.module.globals.get(name)
+        if function is None:
+            function = ir.Function(self.builder.module, ir.FunctionType(NUMBERS, [NUMBERS] * len(operands)), name)
+            function.linkage = "internal"
+            for attribute in ("noinline", "cold"):
+                function.attributes.add(attribute)
+            aside = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
+            aside.builder.ret(emit(aside, *function.args))
+        return self.builder.call(function, operands)
 
     @contextmanager
     def repeat(self, first: Value, end: Value) -> Iterator[Loop]:
