@@ -103,7 +103,7 @@ def _compare(
         plant, log = load_model(model), preparation.read(file)
         comparison = compare_methods(plant, log, wanted, arguments)
         if report:
-            write_report(list(comparison.results.values()), log, page)
+            write_report(comparison.results, log, page)
     screen.show(comparison, as_json)
 
 
