@@ -281,7 +281,7 @@ def _central_erfinv(v: Vectors, x: Value) -> Value:
     """First guess for x < 0.7, good to 1e-3."""
     z = v.mul(x, x)
     above = v.polynomial(z, (-0.140543331, 0.914624893, -1.645349621, 0.886226899))
-    below = v.polynomial(z, (-0.329097515, 0.012229801, 1.442710462, -2.118377725, 1.0))
+    below = v.polynomial(z, (0.012229801, -0.329097515, 1.442710462, -2.118377725, 1.0))
     return v.div(v.mul(x, above), below)
 
 
