@@ -120,6 +120,15 @@ def test_identify_derives_only_when_asked(folder: Path):
     assert json.loads(done.stdout)["parameters"]["mass"] == pytest.approx(TRUE["mass"], rel=0.02)
 
 
+def test_progress_is_shown_on_a_terminal_and_never_on_stdout(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    silent = run("identify", "swim.csv", *MODEL, *QUICK, "--json")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    shown = CliRunner().invoke(app, ["identify", "swim.csv", *MODEL, *QUICK, "--json"], catch_exceptions=False)
+    assert shown.stdout == silent.stdout
+    assert "i-diransac" in shown.stderr
+    assert silent.stderr == ""
+
+
 def test_same_seed_gives_the_same_bytes(folder: Path):
     for name in ("a.json", "b.json"):
         assert run("identify", "swim.csv", *MODEL, *QUICK, "--seed", 3, "-o", name).exit_code == 0
@@ -316,6 +325,9 @@ def test_inspect_finds_what_was_planted(folder: Path):
     assert signals["thrust"]["n_spikes"] == 2
     assert signals["x_ddot"]["n_spikes"] == signals["x_ddot"]["n_missing"] == 0
     assert signals["x_ddot"]["maximum"] == pytest.approx(1.3, abs=1e-3)
+    text = run("inspect", "odd.csv").stdout.splitlines()
+    assert text[1].split() == ["signal", "unit", "minimum", "maximum", "std", "NaN", "spikes", "frozen", "s"]
+    assert next(line for line in text if line.startswith("x_dot ")).split()[-1] == "0.5"
 
 
 def test_inspect_says_what_is_missing_and_what_can_be_derived(folder: Path):
