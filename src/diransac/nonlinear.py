@@ -32,6 +32,8 @@ _START_DECADES = 3.0
 _ROWS_FOR_STARTS = 100
 _ROWS_FOR_WHOLE = 2000
 _CONVERGED = 1e-14
+# Errors whose squares could not be summed: a lane that has one is nowhere to go.
+_HUGE = 1e140
 # Marquardt's damping at the start, and its bounds.
 _DAMPING = (1e-3, 1e-12, 1e12)
 # Bounds of the logarithm of a positive parameter that has none of its own: 1e-12 to 1e12.
@@ -154,10 +156,11 @@ class _BoundNonlinear:
         p, slope = self._chart.to_parameters(free), self._chart.slope(free)
         flat = rows.reshape(-1)
         a, da = self._evaluate(self._state[flat], self._inputs[flat], np.repeat(p, n, axis=0))
-        errors = ((a - self._accelerations[flat]) / self._scale).reshape(n_lanes, -1)
-        da = da.reshape(len(flat), len(slope[0]), len(self._scale)).transpose(0, 2, 1) / self._scale[:, None]
-        J = da.reshape(n_lanes, -1, len(slope[0])) * slope[:, None, :]
-        bad = ~(np.isfinite(errors).all(axis=1) & np.isfinite(J).all(axis=(1, 2)))
+        da = da.reshape(len(flat), self._n_p, len(self._scale)).transpose(0, 2, 1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            errors = ((a - self._accelerations[flat]) / self._scale).reshape(n_lanes, -1)
+            J = (da / self._scale[:, None]).reshape(n_lanes, -1, self._n_p) * slope[:, None, :]
+        bad = ~(np.all(np.abs(errors) < _HUGE, axis=1) & np.all(np.abs(J) < _HUGE, axis=(1, 2)))
         errors[bad], J[bad] = np.inf, 0.0
         return errors, J
 
