@@ -1,0 +1,386 @@
+"""Algorithm 1: ours against a slow and literal one, which shares nothing with it but what it is given."""
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from functools import cache
+from hashlib import sha256
+
+import numpy as np
+import pytest
+
+from algorithm1 import Choices, Problem, Story, algorithm1
+from diransac.consensus import Diransac, InlierBiasedDiransac, Score
+from diransac.errors import IdentificationError
+from diransac.estimators import OrdinaryLeastSquares
+from diransac.evaluation import Simulation, choose_scoring, judged_signals
+from diransac.models import builtin
+from diransac.observations import observe
+from diransac.search import Outcome, search
+from diransac.settings import Settings
+from diransac.simulate import rollouts
+from simulated import MACHINES, as_log, flight, rollout, with_outliers
+
+VARIANTS = ("i-diransac", "diransac")
+FAR = 1e-9
+UNUSED = {"x", "z"}
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A log and the settings that it is searched with.
+
+    Parameters
+    ----------
+    size : rows, and seconds from one to the next
+    corruption : probability and magnitude of outliers, standard deviation of white noise over each signal's own
+    gaps : rows and signals that are NaN
+    """
+
+    name: str
+    machine: str
+    size: tuple[int, float]
+    corruption: tuple[float, float, float]
+    seed: int
+    settings: Settings
+    first_row: str = "clean"
+    gaps: tuple[tuple[int, str], ...] = ()
+
+
+TABLE_IV = replace(Settings.table_iv(), max_iterations=40, stop_inlier_fraction=None)
+EARLY = replace(TABLE_IV, sample_size=9, stop_inlier_fraction=0.85)
+BY_ERROR = replace(TABLE_IV, sample_size=4, acceptance_weights=(1.0, 0.0))
+BY_INLIERS = replace(BY_ERROR, acceptance_weights=(0.0, 1.0))
+BY_FOUR = replace(BY_ERROR, max_iterations=60, min_inlier_signals=4)
+DEFAULT = Settings(sample_size=5, max_iterations=60, stop_inlier_fraction=None)
+DEFAULT_BY_ERROR = replace(DEFAULT, acceptance_weights=(1.0, 0.0))
+DEFAULT_BY_INLIERS = replace(DEFAULT, sample_size=15, acceptance_weights=(0.0, 1.0))
+GAPS = ((3, "x_dot"), (40, "theta"), (41, "theta_ddot"), (90, "z"), (199, "x_ddot"))
+PLANE, VEHICLE, SERVO = "planar-rotorcraft", "underwater-vehicle", "servo-axis"
+
+CASES = [
+    Case("table iv", PLANE, (250, 0.02), (0.1, 80.0, 0.02), 0, replace(TABLE_IV, sample_size=12)),
+    Case("early stop", PLANE, (250, 0.02), (0.1, 80.0, 0.02), 14, EARLY),
+    Case("first row hit", PLANE, (250, 0.02), (0.1, 20.0, 0.05), 3, replace(TABLE_IV, sample_size=10), "hit"),
+    Case("gaps", PLANE, (200, 0.02), (0.1, 30.0, 0.05), 4, replace(TABLE_IV, sample_size=8), gaps=GAPS),
+    Case("near misses", PLANE, (120, 0.02), (0.1, 5.0, 0.2), 21, BY_ERROR),
+    Case("by inliers", PLANE, (120, 0.02), (0.1, 5.0, 0.05), 105, BY_INLIERS),
+    Case("circles", PLANE, (40, 0.02), (0.2, 3.0, 0.5), 32, BY_FOUR),
+    Case("no refits", PLANE, (250, 0.02), (0.2, 10.0, 0.1), 5, replace(TABLE_IV, sample_size=6, refit="none")),
+    Case("one iteration", PLANE, (150, 0.02), (0.0, 0.0, 0.1), 8, replace(TABLE_IV, max_iterations=1)),
+    Case("grown samples", VEHICLE, (250, 0.1), (0.1, 2.0, 0.1), 0, replace(DEFAULT, sample_size=3)),
+    Case("stiff", VEHICLE, (120, 0.4), (0.02, 20.0, 0.05), 24, DEFAULT),
+    Case("small circles", VEHICLE, (40, 0.4), (0.1, 2.0, 0.1), 95, DEFAULT_BY_ERROR),
+    Case("fixed point", VEHICLE, (40, 0.4), (0.1, 2.0, 0.1), 10, DEFAULT_BY_ERROR),
+    Case("divergent and accepted", VEHICLE, (120, 0.4), (0.1, 20.0, 0.1), 14, DEFAULT_BY_INLIERS),
+    Case("dry friction", SERVO, (40, 0.02), (0.2, 3.0, 0.5), 66, DEFAULT_BY_ERROR),
+]
+
+
+@cache
+def order(seed: int, k: int, n_rows: int) -> tuple[int, ...]:
+    """The rows in an order that (seed, k) decides, whatever becomes of anybody's random numbers."""
+    return tuple(sorted(range(n_rows), key=lambda row: sha256(f"{seed} {k} {row}".encode()).digest()))
+
+
+def shuffled(seed, iterations, n_rows, start, stop):
+    """The same as a sampler of ours."""
+    return np.array([order(seed, int(k), n_rows)[start:stop] for k in iterations], dtype=np.int64)
+
+
+class Recorder:
+    """An evaluator that keeps the inlier sets it is asked for."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self.admits, self.scores = simulation.admits, simulation.scores
+        self.inlier_sets: list[np.ndarray] = []
+
+    def inliers(self, parameters):
+        """As the simulation says, and kept."""
+        self.inlier_sets.append(self._simulation.inliers(parameters))
+        return self.inlier_sets[-1]
+
+
+@cache
+def recorded(case: Case):
+    """Signals and inputs of a case's log, as they were recorded."""
+    machine = MACHINES[case.machine]
+    probability, magnitude, noise = case.corruption
+    clean, inputs = flight(machine, *case.size)
+    white = np.random.default_rng(1000 + case.seed).normal(size=clean.shape)
+    noisy = with_outliers(clean, probability, magnitude, case.seed, first_row=case.first_row)
+    noisy += noise * clean.std(axis=0) * white
+    for row, name in case.gaps:
+        noisy[row, machine.signals.index(name)] = np.nan
+    return noisy, inputs
+
+
+def observed(case: Case, settings: Settings | None = None):
+    machine, model, settings = MACHINES[case.machine], builtin(case.machine), settings or case.settings
+    log = as_log(machine, *recorded(case), case.size[1])
+    observations = observe(model, log, judged_signals(model, log, settings))
+    return observations, choose_scoring(observations, settings)
+
+
+def run_ours(case: Case, variant: str, **changes) -> tuple[Outcome | str, list[np.ndarray]]:
+    """What our search found, or what it says where it found nothing, and the inlier sets that it asked for."""
+    settings = replace(case.settings, **changes)
+    observations, scoring = observed(case, settings)
+    object_of = {"i-diransac": InlierBiasedDiransac(settings.acceptance_weights), "diransac": Diransac()}
+    evaluator = Recorder(Simulation(observations, scoring, settings, object_of[variant]))
+    estimator = OrdinaryLeastSquares().bind(observations)
+    try:
+        outcome = search(object_of[variant], settings, estimator, evaluator, shuffled, case.seed)
+    except IdentificationError as error:
+        return str(error), evaluator.inlier_sets
+    return outcome, evaluator.inlier_sets
+
+
+@cache
+def run_literal(case: Case, variant: str, simulator: str) -> Story:
+    machine, model = MACHINES[case.machine], builtin(case.machine)
+    (signals, inputs), (_, dt) = recorded(case), case.size
+    usable = np.ones(len(signals), dtype=bool)
+    for row, name in case.gaps:
+        usable[row] = name in UNUSED
+    start = signals[0, : 2 * len(machine.coordinates)]
+    engine = rollouts(model)
+    simulators = {
+        "ours": lambda p: engine.trajectories(p[None], start, inputs, dt)[0],
+        "its own": lambda p: rollout(machine, p, start, inputs, dt),
+    }
+    bounds = list(model.parameters.values())
+    _, scoring = observed(case)
+    problem = Problem(
+        *machine.rows(signals, inputs),
+        signals,
+        usable,
+        np.array([x.lower for x in bounds]),
+        np.array([x.upper for x in bounds]),
+        np.array([x.positive for x in bounds]),
+        order,
+        simulators[simulator],
+    )
+    s = case.settings
+    choices = Choices(
+        variant,
+        s.sample_size,
+        s.max_iterations,
+        s.stop_inlier_fraction,
+        scoring.thresholds,
+        scoring.min_inlier_signals,
+        scoring.weights,
+        s.acceptance_weights,
+        s.refit == "inliers",
+        case.seed,
+    )
+    return algorithm1(problem, choices)
+
+
+def assert_agree(outcome: Outcome | str, inlier_sets: list[np.ndarray], story: Story) -> None:
+    offered = [h.inliers for h in story.hypotheses if h.offers_refit]
+    assert len(inlier_sets) == len(offered)
+    assert all(np.array_equal(ours, theirs) for ours, theirs in zip(inlier_sets, offered, strict=True))
+    if story.best is None:
+        counts = ", ".join(f"{n} {reason}" for reason, n in story.fates.most_common())
+        assert f"no hypothesis was accepted in {story.k} samples ({counts})" in outcome
+        return
+    assert outcome.iterations == story.k
+    assert outcome.evaluated == len(story.hypotheses)
+    assert outcome.skipped == story.fates
+    assert np.array_equal(np.sort(outcome.best.rows), np.sort(story.best.rows))
+    assert outcome.best.score.inlier_fraction == story.best.fraction
+    assert outcome.best.score.error == pytest.approx(story.best.error, rel=1e-9)
+    assert outcome.best.parameters == pytest.approx(story.best.parameters, rel=1e-9)
+
+
+# ---------------------------------------------------------------------- agreement
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_search_agrees_with_the_literal_algorithm_on_our_simulator(case, variant):
+    assert_agree(*run_ours(case, variant), run_literal(case, variant, "ours"))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_search_agrees_with_the_literal_algorithm_on_its_own_simulator_where_nothing_is_close(case, variant):
+    story = run_literal(case, variant, "its own")
+    assert story.margin > FAR, "this log decides by rounding; choose another seed"
+    assert_agree(*run_ours(case, variant), story)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize(("batch_size", "threads"), [(1, 1), (7, 2), (1024, 3)])
+def test_batch_size_and_threads_never_change_a_bit(case, variant, batch_size, threads):
+    usual, usual_sets = run_ours(case, variant)
+    other, other_sets = run_ours(case, variant, batch_size=batch_size, threads=threads)
+    assert [x.tobytes() for x in other_sets] == [x.tobytes() for x in usual_sets]
+    if isinstance(usual, str):
+        assert other == usual
+        return
+    assert other.best.parameters.tobytes() == usual.best.parameters.tobytes()
+    assert (other.best.rows.tobytes(), other.best.score) == (usual.best.rows.tobytes(), usual.best.score)
+    for name in ("iterations", "evaluated", "skipped", "stop_reason"):
+        assert getattr(other, name) == getattr(usual, name)
+
+
+def test_the_cases_hold_every_turn_that_the_algorithm_can_take():
+    stories = {(c.name, v): run_literal(c, v, "ours") for c in CASES for v in VARIANTS}
+    fates = sum((s.fates for s in stories.values()), Counter())
+    assert all(fates[reason] > 0 for reason in ("out of bounds", "diverged", "no improvement", "not accepted"))
+    assert sum(s.cycles > 0 for s in stories.values()) >= 3
+    assert sum(s.fates["diverged"] for s in stories.values()) >= 5
+    assert sum(s.fixed_points for s in stories.values()) > 0
+    assert sum(s.grown for s in stories.values()) > 0
+    assert stories["early stop", "i-diransac"].k < TABLE_IV.max_iterations
+    assert sum(s.never_run for s in stories.values()) > 0
+    assert any(h.is_refit and h.fate == "stored" for s in stories.values() for h in s.hypotheses)
+    assert any(h.is_refit and h.fate == "out of bounds" for s in stories.values() for h in s.hypotheses)
+    assert any(s.best is not None and np.isinf(s.best.error) for s in stories.values())
+    assert any(s.best is None for s in stories.values())
+
+
+# ---------------------------------------------------------------------- single turns, by a script
+
+
+@dataclass
+class Script:
+    """Estimator and evaluator of a world in which parameter ``p`` of a set of rows, and its fate, are written down.
+
+    Parameters
+    ----------
+    fits : rows (in any order) -> p; every other set gives 0
+    found : p -> (error, inliers); every other p diverges at once
+    smallest : rows that a set needs to be well-defined
+    fitted : the sets that were fitted, in order
+    """
+
+    fits: dict[tuple[int, ...], float]
+    found: dict[float, tuple[float, list[int]]]
+    n_rows: int = 10
+    smallest: int = 1
+    fitted: list[tuple[int, ...]] = field(default_factory=list)
+
+    def well_defined(self, row_sets):
+        """By the number of rows."""
+        return np.array([len(rows) >= self.smallest for rows in row_sets])
+
+    def fit(self, row_sets):
+        """As it is written down."""
+        keys = [tuple(sorted(np.asarray(rows).tolist())) for rows in row_sets]
+        self.fitted += keys
+        return np.array([[self.fits.get(key, 0.0)] for key in keys])
+
+    def admits(self, parameters):
+        """Nothing negative."""
+        return parameters[:, 0] >= 0.0
+
+    def scores(self, parameters):
+        """As it is written down."""
+        found = [self.found.get(p, (np.inf, [])) for p in parameters[:, 0]]
+        return [Score(error, len(rows) / self.n_rows) for error, rows in found]
+
+    def inliers(self, parameters):
+        """As it is written down."""
+        return np.array(self.found[parameters[0]][1], dtype=np.int64)
+
+
+def first_two(seed, iterations, n_rows, start, stop):
+    """Sample k begins with rows k and k + 1."""
+    return np.array([[(k + j) % n_rows for j in range(start, stop)] for k in np.atleast_1d(iterations)])
+
+
+def run_script(script, variant=None, **changes):
+    settings = Settings(**{"sample_size": 2, "max_iterations": 1, "stop_inlier_fraction": None, **changes})
+    return search(variant or InlierBiasedDiransac((1.0, 0.06)), settings, script, script, first_two, seed=0)
+
+
+def test_refit_that_is_pending_at_the_iteration_limit_never_runs():
+    script = Script({(0, 1): 1.0, (2, 3, 4): 2.0}, {1.0: (5.0, [2, 3, 4]), 2.0: (1.0, [2, 3, 4])})
+    outcome = run_script(script)
+    assert outcome.best.parameters == [1.0]
+    assert (outcome.iterations, outcome.evaluated) == (1, 1)
+
+
+def test_refit_runs_before_the_next_sample_and_does_not_count():
+    script = Script(
+        {(0, 1): 1.0, (2, 3, 4): 2.0, (1, 2): 3.0}, {1.0: (5.0, [2, 3, 4]), 2.0: (1.0, [2, 3, 4]), 3.0: (9.0, [])}
+    )
+    outcome = run_script(script, max_iterations=2, batch_size=1)
+    assert script.fitted == [(0, 1), (2, 3, 4), (1, 2)]
+    assert outcome.best.parameters == [2.0]
+    assert (outcome.iterations, outcome.evaluated) == (2, 3)
+
+
+def test_refit_that_is_pending_when_the_inlier_fraction_is_reached_never_runs():
+    script = Script({(0, 1): 1.0, (2, 3, 4): 2.0}, {1.0: (5.0, [2, 3, 4]), 2.0: (1.0, [2, 3, 4])})
+    outcome = run_script(script, max_iterations=5, batch_size=1, stop_inlier_fraction=0.3)
+    assert outcome.best.parameters == [1.0]
+    assert (outcome.iterations, outcome.evaluated, outcome.stop_reason) == (1, 1, "inlier fraction reached")
+
+
+def test_refit_that_fails_the_preliminary_test_ends_its_chain():
+    script = Script({(0, 1): 1.0, (2, 3, 4): -1.0, (1, 2): 3.0}, {1.0: (5.0, [2, 3, 4]), 3.0: (9.0, [])})
+    outcome = run_script(script, max_iterations=2)
+    assert outcome.best.parameters == [1.0]
+    assert outcome.skipped == {"out of bounds": 1, "no improvement": 1}
+
+
+def test_chain_that_meets_a_set_again_ends():
+    fits = {(0, 1): 1.0, (2, 3, 4): 2.0, (5, 6, 7, 8): 3.0, (2, 3, 4, 5): 2.0}
+    found = {1.0: (1.0, [2, 3, 4]), 2.0: (9.0, [5, 6, 7, 8]), 3.0: (9.0, [2, 3, 4, 5])}
+    script = Script(fits, found)
+    outcome = run_script(script, InlierBiasedDiransac((1.0, 0.0)), max_iterations=2)
+    assert (outcome.iterations, outcome.best.parameters) == (2, [1.0])
+    assert script.fitted == [(0, 1), (1, 2), (2, 3, 4), (5, 6, 7, 8), (2, 3, 4, 5)]
+
+
+def test_inliers_that_are_the_sample_itself_are_not_fitted_again():
+    script = Script({(0, 1): 1.0}, {1.0: (5.0, [0, 1])})
+    assert run_script(script, max_iterations=1).evaluated == 1
+
+
+@pytest.mark.parametrize("variant", [InlierBiasedDiransac((1.0, 0.0)), Diransac()], ids=lambda v: v.name)
+def test_no_inliers_at_all_lead_to_a_new_sample(variant):
+    script = Script({(0, 1): 1.0, (1, 2): 2.0}, {1.0: (5.0, []), 2.0: (4.0, [])})
+    outcome = run_script(script, variant, max_iterations=2)
+    assert outcome.best.parameters == [2.0]
+    assert () not in script.fitted
+
+
+def test_no_inliers_are_never_stored_while_inliers_have_weight():
+    script = Script({(0, 1): 1.0, (1, 2): 2.0}, {1.0: (5.0, []), 2.0: (6.0, [1])})
+    outcome = run_script(script, max_iterations=2)
+    assert outcome.best.parameters == [2.0]
+    assert outcome.skipped["not accepted"] == 1
+
+
+def test_sample_grows_by_as_few_observations_as_it_needs():
+    script = Script({(0, 1, 2, 3, 4): 1.0}, {1.0: (5.0, [1]), 0.0: (9.0, [])}, smallest=5)
+    outcome = run_script(script)
+    assert outcome.best.rows.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_log_that_never_becomes_well_defined_is_refused():
+    with pytest.raises(IdentificationError, match="not well-defined"):
+        run_script(Script({}, {}, smallest=11))
+
+
+def test_nothing_accepted_says_how_many_failed_at_which_step():
+    found = {1.0: (np.inf, [1]), 2.0: (5.0, [])}
+    script = Script({(0, 1): 1.0, (1, 2): 2.0, (2, 3): -1.0}, found, smallest=2)
+    with pytest.raises(IdentificationError, match="3 samples") as caught:
+        run_script(script, max_iterations=3)
+    for count in ("1 diverged", "1 out of bounds", "1 not accepted"):
+        assert count in str(caught.value)
+
+
+def test_progress_is_told_after_every_batch():
+    calls = []
+    script = Script({}, {0.0: (5.0, [1])})
+    settings = Settings(sample_size=2, max_iterations=10, stop_inlier_fraction=None, batch_size=4)
+    search(Diransac(), settings, script, script, first_two, 0, lambda *now: calls.append(now))
+    assert calls == [(k, 10, Score(5.0, 0.1)) for k in (4, 8, 10)]
