@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from diransac.errors import ModelError, SettingsError
 from diransac.kernel.graph import read_graph
+from diransac.kernel.lanes import Lanes, arranged_lanes, arranged_measurements, squared_thresholds
 from diransac.kernel.machine_code import LANES, MachineCode, Target, compile_function, run_blocks
 
 if TYPE_CHECKING:
@@ -202,9 +203,10 @@ class Rollouts:
 
     A lane is one rollout: its parameters, its initial state, and with `start_rows` a window of the log of its own. What
     a lane gives depends on nothing but its own data: not on the other lanes, their number, `threads`, or what is kept.
+    All methods share these arguments:
 
-    Common parameters
-    -----------------
+    Parameters
+    ----------
     parameters : (n_lanes, n_p)   each parameter's unit
     initial_states : (n_x,) or (n_lanes, n_x)   coordinates, then velocities
     inputs : (n_log, n_u)   held from each row to the next
@@ -214,6 +216,8 @@ class Rollouts:
     start_rows : (n_lanes,)   row at which each lane starts; row 0 by default
     n_rows : rows that a lane simulates; all of the log by default, required with `start_rows`
     threads : how many blocks of lanes run at a time
+
+    Raises SettingsError: an array of another shape, a window outside the log, a time step that isn't positive.
     """
 
     def __init__(
@@ -250,18 +254,21 @@ class Rollouts:
         ----------
         thresholds : (n_s,)   a signal is near where `|error| < threshold`; 0 switches it off
         min_inlier_signals : near signals that make a row an inlier
-
-        Raises SettingsError: an array of the wrong shape, a window outside the log, a time step that isn't positive.
         """
         from diransac.kernel.time_loop import Keep
 
-        task = self._task(parameters, initial_states, inputs, dt, start_rows, n_rows)
-        task.measure(measured, valid, len(self.signals))
-        task.limit(thresholds, min_inlier_signals)
-        sums = np.empty((len(self.signals), task.n_padded))
-        counts = np.empty((2, task.n_padded), np.int64)
-        self._run(Keep.SCORES, task, {"sums": sums, "counts": counts}, threads)
-        n = task.n_lanes
+        n_signals = len(self.signals)
+        lanes = self._lanes(parameters, initial_states, inputs, start_rows, n_rows)
+        sums, counts = np.empty((n_signals, lanes.n_padded)), np.empty((2, lanes.n_padded), np.int64)
+        values = {
+            **arranged_measurements(lanes, n_signals, measured, valid),
+            "squared_thresholds": squared_thresholds(thresholds, n_signals),
+            "min_inlier_signals": int(min_inlier_signals),
+            "sums": sums,
+            "counts": counts,
+        }
+        self._run(Keep.SCORES, lanes, dt, values, threads)
+        n = lanes.n_lanes
         return Scores(sums[:, :n].T.copy(), counts[0, :n].copy(), counts[1, :n] != 0)
 
     def errors(
@@ -283,10 +290,11 @@ class Rollouts:
         """
         from diransac.kernel.time_loop import Keep
 
-        task = self._task(parameters, initial_states, inputs, dt, start_rows, n_rows)
-        task.measure(measured, valid, len(self.signals))
-        series = np.empty((task.n_lanes, task.n_rows, len(self.signals)))
-        self._run(Keep.ERRORS, task, {"series": series}, threads)
+        n_signals = len(self.signals)
+        lanes = self._lanes(parameters, initial_states, inputs, start_rows, n_rows)
+        series = np.empty((lanes.n_lanes, lanes.n_rows, n_signals))
+        measurements = arranged_measurements(lanes, n_signals, measured, valid)
+        self._run(Keep.ERRORS, lanes, dt, {**measurements, "series": series}, threads)
         return series
 
     def trajectories(
@@ -303,35 +311,40 @@ class Rollouts:
         """All signals of the model, (n_lanes, n_rows, n_signals): states, accelerations; NaN from a divergence on."""
         from diransac.kernel.time_loop import Keep
 
-        task = self._task(parameters, initial_states, inputs, dt, start_rows, n_rows)
-        series = np.empty((task.n_lanes, task.n_rows, len(self._equations.signals)))
-        self._run(Keep.SIGNALS, task, {"series": series}, threads)
+        lanes = self._lanes(parameters, initial_states, inputs, start_rows, n_rows)
+        series = np.empty((lanes.n_lanes, lanes.n_rows, len(self._equations.signals)))
+        self._run(Keep.SIGNALS, lanes, dt, {"series": series}, threads)
         return series
 
-    def _task(
+    def _lanes(
         self,
         parameters: ArrayLike,
         initial_states: ArrayLike,
         inputs: ArrayLike,
-        dt: float,
         start_rows: ArrayLike | None,
         n_rows: int | None,
-    ) -> _Task:
-        """Check and arrange what every kind of run takes."""
+    ) -> Lanes:
+        """Check and arrange what every kind of run starts from."""
         n_q, n_v, n_u, n_p = self._equations.sizes
+        return arranged_lanes((n_p, n_q + n_v, n_u), parameters, initial_states, inputs, start_rows, n_rows)
+
+    def _run(self, keep: Keep, lanes: Lanes, dt: float, values: dict[str, Any], threads: int) -> None:
+        """Run the time loop over all blocks of lanes; `values` are its other arguments by name."""
+        from diransac.kernel.time_loop import ARGUMENTS
+
         if not (np.isfinite(dt) and dt > 0):
             raise SettingsError(f"dt is {dt}, but the time from row to row must be positive seconds.")
-        p = _array("parameters", parameters, (None, n_p))
-        x = np.asarray(initial_states, np.float64)
-        x = _array("initial_states", np.broadcast_to(x, (len(p), n_q + n_v)) if x.ndim == 1 else x, (len(p), n_q + n_v))
-        u = _array("inputs", inputs, (None, n_u))
-        return _Task(p, x, u, dt / self._substeps, start_rows, n_rows)
-
-    def _run(self, keep: Keep, task: _Task, results: dict[str, NDArray[Any]], threads: int) -> None:
-        """Run the time loop over all blocks of lanes."""
-        if task.n_lanes:
-            code = self._compiled(keep, task.start_rows is not None)
-            run_blocks(code.call, task.arguments(results), task.n_padded // LANES, threads)
+        if not lanes.n_lanes:
+            return
+        values = {"step": dt / self._substeps, "n_lanes": lanes.n_lanes, **lanes.arrays, **values}
+        values |= {"n_padded": lanes.n_padded, "n_rows": lanes.n_rows}
+        arguments = [
+            array.ctypes.data if isinstance(array := values.get(name), np.ndarray) else array or 0
+            for name in ARGUMENTS
+            if not name.endswith("_block")
+        ]
+        code = self._compiled(keep, lanes.has_windows)
+        run_blocks(code.call, arguments, lanes.n_padded // LANES, threads)
 
     def _compiled(self, keep: Keep, windows: bool) -> MachineCode:
         """Machine code of a variant of the time loop, compiled when first needed."""
@@ -342,63 +355,6 @@ class Rollouts:
                 module = emit_time_loop(self._plan, keep, windows=windows)
                 self._code[keep, windows] = compile_function(module, "time_loop", ARGUMENTS.values(), self._target)
             return self._code[keep, windows]
-
-
-class _Task:
-    """Arrays of one run, arranged as the time loop reads them."""
-
-    def __init__(
-        self, p: Floats, x: Floats, u: Floats, step: float, start_rows: ArrayLike | None, n_rows: int | None
-    ) -> None:
-        self.n_lanes, self.n_padded = len(p), -(-len(p) // LANES) * LANES
-        self.parameters, self.initial_states = _padded(p, self.n_padded), _padded(x, self.n_padded)
-        self.inputs = u
-        self.step = step
-        self.n_rows = len(u) if n_rows is None else int(n_rows)
-        self.start_rows = None if start_rows is None else self._windows(start_rows, n_rows)
-        self.measured = self.squared_thresholds = np.empty(0)
-        self.valid = np.empty(0, np.bool_)
-        self.min_inlier_signals = 0
-        if not 1 <= self.n_rows <= len(u):
-            raise SettingsError(f"n_rows is {self.n_rows}, but the log has {len(u)} rows.")
-
-    def _windows(self, start_rows: ArrayLike, n_rows: int | None) -> NDArray[np.int64]:
-        """Starts of the lanes' windows, padded."""
-        starts = np.asarray(start_rows)
-        if n_rows is None:
-            raise SettingsError("start_rows is given without n_rows; say how many rows each window has.")
-        if starts.shape != (self.n_lanes,) or starts.dtype.kind not in "iu":
-            raise SettingsError(f"start_rows must be one integer a lane, {self.n_lanes} in all; found {starts.shape}.")
-        if self.n_lanes and (starts.min() < 0 or starts.max() + self.n_rows > len(self.inputs)):
-            raise SettingsError(
-                f"windows of {self.n_rows} rows starting at rows {starts.min()} to {starts.max()} do not lie in the "
-                f"log's {len(self.inputs)} rows."
-            )
-        return _padded(starts.astype(np.int64), self.n_padded)
-
-    def measure(self, measured: ArrayLike, valid: ArrayLike, n_signals: int) -> None:
-        """Take what the rollouts are compared with."""
-        self.measured = _array("measured", measured, (len(self.inputs), n_signals))
-        self.valid = np.ascontiguousarray(valid)
-        if self.valid.shape != (len(self.inputs),) or self.valid.dtype != np.bool_:
-            raise SettingsError(f"valid must be {len(self.inputs)} Booleans, one a row; found {self.valid.shape}.")
-        if not np.isfinite(self.measured.sum()) and not np.isfinite(self.measured[self.valid]).all():
-            raise SettingsError("measured holds a NaN or an infinity in a valid row; mark such rows as not valid.")
-
-    def limit(self, thresholds: ArrayLike, min_inlier_signals: int) -> None:
-        """Take what makes a row an inlier."""
-        with np.errstate(over="ignore", under="ignore"):
-            self.squared_thresholds = np.square(_array("thresholds", thresholds, (self.measured.shape[-1],)))
-        self.min_inlier_signals = int(min_inlier_signals)
-
-    def arguments(self, results: dict[str, NDArray[Any]]) -> list[Any]:
-        """Arguments of the time loop, but for the range of blocks; the arrays must outlive the call."""
-        from diransac.kernel.time_loop import ARGUMENTS
-
-        values = vars(self) | results
-        pointers = [name for name, kind in ARGUMENTS.items() if kind == "pointer"]
-        numbers = [self.step, self.min_inlier_signals, self.n_lanes, self.n_padded, self.n_rows]
-        return [None if (array := values.get(name)) is None else array.ctypes.data for name in pointers] + numbers
 
 
 def inlier_mask(
@@ -417,26 +373,7 @@ def inlier_mask(
     -------
     (n_lanes, n_rows)
     """
-    near = np.abs(errors) < np.asarray(thresholds)
-    alive = np.logical_and.accumulate(~np.isnan(errors).all(axis=-1) | ~valid, axis=-1)
-    return np.asarray((near.sum(axis=-1) >= min_inlier_signals) & alive & valid)
-
-
-def _array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Floats:
-    """Contiguous float64 array of the shape, None being any length."""
-    array = np.ascontiguousarray(values, np.float64)
-    fits = array.ndim == len(shape) and all(
-        want in (None, found) for want, found in zip(shape, array.shape, strict=True)
-    )
-    if not fits:
-        wanted = " x ".join("any" if length is None else str(length) for length in shape)
-        raise SettingsError(f"{name} has shape {array.shape}, but {wanted} is needed.")
-    return array
-
-
-def _padded(lanes: NDArray[Any], n_padded: int) -> NDArray[Any]:
-    """Lanes on the last axis, the last one repeated to fill whole vectors."""
-    if not len(lanes):
-        return lanes.T
-    padding = np.repeat(lanes[-1:], n_padded - len(lanes), axis=0)
-    return np.ascontiguousarray(np.concatenate([lanes, padding]).T)
+    with np.errstate(over="ignore", under="ignore"):
+        near = np.square(errors) < squared_thresholds(thresholds, errors.shape[-1])
+    diverged = np.isnan(errors).any(axis=-1)
+    return np.asarray((near.sum(axis=-1) >= min_inlier_signals) & ~diverged & valid)

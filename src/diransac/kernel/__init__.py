@@ -8,7 +8,7 @@
 | `operations.py` | the vector form of every operation, in one table; emits a graph by it |
 | `machine_code.py` | LLVM module -> callable machine code; threads |
 | `map_loop.py`, `row_map.py` | one function over many rows |
-| `time_loop.py` | the time loop of a simulation; `diransac.simulate` is its face |
+| `lanes.py`, `time_loop.py` | the time loop of a simulation; `diransac.simulate` is its face |
 
 LLVM is loaded when something is first compiled.
 """
