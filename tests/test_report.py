@@ -1,0 +1,434 @@
+"""The report page: what it says, that it is safe to open, and that its figures hide nothing."""
+
+import base64
+import dataclasses
+import hashlib
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import diransac as dr
+from diransac.report import figures, markup
+from diransac.report.judgement import findings, verdict, worst
+from diransac.report.runs import bulk, labelled, simulate_on
+from diransac.simulate import rollouts
+
+VOID = {"meta", "input", "link"}
+HOSTILE = '</script><script>alert(1)</script>"><img src=x onerror=alert(1)>'
+PARAMETERS = {"mass": 40.0, "linear_drag": 8.0, "quadratic_drag": 12.0, "bias": 1.0}
+
+
+# ---------------------------------------------------------------------- material
+
+
+class Page(HTMLParser):
+    """The elements of a page, in order; fails where they do not nest."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.words, self._open = [], [], []
+        self.feed(text)
+        self.close()
+        assert not self._open
+
+    def handle_starttag(self, name, attributes):
+        """Note an element that opens."""
+        self.elements.append((name, dict(attributes)))
+        if name not in VOID:
+            self._open.append(name)
+
+    def handle_endtag(self, name):
+        """Close the element that was opened last."""
+        assert self._open.pop() == name
+
+    def handle_data(self, data):
+        """Keep what is read."""
+        if not {"script", "style"} & set(self._open):
+            self.words.append(data)
+
+    @property
+    def text(self):
+        """What is read, with single spaces."""
+        return " ".join(" ".join(self.words).split())
+
+    def all(self, name, look=""):
+        """Attributes of the elements of a name and CSS classes."""
+        wanted = set(look.split())
+        return [a for n, a in self.elements if n == name and wanted <= set((a.get("class") or "").split())]
+
+
+@pytest.fixture(scope="module")
+def model():
+    return dr.models.underwater_vehicle()
+
+
+def dive(model, n_rows=600, dt=0.02, source='log "dive.csv"'):
+    """A noise-free dive: a thrust that sweeps, and what the vehicle does."""
+    t = np.arange(n_rows) * dt
+    thrust = 25.0 * np.sin(0.9 * t) + 12.0 * np.sin(2.3 * t + 0.4)
+    flown = rollouts(model).trajectories([list(PARAMETERS.values())], np.zeros(2), thrust[:, None], dt)[0]
+    signals = dict(zip(model.signals, flown.T, strict=True))
+    return dr.Log.from_arrays(3.0 + t, {**signals, "thrust": thrust}, units=model.units, source=source)
+
+
+def with_signals(log, **changed):
+    return dr.Log.from_arrays(log.time, {**log.signals, **changed}, units=dict(log.units), source=log.source)
+
+
+def spiked(log, rows, size=80.0):
+    """The log with outliers in every signal but the input of some rows."""
+    changed = {n: log[n].copy() for n in ("x", "x_dot", "x_ddot")}
+    for values in changed.values():
+        values[rows] += size
+    return with_signals(log, **changed)
+
+
+@pytest.fixture(scope="module")
+def log(model):
+    return dive(model)
+
+
+@pytest.fixture(scope="module")
+def result(model, log):
+    return dr.identify(model, log, "ols")
+
+
+def written(results, log, folder):
+    path = folder / "report.html"
+    dr.write_report(results, log, path)
+    return path.read_text(encoding="utf-8")
+
+
+def vertices(path):
+    """Rows and heights of a path, by its grammar: relative pairs, ``h0`` making dots."""
+    numbers = [int(x) for x in re.findall(r"-?\d+", path.replace("h0", ""))]
+    return np.cumsum(np.reshape(numbers, (-1, 2)), axis=0)
+
+
+# ---------------------------------------------------------------------- what the page says
+
+
+def test_page_names_model_method_log_and_every_parameter_with_its_interval(result, log, tmp_path):
+    text = Page(written(result, log, tmp_path)).text
+    assert "underwater-vehicle an underwater vehicle" in text
+    assert 'Identified by ols from log "dive.csv" (11.98 s at 50 Hz, 600 rows)' in text
+    for name, (low, high) in result.intervals().items():
+        assert f"{name} {result.units[name]}" in text
+        assert f"{markup.number(low, 5)} … {markup.number(high, 5)}" in text
+
+
+def test_page_holds_what_repeats_the_identification(model, log, tmp_path):
+    settings = dr.Settings(max_iterations=7, stop_inlier_fraction=None)
+    text = Page(written(dr.identify(model, log, seed=5, settings=settings), log, tmp_path)).text
+    assert "dr.identify(model, log, method='i-diransac', seed=5, settings=dr.Settings(max_iterations=7" in text
+    assert log.fingerprint in text
+    assert "llvmlite" in text
+
+
+def test_page_shows_the_equations_and_the_notes(result, log, tmp_path):
+    noted = dataclasses.replace(result, notes=("the sea was rough",))
+    text = Page(written(noted, log, tmp_path)).text
+    assert all(" ".join(line.split()) in text for line in result.model.equations_text())
+    assert "the sea was rough" in text
+
+
+def test_every_measured_signal_has_a_figure_with_words_for_those_who_cannot_see_it(result, log, tmp_path):
+    page = Page(written(result, log, tmp_path))
+    labels = [a["aria-label"] for a in page.all("svg")]
+    for name in ("x", "x_dot", "x_ddot"):
+        assert any(label.startswith(f"{name} in ") for label in labels)
+        assert any(label.startswith(f"Residuals of {name}") for label in labels)
+    assert all(a["role"] == "img" for a in page.all("svg"))
+
+
+def test_methods_stand_side_by_side_in_their_own_colours(model, log, tmp_path):
+    settings = dr.Settings(max_iterations=20)
+    results = [dr.identify(model, log, m, settings=settings) for m in ("i-diransac", "diransac", "ols")]
+    page = Page(written(results, log, tmp_path))
+    assert "in 3 ways (i-diransac, diransac, ols)" in page.text
+    assert len(page.all("article", "card")) == 3
+    assert len(page.all("span", "estimate")) == 3 * model.n_p
+    assert len(page.all("path", "line m2")) >= 3
+
+
+def test_a_log_of_one_signal_is_enough(model, log, tmp_path):
+    settings = dr.Settings(initial_state={"x": log["x"][0], "x_dot": log["x_dot"][0]})
+    found = dr.identify(model, log, "ols", settings=settings)
+    alone = dr.Log.from_arrays(log.time, {"x": log["x"], "thrust": log["thrust"]}, source="position alone")
+    page = Page(written(found, alone, tmp_path))
+    assert "position alone" in page.text
+    assert len([a for a in page.all("svg") if a["aria-label"].startswith("Residuals")]) == 1
+
+
+def test_same_results_and_log_give_the_same_page(result, log, tmp_path):
+    assert written(result, log, tmp_path) == written(result, log, tmp_path)
+
+
+def test_labels_are_the_mappings_or_the_methods_numbered_where_they_repeat(result):
+    assert list(labelled(result)) == ["ols"]
+    assert list(labelled([result, result])) == ["ols", "ols #2"]
+    assert list(labelled({"before": result, "after": result})) == ["before", "after"]
+
+
+@pytest.mark.parametrize("nothing", [[], {}, ["model.json"], None])
+def test_what_is_no_result_is_refused(nothing, log, tmp_path):
+    with pytest.raises(dr.ResultError, match=r"results of diransac\.identify; found"):
+        dr.write_report(nothing, log, tmp_path / "report.html")
+
+
+# ---------------------------------------------------------------------- whether it can be trusted
+
+
+def levels(result, log):
+    return {finding.text: finding.level for finding in findings(simulate_on("it", result, log))}
+
+
+def level_of(result, log, words):
+    found = [level for text, level in levels(result, log).items() if words in text]
+    assert found, levels(result, log)
+    return found[0]
+
+
+def test_a_noise_free_log_speaks_against_nothing(result, log):
+    found = findings(simulate_on("ols", result, log))
+    assert worst(found) == "good"
+    assert verdict("good") == "Nothing in this log speaks against this model."
+
+
+def test_a_violated_bound_is_bad_and_says_which(result, log):
+    broken = dataclasses.replace(
+        result, parameters={**result.parameters, "linear_drag": -0.5}, violations=("linear_drag",)
+    )
+    assert level_of(broken, log, "linear_drag = −0.5 N s/m is outside its bounds (≥ 0)") == "bad"
+
+
+def test_a_parameter_that_the_log_cannot_tell_asks_for_care(result, log, tmp_path):
+    vague = dataclasses.replace(result, covariance=np.full((4, 4), np.inf))
+    assert level_of(vague, log, "cannot tell how certain mass is") == "care"
+    assert "the log cannot tell" in Page(written(vague, log, tmp_path)).text
+
+
+@pytest.mark.parametrize(("change", "level"), [(0.01, "good"), (-0.1, "care"), (0.5, "bad"), (np.nan, "care")])
+def test_sensitivity_to_the_filters_bandwidth_is_graded(result, log, change, level):
+    shaky = dataclasses.replace(result, sensitivity={"mass": (change, 0.0)})
+    assert level_of(shaky, log, "the filter's bandwidth") == level
+
+
+def test_a_wrong_parameter_shows_in_the_simulation(result, log):
+    heavy = dataclasses.replace(result, parameters={**result.parameters, "mass": 400.0})
+    assert level_of(heavy, log, "typically off by") == "bad"
+
+
+def test_a_diverging_simulation_is_said_and_drawn_as_far_as_it_goes(result, log, tmp_path):
+    wild = dataclasses.replace(result, parameters={**result.parameters, "quadratic_drag": -1e6}, fit_error=np.inf)
+    assert level_of(wild, log, "The simulation diverges at t = 3.") == "bad"
+    page = Page(written(wild, log, tmp_path))
+    assert "∞" in page.text
+    assert page.all("path", "line m0")
+
+
+def test_inlier_fraction_is_graded_and_a_bad_stretch_is_named(result, log):
+    mask = np.ones(len(log), dtype=bool)
+    mask[300:330] = False
+    patchy = dataclasses.replace(result, inliers=mask, inlier_fraction=0.95)
+    assert level_of(patchy, log, "95 % of 600 rows agree") == "good"
+    assert level_of(patchy, log, "Between 9 and 9.5 s only 0 % agree") == "care"
+    mask[:400] = False
+    assert level_of(dataclasses.replace(result, inliers=mask), log, "33 % of 600 rows agree") == "bad"
+
+
+def test_another_log_makes_it_a_held_out_validation_with_inliers_of_its_own(model, result, log, tmp_path):
+    other = spiked(dive(model, 500), np.arange(100, 150))
+    run = simulate_on("ols", result, other)
+    assert run.held_out
+    assert not run.inliers[100:150].any()
+    assert run.inlier_fraction == pytest.approx(0.9)
+    text = Page(written(result, other, tmp_path)).text
+    assert "Held-out validation." in text
+    assert other.fingerprint in text
+    assert "Held-out" not in Page(written(result, log, tmp_path)).text
+
+
+def test_rows_with_missing_samples_are_counted(model, log, tmp_path):
+    gappy = log["x_dot"].copy()
+    gappy[50:70] = np.nan
+    holed = with_signals(log, x_dot=gappy)
+    found = dr.identify(model, holed, "ols")
+    assert level_of(found, holed, "20 of 600 rows do not count") == "note"
+    assert Page(written(found, holed, tmp_path)).all("path", "bar uncounted")
+
+
+def test_a_log_of_positions_is_differentiated_as_the_results_was(model, log):
+    bare = dr.Log.from_arrays(log.time, {"x": log["x"], "thrust": log["thrust"]}, source="bare")
+    found = dr.identify(model, bare, "ols", differentiate=True)
+    run = simulate_on("ols", found, bare)
+    assert set(run.observations.signals) == {"x", "x_dot", "x_ddot"}
+    assert not run.held_out
+    inside = slice(20, -20)
+    np.testing.assert_allclose(run.observations.column("x_dot")[inside], log["x_dot"][run.rows][inside], atol=0.05)
+
+
+def test_a_log_that_cannot_be_simulated_is_refused_and_leaves_the_old_page(result, log, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text("the old page")
+    blind = dr.Log.from_arrays(log.time, {"x": log["x"]}, source="no thrust")
+    with pytest.raises(
+        dr.ResultError, match=r'"underwater-vehicle" cannot be simulated on this log: no thrust: .*thrust'
+    ):
+        dr.write_report(result, blind, path)
+    assert path.read_text() == "the old page"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_page_that_cannot_be_written_is_an_error_that_names_it(result, log, tmp_path):
+    with pytest.raises(dr.ResultError, match=r"nowhere.report\.html: cannot be written"):
+        dr.write_report(result, log, tmp_path / "nowhere" / "report.html")
+
+
+# ---------------------------------------------------------------------- safe to open
+
+
+def test_page_loads_nothing_and_runs_its_own_script_alone(result, log, tmp_path):
+    text = written(result, log, tmp_path)
+    page = Page(text)
+    policy = next(a["content"] for a in page.all("meta") if a.get("http-equiv") == "Content-Security-Policy")
+    script = re.search(r"<script>(.*)</script>", text, re.DOTALL).group(1)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert policy == f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+    assert not re.search(r"https?:|src=|@import|url\(", text)
+
+
+def test_hostile_names_stay_text(model, log, tmp_path):
+    named = dr.Model(
+        HOSTILE, model.coordinates, model.inputs, model.parameters, _vehicle, description=HOSTILE + "description"
+    )
+    hostile = dataclasses.replace(log, source=HOSTILE, notes=(HOSTILE,))
+    found = dataclasses.replace(
+        dr.identify(named, hostile, "ols"),
+        notes=(HOSTILE,),
+        stop_reason=HOSTILE,
+        preparation=({"step": HOSTILE, HOSTILE: [HOSTILE, {HOSTILE: None}]},),
+        skipped={HOSTILE: 1},
+        estimator=HOSTILE,
+    )
+    page = Page(written({HOSTILE: found}, hostile, tmp_path))
+    assert len(page.all("script")) == 1
+    assert not page.all("img")
+    assert not any(key.startswith("on") for _, attributes in page.elements for key in attributes)
+    assert page.text.count("alert(1)") >= 10
+
+
+def _vehicle(q, v, a, u, p):
+    return [p.mass * a.x + p.linear_drag * v.x + p.quadratic_drag * v.x * abs(v.x) + p.bias - u.thrust]
+
+
+def test_an_undecodable_file_name_is_written_with_replacements(result, log, tmp_path):
+    odd = dataclasses.replace(result, log=dataclasses.replace(result.log, source="dive\udcff.csv"))
+    assert "dive?.csv" in written(odd, log, tmp_path)
+
+
+@given(st.text(), st.text())
+def test_markup_gives_back_exactly_the_text_and_attribute_that_went_in(text, value):
+    elements, words = [], []
+    parser = HTMLParser()
+    parser.handle_starttag = lambda name, attributes: elements.append((name, dict(attributes)))
+    parser.handle_data = words.append
+    parser.feed(markup.tag("p", text, title=value))
+    parser.close()
+    kept = text.encode(errors="replace").decode()
+    assert elements == [("p", {"title": value.encode(errors="replace").decode()})]
+    assert "".join(words) == kept
+
+
+# ---------------------------------------------------------------------- figures that hide nothing
+
+
+@pytest.mark.parametrize("kind", ["line", "dots"])
+def test_a_long_signal_keeps_every_stretchs_extremes_and_draws_samples_alone(kind):
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=25_000)
+    rows, scale = np.arange(25_000), figures.Scale(-5.0, 5.0)
+    drawn = vertices(figures.path_data(figures.Trace("noise", "m0", kind, rows, values), scale, 25_000))
+    assert len(drawn) <= 2_200
+    np.testing.assert_array_equal(drawn[:, 1], scale.height(values)[drawn[:, 0]])
+    assert {int(values.argmin()), int(values.argmax())} <= set(drawn[:, 0].tolist())
+    for begin in range(0, 25_000, 250):
+        inside = drawn[(drawn[:, 0] >= begin) & (drawn[:, 0] < begin + 250), 1]
+        stretch = scale.height(values[begin : begin + 250])
+        assert (inside.min(), inside.max()) == (stretch.min(), stretch.max())
+
+
+def test_a_short_signal_is_drawn_whole_and_a_line_breaks_where_samples_are_missing():
+    values = np.array([0.0, 1.0, np.nan, 3.0, 4.0])
+    trace = figures.Trace("x", "m0", "line", np.arange(5), values)
+    path = figures.path_data(trace, figures.Scale(0.0, 4.0), 5)
+    assert path == "M0 1000h0l1-250m2-500h0l1-250"
+
+
+def test_extremes_are_each_cells_smallest_and_largest():
+    values, cells = np.array([3.0, 1.0, 2.0, 5.0, 5.0, 9.0]), np.array([0, 0, 0, 1, 1, 2])
+    assert figures.extremes(values, cells).tolist() == [0, 1, 3, 4, 5]
+
+
+def test_an_outlier_of_eighty_does_not_decide_the_range_and_is_said(result, log, tmp_path):
+    rows = np.arange(10, 600, 37)
+    hit = spiked(log, rows)
+    page = Page(written(result, hit, tmp_path))
+    shown = next(a for a in page.all("svg") if a["aria-label"].startswith("x_dot in"))
+    assert float(shown["data-high"]) < 3.0 * log["x_dot"].max()
+    assert "data-full" in shown
+    assert f"{len(rows)} samples beyond, from" in page.text
+
+
+def test_a_rare_manoeuvre_that_the_simulation_meets_is_in_range(model):
+    t = np.arange(2000) * 0.02
+    thrust = np.where((t > 30.0) & (t < 31.0), 400.0, np.sin(t))
+    flown = rollouts(model).trajectories([list(PARAMETERS.values())], np.zeros(2), thrust[:, None], 0.02)[0]
+    log = dr.Log.from_arrays(t, {**dict(zip(model.signals, flown.T, strict=True)), "thrust": thrust})
+    low, high = simulate_on("ols", dr.identify(model, log, "ols"), log).ranges["x_ddot"]
+    assert (low, high) == (log["x_ddot"].min(), log["x_ddot"].max())
+    assert bulk(log["x_ddot"])[1] < 0.2 * high
+
+
+def test_outliers_are_marked_at_the_rows_that_are_no_inliers(result, log, tmp_path):
+    mask = np.ones(len(log), dtype=bool)
+    mask[[7, 300, 301]] = False
+    page = Page(written(dataclasses.replace(result, inliers=mask), log, tmp_path))
+    marked = page.all("path", "dots outlier")
+    assert marked
+    assert all(vertices(a["d"])[:, 0].tolist() == [7, 300, 301] for a in marked)
+    bars = page.all("path", "bar m0")[0]["d"]
+    assert bars == "M7 1000v-1000h1v1000zM300 1000v-1000h2v1000z"
+
+
+def test_a_log_of_25_000_rows_stays_light(model, tmp_path):
+    long = dive(model, 25_000, 0.001)
+    assert len(written(dr.identify(model, long, "ols"), long, tmp_path)) < 250_000
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-9, 1e9))
+def test_ticks_are_round_within_the_range_and_told_apart(low, width):
+    high = low + max(width, 1e-6 * abs(low))
+    found = figures.ticks(low, high)
+    assert 2 <= len(found) <= 7
+    assert all(low - 1e-6 * width <= x <= high + 1e-6 * width for x, _ in found)
+    assert len({text for _, text in found}) == len(found)
+
+
+def test_numbers_are_printed_as_a_reader_expects_them():
+    assert [markup.number(x) for x in (-1.5, 1.2e-6, np.inf, np.nan)] == ["−1.5", "1.2×10⁻⁶", "∞", "–"]
+    assert [markup.percent(x) for x in (0.0042, 0.131, 0.996, 0.9999, 1.0, 1e-6, -1e-6)] == [
+        "0.42 %",
+        "13 %",
+        "99.6 %",
+        "99.9 %",
+        "100 %",
+        "< 0.01 %",
+        "> −0.01 %",
+    ]
+    assert markup.share(0.02, "its range") == "2 % of its range"
+    assert markup.share(19.3, "its range") == "19 times its range"
