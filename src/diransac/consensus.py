@@ -100,7 +100,8 @@ class InlierBiasedDiransac:
 
     def _cost(self, score: Score) -> float:
         for_error, for_inliers = self.acceptance_weights
-        cost = for_error * score.error**2 if for_error > 0.0 else 0.0
+        # A product overflows to infinity, where a power of a Python float raises.
+        cost = for_error * (score.error * score.error) if for_error > 0.0 else 0.0
         if for_inliers > 0.0:
             cost += for_inliers * (1.0 / score.inlier_fraction) ** 2 if score.inlier_fraction > 0.0 else np.inf
         return cost

@@ -62,12 +62,13 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name in ("sample_size", "max_iterations", "substeps", "batch_size"):
-            _positive_integer(name, getattr(self, name))
+            object.__setattr__(self, name, _positive_integer(name, getattr(self, name)))
         for name in ("min_inlier_signals", "threads"):
             if getattr(self, name) is not None:
-                _positive_integer(name, getattr(self, name))
+                object.__setattr__(self, name, _positive_integer(name, getattr(self, name)))
         if self.stop_inlier_fraction is not None:
-            _within("stop_inlier_fraction", self.stop_inlier_fraction, 0.0, 1.0)
+            fraction = _fraction("stop_inlier_fraction", self.stop_inlier_fraction)
+            object.__setattr__(self, "stop_inlier_fraction", fraction)
         for name in ("inlier_thresholds", "error_weights"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _by_name(name, getattr(self, name), 0.0))
@@ -121,14 +122,16 @@ class Settings:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
 
 
-def _positive_integer(name: str, value: object) -> None:
+def _positive_integer(name: str, value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise SettingsError(f"{name} is {value!r}; give a whole number of at least 1")
+    return int(value)
 
 
-def _within(name: str, value: object, low: float, high: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.floating) or not low <= value <= high:
-        raise SettingsError(f"{name} is {value!r}; give a number from {low:g} to {high:g}")
+def _fraction(name: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0.0 < value <= 1.0:
+        raise SettingsError(f"{name} is {value!r}; give a number above 0 and up to 1, or None")
+    return float(value)
 
 
 def _one_of(name: str, value: object, choices: tuple[str, ...]) -> None:
