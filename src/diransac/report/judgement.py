@@ -150,11 +150,11 @@ def _certainty(run: Run) -> Iterator[Finding]:
             widths[name] = 0.5 * (high - low) / abs(result.parameters[name])
     for name, width in widths.items():
         if width > _UNCERTAIN:
-            yield Finding("care", f"{name} is known to ± {percent(width)} only: the motion hardly shows it.")
+            yield Finding("care", f"{name} is known to {percent(width)} only: the motion hardly shows it.")
     if widths and max(widths.values()) <= _UNCERTAIN:
         name = max(widths, key=lambda n: widths[n])
         what = f"{name} is known to" if len(widths) == 1 else f"The least certain parameter, {name}, is known to"
-        yield Finding("good", f"{what} ± {percent(widths[name])} (95 %).")
+        yield Finding("good", f"{what} {percent(widths[name])} (half its 95 % interval).")
 
 
 def _bandwidth(run: Run) -> Iterator[Finding]:

@@ -18,6 +18,7 @@ FloatArray = npt.NDArray[np.float64]
 
 _BEYOND_MEASURED = 0.4
 _BEYOND_REFERENCE = 2.0
+_VISIBLE = 0.01
 _MOST = 0.5
 
 
@@ -145,17 +146,18 @@ def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timelin
         ranges.append(bulk(errors[~outlying] if np.mean(outlying) < _MOST else errors))
     threshold = float(shown.thresholds[shown.observations.signals.index(name)])
     levels = (-threshold, threshold) if threshold > 0.0 else ()
-    scale = _residual_scale(ranges, [run is shown for _, run in having])
+    low, high = shown.ranges[name]
+    scale = _residual_scale(ranges, [run is shown for _, run in having], _VISIBLE * (high - low))
     note = f"; the dashed lines are the inlier threshold, {number(threshold)}" if levels else ""
     label = f"Residuals of {name}, simulated less measured{note}"
     heading = tag("p", f"simulated − measured{note}", class_="residual-title")
     return tag("div", heading, time_plot(traces, scale, timeline, label, look="residual", levels=levels))
 
 
-def _residual_scale(ranges: Sequence[tuple[float, float]], is_shown: Sequence[bool]) -> Scale:
-    """The marking run's range, and the others' as far as they do not dwarf it."""
+def _residual_scale(ranges: Sequence[tuple[float, float]], is_shown: Sequence[bool], visible: float) -> Scale:
+    """The marking run's range, and the others' as far as they do not dwarf it, or are no larger than ``visible``."""
     low, high = ranges[is_shown.index(True)]
-    reach = _BEYOND_REFERENCE * (high - low)
+    reach = max(_BEYOND_REFERENCE * (high - low), visible)
     lowest, highest = min(a for a, _ in ranges), max(b for _, b in ranges)
     return padded(max(lowest, low - reach), min(highest, high + reach))
 
