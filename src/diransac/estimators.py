@@ -27,6 +27,7 @@ __all__ = [
     "ScikitLearnEstimator",
     "TotalLeastSquares",
     "as_estimator",
+    "name_of",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -276,6 +277,12 @@ def as_estimator(candidate: object) -> Estimator:
         f"estimator is {candidate!r}; give dr.OrdinaryLeastSquares(), dr.TotalLeastSquares(), "
         "dr.NonlinearLeastSquares() or a scikit-learn linear regressor"
     )
+
+
+def name_of(estimator: Estimator) -> str:
+    """What users call it: its class, or the scikit-learn class that it wraps."""
+    named = estimator.regressor if isinstance(estimator, ScikitLearnEstimator) else estimator
+    return type(named).__name__
 
 
 def column_scale(columns: FloatArray) -> FloatArray:

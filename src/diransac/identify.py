@@ -12,7 +12,14 @@ import numpy.typing as npt
 from diransac import prepare
 from diransac.consensus import Diransac, InlierBiasedDiransac, Score, Variant
 from diransac.errors import DiransacError, IdentificationError, LogError, SettingsError
-from diransac.estimators import BoundEstimator, Estimator, OrdinaryLeastSquares, TotalLeastSquares, as_estimator
+from diransac.estimators import (
+    BoundEstimator,
+    Estimator,
+    OrdinaryLeastSquares,
+    TotalLeastSquares,
+    as_estimator,
+    name_of,
+)
 from diransac.evaluation import Scoring, Simulation, choose_scoring, judged_signals
 from diransac.log import Log
 from diransac.model import Model
@@ -145,7 +152,7 @@ class _Task:
             inlier_fraction=score.inlier_fraction,
             fit_error=score.error,
             method=self.method,
-            estimator=type(self.estimator).__name__,
+            estimator=name_of(self.estimator),
             seed=int(self.seed),
             settings=self.settings,
             iterations=outcome.iterations,
