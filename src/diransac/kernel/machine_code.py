@@ -23,7 +23,7 @@ LANES = 8
 
 CHUNKS_PER_THREAD = 4
 
-PASSES = ("sroa", "instruction_combine", "simplify_cfg", "loop_rotate", "instruction_combine")
+PASSES = ("sroa", "simplify_cfg", "loop_rotate")
 """What LLVM does to the code: variables into registers, tidying. Its own list takes 3 times as long, for no gain."""
 
 LLVM: TypeAlias = Any
