@@ -3,10 +3,11 @@
 Each step adds one mapping to ``Log.history`` and, where it did something to the samples, a sentence to ``Log.notes``.
 """
 
-from diransac.prepare.differentiation import differentiate, filter_rows
+from diransac.prepare.differentiation import acting_inputs, differentiate, filter_rows
 from diransac.prepare.steps import despike, rename, resample, scale, shift, spikes, unwrap
 
 __all__ = [
+    "acting_inputs",
     "despike",
     "differentiate",
     "filter_rows",

@@ -26,29 +26,29 @@ def half_length(bandwidth: float, dt: float) -> int:
 def kernels(bandwidth: float, dt: float) -> FloatArray:
     """Impulse responses (3, 2 L + 1) of the filter and of its first and second derivatives, in 1, 1/s and 1/s^2.
 
-    They are exact for a constant, a ramp and a parabola.
+    The filter leaves a ramp as it is, the first derivative is exact for a parabola, the second for a cubic.
     """
     L = half_length(bandwidth, dt)
     t = np.arange(-L, L + 1) * dt
     smooth = np.sinc(2.0 * bandwidth * t) * np.kaiser(2 * L + 1, _KAISER_BETA)
     smooth /= smooth.sum()
-    f = np.fft.rfftfreq(8 * L, dt)
-    H = np.fft.rfft(np.roll(np.pad(smooth, (0, 8 * L - len(smooth))), -L))
-    w = 2.0 * np.pi * f
-    first = np.roll(np.fft.irfft(1j * w * H, 8 * L), L)[: 2 * L + 1]
-    second = np.roll(np.fft.irfft(-(w**2) * H, 8 * L), L)[: 2 * L + 1]
-    first = 0.5 * (first - first[::-1])
-    first /= -(t * first).sum()
-    second = 0.5 * (second + second[::-1])
-    second -= smooth * second.sum()
-    second /= 0.5 * (t**2 * second).sum() - 0.0
-    return np.stack([smooth, first, second])
+    first, second = (_derivative(smooth, order, dt) for order in (1, 2))
+    first = first - first[::-1]
+    second = second + second[::-1]
+    second -= second.sum() * smooth
+    return np.stack([smooth, -first / (t * first).sum(), 2.0 * second / (t**2 * second).sum()])
+
+
+def _derivative(kernel: FloatArray, order: int, dt: float) -> FloatArray:
+    """The derivative of the band-limited function that runs through a kernel, at the kernel's samples."""
+    n = 4 * len(kernel)
+    spectrum = np.fft.rfft(kernel, n) * (2j * np.pi * np.fft.rfftfreq(n, dt)) ** order
+    return np.asarray(np.fft.irfft(spectrum, n)[: len(kernel)])
 
 
 def convolve(values: FloatArray, kernel: FloatArray) -> FloatArray:
     """``values (N, ...)`` filtered along the first axis, taken as zero outside; as many rows."""
     N, L = len(values), len(kernel) // 2
     n = 1 << (N + 2 * L).bit_length()
-    shape = (-1,) + (1,) * (values.ndim - 1)
-    spectrum = np.fft.rfft(values, n, axis=0) * np.fft.rfft(kernel, n).reshape(shape)
-    return np.asarray(np.fft.irfft(spectrum, n, axis=0)[L : L + N])
+    response = np.fft.rfft(kernel, n).reshape(-1, *(1,) * (values.ndim - 1))
+    return np.asarray(np.fft.irfft(np.fft.rfft(values, n, axis=0) * response, n, axis=0)[L : L + N])

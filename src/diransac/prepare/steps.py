@@ -37,6 +37,7 @@ _BRIDGED_INTERVALS = 3.5
 _ROUNDING = 1e-6
 _MAD_TO_STD, _MEAN_TO_STD = 1.4826, 1.2533
 _COUNT_ROUNDING, _USUAL = 1e-3, 0.01
+_WRAPPING = 0.75
 
 
 # ---------------------------------------------------------------------- names and factors
@@ -131,7 +132,7 @@ def resample_columns(
     left = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, len(time) - 2)
     weight = np.clip((grid - time[left]) / steps[left], 0.0, 1.0)
     gaps = steps > max(_BRIDGED_INTERVALS * usual, 1.0 / hertz)
-    blank = gaps[left] & (weight > 0.0) & (weight < 1.0)
+    blank = gaps[left] & (weight > _ROUNDING) & (weight < 1.0 - _ROUNDING)
     resampled = {name: np.where(blank, np.nan, _between(values, left, weight)) for name, values in signals.items()}
     step = {"step": "resample", "rate": hertz, "method": "linear", "rows": [len(time), n], "gaps": int(gaps.sum())}
     return grid, resampled, step, _resampling_notes(time, gaps, blank, hertz)
@@ -147,10 +148,8 @@ def _rate(rate: float | str, usual: float) -> float:
 
 def _between(values: FloatArray, left: npt.NDArray[np.intp], weight: FloatArray) -> FloatArray:
     """Linear interpolation that looks at a neighbour only where it has weight, so that NaN does not spread."""
-    with np.errstate(invalid="ignore"):
-        mixed = (1.0 - weight) * values[left] + weight * values[left + 1]
-    exact = np.where(weight == 0.0, values[left], values[left + 1])
-    return np.where((weight == 0.0) | (weight == 1.0), exact, mixed)
+    mixed = (1.0 - weight) * values[left] + weight * values[left + 1]
+    return np.where(weight < _ROUNDING, values[left], np.where(weight > 1.0 - _ROUNDING, values[left + 1], mixed))
 
 
 def _resampling_notes(
@@ -184,7 +183,7 @@ def shift(log: Log, delays: Mapping[str, float]) -> Log:
             raise SettingsError(f'the delay of "{name}" is {delay}; give seconds')
         rows = n - delay / log.dt
         covered &= (rows >= -_ROUNDING) & (rows <= n[-1] + _ROUNDING)
-        rows = np.clip(np.where(np.abs(rows - np.round(rows)) < _ROUNDING, np.round(rows), rows), 0.0, n[-1])
+        rows = np.clip(rows, 0.0, n[-1])
         left = np.minimum(rows.astype(np.intp), len(log) - 2)
         signals[name] = _between(log[name], left, rows - left)
     if covered.sum() < 2:
@@ -212,7 +211,7 @@ def despike(log: Log, signals: Sequence[str] | None = None, window: int = 15, th
     for name in log.names if signals is None else signals:
         found = spikes(log[name], window, threshold)
         replaced[name] = int(found.sum())
-        cleaned[name] = np.where(found, _running(np.median, log[name], window), log[name])
+        cleaned[name] = np.where(found, _row_wise(np.median, _windows(log[name], window)), log[name])
     step = {"step": "despike", "window": window, "threshold": float(threshold), "replaced": replaced}
     notes = [f'{n} of {len(log)} samples of "{name}" were spikes and are replaced' for name, n in replaced.items() if n]
     return log.with_step(step, signals=cleaned, notes=notes)
@@ -235,22 +234,28 @@ def spikes(values: FloatArray, window: int = 15, threshold: float = 8.0) -> Bool
         raise SettingsError(
             f"window = {window}, threshold = {threshold}: give an odd window from 3, a threshold above 0"
         )
-    off = np.abs(values - _running(np.median, values, window))
-    scale = _MAD_TO_STD * _running(np.median, off, window)
-    scale = np.where(scale > 0.0, scale, _MEAN_TO_STD * _running(np.mean, off, window))
+    around = _windows(values, window)
+    middle = _row_wise(np.median, around)
+    off = np.abs(around - middle[:, None])
+    scale = _MAD_TO_STD * _row_wise(np.median, off)
+    scale = np.where(scale > 0.0, scale, _MEAN_TO_STD * _row_wise(np.mean, off))
     with np.errstate(invalid="ignore"):
-        return np.asarray(off > threshold * np.maximum(scale, _count(values)))
+        return np.asarray(np.abs(values - middle) > threshold * np.maximum(scale, _count(values)))
 
 
-def _running(statistic: Callable[..., Any], values: FloatArray, window: int) -> FloatArray:
-    """A statistic ``(N,)`` of the finite samples in the window around each, mirrored at the ends; NaN where none is."""
-    window = min(window, 2 * len(values) - 1)
-    padded = np.pad(values, window // 2, mode="reflect")
-    around = np.lib.stride_tricks.sliding_window_view(padded, window)
-    result = np.asarray(statistic(around, axis=1), dtype=float)
-    for row in np.flatnonzero(~np.isfinite(around).all(axis=1)):
-        finite = around[row][np.isfinite(around[row])]
-        result[row] = statistic(finite) if len(finite) else np.nan
+def _windows(values: FloatArray, window: int) -> FloatArray:
+    """The samples ``(N, window)`` around each, mirrored at the ends."""
+    reach = min(window // 2, len(values) - 1)
+    return np.lib.stride_tricks.sliding_window_view(np.pad(values, reach, mode="reflect"), 2 * reach + 1)
+
+
+def _row_wise(statistic: Callable[..., Any], rows: FloatArray) -> FloatArray:
+    """A statistic ``(N,)`` of each row's finite numbers; NaN where there is none."""
+    finite = np.isfinite(rows)
+    with np.errstate(invalid="ignore"):
+        result = np.asarray(statistic(rows, axis=1), dtype=float)
+    for row in np.flatnonzero(~finite.all(axis=1)):
+        result[row] = statistic(rows[row][finite[row]]) if finite[row].any() else np.nan
     return result
 
 
@@ -268,8 +273,9 @@ def _count(values: FloatArray) -> float:
 def unwrap(log: Log, names: Sequence[str]) -> Log:
     """The log with the jumps by a turn taken out of the angles that are wrapped.
 
-    An angle is wrapped if it lies within one turn and jumps by more than half of it: outliers that leave that range
-    are no wrapping, and such a signal is left alone.  The turn is 360 for a signal in degrees, 2 pi otherwise.
+    An angle is wrapped if it lies within one turn and jumps by more than half of it, most often by three quarters and
+    more: outliers leave that range, or jump by less, and such a signal is left alone.  The turn is 360 for a signal in
+    degrees, 2 pi otherwise.
     Raises LogError: there is no such signal.
     """
     wrapped = {name: jumps for name in names if (jumps := _jumps(log[name], _turn(log, name)))}
@@ -286,11 +292,13 @@ def _turn(log: Log, name: str) -> float:
 
 
 def _jumps(values: FloatArray, turn: float) -> int:
-    """How often an angle that lies within one turn jumps by more than half of it."""
+    """How often an angle that lies within one turn jumps by more than half of it, as wrapping does: mostly by all."""
     finite = values[np.isfinite(values)]
     if len(finite) < 2 or np.ptp(finite) > turn * (1.0 + _ROUNDING):
         return 0
-    return int((np.abs(np.diff(finite)) > 0.5 * turn).sum())
+    jumps = np.abs(np.diff(finite))
+    jumps = jumps[jumps > 0.5 * turn]
+    return len(jumps) if len(jumps) and np.median(jumps) > _WRAPPING * turn else 0
 
 
 def _unwrapped(values: FloatArray, turn: float) -> FloatArray:
