@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.errors import LogError
-from diransac.log import Log, check_names, check_time_order
+from diransac.log import Log
+from diransac.log.checks import check_names, check_time_order
 from diransac.prepare.steps import check_factor, rename_columns, resample_columns
 from diransac.readers.comma_separated import read_csv, read_csv_gz
 from diransac.readers.mat import read_mat

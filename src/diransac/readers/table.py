@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.errors import LogError
-from diransac.log import as_numbers
+from diransac.log.checks import as_numbers
 from diransac.units import split_unit
 
 if TYPE_CHECKING:

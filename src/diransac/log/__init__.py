@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gzip
 import hashlib
-import zipfile
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,22 +12,21 @@ from typing import TYPE_CHECKING, Any, Protocol, overload
 import numpy as np
 import numpy.typing as npt
 
-from diransac.atomic import write_with
 from diransac.errors import LogError
+from diransac.log import checks
+from diransac.log.checks import as_column, numeric_columns
+from diransac.log.writing import write_columns
 from diransac.units import split_unit
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-__all__ = ["Log", "as_numbers", "check_names", "check_time_order"]
+__all__ = ["Log"]
 
 FloatArray = npt.NDArray[np.float64]
 
-SILENT_JITTER = 1e-3
-TOLERATED_JITTER = 0.2
-GAP = 1.5
 _LARGEST = 1e150
-_JITTER_ROUNDING = 1e-6
+_ROUNDING = 1e-6
 
 
 class Frame(Protocol):
@@ -78,14 +75,14 @@ class Log:
     unusable: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_names(self.signals, self.source)
-        time = _column(self.time, "t", self.source)
-        signals = {name: _column(values, name, self.source) for name, values in self.signals.items()}
+        checks.check_names(self.signals, self.source)
+        time = as_column(self.time, "t", self.source)
+        signals = {name: as_column(values, name, self.source) for name, values in self.signals.items()}
         for name, values in signals.items():
             if len(values) != len(time):
                 raise LogError(f'{self.source}: signal "{name}" has {len(values)} rows, the time has {len(time)}')
-        check_time_order(time, self.source)
-        _check_even(time, self.source)
+        checks.check_time_order(time, self.source)
+        checks.check_even(time, self.source)
         units = {name: unit for name, unit in self.units.items() if name in signals}
         for key, value in (("time", time), ("signals", signals), ("units", units), ("unusable", dict(self.unusable))):
             object.__setattr__(self, key, MappingProxyType(value) if isinstance(value, dict) else value)
@@ -127,7 +124,7 @@ class Log:
             raise LogError(
                 f'{source}: there is no time column "{time}"; found {", ".join(columns)}. Name it with time='
             )
-        numbers, unusable = _numeric_columns({name: values for name, values in columns.items() if name != time})
+        numbers, unusable = numeric_columns({name: values for name, values in columns.items() if name != time})
         known = {name: unit for name, unit in headers if unit is not None} | dict(units or {})
         known.pop(time, None)
         return cls._from_columns(columns[time], numbers, known, source, unusable)
@@ -149,14 +146,8 @@ class Log:
 
     def findings(self) -> tuple[str, ...]:
         """What is worth saying: columns left out, an uneven clock, missing values, infinities; a sentence each."""
-        notes = [f'column "{name}" is left out: it {why}' for name, why in self.unusable.items()]
-        jitter = np.abs(np.diff(self.time) / self.dt - 1.0)
-        if jitter.max() > SILENT_JITTER:
-            at = self.time[int(jitter.argmax())]
-            notes.append(f"time is uneven by up to {jitter.max():.1%} of a sample (at t = {at:.6g} s)")
-        for word, test in (("NaN", np.isnan), ("infinite", np.isinf)):
-            notes += _where(word, {name: test(values) for name, values in self.signals.items()}, self.time)
-        return tuple(notes)
+        left_out = [f'column "{name}" is left out: it {why}' for name, why in self.unusable.items()]
+        return (*left_out, *checks.say_jitter(self.time), *checks.say_gaps(self.time, self.signals))
 
     # ------------------------------------------------------------------ looking at it
 
@@ -241,7 +232,7 @@ class Log:
 
         Raises LogError: fewer than 2 rows lie there.
         """
-        slack = _JITTER_ROUNDING * self.dt
+        slack = _ROUNDING * self.dt
         first, last = np.searchsorted(self.time, [start - slack, end + slack])
         if last - first < 2:
             raise LogError(
@@ -289,146 +280,4 @@ class Log:
         The file appears whole or not at all.  Units, history and notes are not written.
         Raises LogError: another ending, or the file cannot be written.
         """
-        path = Path(path)
-        endings = [ending for ending in _WRITERS if path.name.lower().endswith(ending)]
-        if not endings:
-            raise LogError(f'cannot write "{path}": its ending is not known; use one of {", ".join(_WRITERS)}')
-        try:
-            write_with(path, lambda file: _WRITERS[endings[0]]({"t": self.time, **self.signals}, file))
-        except OSError as error:
-            raise LogError(f'cannot write "{path}": {error.strerror or error}') from error
-
-
-# ---------------------------------------------------------------------- columns
-
-
-def as_numbers(values: npt.NDArray[Any]) -> FloatArray | str:
-    """A copy of an array as float64, or why there is none: ``is not numeric: row 3 holds 'takeoff'``."""
-    if values.dtype.kind in "biuf":
-        return values.astype(np.float64)
-    if values.dtype.kind != "O":
-        return f"is not numeric: row 0 holds {values.ravel()[0]!s:.60}" if values.size else "is empty"
-    numbers = np.full(values.shape, np.nan)
-    for row, value in enumerate(values.ravel()):
-        if isinstance(value, (bool, int, float, np.number, np.bool_)) and not isinstance(value, np.complexfloating):
-            numbers.flat[row] = value
-        elif value is not None and str(value) not in ("<NA>", "NaT"):
-            return f"is not numeric: row {row} holds {value!r:.60}"
-    return numbers
-
-
-def _numeric_columns(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """The columns that hold numbers, and why each of the others does not."""
-    converted = {name: as_numbers(values) for name, values in columns.items()}
-    numbers = {name: values for name, values in converted.items() if not isinstance(values, str)}
-    return numbers, {name: why for name, why in converted.items() if isinstance(why, str)}
-
-
-def _where(word: str, flags: Mapping[str, npt.NDArray[np.bool_]], time: FloatArray) -> list[str]:
-    """Sentences such as ``"x", "z" are NaN in 3 of 100 rows``, one for all signals that are so in the same rows."""
-    groups: dict[bytes, list[str]] = {}
-    for name, flag in flags.items():
-        if flag.any():
-            groups.setdefault(flag.tobytes(), []).append(name)
-    sentences = []
-    for names in groups.values():
-        flag = flags[names[0]]
-        subject = ", ".join(f'"{name}"' for name in names) + (" is" if len(names) == 1 else " are")
-        first = time[int(flag.argmax())]
-        sentences.append(f"{subject} {word} in {flag.sum()} of {len(flag)} rows, first at t = {first:.6g} s")
-    return sentences
-
-
-def _column(values: npt.ArrayLike, name: str, source: str) -> FloatArray:
-    """A read-only copy ``(N,)``.  Raises LogError: it is not one column of real numbers."""
-    array = np.asarray(values)
-    numbers = as_numbers(array)
-    if isinstance(numbers, str):
-        raise LogError(f'{source}: signal "{name}" {numbers}')
-    if numbers.ndim != 1:
-        raise LogError(f'{source}: signal "{name}" has shape {numbers.shape}; give one number a row, (N,)')
-    numbers.flags.writeable = False
-    return numbers
-
-
-def check_names(names: Iterable[object], source: str) -> None:
-    """Raise LogError where a name cannot stand for a signal."""
-    for name in names:
-        if not isinstance(name, str) or not name or name != name.strip():
-            raise LogError(f"{source}: {name!r} cannot name a signal; use a text that has no spaces around it")
-        if name == "t":
-            raise LogError(f'{source}: "t" is the time; give the signal another name')
-
-
-# ---------------------------------------------------------------------- time
-
-
-def check_time_order(time: FloatArray, source: str) -> None:
-    """Raise LogError where time ``(N,)`` has fewer than 2 rows, is not finite, repeats or runs backwards."""
-    if len(time) < 2:
-        raise LogError(f"{source}: a log has at least 2 rows; found {len(time)}")
-    if not np.isfinite(time).all():
-        row = int(np.argmin(np.isfinite(time)))
-        raise LogError(f"{source}: time is {time[row]} at row {row}; give every row a time in seconds")
-    steps = np.diff(time)
-    if steps.min() > 0.0:
-        return
-    row, n = int(np.argmax(steps <= 0.0)), int((steps <= 0.0).sum())
-    more = f" (and {n - 1} more rows like it)" if n > 1 else ""
-    if steps[row] == 0.0:
-        raise LogError(f"{source}: time {time[row]:.9g} s repeats at row {row + 1}{more}; remove the duplicate rows")
-    raise LogError(
-        f"{source}: time runs backwards at row {row + 1}: {time[row + 1]:.9g} s follows {time[row]:.9g} s{more}; "
-        "sort the rows by time, or split the file there"
-    )
-
-
-def _check_even(time: FloatArray, source: str) -> None:
-    """Raise LogError where an interval differs from the mean one by more than a fifth, and say how large a gap is.
-
-    Every row is taken to last ``dt``: what counts is how far one interval is off, not how far the clock drifts.
-    """
-    steps = np.diff(time)
-    dt, usual = float(np.mean(steps)), float(np.median(steps))
-    off = np.abs(steps - dt)
-    if off.max() <= (TOLERATED_JITTER + _JITTER_ROUNDING) * dt:
-        return
-    row = int(np.argmax(np.abs(steps - usual)))
-    n_gaps = int((steps > GAP * usual).sum())
-    what = f"{n_gaps} gap{'s' * (n_gaps > 1)}, the longest" if steps[row] > GAP * usual else "the most uneven interval"
-    raise LogError(
-        f"{source}: time is not uniform: {what} after t = {time[row]:.6g} s (row {row}) is {steps[row]:.4g} s long, "
-        f"the usual interval {usual:.4g} s; resample it: --resample {1.0 / usual:.4g}, or read_log(..., resample=...)"
-    )
-
-
-# ---------------------------------------------------------------------- writing
-
-
-def _write_csv(columns: Mapping[str, FloatArray], file: Path) -> None:
-    import polars as pl
-
-    pl.DataFrame(dict(columns)).write_csv(file)
-
-
-def _write_csv_gz(columns: Mapping[str, FloatArray], file: Path) -> None:
-    import polars as pl
-
-    with file.open("wb") as packed, gzip.GzipFile(fileobj=packed, mode="wb", filename="", mtime=0) as unpacked:
-        unpacked.write(pl.DataFrame(dict(columns)).write_csv().encode())
-
-
-def _write_parquet(columns: Mapping[str, FloatArray], file: Path) -> None:
-    import polars as pl
-
-    pl.DataFrame(dict(columns)).write_parquet(file)
-
-
-def _write_npz(columns: Mapping[str, FloatArray], file: Path) -> None:
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, values in columns.items():
-            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, values, allow_pickle=False)
-
-
-_WRITERS = {".csv": _write_csv, ".csv.gz": _write_csv_gz, ".parquet": _write_parquet, ".npz": _write_npz}
+        write_columns(Path(path), {"t": self.time, **self.signals})
