@@ -77,7 +77,7 @@ class _SumsEstimator:
     def fit(self, W: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:
         """Parameters ``(n_p,)`` from ``W (..., n_p)`` and ``b (...)``."""
         bound = self._bind(*_flat(W, b))
-        return bound.fit([np.arange(bound.n_rows)])[0]
+        return np.asarray(bound.fit([np.arange(bound.n_rows)])[0])
 
     def well_defined(self, W: npt.ArrayLike, b: npt.ArrayLike) -> bool:
         """Whether ``W (..., n_p)``, ``b (...)`` determine the parameters, with the columns scaled by their own RMS."""

@@ -148,7 +148,7 @@ class _BoundNonlinear:
 
     def _costs(self, rows: IntArray, free: FloatArray) -> FloatArray:
         """Sum of squares ``(B,)``, infinite where it is not finite."""
-        return np.square(self._errors(rows, free)[0]).sum(axis=1)
+        return np.asarray(np.square(self._errors(rows, free)[0]).sum(axis=1))
 
     def _errors(self, rows: IntArray, free: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Scaled errors ``(B, n r)`` and their Jacobian ``(B, n r, n_p)`` in the free coordinates."""
