@@ -26,6 +26,7 @@ def test_signals_are_found_by_name():
     assert log.names == ("x", "u")
     assert "x" in log
     assert "t" not in log
+    assert np.array_equal(log["t"], log.time)
     assert "y" not in log
     assert len(log) == 100
     assert log.dt == pytest.approx(0.01, rel=1e-12)

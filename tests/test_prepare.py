@@ -84,6 +84,11 @@ def test_resample_at_the_same_rate_keeps_every_sample_and_every_hole():
     assert np.allclose(new["x"], x, atol=1e-12, equal_nan=True)
 
 
+def test_resample_says_what_it_folds():
+    new = prepare.resample(log_of(x=T), 20.0)
+    assert new.notes[-1] == "no filter went before it: motion and noise above 10 Hz now appear below"
+
+
 @given(st.floats(-0.5, 0.5))
 def test_shift_by_any_delay_moves_a_straight_line_exactly(delay):
     log = log_of(u=2 * T + 1, x=T)
@@ -98,7 +103,7 @@ def test_shift_by_whole_samples_interpolates_nothing():
     u = np.random.default_rng(0).normal(size=N)
     new = prepare.shift(log_of(u=u), {"u": 0.03})
     assert np.array_equal(new["u"], u[:-3])
-    assert new.notes == ("3 rows at the ends are cut, which delayed signals do not cover",)
+    assert new.notes == ("3 rows cut at the ends, which delayed signals do not cover",)
 
 
 def test_shift_refuses_what_leaves_nothing():
@@ -304,6 +309,14 @@ def test_differentiate_records_and_says_what_it_did():
     assert len(new) == 1000 - 2 * cut
     assert new.time[0] == log.time[cut]
     assert new.notes == ("derived position_dot, position_ddot; filtered at 5 Hz (given), 0.13 s cut at either end",)
+
+
+def test_differentiate_says_when_noise_is_strong():
+    x = noisy_motion(0, n=2000, noise=0.5)
+    x[::50] += 40.0
+    new = prepare.differentiate(axis_log(x), servo_axis())
+    assert "of the accelerations' power" in new.notes[-1]
+    assert 0.05 < new.history[-1]["noise_share"] <= 1.0
 
 
 def test_a_measured_velocity_is_kept_and_gives_the_acceleration():

@@ -151,6 +151,15 @@ def is_log_or_sentence(folder, data, name="a.csv"):
         return "\n" not in str(error)
 
 
+def test_a_file_that_the_system_withholds_is_refused(tmp_path, monkeypatch):
+    def withhold(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("pathlib.Path.read_bytes", withhold)
+    with pytest.raises(LogError, match="it cannot be read: Permission denied"):
+        read_log(tmp_path / "a.csv")
+
+
 @pytest.mark.parametrize(
     ("name", "data"),
     [

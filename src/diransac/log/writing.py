@@ -44,7 +44,10 @@ def _write_csv(columns: Mapping[str, FloatArray], file: Path) -> None:
 def _write_csv_gz(columns: Mapping[str, FloatArray], file: Path) -> None:
     import polars as pl
 
-    with file.open("wb") as packed, gzip.GzipFile(fileobj=packed, mode="wb", filename="", mtime=0) as unpacked:
+    with (
+        file.open("wb") as packed,
+        gzip.GzipFile(fileobj=packed, mode="wb", filename="", mtime=0, compresslevel=6) as unpacked,
+    ):
         unpacked.write(pl.DataFrame(dict(columns)).write_csv().encode())
 
 
@@ -55,7 +58,7 @@ def _write_parquet(columns: Mapping[str, FloatArray], file: Path) -> None:
 
 
 def _write_npz(columns: Mapping[str, FloatArray], file: Path) -> None:
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(file, "w") as archive:
         for name, values in columns.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, values, allow_pickle=False)

@@ -38,6 +38,7 @@ _ROUNDING = 1e-6
 _MAD_TO_STD, _MEAN_TO_STD = 1.4826, 1.2533
 _COUNT_ROUNDING, _USUAL = 1e-3, 0.01
 _WRAPPING = 0.75
+_FOLDING = 0.9
 
 
 # ---------------------------------------------------------------------- names and factors
@@ -107,7 +108,8 @@ def resample(log: Log, rate: float | str = "median") -> Log:
     ----------
     rate : Hz, or ``"median"`` for one sample per median interval
 
-    A signal is NaN where its samples are, and in gaps of the clock.
+    A signal is NaN where its samples are, and in gaps of the clock.  Nothing is filtered: at a lower rate, what moves
+    faster than half of it is folded to lower frequencies, and said.
     Raises SettingsError: the rate has no meaning.  LogError: fewer than 2 samples are left.
     """
     time, signals, step, notes = resample_columns(log.time, log.signals, rate, log.source)
@@ -156,6 +158,8 @@ def _resampling_notes(
     time: FloatArray, gaps: npt.NDArray[np.bool_], blank: npt.NDArray[np.bool_], hertz: float
 ) -> list[str]:
     notes = [f"resampled from {len(time)} to {len(blank)} rows at {hertz:.6g} Hz, by linear interpolation"]
+    if hertz * np.median(np.diff(time)) < _FOLDING:
+        notes.append(f"no filter went before it: motion and noise above {hertz / 2.0:.4g} Hz now appear below")
     if gaps.any():
         steps = np.where(gaps, np.diff(time), 0.0)
         row = int(steps.argmax())
@@ -189,7 +193,7 @@ def shift(log: Log, delays: Mapping[str, float]) -> Log:
     if covered.sum() < 2:
         raise LogError(f"{log.source}: delays of {dict(delays)} s leave no row of {len(log) * log.dt:.6g} s")
     step = {"step": "shift", "delays": {name: float(delay) for name, delay in delays.items()}}
-    note = f"{(~covered).sum()} rows at the ends are cut, which delayed signals do not cover"
+    note = f"{(~covered).sum()} rows cut at the ends, which delayed signals do not cover"
     kept = {name: values[covered] for name, values in signals.items()}
     return log.with_step(step, time=log.time[covered], signals=kept, notes=[note] if not covered.all() else [])
 
