@@ -217,7 +217,7 @@ def test_solver_gives_nan_where_the_matrix_is_not_definite(A):
 
 
 def test_scikit_learns_least_squares_is_ours():
-    theirs, W, b = bound(dr.ScikitLearnEstimator(LinearRegression()))
+    theirs, _, _ = bound(dr.ScikitLearnEstimator(LinearRegression()))
     ours, _, _ = bound(dr.OrdinaryLeastSquares())
     rows = np.arange(0, 300, 3)
     assert theirs.fit([rows]) == pytest.approx(ours.fit([rows]), rel=1e-9)

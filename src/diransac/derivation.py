@@ -29,7 +29,7 @@ _SINGULAR = 1e-10
 _TOLERANCE = 1e-8
 _ARGUMENTS = "qvaup"
 # What a user's function raises when it meets a symbol where it expects a number, or the wrong count of arguments.
-_USER_ERRORS = (RuntimeError, TypeError, ValueError, NotImplementedError, ArithmeticError, LookupError, NameError)
+_USER_ERRORS = (RuntimeError, TypeError, ValueError, ArithmeticError, LookupError, NameError, AttributeError)
 
 
 class Symbols:
@@ -61,18 +61,43 @@ class Symbols:
 def call_user(label: str, what: str, function: Callable[..., Any], *arguments: Symbols) -> ca.SX:
     """What the user's function returns, as one column of SX.
 
-    Raises ModelError: it branches on a symbol, fails, or returns something else than numbers and expressions.
+    Raises ModelError: it branches on a symbol, fails, or returns something else than numbers and expressions of the
+    model's own symbols.
     """
     try:
         returned = function(*arguments)
-        values = list(returned.values()) if isinstance(returned, Mapping) else returned
-        return ca.vertcat(*(values if isinstance(values, list | tuple) else [values]), ca.SX(0, 1))
     except _USER_ERRORS as error:
         if "truth value" in str(error):
             raise ModelError(
                 f"{label}: {what} branch on a symbol (if, and, or, min, max); use casadi.if_else, fmin or fmax"
             ) from error
-        raise ModelError(f"{label}: {what} failed: {type(error).__name__}: {error}") from error
+        reason = str(error).partition("\n")[0]
+        raise ModelError(f"{label}: {what} failed: {type(error).__name__}: {reason}") from error
+    values = list(returned.values()) if isinstance(returned, Mapping) else returned
+    try:
+        column = ca.vertcat(*(values if isinstance(values, list | tuple) else [values]), ca.SX(0, 1))
+    except (TypeError, NotImplementedError) as error:
+        raise ModelError(f"{label}: {what} return {returned!r:.80}; return a list of expressions") from error
+    own = {symbol.element_hash() for symbols in arguments for symbol in symbols}
+    foreign = [str(symbol) for symbol in ca.symvar(column) if symbol.element_hash() not in own]
+    if foreign:
+        raise ModelError(f"{label}: {what} hold a symbol {foreign[0]} of their own; declare it, or give its value")
+    return column
+
+
+def check_groups(label: str, units: Mapping[str, object], parameters: object) -> None:
+    """Raises ModelError: a group of signals does not map names to units, or the parameters are none."""
+    for kind, group in units.items():
+        if not isinstance(group, Mapping):
+            raise ModelError(f'{label}: {kind} = {group!r}; give a mapping from name to unit, such as {{"x": "m"}}')
+        for name, unit in group.items():
+            if not isinstance(unit, str):
+                raise ModelError(f'{label}: the unit of {name!r} is {unit!r}; give a text, such as "m"')
+    if not isinstance(parameters, Mapping):
+        raise ModelError(f"{label}: parameters = {parameters!r}; give a mapping from name to dr.Parameter")
+    for name, parameter in parameters.items():
+        if not hasattr(parameter, "admits"):
+            raise ModelError(f'{label}: parameter {name!r} is {parameter!r}; give dr.Parameter("kg") or the like')
 
 
 def check_names(label: str, model: Model) -> None:
@@ -80,7 +105,7 @@ def check_names(label: str, model: Model) -> None:
     groups = (model.coordinates, model.velocities, model.accelerations, model.inputs, model.parameters)
     names = [n for group in groups for n in group]
     for name in names:
-        if not str(name).isidentifier() or keyword.iskeyword(name) or name.startswith("__"):
+        if str(name) != name or not name.isidentifier() or keyword.iskeyword(name) or name.startswith("__"):
             raise ModelError(
                 f"{label}: {name!r} cannot name a signal or parameter; use letters, digits and underscores"
             )
@@ -272,7 +297,7 @@ def _is_curved(both: ca.Function, others: Sequence[FloatArray], start: FloatArra
 
 
 def find_quaternions(kinematics: ca.Function) -> tuple[tuple[int, int, int, int], ...]:
-    """Runs of four coordinates whose norm the kinematics conserve without any of them standing still."""
+    """Runs of four coordinates whose norm the kinematics conserve, but that of no fewer of them."""
     rng = np.random.default_rng(20231002)
     q = rng.normal(size=(kinematics.size1_in(0), _N_POINTS))
     rates = np.array(kinematics(q, rng.normal(size=(kinematics.size1_in(1), _N_POINTS))))
@@ -280,9 +305,10 @@ def find_quaternions(kinematics: ca.Function) -> tuple[tuple[int, int, int, int]
     start = 0
     while start + 4 <= len(q):
         four = slice(start, start + 4)
-        drift = np.abs((q[four] * rates[four]).sum(axis=0)).max()
-        conserved = drift < _TOLERANCE * max(1.0, np.abs(rates[four]).max())
-        if conserved and (np.abs(rates[four]).max(axis=1) > 0.0).all():
+        work = q[four] * rates[four]
+        small = _TOLERANCE * max(1.0, np.abs(rates[four]).max())
+        fewer = [*work, *(work[0] + work[i] for i in (1, 2, 3))]
+        if np.abs(work.sum(axis=0)).max() < small <= min(np.abs(x).max() for x in fewer):
             found.append((start, start + 1, start + 2, start + 3))
             start += 4
         else:

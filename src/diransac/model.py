@@ -129,6 +129,8 @@ class Model:
         description: str,
     ) -> None:
         self.name, self.description = name, description
+        units = {"coordinates": coordinates, "inputs": inputs, "velocities": velocities or {}}
+        derivation.check_groups(self._label, units, parameters)
         self.coordinates, self.inputs, self.parameters = dict(coordinates), dict(inputs), dict(parameters)
         if velocities is None:
             self.velocities = {f"{q}_dot": _per_second(unit) for q, unit in coordinates.items()}
@@ -249,8 +251,8 @@ class Model:
         """
         if self.nonlinear_parameters:
             raise ModelError(
-                f"{self._label}: the equations are not affine in {', '.join(self.nonlinear_parameters)}, so there is no "
-                'linear regression W p = b; use method="nls", or a RANSAC method: they fit by nonlinear least squares'
+                f"{self._label}: the equations are not affine in {', '.join(self.nonlinear_parameters)}: there is no "
+                'regression W p = b; use method="nls" or a RANSAC method, which fit by nonlinear least squares'
             )
         q, v, a, u, p = self._symbols()
         W, r0 = self._probe.affine_parts("p", (q, v, a, u, p))
@@ -314,24 +316,21 @@ class Model:
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of the names, units, bounds and equations."""
-        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
+        return str(self.to_dict()["checksum"])
 
     def to_dict(self) -> dict[str, Any]:
         """Names, units, bounds and serialised equations, ready for JSON; `from_dict` reads it back."""
-        serialised = {
-            "residual": self.residual.serialize(),
-            "kinematics": None if self.kinematics is None else self.kinematics.serialize(),
-        }
-        return {
+        data = {
             "name": self.name,
             "description": self.description,
             "coordinates": self.coordinates,
             "velocities": None if self.kinematics is None else self.velocities,
             "inputs": self.inputs,
             "parameters": {n: _parameter_to_dict(x) for n, x in self.parameters.items()},
-            **serialised,
-            "checksum": _checksum(serialised),
+            "residual": self.residual.serialize(),
+            "kinematics": None if self.kinematics is None else self.kinematics.serialize(),
         }
+        return {**data, "checksum": _checksum(data)}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Model:
@@ -339,20 +338,28 @@ class Model:
 
         Raises ResultError: the data are damaged.
         """
-        model = cls.__new__(cls)
         try:
-            serialised = {"residual": data["residual"], "kinematics": data["kinematics"]}
-            if data["checksum"] != _checksum(serialised):
-                raise ResultError("the stored model is damaged: its checksum does not match; identify again")
-            parameters = {n: _parameter_from_dict(x) for n, x in data["parameters"].items()}
-            model._name_signals(
-                data["name"], data["coordinates"], data["inputs"], parameters, data["velocities"], data["description"]
-            )
-        except (KeyError, TypeError, AttributeError) as error:
-            raise ResultError(f"the stored model is damaged: {error!r} is missing or has a wrong type") from error
-        model.residual = derivation.deserialize(serialised["residual"])
-        stored = serialised["kinematics"]
+            return cls._from_checked(data)
+        except (KeyError, TypeError, AttributeError, ValueError, ModelError) as error:
+            raise ResultError(
+                f"the stored model is damaged: {type(error).__name__}: {error}; identify again"
+            ) from error
+
+    @classmethod
+    def _from_checked(cls, data: Mapping[str, Any]) -> Model:
+        model = cls.__new__(cls)
+        if data["checksum"] != _checksum({k: x for k, x in data.items() if k != "checksum"}):
+            raise ResultError("the stored model is damaged: its checksum does not match; identify again")
+        parameters = {n: _parameter_from_dict(x) for n, x in data["parameters"].items()}
+        model._name_signals(
+            data["name"], data["coordinates"], data["inputs"], parameters, data["velocities"], data["description"]
+        )
+        model.residual = derivation.deserialize(data["residual"])
+        stored = data["kinematics"]
         model.kinematics = None if stored is None else derivation.deserialize(stored)
+        sizes = [model.residual.size1_in(i) for i in range(model.residual.n_in())]
+        if sizes != [model.n_q, model.n_v, model.n_v, model.n_u, model.n_p]:
+            raise ResultError("the stored model is damaged: its names do not fit its equations; identify again")
         model._check()
         return model
 
@@ -406,5 +413,5 @@ def _parameter_from_dict(data: Mapping[str, Any]) -> Parameter:
     return Parameter(data["unit"], lower, upper, data["positive"])
 
 
-def _checksum(serialised: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(serialised, sort_keys=True).encode()).hexdigest()
+def _checksum(data: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
