@@ -75,7 +75,7 @@ class _BoundNonlinear:
         model = observations.model
         q, v, a = (x[observations.valid] for x in observations.state_arrays())
         known = [i for i, n in enumerate(model.accelerations) if n in observations.signals]
-        self._state, self._inputs = np.hstack([q, v]), observations.inputs[observations.valid]
+        self._state, self._inputs = np.hstack([q, v]), observations.acting_inputs()[observations.valid]
         self._accelerations = a[:, known]
         self._scale = np.sqrt(np.square(self._accelerations).mean(axis=0))
         self._scale[self._scale == 0.0] = 1.0

@@ -87,6 +87,10 @@ class Observations:
         n_q, n_v = self.model.n_q, self.model.n_v
         return full[:, :n_q], full[:, n_q : n_q + n_v], full[:, n_q + n_v :]
 
+    def acting_inputs(self) -> FloatArray:
+        """Inputs ``(N, n_u)`` that belong to each row's accelerations; see `prepare.acting_inputs`."""
+        return prepare.acting_inputs(self.log, self.inputs)
+
     def regression(self) -> tuple[FloatArray, FloatArray]:
         """``W (N, r, n_p)`` and ``b (N, r)`` of the rows that count, eqs. (1) and (5).
 
@@ -94,10 +98,10 @@ class Observations:
         """
         from diransac.kernel import compile_map
 
-        W, b = compile_map(self.model.regressor)(*self.state_arrays(), self.inputs)
+        W, b = compile_map(self.model.regressor)(*self.state_arrays(), self.acting_inputs())
         n_p, r = self.model.n_p, self.model.n_v
         W = W.reshape(len(self), n_p, r).transpose(0, 2, 1)
-        W, b = prepare.filter_rows(self.log, W), prepare.filter_rows(self.log, b)
+        W, b = (prepare.filter_rows(self.log, rows, self.valid) for rows in (W, b))
         return np.ascontiguousarray(W[self.valid]), np.ascontiguousarray(b[self.valid])
 
     def initial_state(self, rule: str | Mapping[str, float]) -> FloatArray:
