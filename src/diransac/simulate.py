@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -23,25 +23,13 @@ from diransac.kernel.machine_code import LANES, MachineCode, Target, compile_fun
 
 if TYPE_CHECKING:
     from diransac.kernel.time_loop import Keep, Plan
+    from diransac.model import Model
 
 __all__ = ["INTEGRATORS", "Rollouts", "Scores", "inlier_mask", "rollouts"]
 
 Floats = NDArray[np.float64]
 Dynamics = Callable[[ca.SX], ca.SX]
 """State -> its derivative, with inputs and parameters held."""
-
-
-class Simulated(Protocol):
-    """What a model offers to be simulated."""
-
-    name: str
-    dynamics: ca.Function
-    signals: Sequence[str]
-    quaternions: Sequence[Sequence[int]]
-    n_q: int
-    n_v: int
-    n_u: int
-    n_p: int
 
 
 @dataclass(frozen=True)
@@ -62,7 +50,7 @@ class Scores:
 
 
 def rollouts(
-    model: Simulated,
+    model: Model,
     signals: Sequence[str] | None = None,
     *,
     integrator: str = "rk4",
@@ -73,8 +61,7 @@ def rollouts(
 
     Parameters
     ----------
-    model : its `dynamics` is an SX function (x, u, p) -> (dx/dt, accelerations), and its `signals` name x and the
-        accelerations
+    model : what is simulated: its `dynamics`, an SX function (x, u, p) -> (dx/dt, accelerations)
     signals : those that are compared with measurements, in the order of their columns; all by default
     integrator : `rk4`, `euler` or `semi-implicit-euler` (velocities first, then coordinates with the new velocities)
     substeps : integration steps from one row to the next
