@@ -24,7 +24,16 @@ BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
 
 _FORMAT = 1
-_PLAIN = ("method", "estimator", "seed", "fitted_rows", "iterations", "evaluated", "stop_reason", "skipped")
+_PLAIN = {
+    "method": str,
+    "estimator": str,
+    "seed": int,
+    "fitted_rows": int,
+    "iterations": int,
+    "evaluated": int,
+    "stop_reason": str,
+    "skipped": dict,
+}
 
 
 @dataclass(frozen=True)
@@ -38,7 +47,7 @@ class LogSummary:
     n_rows: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Result:
     """Parameters of a model with everything that is needed to judge and repeat them.
 
@@ -59,6 +68,8 @@ class Result:
     violations : names of the parameters outside their bounds (never with a RANSAC method)
     log : which log it was; preparation : what was done to it, in order; notes : what was found on the way
     sensitivity : name -> relative change at half and at twice the differentiating filter's bandwidth
+
+    Two results are equal if all of this is.
     """
 
     model: Model
@@ -158,7 +169,9 @@ class Result:
     def _from_checked(cls, data: Mapping[str, Any]) -> Result:
         model = Model.from_dict(data["model"])
         log = LogSummary(**data["log"])
-        packed = np.frombuffer(base64.b64decode(data["inliers"]), dtype=np.uint8)
+        packed = np.frombuffer(base64.b64decode(data["inliers"], validate=True), dtype=np.uint8)
+        if len(packed) != (log.n_rows + 7) // 8:
+            raise ValueError(f"inliers of {log.n_rows} rows")
         values = model.parameter_vector(data["parameters"])
         pairs = data["sensitivity"]
         return cls(
@@ -177,9 +190,7 @@ class Result:
             preparation=tuple(data["preparation"]),
             sensitivity=None if pairs is None else {n: (_decode(a), _decode(b)) for n, (a, b) in pairs.items()},
             log=log,
-            **{
-                k: data[k] for k in _PLAIN
-            },
+            **{key: _of_kind(kind, data[key], key) for key, kind in _PLAIN.items()},
         )
 
     def save(self, path: str | Path) -> None:
@@ -188,7 +199,7 @@ class Result:
         Raises ResultError: it cannot be written there.
         """
         try:
-            write_text(path, json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
+            write_text(path, self._text())
         except OSError as error:
             raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
 
@@ -206,6 +217,15 @@ class Result:
             raise ResultError(f"{path}: is no JSON: {error}") from error
         except DiransacError as error:
             raise ResultError(f"{path}: {error}") from error
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Result) and self._text() == other._text()
+
+    def __hash__(self) -> int:
+        return hash(self._text())
+
+    def _text(self) -> str:
+        return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
 
     def __str__(self) -> str:
         return "\n".join([self._headline(), *self._table(), self._summary(), *self._warnings()])
@@ -247,6 +267,12 @@ def _encode(x: float) -> float | str:
 
 def _decode(x: float | str) -> float:
     return float(x)
+
+
+def _of_kind(kind: type, value: Any, key: str) -> Any:
+    if not isinstance(value, kind):
+        raise TypeError(f"{key} {value!r}")
+    return value
 
 
 def _encode_pairs(pairs: Mapping[str, tuple[float, float]] | None) -> dict[str, list[float | str]] | None:
