@@ -15,6 +15,7 @@ from diransac.errors import ModelError, ResultError
 from diransac.model import Model, Parameter, Plant
 from diransac.models import BUILTIN, builtin
 from simulated import MACHINES
+from user_models import tumbling
 
 SEEDS = st.integers(0, 2**32 - 1)
 FEW = settings(max_examples=30)
@@ -36,35 +37,6 @@ def two_axes(equations):
 
 def plain(q, v, a, u, p):
     return [p.m * a.x + p.k * v.x - u.f]
-
-
-def tumbling(**changes):
-    """A rigid body that turns: unit quaternion, body rates, principal inertias."""
-
-    def equations(q, v, a, u, p):
-        return [
-            p.Jx * a.wx + (p.Jz - p.Jy) * v.wy * v.wz - u.tx,
-            p.Jy * a.wy + (p.Jx - p.Jz) * v.wz * v.wx - u.ty,
-            p.Jz * a.wz + (p.Jy - p.Jx) * v.wx * v.wy - u.tz,
-        ]
-
-    def kinematics(q, v):
-        return [
-            0.5 * (-q.qx * v.wx - q.qy * v.wy - q.qz * v.wz),
-            0.5 * (q.qw * v.wx + q.qy * v.wz - q.qz * v.wy),
-            0.5 * (q.qw * v.wy + q.qz * v.wx - q.qx * v.wz),
-            0.5 * (q.qw * v.wz + q.qx * v.wy - q.qy * v.wx),
-        ]
-
-    parts = {
-        "coordinates": dict.fromkeys(("qw", "qx", "qy", "qz"), "1"),
-        "velocities": dict.fromkeys(("wx", "wy", "wz"), "rad/s"),
-        "inputs": dict.fromkeys(("tx", "ty", "tz"), "N m"),
-        "parameters": dict.fromkeys(("Jx", "Jy", "Jz"), Parameter("kg m^2", positive=True)),
-        "equations": equations,
-        "kinematics": kinematics,
-    }
-    return Model(name="tumbling", **(parts | changes))
 
 
 def random_arguments(model, seed):
