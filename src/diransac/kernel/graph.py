@@ -1,14 +1,13 @@
 """Expression graph of a CasADi SX function, as a list of instructions that a code generator can walk.
 
-Equal sub-expressions are one instruction. A product that is used once, by a sum or a difference, is fused with it; what
-depends on invariant inputs alone is marked, to be computed once instead of in every step. All of it is decided on the
-whole graph, never on the outputs that a caller happens to want, so every use of a graph computes the same bits.
+Equal sub-expressions are one instruction. A product is fused into the sums and differences that take it; what depends
+on invariant inputs alone is marked, to be computed once instead of in every step. Each is decided by what an
+instruction depends on, never by what depends on it, so an expression has the same bits whatever is computed beside it.
 """
 
 from __future__ import annotations
 
 import struct
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TYPE_CHECKING
@@ -200,15 +199,16 @@ def _with_reciprocals(graph: Graph, inputs: frozenset[int]) -> Graph:
 
 
 def _fused(graph: Graph, inputs: frozenset[int]) -> Graph:
-    """Graph whose sums take in a product that nothing else uses; its rounding is saved."""
-    uses = Counter(k for instruction in graph.instructions for k in instruction.operands)
-    uses.update(k for row in graph.outputs for k in row)
-    fused = [_fuse(graph, uses, position) for position in range(len(graph.instructions))]
+    """Graph whose sums take in the products that they add: one rounding and one operation less."""
+    fused = [_fuse(graph, position) for position in range(len(graph.instructions))]
     return _marked(fused, graph.outputs, inputs)
 
 
-def _fuse(graph: Graph, uses: Counter[int], position: int) -> Instruction:
-    """Fuse a sum or difference with its first operand, else its second, if that is a product fit for it."""
+def _fuse(graph: Graph, position: int) -> Instruction:
+    """Fuse a sum or difference with its first operand, else its second, if that is a product fit for it.
+
+    What else uses the product does not matter: a sum has the same bits whatever is computed beside it.
+    """
     instruction = graph.instructions[position]
     if instruction.operation not in ("ADD", "SUB"):
         return instruction
@@ -218,6 +218,6 @@ def _fuse(graph: Graph, uses: Counter[int], position: int) -> Instruction:
         product = graph.instructions[factor]
         # A product that waits outside the loop costs nothing inside it: fusing would only occupy a register more.
         waits = graph.invariant[factor] and not graph.invariant[position]
-        if product.operation == "MUL" and uses[factor] == 1 and not waits:
+        if product.operation == "MUL" and not waits:
             return Instruction(name, (*product.operands, instruction.operands[1 - side]))
     return instruction
