@@ -270,19 +270,24 @@ class Model:
 
     @cached_property
     def linearization(self) -> ca.Function:
-        """Function ``(x, u, p) -> (A (n_x, n_x), B (n_x, n_u))`` of ``d x_dot = A dx + B du``, by ``M da = -dr``."""
+        """Function ``(x, u, p) -> (A (n_x, n_x), B (n_x, n_u))`` of ``d x_dot = A dx + B du``."""
+        x, u, p = (ca.SX.sym(n, size) for n, size in (("x", len(self.state)), ("u", self.n_u), ("p", self.n_p)))
+        outputs = [ca.densify(J) for J in self.rate_jacobians(x, u, p)[:2]]
+        return ca.Function("linearization", [x, u, p], outputs, ["x", "u", "p"], ["A", "B"])
+
+    @cached_property
+    def rate_jacobians(self) -> ca.Function:
+        """Function ``(x, u, p) -> d x_dot / d(x, u, p)``, three sparse matrices, by ``M da = -dr``."""
         q, v, a, u, p = self._symbols()
         x = ca.vertcat(q, v)
         r = self.residual(q, v, a, u, p)
-        partials = ca.horzcat(ca.jacobian(r, x), ca.jacobian(r, u))
-        solved = -self._solve_mass(q, v, u, p, partials)
-        solved = ca.substitute(solved, a, self.dynamics(x, u, p)[1])
         q_dot = v if self.kinematics is None else self.kinematics(q, v)
-        upper = ca.horzcat(ca.jacobian(q_dot, x), ca.SX(self.n_q, self.n_u))
-        A, B = ca.horzsplit(
-            ca.densify(ca.vertcat(upper, solved)), [0, self.n_q + self.n_v, self.n_q + self.n_v + self.n_u]
-        )
-        return ca.Function("linearization", [x, u, p], ca.cse([A, B]), ["x", "u", "p"], ["A", "B"])
+        solved = -self._solve_mass(q, v, u, p, ca.jacobian(r, ca.vertcat(x, u, p)))
+        solved = ca.sparsify(ca.substitute(solved, a, self.dynamics(x, u, p)[1]))
+        both = ca.vertcat(ca.jacobian(q_dot, ca.vertcat(x, u, p)), solved)
+        edges = [0, x.numel(), x.numel() + u.numel(), both.size2()]
+        names = ["dx", "du", "dp"]
+        return ca.Function("rate_jacobians", [x, u, p], ca.cse(ca.horzsplit(both, edges)), ["x", "u", "p"], names)
 
     def _solve_mass(self, q: ca.SX, v: ca.SX, u: ca.SX, p: ca.SX, rhs: ca.SX) -> ca.SX:
         """``M^-1 rhs``: LDL^T where the probe found ``M`` symmetric and definite, CasADi's solve elsewhere."""
