@@ -208,8 +208,8 @@ def test_a_violated_bound_is_bad_and_says_which(result, log):
 
 def test_a_parameter_that_the_log_cannot_tell_asks_for_care(result, log, tmp_path):
     vague = dataclasses.replace(result, covariance=np.full((4, 4), np.inf))
-    assert level_of(vague, log, "cannot tell how certain mass is") == "care"
-    assert "the log cannot tell" in Page(written(vague, log, tmp_path)).text
+    assert level_of(vague, log, "cannot be told: the fit rests on") == "care"
+    assert "unknown" in Page(written(vague, log, tmp_path)).text
 
 
 @pytest.mark.parametrize(("change", "level"), [(0.01, "good"), (-0.1, "care"), (0.5, "bad"), (np.nan, "care")])

@@ -140,10 +140,15 @@ def windows(run: Run) -> tuple[IntArray, FloatArray]:
 def _certainty(run: Run) -> Iterator[Finding]:
     """What the intervals say."""
     result, widths = run.result, {}
-    for name, (low, high) in result.intervals().items():
-        if not np.isfinite(high - low):
-            yield Finding("care", f"The log cannot tell how certain {name} is.")
-        elif low <= 0.0 <= high:
+    intervals = result.intervals()
+    vague = [name for name, (low, high) in intervals.items() if not np.isfinite(high - low)]
+    if vague:
+        rows = plural(result.fitted_rows, "row")
+        yield Finding("care", f"How certain {', '.join(vague)} is cannot be told: the fit rests on {rows}.")
+    for name, (low, high) in intervals.items():
+        if name in vague:
+            continue
+        if low <= 0.0 <= high:
             possible = result.model.parameters[name].admits(0.0)
             yield Finding("note" if possible else "care", f"{name} cannot be told from zero.")
         else:

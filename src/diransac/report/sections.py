@@ -139,7 +139,7 @@ def _estimate(name: str, run: Run, i: int, scale: Scale) -> list[Html]:
     result = run.result
     value, (low, high) = result.parameters[name], result.intervals()[name]
     known = np.isfinite(high - low)
-    interval = f"{number(low, 5)} … {number(high, 5)}" if known else "the log cannot tell"
+    interval = f"{number(low, 5)} … {number(high, 5)}" if known else "unknown"
     width = "includes 0" if low <= 0.0 <= high else percent(0.5 * (high - low) / abs(value))
     outside = tag("strong", " outside its bounds") if name in result.violations else ""
     return [
