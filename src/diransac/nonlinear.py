@@ -13,7 +13,13 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from diransac.estimators import BoundEstimator, loose_parameters, smallest_eigenvalue, solve_definite
+from diransac.estimators import (
+    BoundEstimator,
+    OrdinaryLeastSquares,
+    loose_parameters,
+    smallest_eigenvalue,
+    solve_definite,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,6 +37,8 @@ IntArray = npt.NDArray[np.int64]
 _START_DECADES = 3.0
 _ROWS_FOR_STARTS = 100
 _ROWS_FOR_WHOLE = 2000
+# Evaluated together: bounds the memory, whatever the number of sets.
+_ROWS_AT_A_TIME = 300_000
 _CONVERGED = 1e-14
 # Errors whose squares could not be summed: a lane that has one is nowhere to go.
 _HUGE = 1e140
@@ -45,7 +53,8 @@ class NonlinearLeastSquares:
     """Least squares of ``(a - a_model(q, v, u, p)) / rms(a)`` within the parameters' bounds.
 
     No starting value is asked for: ``n_starts`` points spread over six decades, or over the bounds, are evaluated on
-    the rows to be fitted, and the best few are followed by Levenberg and Marquardt's method.
+    the rows to be fitted, and the best few are followed by Levenberg and Marquardt's method; where the model is affine
+    in its parameters, the solution of the linear regression is followed, too.
 
     Parameters
     ----------
@@ -84,6 +93,7 @@ class _BoundNonlinear:
         self.n_rows = len(self._state)
         self._n_p = model.n_p
         self._starts = self._chart.starts(settings.n_starts)
+        self._linear = None if model.nonlinear_parameters else OrdinaryLeastSquares().bind(observations)
         everything = np.arange(self.n_rows)[None]
         whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // _ROWS_FOR_WHOLE)]))
         self._starts = np.vstack([whole, self._starts])
@@ -103,7 +113,10 @@ class _BoundNonlinear:
         fits = np.empty((len(row_sets), self._n_p))
         for length in {len(rows) for rows in row_sets}:
             places = [i for i, rows in enumerate(row_sets) if len(rows) == length]
-            fits[places] = self._fit_equal(np.array([row_sets[i] for i in places]))
+            at_a_time = max(1, _ROWS_AT_A_TIME // (len(self._starts) * max(1, length)))
+            for first in range(0, len(places), at_a_time):
+                some = places[first : first + at_a_time]
+                fits[some] = self._fit_equal(np.array([row_sets[i] for i in some]))
         return fits
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
@@ -118,7 +131,11 @@ class _BoundNonlinear:
         every = np.tile(np.arange(len(starts)), n_sets)
         costs = self._costs(np.repeat(few, len(starts), axis=0), starts[every]).reshape(n_sets, -1)
         best = np.argsort(costs, axis=1, kind="stable")[:, : self._settings.n_followed]
-        free, costs = self._descend(np.repeat(rows, best.shape[1], axis=0), starts[best.reshape(-1)])
+        followed = starts[best]
+        if self._linear is not None:
+            solved = self._chart.clip(self._chart.to_free(self._linear.fit(list(rows))))
+            followed = np.concatenate([solved[:, None], followed], axis=1)
+        free, costs = self._descend(np.repeat(rows, followed.shape[1], axis=0), followed.reshape(-1, self._n_p))
         winner = np.argmin(costs.reshape(n_sets, -1), axis=1)
         return self._chart.to_parameters(free.reshape(n_sets, -1, self._n_p)[np.arange(n_sets), winner])
 
@@ -135,7 +152,8 @@ class _BoundNonlinear:
             trial = self._chart.clip(free[active] - np.nan_to_num(solve_definite(H, slope)))
             trial_errors, trial_J = self._errors(rows[active], trial)
             trial_costs = np.square(trial_errors).sum(axis=1)
-            gain = costs[active] - trial_costs
+            with np.errstate(invalid="ignore"):
+                gain = costs[active] - trial_costs
             better = gain > 0.0
             going = np.where(better, gain > _CONVERGED * costs[active], damping[active] < _DAMPING[2])
             damping[active] = np.clip(damping[active] * np.where(better, 0.1, 4.0), *_DAMPING[1:])
