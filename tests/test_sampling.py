@@ -46,6 +46,10 @@ def test_seeds_and_iterations_give_different_samples():
     assert len(samples) == 800
 
 
+def test_seed_may_be_numpys():
+    assert np.array_equal(sample_rows(np.int64(-1), [0], 100, 0, 9), sample_rows(-1, [0], 100, 0, 9))
+
+
 def test_seed_and_k_are_no_sum():
     """A sample of (seed, k + 1) is not that of (seed + 1, k)."""
     assert not np.array_equal(sample_rows(0, [1], 1000, 0, 10), sample_rows(1, [0], 1000, 0, 10))

@@ -83,8 +83,8 @@ def identify(
     no hypothesis was accepted.
     References: Dimmig et al. 2023, Algorithm 1.
     """
-    _check_arguments(model, log, method, estimator, seed)
     settings = Settings() if settings is None else settings
+    _check_arguments(model, log, method, estimator, seed, settings)
     task = _Task(model, log, method, seed, settings, _estimator(model, method, estimator))
     if not differentiate:
         if bandwidth is not None:
@@ -95,7 +95,9 @@ def identify(
     return task.with_sensitivity(result, derived)
 
 
-def _check_arguments(model: object, log: object, method: object, estimator: object, seed: object) -> None:
+def _check_arguments(
+    model: object, log: object, method: object, estimator: object, seed: object, settings: object
+) -> None:
     if not isinstance(model, Model):
         raise SettingsError(f"model is {model!r}; give a dr.Model, such as dr.models.planar_rotorcraft()")
     if not isinstance(log, Log):
@@ -104,6 +106,8 @@ def _check_arguments(model: object, log: object, method: object, estimator: obje
         raise SettingsError(f'there is no method "{method}"; there are {", ".join(METHODS)}')
     if estimator is not None and method not in _VARIANTS:
         raise SettingsError(f'estimator serves the RANSAC methods; method "{method}" is an estimator itself')
+    if not isinstance(settings, Settings):
+        raise SettingsError(f"settings is {settings!r}; give a dr.Settings, such as dr.Settings(sample_size=75)")
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
         raise SettingsError(f"seed is {seed!r}; give a whole number")
 
@@ -183,7 +187,12 @@ class _Task:
     def _estimate(self, bound: BoundEstimator, simulation: Simulation | None, progress: Progress | None) -> Outcome:
         if simulation is None or self.method not in _VARIANTS:
             rows = np.arange(bound.n_rows)
-            best = Hypothesis(bound.fit([rows])[0], rows, Score(np.nan, np.nan))
+            parameters = bound.fit([rows])[0]
+            if not np.isfinite(parameters).all():
+                raise IdentificationError(
+                    f"{self.given.source}: {self.method} finds no finite parameters; try another method"
+                )
+            best = Hypothesis(parameters, rows, Score(np.nan, np.nan))
             return Outcome(best, evaluated=1, stop_reason="whole log fitted")
         if bound.n_rows < self.settings.sample_size:
             raise LogError(

@@ -44,7 +44,7 @@ def sample_rows(seed: int, iterations: npt.ArrayLike, n_rows: int, start: int, s
     k = np.atleast_1d(np.asarray(iterations, dtype=np.uint64))
     half = np.uint64(max(1, -(-(n_rows - 1).bit_length() // 2)))
     n_rounds = _ROUNDS_OF_FEW if half <= _FEW_BITS else _ROUNDS
-    key = _mix(_mix(np.array([seed % 2**64], dtype=np.uint64)) + k)
+    key = _mix(_mix(np.array([int(seed) % 2**64], dtype=np.uint64)) + k)
     round_keys = [_mix(key + np.uint64(r * _GOLDEN % 2**64))[:, None] for r in range(1, n_rounds + 1)]
     values = np.broadcast_to(np.arange(start, stop, dtype=np.uint64), (len(k), stop - start))
     permuted = _feistel(values, round_keys, half)
