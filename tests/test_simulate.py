@@ -30,6 +30,7 @@ def stand_in(name, dynamics, n_q, quaternions=()):
         dynamics=function,
         signals=tuple(letters),
         quaternions=quaternions,
+        parameters=tuple(f"p{k}" for k in range(n_p)),
         n_q=n_q,
         n_v=n_v,
         n_u=n_u,

@@ -15,7 +15,15 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-__all__ = ["Lanes", "arranged_lanes", "arranged_measurements", "squared_thresholds"]
+__all__ = [
+    "Lanes",
+    "aligned",
+    "arranged_lanes",
+    "arranged_laws",
+    "arranged_measurements",
+    "arranged_weights",
+    "squared_thresholds",
+]
 
 
 @dataclass(frozen=True)
@@ -93,13 +101,72 @@ def arranged_measurements(
     """
     n_log = lanes.n_log
     y = _array("measured", measured, (n_log, n_signals))
-    flags = np.ascontiguousarray(valid)
-    if flags.shape != (n_log,) or flags.dtype != np.bool_:
-        raise SettingsError(f"valid must be {n_log} Booleans, one a row; found {flags.shape} of {flags.dtype}.")
+    flags = _flags(valid, n_log)
     # One sum is a quick first look: it is finite unless something in it isn't, or is huge.
     if not np.isfinite(y.sum()) and not np.isfinite(y[flags]).all():
         raise SettingsError("measured holds a NaN or an infinity in a valid row; mark such rows as not valid.")
     return {"measured": y[lanes.window], "valid": flags[lanes.window]}
+
+
+def arranged_weights(
+    lanes: Lanes, n_signals: int, measured: ArrayLike, valid: ArrayLike, weights: ArrayLike
+) -> dict[str, NDArray[Any]]:
+    """Check what rollouts are compared with, and arrange it: measured and weights (n_window, n_signals).
+
+    The weights of rows that do not count are zero, and what has no weight is finite.
+
+    Parameters
+    ----------
+    weights : (n_signals,) or (n_log, n_signals)
+
+    Raises SettingsError: an array of another shape, a weight that is negative or not finite, or a measurement with a
+    weight that isn't finite.
+    """
+    w = np.asarray(weights, np.float64)
+    w = np.broadcast_to(w, (lanes.n_log, n_signals)) if w.shape == (n_signals,) else w
+    w = _array("weights", w, (lanes.n_log, n_signals))[lanes.window]
+    if not (np.isfinite(w).all() and (w >= 0).all()):
+        raise SettingsError("weights hold a number that is negative or not finite.")
+    y = _array("measured", measured, (lanes.n_log, n_signals))[lanes.window]
+    w = np.where(_flags(valid, lanes.n_log)[lanes.window, None], w, 0.0)
+    finite = np.isfinite(y)
+    if not finite[w > 0].all():
+        raise SettingsError(
+            "measured holds a NaN or an infinity in a valid row and a signal that has a weight; give it none, or mark "
+            "the row as not valid."
+        )
+    return {"measured": np.where(finite, y, 0.0), "weights": w}
+
+
+def arranged_laws(
+    lanes: Lanes, table: Floats, n_laws: int | None, law_of_lane: ArrayLike | None, width: int
+) -> dict[str, NDArray[Any]]:
+    """Check which laws steer the lanes, and arrange them: laws, and law_starts (n_padded,) unless one steers all alike.
+
+    Parameters
+    ----------
+    table : (n_laws, n_log, width)
+    n_laws : None if there is one law for all
+    law_of_lane : (n_lanes,)
+
+    Raises SettingsError: laws of another model, or not one law for each lane.
+    """
+    if table.shape[-1] != width:
+        raise SettingsError(
+            f"the law has {table.shape[-1]} numbers a row, but the model's states and inputs need {width}."
+        )
+    if n_laws is None and law_of_lane is None and not lanes.has_windows:
+        return {"laws": table[0, lanes.window]}
+    own = np.zeros(lanes.n_lanes, np.int64) if n_laws is None else np.arange(lanes.n_lanes)
+    chosen = own if law_of_lane is None else np.asarray(law_of_lane)
+    fits = chosen.shape == (lanes.n_lanes,) and chosen.dtype.kind in "iu"
+    if not fits or (lanes.n_lanes and not (chosen.min() >= 0 and chosen.max() < len(table))):
+        raise SettingsError(
+            f"law_of_lane must be one integer a lane, {lanes.n_lanes} in all, from 0 to {len(table) - 1}; without it "
+            "there must be a law for each lane."
+        )
+    starts = lanes.arrays.get("start_rows", np.zeros(lanes.n_padded, np.int64))
+    return {"laws": table, "law_starts": _padded(chosen.astype(np.int64)) * lanes.n_log + lanes.window.start + starts}
 
 
 def squared_thresholds(thresholds: ArrayLike, n_signals: int) -> Floats:
@@ -135,6 +202,22 @@ def _windows(
             f"log's {n_log} rows."
         )
     return starts.astype(np.int64), length
+
+
+def aligned(shape: tuple[int, ...]) -> Floats:
+    """New array that starts at a multiple of a vector's size, so that none of its vectors straddles two cache lines."""
+    size = int(np.prod(shape))
+    memory = np.empty(size + LANES)
+    start = -(memory.ctypes.data // 8) % LANES
+    return memory[start : start + size].reshape(shape)
+
+
+def _flags(valid: ArrayLike, n_log: int) -> NDArray[np.bool_]:
+    """One Boolean a row."""
+    flags = np.ascontiguousarray(valid)
+    if flags.shape != (n_log,) or flags.dtype != np.bool_:
+        raise SettingsError(f"valid must be {n_log} Booleans, one a row; found {flags.shape} of {flags.dtype}.")
+    return flags
 
 
 def _array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Floats:

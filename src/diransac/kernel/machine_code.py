@@ -16,7 +16,7 @@ from diransac.errors import SettingsError
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
 
-__all__ = ["LANES", "MachineCode", "Target", "compile_function", "run_blocks"]
+__all__ = ["LANES", "MachineCode", "Target", "compile_function", "default_threads", "run_blocks"]
 
 LANES = 8
 """Lanes of a vector, on every processor: what is computed never depends on the width of the machine."""
@@ -111,6 +111,26 @@ def _optimise(module: LLVM, machine: LLVM) -> None:
     for function in module.functions:
         if not function.is_declaration:
             passes.run(function, builder)
+
+
+def default_threads() -> int:
+    """How many threads to use where nobody says: `DIRANSAC_THREADS`, one in a worker process, else all own cores.
+
+    A pool has a worker for every core already; what starts workers in other ways sets the variable for them.
+
+    Raises SettingsError: the variable is no positive whole number.
+    """
+    asked = os.environ.get("DIRANSAC_THREADS", "")
+    if asked:
+        if not asked.isdecimal() or int(asked) < 1:
+            raise SettingsError(f"DIRANSAC_THREADS is {asked!r}; give a positive whole number, or unset it.")
+        return int(asked)
+    from multiprocessing import parent_process
+
+    if parent_process() is not None:
+        return 1
+    # What the system lets this process use; not every system can tell.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: int, threads: int) -> None:

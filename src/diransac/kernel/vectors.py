@@ -17,7 +17,7 @@ from diransac.kernel.machine_code import LANES
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-__all__ = ["Cell", "Loop", "Value", "Vectors"]
+__all__ = ["Cell", "Loop", "Value", "Vectors", "integer"]
 
 Value: TypeAlias = Any
 """An LLVM value: a vector of numbers, of 64-bit integers or of conditions, or a scalar (llvmlite has no types)."""
@@ -46,6 +46,11 @@ class Loop:
 
     index: Value
     leave: Value
+
+
+def integer(value: int) -> Value:
+    """64-bit integer constant, a scalar."""
+    return ir.Constant(INTEGER, value)
 
 
 class Vectors:
@@ -184,6 +189,18 @@ class Vectors:
         mask = self.builder.bitcast(condition, ir.IntType(LANES))
         return self.builder.icmp_unsigned("!=", mask, ir.Constant(ir.IntType(LANES), 0))
 
+    def turned_towards(
+        self, values: Sequence[Value], targets: Sequence[Value], places: Sequence[int]
+    ) -> tuple[list[Value], Value]:
+        """Return the values, those at `places` with the common sign that is nearer to the targets; where it changed."""
+        dot, turned = self.number(0.0), list(values)
+        for k in places:
+            dot = self.fma(values[k], targets[k], dot)
+        opposite = self.compare("<", dot, self.number(0.0))
+        for k in places:
+            turned[k] = self.select(opposite, self.neg(values[k]), values[k])
+        return turned, opposite
+
     # Bits ----------------------------------------------------------------------------------------------------------
     def bits(self, x: Value) -> Value:
         """Return the 64 bits of each number as an integer."""
@@ -250,6 +267,10 @@ class Vectors:
         element = kind.element if isinstance(kind, ir.VectorType) else kind
         address = self.builder.gep(base, [index], source_etype=element)
         return self.builder.load(address, typ=kind, align=1 if element == BYTE else 8)
+
+    def element(self, base: Value, row: Value, width: int, column: int, kind: Value) -> Value:
+        """Load a scalar from a row of a matrix."""
+        return self.load(base, self.builder.add(self.builder.mul(row, integer(width)), integer(column)), kind)
 
     def store(self, value: Value, base: Value, index: Value) -> None:
         """Store a scalar or a vector at element `index` of an array of float64 or int64."""

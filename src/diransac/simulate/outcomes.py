@@ -1,0 +1,107 @@
+"""What rollouts give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diransac.kernel.lanes import squared_thresholds
+
+__all__ = ["Flights", "GaussNewton", "LinearizedErrors", "Scores", "inlier_mask"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How well each rollout agrees with a log.
+
+    Attributes
+    ----------
+    sum_squares : (n_lanes, n_signals)   sum over valid rows of squared errors, each signal's unit squared; infinite in
+        every signal where the rollout diverged
+    inlier_count : (n_lanes,)   valid rows in which enough signals are near; rows from a divergence on are not
+    diverged : (n_lanes,)   whether some state or acceleration became infinite or NaN
+    """
+
+    sum_squares: Floats
+    inlier_count: NDArray[np.int64]
+    diverged: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """Least-squares sums of each rollout, for a Gauss-Newton step d z = -(J' W J)^-1 J' W e in its unknowns z.
+
+    Attributes
+    ----------
+    unknowns : names of z: parameters, and states, whose initial values are meant
+    cost : (n_lanes,)   e' W e, without a factor of one half; infinite where the rollout diverged
+    gradient : (n_lanes, n_z)   J' W e; zero where it diverged
+    normal_matrix : (n_lanes, n_z, n_z)   J' W J; zero where it diverged
+    final_states : (n_lanes, n_x)   one row after the last, where the next window begins; NaN where it diverged
+    final_slopes : (n_lanes, n_x, n_z)   d(final state)/dz; NaN where it diverged
+    diverged : (n_lanes,)   whether a signal, a derivative of the final state or a sum became infinite or NaN
+    """
+
+    unknowns: tuple[str, ...]
+    cost: Floats
+    gradient: Floats
+    normal_matrix: Floats
+    final_states: Floats
+    final_slopes: Floats
+    diverged: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class LinearizedErrors:
+    """Errors of each rollout and their derivatives, row by row; NaN from a divergence on.
+
+    Attributes
+    ----------
+    unknowns : names of z, as `GaussNewton` has them
+    errors : (n_lanes, n_rows, n_s)   simulated less measured, each signal's unit
+    jacobian : (n_lanes, n_rows, n_s, n_z)   their derivatives
+    """
+
+    unknowns: tuple[str, ...]
+    errors: Floats
+    jacobian: Floats
+
+
+@dataclass(frozen=True)
+class Flights:
+    """Rollouts under feedback, row by row; NaN from a divergence on.
+
+    Attributes
+    ----------
+    signals : (n_lanes, n_rows, n_signals)   states and accelerations
+    inputs : (n_lanes, n_rows, n_u)   those that were applied from each row to the next
+    """
+
+    signals: Floats
+    inputs: Floats
+
+
+def inlier_mask(
+    errors: Floats, valid: NDArray[np.bool_], thresholds: ArrayLike, min_inlier_signals: int
+) -> NDArray[np.bool_]:
+    """Which rows `Rollouts.score` counts as inliers, from `Rollouts.errors`.
+
+    Parameters
+    ----------
+    errors : (n_lanes, n_rows, n_s)   each signal's unit
+    valid : (n_rows,) or (n_lanes, n_rows)   rows that count
+    thresholds : (n_s,)   each signal's unit
+    min_inlier_signals : near signals that make a row an inlier
+
+    Returns
+    -------
+    (n_lanes, n_rows)
+    """
+    with np.errstate(over="ignore", under="ignore"):
+        near = np.square(errors) < squared_thresholds(thresholds, errors.shape[-1])
+    diverged = np.isnan(errors).any(axis=-1)
+    return np.asarray((near.sum(axis=-1) >= min_inlier_signals) & ~diverged & valid)
