@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -29,22 +28,43 @@ Problem = tuple[Array, Array, Array, Array, Array, float, Array, int]
 SOURCE = Path(__file__).with_name("kernel_loops.c")
 FLAGS = ["-O3", "-march=native", "-fno-math-errno", "-Wno-psabi"]
 N_ROWS, N_LANES, DT, REPETITIONS = 2500, 1024, 0.01, 15
+ROTORCRAFT = [0.5, 0.003, 0.02], [4.9, 0.0]
+QUADROTOR = [1.0, 0.01, 0.012, 0.02, 0.1], [9.81, 0.0, 0.0, 0.0]
+"""Parameters, and the inputs of a trimmed flight."""
 OPERATIONS = ["sin", "tan", "tanh", "exp", "log", "atan2", "pow"]
 
 
-def quadrotor() -> SimpleNamespace:
+def quadrotor() -> dr.Model:
     """A 13-state rigid body with four inputs: `kernel_loops.c` holds the same equations."""
-    x, u, p = ca.SX.sym("x", 13), ca.SX.sym("u", 4), ca.SX.sym("p", 5)
-    q, v, w = x[3:7], x[7:10], x[10:13]
-    inertia = ca.diag(p[1:4])
-    spin = ca.vertcat(-ca.dot(q[1:], w), q[0] * w + ca.cross(q[1:], w)) / 2
-    up = ca.vertcat(
-        2 * (q[1] * q[3] + q[0] * q[2]), 2 * (q[2] * q[3] - q[0] * q[1]), 1 - 2 * (q[1] * q[1] + q[2] * q[2])
-    )
-    a = ca.vertcat((up * u[0] - p[4] * v) / p[0] - ca.DM([0, 0, 9.81]), (u[1:] - ca.cross(w, inertia @ w)) / p[1:4])
-    return SimpleNamespace(
-        name="quadrotor", dynamics=ca.Function("dynamics", [x, u, p], [ca.vertcat(v, spin, a), a]),
-        signals=tuple(f"s{k}" for k in range(19)), quaternions=((3, 4, 5, 6),), n_q=7, n_v=6, n_u=4, n_p=5,
+
+    def equations(q: Any, v: Any, a: Any, u: Any, p: Any) -> list[Any]:
+        w, x, y, z = (q[n] for n in ("qw", "qx", "qy", "qz"))
+        up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+        moved = [p.mass * a[n] - f * u.thrust + p.drag * v[n] for n, f in zip(("vx", "vy", "vz"), up, strict=True)]
+        moved[2] += p.mass * 9.81
+        turned = [
+            p.ix * a.wx - u.mx + (p.iz - p.iy) * v.wy * v.wz,
+            p.iy * a.wy - u.my + (p.ix - p.iz) * v.wz * v.wx,
+            p.iz * a.wz - u.mz + (p.iy - p.ix) * v.wx * v.wy,
+        ]
+        return [*moved, *turned]
+
+    return dr.Model(
+        "quadrotor",
+        coordinates={**dict.fromkeys(("x", "y", "z"), "m"), **dict.fromkeys(("qw", "qx", "qy", "qz"), "1")},
+        velocities={**dict.fromkeys(("vx", "vy", "vz"), "m/s"), **dict.fromkeys(("wx", "wy", "wz"), "rad/s")},
+        inputs={"thrust": "N", "mx": "N m", "my": "N m", "mz": "N m"},
+        parameters={
+            "mass": dr.Parameter("kg", positive=True),
+            **{n: dr.Parameter("kg m^2", positive=True) for n in ("ix", "iy", "iz")},
+            "drag": dr.Parameter("N s/m"),
+        },
+        equations=equations,
+        kinematics=lambda q, v: [
+            v.vx, v.vy, v.vz,
+            -(q.qx * v.wx + q.qy * v.wy + q.qz * v.wz) / 2, (q.qw * v.wx + q.qy * v.wz - q.qz * v.wy) / 2,
+            (q.qw * v.wy + q.qz * v.wx - q.qx * v.wz) / 2, (q.qw * v.wz + q.qx * v.wy - q.qy * v.wx) / 2,
+        ],
     )  # fmt: skip
 
 
@@ -151,41 +171,55 @@ def compare_with_c(loops: CLoops, name: str, model: Any, parameters: Sequence[fl
 
 def compare_lengths(model: Any) -> None:
     """A log ten times as long."""
-    problems = {n: problem_of(model, [0.5, 0.003, 0.02], [4.9, 0.0], n) for n in (N_ROWS, 10 * N_ROWS)}
+    problems = {n: problem_of(model, *ROTORCRAFT, n) for n in (N_ROWS, 10 * N_ROWS)}
     engine = rollouts(model)
     found = medians({str(n): partial(engine.score, *problem) for n, problem in problems.items()})
     short, long = found.values()
     show("rotorcraft: 25,000 rows over 2,500", long, short)
 
 
-def operation(name: str, x: ca.SX) -> ca.SX:
+def operation(name: str, q: Any, v: Any) -> Any:
     """One more operation on an oscillator's state."""
     if name == "atan2":
-        return ca.atan2(x[0], x[1])
-    size = x[0] * x[0] + 1
+        return ca.atan2(q, v)
+    size = q * q + 1
     return size**1.3 if name == "pow" else getattr(ca, name)(size)
+
+
+def oscillator(name: str) -> dr.Model:
+    """An oscillator with one more operation in its acceleration, or with nothing."""
+
+    def equations(q: Any, v: Any, a: Any, u: Any, p: Any) -> list[Any]:
+        extra = 0.0 if name == "nothing" else 0.01 * operation(name, q.q, v.q)
+        return [a.q - u.force + p.stiffness * q.q + p.damping * v.q - extra]
+
+    parameters = {"stiffness": dr.Parameter("1/s^2"), "damping": dr.Parameter("1/s")}
+    return dr.Model("oscillator", {"q": "m"}, {"force": "N/kg"}, parameters, equations)
 
 
 def compare_operations() -> None:
     """One more operation in an oscillator's acceleration, over the oscillator alone."""
-    x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("p", 2)
-
-    def oscillator(extra: ca.SX) -> SimpleNamespace:
-        a = u - p[0] * x[0] - p[1] * x[1] + extra
-        return SimpleNamespace(
-            name="oscillator", dynamics=ca.Function("dynamics", [x, u, p], [ca.vertcat(x[1], a), a]),
-            signals=("q", "v", "a"), quaternions=(), n_q=1, n_v=1, n_u=1, n_p=2,
-        )  # fmt: skip
-
-    extras = {"nothing": ca.SX(0)}
-    for name in OPERATIONS:
-        extras[name] = 0.01 * operation(name, x)
-    models = {name: oscillator(extra) for name, extra in extras.items()}
+    models = {name: oscillator(name) for name in ("nothing", *OPERATIONS)}
     problem = problem_of(models["nothing"], [4.0, 0.1], [0.0])
     found = medians({name: partial(rollouts(model).score, *problem) for name, model in models.items()})
     show("oscillator", found["nothing"])
     for name in OPERATIONS:
         show(f"oscillator with {name}", found[name], found["nothing"])
+
+
+def compare_sensitivities(model: dr.Model, parameters: Sequence[float], trim: Sequence[float]) -> None:
+    """Gauss-Newton sums over scores: the price of derivatives in rollouts."""
+    problem = problem_of(model, parameters, trim)
+    engine, weights = rollouts(model), np.ones(len(model.signals))
+    choices = {"parameters": tuple(model.parameters), "initial states": model.state, "both": None}
+    calls: dict[str, Call] = {"score": partial(engine.score, *problem)}
+    for name, unknowns in choices.items():
+        calls[name] = partial(engine.gauss_newton, *problem[:6], weights, unknowns=unknowns)
+    compiled = {name: timed(call) for name, call in calls.items()}
+    found = medians(calls)
+    for name in choices:
+        note = f"compiled in {1e3 * (compiled[name] - found[name]):.0f} ms"
+        show(f"{model.name}: Gauss-Newton sums, {name}", found[name], found["score"], note)
 
 
 def main() -> None:
@@ -194,9 +228,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         loops = CLoops(folder)
         rotorcraft = dr.models.planar_rotorcraft()
-        compare_with_c(loops, "rotorcraft", rotorcraft, [0.5, 0.003, 0.02], [4.9, 0.0])
-        compare_with_c(loops, "quadrotor", quadrotor(), [1.0, 0.01, 0.012, 0.02, 0.1], [9.81, 0.0, 0.0, 0.0])
+        compare_with_c(loops, "rotorcraft", rotorcraft, *ROTORCRAFT)
+        compare_with_c(loops, "quadrotor", quadrotor(), *QUADROTOR)
     compare_lengths(rotorcraft)
+    compare_sensitivities(rotorcraft, *ROTORCRAFT)
+    compare_sensitivities(quadrotor(), *QUADROTOR)
     compare_operations()
 
 
