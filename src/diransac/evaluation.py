@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,7 @@ import numpy.typing as npt
 
 from diransac.consensus import Score, Variant
 from diransac.errors import LogError, SettingsError
-from diransac.simulate import inlier_mask, rollouts
+from diransac.simulate import default_threads, inlier_mask, rollouts
 
 if TYPE_CHECKING:
     from diransac.log import Log
@@ -109,7 +108,7 @@ class Simulation:
             observations.valid,
             observations.log.dt,
         )
-        self._threads = settings.threads or len(os.sched_getaffinity(0))
+        self._threads = settings.threads or default_threads()
 
     def admits(self, parameters: FloatArray) -> BoolArray:
         """Preliminary test of ``(n, n_p)`` parameters: every one within its bounds."""
