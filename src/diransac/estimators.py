@@ -162,7 +162,12 @@ class _BoundSums:
 
     def _gram(self, row_sets: Sequence[IntArray]) -> FloatArray:
         """Sums ``(n_sets, n_p + 1, n_p + 1)``, each in the order of its rows."""
-        sums = np.array([np.add.reduce(self._blocks[rows], axis=0) for rows in row_sets])
+        sums = np.empty((len(row_sets), self._blocks.shape[1]))
+        lengths = np.array([len(rows) for rows in row_sets])
+        for length in np.unique(lengths):
+            (alike,) = np.nonzero(lengths == length)
+            rows = np.stack([row_sets[i] for i in alike], axis=1)
+            sums[alike] = np.add.reduce(np.take(self._blocks, rows, axis=0), axis=0)
         gram = np.empty((len(row_sets), self._n_p + 1, self._n_p + 1))
         i, j = self._upper
         gram[:, i, j] = gram[:, j, i] = sums

@@ -61,12 +61,20 @@ def _feistel(values: _Words, round_keys: Sequence[_Words], half: np.uint64) -> _
     low = np.uint64((1 << int(half)) - 1)
     left, right = values >> half, values & low
     for key in round_keys:
-        left, right = right, left ^ (_mix(right + key) & low)
-    return (left << half) | right
+        mixed = _mix(right + key)
+        mixed &= low
+        left ^= mixed
+        left, right = right, left
+    left <<= half
+    left |= right
+    return left
 
 
 def _mix(x: _Words) -> _Words:
-    """SplitMix64's finalizer, a bijection of 64-bit words."""
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))
+    """SplitMix64's finalizer, a bijection of 64-bit words, in place of its argument: copies take half the time."""
+    shifted = np.empty_like(x)
+    for places, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        x ^= np.right_shift(x, np.uint64(places), out=shifted)
+        x *= np.uint64(factor)
+    x ^= np.right_shift(x, np.uint64(31), out=shifted)
+    return x

@@ -176,10 +176,10 @@ def _replay(
         if hypothesis is None:
             outcome.skipped["out of bounds"] += 1
             return
-        used.add(np.sort(hypothesis.rows).tobytes())
         stored = _judge(hypothesis, outcome, variant)
         if stored is None or settings.refit == "none" or not variant.refits(stored=stored):
             return
+        used.add(np.sort(hypothesis.rows).tobytes())
         inliers = evaluator.inliers(hypothesis.parameters)
         if inliers.tobytes() in used or not estimator.well_defined([inliers])[0]:
             return
