@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["Scores", "Validation", "validate"]
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 _NICE = (1.0, 2.0, 5.0)
 
@@ -121,7 +121,7 @@ def validate(
     Parameters
     ----------
     horizon : s; the simulation restarts from the measured state after each.  None: two that suit the log's length.  The
-        whole log from its first row is always scored, too
+        whole log from its first complete state on is always scored, too
     integrator, substeps : as in `Settings`
 
     The first row of a window, where the state is the measured one, is not scored.
@@ -130,28 +130,38 @@ def validate(
     observations = observe(plant.model, log, pointwise=False)
     parameters = plant.model.parameter_vector(plant.parameters)
     engine = rollouts(plant.model, observations.signals, integrator=integrator, substeps=substeps)
-    span = (len(observations) - 1) * log.dt
-    if horizon is not None and not log.dt <= horizon:
+    states = _states(observations)
+    n_steps = len(states) - 1 - int(np.argmax(_complete(states)))
+    if horizon is not None and not horizon > 0.5 * log.dt:
         raise SettingsError(f"horizon is {horizon} s; give at least one sample, {log.dt:g} s")
+    span = n_steps * log.dt
     wanted = [horizon] if horizon is not None else sorted({_nice(span / 50.0), _nice(span / 10.0)})
-    lengths = [round(h / log.dt) for h in wanted if round(h / log.dt) >= 1 and h < span]
-    scores = [_score(engine, observations, parameters, n * log.dt, n) for n in lengths]
-    scores.append(_score(engine, observations, parameters, np.inf, len(observations) - 1))
+    lengths = [round(h / log.dt) for h in wanted if h < span and round(h / log.dt) >= 1]
+    scores = [_score(engine, observations, states, parameters, n * log.dt, n) for n in lengths]
+    scores.append(_score(engine, observations, states, parameters, np.inf, n_steps))
     asked = 0 if horizon is not None else len(scores) - 1
     units = {n: plant.model.units[n] for n in observations.signals}
     return Validation(log.source, units, tuple(scores), asked, observations.notes)
 
 
-def _score(engine: Rollouts, observations: Observations, parameters: FloatArray, horizon: float, steps: int) -> Scores:
-    """Scores of windows of so many steps, one after another."""
-    starts, states = _starts(observations, steps)
-    valid = observations.valid
+def _score(
+    engine: Rollouts,
+    observations: Observations,
+    states: FloatArray,
+    parameters: FloatArray,
+    horizon: float,
+    steps: int,
+) -> Scores:
+    """Scores of windows of so many steps, one after another; one that starts at an incomplete state is left out."""
+    complete = _complete(states)
+    starts = np.arange(int(np.argmax(complete)), len(states) - steps, steps)
+    starts = starts[complete[starts]]
     errors = engine.errors(
         np.tile(parameters, (len(starts), 1)),
-        states,
+        states[starts],
         observations.inputs,
         np.nan_to_num(observations.measured),
-        np.ones_like(valid),
+        np.ones_like(observations.valid),
         observations.log.dt,
         start_rows=starts,
         n_rows=steps + 1,
@@ -160,7 +170,9 @@ def _score(engine: Rollouts, observations: Observations, parameters: FloatArray,
     measured = observations.measured[rows]
     present = np.isfinite(measured)
     diverged = (~np.isfinite(errors) & present).any(axis=(1, 2))
-    squared = np.where(present, np.where(np.isfinite(errors), np.square(errors), np.inf), 0.0).sum(axis=(0, 1))
+    with np.errstate(over="ignore"):
+        squares = np.where(np.isfinite(errors), np.square(errors), np.inf)
+        squared = np.where(present, squares, 0.0).sum(axis=(0, 1))
     count = present.sum(axis=(0, 1))
     mean = np.where(present, measured, 0.0).sum(axis=(0, 1)) / np.maximum(count, 1)
     spread = np.where(present, np.square(measured - mean), 0.0).sum(axis=(0, 1))
@@ -173,25 +185,24 @@ def _score(engine: Rollouts, observations: Observations, parameters: FloatArray,
     return Scores(horizon, len(starts), int(diverged.sum()), *by_name)
 
 
-def _starts(observations: Observations, steps: int) -> tuple[IntArray, FloatArray]:
-    """Rows at which windows start, and the measured states there; a window whose state is incomplete is left out.
+def _states(observations: Observations) -> FloatArray:
+    """The measured state ``(N, n_x)`` at every row, NaN where it is incomplete; 0 where nothing measured depends on it.
 
-    Raises LogError: no window is left.
+    Raises LogError: no row has a complete state.
     """
     model = observations.model
-    base = observations.initial_state("first")
-    starts = np.arange(0, len(observations) - steps, steps)
-    states = np.tile(base, (len(starts), 1))
+    states = np.tile(observations.initial_state("first"), (len(observations), 1))
+    matter = model.states_behind(observations.signals)
     for i, name in enumerate(model.state):
-        if name in observations.signals:
-            states[:, i] = observations.column(name)[starts]
-    matter = [i for i, n in enumerate(model.state) if n in model.states_behind(observations.signals)]
-    whole = np.isfinite(states[:, matter]).all(axis=1)
-    if not whole.any():
-        raise LogError(
-            f"{observations.log.source}: no window of {steps} steps starts at a complete state; found NaN in each"
-        )
-    return starts[whole], np.nan_to_num(states[whole])
+        if name in observations.signals and name in matter:
+            states[:, i] = observations.column(name)
+    if not _complete(states)[:-1].any():
+        raise LogError(f"{observations.log.source}: no row has a complete state ({', '.join(matter)}) to start from")
+    return states
+
+
+def _complete(states: FloatArray) -> BoolArray:
+    return np.asarray(np.isfinite(states).all(axis=1))
 
 
 def _nice(seconds: float) -> float:

@@ -1,0 +1,192 @@
+"""Open-loop prediction of a held-out log, recomputed by a plain Runge-Kutta loop."""
+
+import json
+
+import numpy as np
+import pytest
+
+import diransac as dr
+from diransac.errors import LogError, SettingsError
+from diransac.models import builtin
+from simulated import MACHINES, as_log, flight, rollout
+
+PLANE, VEHICLE = MACHINES["planar-rotorcraft"], MACHINES["underwater-vehicle"]
+TRUE = dr.Plant(builtin("planar-rotorcraft"), PLANE.truth)
+WRONG = dr.Plant(builtin("planar-rotorcraft"), {"mass": 0.26, "inertia": 0.0039, "drag": 0.03})
+N, DT = 300, 0.01
+
+
+def noisy_flight(noise=0.01, seed=0):
+    signals, inputs = flight(PLANE, N, DT)
+    return signals + noise * np.random.default_rng(seed).normal(size=signals.shape), inputs
+
+
+def by_hand(plant, signals, inputs, steps, starts):
+    """RMSE, fit and R^2 of every signal over windows from the measured state, without their first rows."""
+    p = list(plant.parameters.values())
+    pairs = [
+        (rollout(PLANE, p, signals[row, :6], inputs[row : row + steps + 1], DT)[1:], signals[row + 1 : row + steps + 1])
+        for row in starts
+    ]
+    predicted, measured = (np.concatenate(x) for x in zip(*pairs, strict=True))
+    used = np.isfinite(measured)
+    rmse, fit, r_squared = [], [], []
+    for i in range(measured.shape[1]):
+        y, error = measured[used[:, i], i], (predicted - measured)[used[:, i], i]
+        ratio = np.sum(error**2) / np.sum((y - y.mean()) ** 2)
+        rmse.append(np.sqrt(np.mean(error**2)))
+        fit.append(100.0 * (1.0 - np.sqrt(ratio)))
+        r_squared.append(1.0 - ratio)
+    return rmse, fit, r_squared
+
+
+def assert_scores(scores, expected):
+    for found, wanted in zip((scores.rmse, scores.fit_percent, scores.r_squared), expected, strict=True):
+        assert list(found) == list(PLANE.signals)
+        assert list(found.values()) == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+
+
+def test_true_plant_predicts_a_clean_flight_exactly():
+    validation = dr.validate(TRUE, as_log(PLANE, *flight(PLANE, N, DT), DT))
+    for scores in validation.horizons:
+        assert max(scores.rmse.values()) < 1e-11
+        assert min(scores.fit_percent.values()) == pytest.approx(100.0)
+        assert min(scores.r_squared.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("plant", [TRUE, WRONG], ids=["true", "wrong"])
+def test_scores_are_those_of_windows_that_start_at_the_measured_state(plant):
+    signals, inputs = noisy_flight()
+    validation = dr.validate(plant, as_log(PLANE, signals, inputs, DT), horizon=0.25)
+    windows, whole = validation.horizons
+    assert (windows.horizon, windows.windows) == (pytest.approx(0.25), 11)
+    assert_scores(windows, by_hand(plant, signals, inputs, 25, range(0, N - 25, 25)))
+    assert (whole.horizon, whole.windows) == (np.inf, 1)
+    assert_scores(whole, by_hand(plant, signals, inputs, N - 1, [0]))
+
+
+def test_asked_horizon_is_the_one_on_top():
+    validation = dr.validate(WRONG, as_log(PLANE, *noisy_flight(), DT), horizon=0.25)
+    assert validation.rmse == validation.horizons[0].rmse
+    assert validation.fit_percent == validation.horizons[0].fit_percent
+    assert validation.r_squared == validation.horizons[0].r_squared
+
+
+def test_without_a_horizon_two_that_suit_the_log_are_scored_and_the_whole_log_is_on_top():
+    validation = dr.validate(WRONG, as_log(PLANE, *noisy_flight(), DT))
+    assert [scores.horizon for scores in validation.horizons] == pytest.approx([0.05, 0.2, np.inf])
+    assert validation.rmse == validation.horizons[-1].rmse
+
+
+def test_horizon_of_one_sample_is_one_step():
+    signals, inputs = noisy_flight()
+    log = as_log(PLANE, signals, inputs, DT)
+    for horizon in (DT, log.dt, np.nextafter(DT, 0.0)):
+        scores = dr.validate(TRUE, log, horizon=horizon).horizons[0]
+        assert_scores(scores, by_hand(TRUE, signals, inputs, 1, range(N - 1)))
+
+
+@pytest.mark.parametrize("horizon", [0.0, -1.0, 0.001, float("nan")])
+def test_horizon_shorter_than_a_sample_is_refused(horizon):
+    with pytest.raises(SettingsError, match="horizon"):
+        dr.validate(TRUE, as_log(PLANE, *noisy_flight(), DT), horizon=horizon)
+
+
+def test_horizon_longer_than_the_log_is_the_whole_log():
+    validation = dr.validate(TRUE, as_log(PLANE, *noisy_flight(), DT), horizon=1e6)
+    assert [scores.horizon for scores in validation.horizons] == [np.inf]
+
+
+# ---------------------------------------------------------------------- logs with less
+
+
+def test_missing_samples_are_not_scored_and_windows_that_start_at_one_are_left_out():
+    signals, inputs = noisy_flight()
+    signals[[30, 31], 8] = np.nan  # an acceleration: not scored there
+    signals[50, 3] = np.nan  # a velocity at the start of the third window
+    scores = dr.validate(WRONG, as_log(PLANE, signals, inputs, DT), horizon=0.25).horizons[0]
+    starts = [row for row in range(0, N - 25, 25) if row != 50]
+    assert scores.windows == len(starts)
+    assert_scores(scores, by_hand(WRONG, signals, inputs, 25, starts))
+
+
+def test_log_is_scored_from_its_first_complete_state_on():
+    signals, inputs = noisy_flight()
+    signals[:4, 5] = np.nan
+    windows, whole = dr.validate(WRONG, as_log(PLANE, signals, inputs, DT), horizon=0.25).horizons
+    assert_scores(windows, by_hand(WRONG, signals, inputs, 25, range(4, N - 25, 25)))
+    assert_scores(whole, by_hand(WRONG, signals, inputs, N - 5, [4]))
+
+
+def test_signals_that_the_log_lacks_are_not_scored():
+    log = as_log(PLANE, *noisy_flight(), DT)
+    columns = {n: log[n] for n in log.names if not n.endswith("ddot") and n != "x"}
+    validation = dr.validate(TRUE, dr.Log.from_arrays(log.time, columns))
+    assert list(validation.rmse) == ["z", "theta", "x_dot", "z_dot", "theta_dot"]
+
+
+@pytest.mark.parametrize(("missing", "says"), [("thrust", '"thrust" is missing'), ("theta_dot", '"theta_dot"')])
+def test_log_that_cannot_be_simulated_is_refused_by_name(missing, says):
+    log = as_log(PLANE, *noisy_flight(), DT)
+    columns = {n: log[n] for n in log.names if n != missing}
+    with pytest.raises(LogError, match=says):
+        dr.validate(TRUE, dr.Log.from_arrays(log.time, columns))
+
+
+def test_log_without_one_complete_state_is_refused():
+    signals, inputs = noisy_flight()
+    signals[:-1:2, 4], signals[1:-1:2, 5] = np.nan, np.nan  # the last row, whole, starts nothing
+    with pytest.raises(LogError, match="complete state"):
+        dr.validate(TRUE, as_log(PLANE, signals, inputs, DT))
+
+
+def test_divergence_is_counted_and_infinitely_bad():
+    signals, inputs = flight(VEHICLE, 200, 0.1)
+    plant = dr.Plant(
+        builtin("underwater-vehicle"), {"mass": 0.1, "linear_drag": 50.0, "quadratic_drag": 500.0, "bias": 0.0}
+    )
+    validation = dr.validate(plant, as_log(VEHICLE, signals, inputs, 0.1))
+    assert validation.horizons[-1].diverged == 1
+    assert validation.rmse["x_dot"] == np.inf
+    assert validation.to_dict()["rmse"]["x_dot"] is None
+
+
+def test_prediction_whose_square_overflows_is_infinitely_bad():
+    signals, inputs = flight(VEHICLE, 20, 0.1)
+    plant = dr.Plant(
+        builtin("underwater-vehicle"), {"mass": 1e-180, "linear_drag": 0.0, "quadratic_drag": 0.0, "bias": 0.0}
+    )
+    assert dr.validate(plant, as_log(VEHICLE, signals, inputs, 0.1)).rmse["x_ddot"] == np.inf
+
+
+def test_signal_that_never_changes_has_no_fit():
+
+    still = np.zeros((N, 9))
+    still[:, 1] = 1.0
+    hover = np.column_stack([np.full(N, 0.249 * 9.81), np.zeros(N)])
+    validation = dr.validate(TRUE, as_log(PLANE, still, hover, DT))
+    data = validation.to_dict()
+    assert data["rmse"]["x"] == 0.0
+    assert data["r_squared"]["x"] is None
+    assert "nan" in str(validation)
+
+
+# ---------------------------------------------------------------------- what is shown
+
+
+def test_result_serves_as_a_plant():
+    log = as_log(PLANE, *noisy_flight(), DT)
+    result = dr.identify(TRUE.model, log, "ols")
+    plant = dr.Plant(result.model, result.parameters)
+    assert dr.validate(result, log).to_dict() == dr.validate(plant, log).to_dict()
+
+
+def test_validation_is_ready_for_json_and_prints_every_signal_with_its_unit():
+    validation = dr.validate(WRONG, as_log(PLANE, *noisy_flight(), DT), horizon=0.25)
+    data = json.loads(json.dumps(validation.to_dict(), allow_nan=False))
+    assert data["rmse"] == validation.rmse
+    assert [row["windows"] for row in data["horizons"]] == [11, 1]
+    lines = str(validation).splitlines()
+    assert "RMSE 0.25 s" in lines[0]
+    assert "RMSE whole log" in lines[0]
+    assert [line.split()[:2] for line in lines[1:4]] == [["x", "m"], ["z", "m"], ["theta", "rad"]]
