@@ -234,8 +234,7 @@ class Rollouts:
         weighted = arranged_weights(lanes, len(self.signals), measured, valid, weights)
         values = {**weighted, **_augmented(lanes, sensitivities), "sums": sums, "final": final}
         self._run(kept.Sums, lanes, dt, values, threads, unknowns=names)
-        sums, final = (array.swapaxes(1, 2).reshape(lanes.n_padded, -1)[: lanes.n_lanes] for array in (sums, final))
-        return self._gauss_newton(sensitivities, sums, final)
+        return self._gauss_newton(sensitivities, _by_lane(lanes, sums), _by_lane(lanes, final))
 
     def _gauss_newton(self, sensitivities: Sensitivities, sums: Floats, final: Floats) -> GaussNewton:
         """Sums (n_lanes, n_sums) and final states (n_lanes, n_states) by their names."""
@@ -389,3 +388,8 @@ def _augmented(lanes: Lanes, sensitivities: Sensitivities) -> dict[str, Floats]:
     states = lanes.arrays["initial_states"]
     slopes = np.repeat(sensitivities.initial_values[:, None], states.shape[1], axis=1)
     return {"initial_states": np.concatenate([states, slopes])}
+
+
+def _by_lane(lanes: Lanes, blocks: Floats) -> Floats:
+    """What each lane has, (n_lanes, width), from what is stored block by block, (n_blocks, width, 8)."""
+    return blocks.swapaxes(1, 2).reshape(lanes.n_padded, blocks.shape[1])[: lanes.n_lanes]
