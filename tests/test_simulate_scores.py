@@ -22,6 +22,7 @@ def test_scores_are_those_of_the_errors(signals):
     np.testing.assert_array_equal(scores.sum_squares, np.cumsum(counted**2, axis=1)[:, -1])
     mask = inlier_mask(errors, task.valid, np.full(len(engine.signals), 0.4), 2)
     np.testing.assert_array_equal(scores.inlier_count, mask.sum(axis=1))
+    np.testing.assert_array_equal([scores.inliers(lane) for lane in range(len(mask))], mask)
     assert 0 < mask.mean() < 0.9
     assert not scores.diverged.any()
 

@@ -165,7 +165,7 @@ class _BoundSums:
         sums = np.empty((len(row_sets), self._blocks.shape[1]))
         lengths = np.array([len(rows) for rows in row_sets])
         for length in np.unique(lengths):
-            (alike,) = np.nonzero(lengths == length)
+            alike = np.flatnonzero(lengths == length).tolist()
             rows = np.stack([row_sets[i] for i in alike], axis=1)
             sums[alike] = np.add.reduce(np.take(self._blocks, rows, axis=0), axis=0)
         gram = np.empty((len(row_sets), self._n_p + 1, self._n_p + 1))

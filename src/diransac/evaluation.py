@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from diransac.consensus import Score, Variant
 from diransac.errors import LogError, SettingsError
-from diransac.simulate import default_threads, inlier_mask, rollouts
+from diransac.simulate import Scores, default_threads, rollouts
 
 if TYPE_CHECKING:
     from diransac.log import Log
@@ -109,6 +109,7 @@ class Simulation:
             observations.log.dt,
         )
         self._threads = settings.threads or default_threads()
+        self._latest: dict[bytes, tuple[Scores, int]] = {}
 
     def admits(self, parameters: FloatArray) -> BoolArray:
         """Preliminary test of ``(n, n_p)`` parameters: every one within its bounds."""
@@ -120,15 +121,21 @@ class Simulation:
         found = self._rollouts.score(
             parameters, *self._log_arrays, self._thresholds, self._scoring.min_inlier_signals, threads=self._threads
         )
+        self._latest = {p.tobytes(): (found, lane) for lane, p in enumerate(parameters)}
         n_rows = self._observations.n_rows
         errors = self._variant.errors(found.sum_squares, n_rows, self._weights)
         fractions = found.inlier_count / n_rows
         return [Score(e, f) for e, f in zip(errors.tolist(), fractions.tolist(), strict=True)]
 
     def inlier_mask(self, parameters: FloatArray) -> BoolArray:
-        """Inliers ``(N,)`` of one hypothesis over all rows; a row that does not count is none (section III.D)."""
-        errors = self._rollouts.errors(parameters[None], *self._log_arrays)[0]
-        return inlier_mask(errors, self._observations.valid, self._thresholds, self._scoring.min_inlier_signals)
+        """Inliers ``(N,)`` of one hypothesis over all rows; a row that does not count is none (section III.D).
+
+        The latest `scores` found those of its hypotheses on the way; any other is simulated.
+        """
+        if parameters.tobytes() not in self._latest:
+            self.scores(parameters[None])
+        found, lane = self._latest[parameters.tobytes()]
+        return found.inliers(lane)
 
     def inliers(self, parameters: FloatArray) -> IntArray:
         """Usable rows that are inliers of one hypothesis ``(n_p,)``, ascending."""

@@ -46,7 +46,10 @@ class _Kept:
 
 # Sums ----------------------------------------------------------------------------------------------------------------
 class Scores(_Kept):
-    """`sums` (n_s, n_padded) of squared errors, and `counts` (2, n_padded): inliers, and 1 where the lane diverged."""
+    """`sums` (n_s, n_padded) of squared errors, and `counts` (2, n_padded): inliers, and 1 where the lane diverged.
+
+    `inlier_bits` (n_blocks, n_rows) has a bit for every inlier, up to the row at which all lanes have diverged.
+    """
 
     ends_early = True
 
@@ -60,6 +63,8 @@ class Scores(_Kept):
         for cell in self.sums:
             self.v.set(cell, self.v.number(0.0))
         self.v.set(self.inliers, self.v.integer(0))
+        builder = self.loop.builder
+        self.first_bits = builder.mul(builder.udiv(block.first, integer(LANES)), self.arguments["n_rows"])
 
     def row(self, block: Block, row: Row) -> None:
         """Add a row's squared errors to the sums, and the row to the inliers if it is one."""
@@ -76,6 +81,7 @@ class Scores(_Kept):
         enough = self.loop.builder.icmp_signed(">=", n_inside, v.splat(self.arguments["min_inlier_signals"]))
         inlier = v.both(v.both(enough, valid), row.alive)
         v.set(self.inliers, v.count(v.get(self.inliers), inlier))
+        v.store_bits(inlier, self.arguments["inlier_bits"], self.loop.builder.add(self.first_bits, row.index))
 
     def end(self, block: Block) -> None:
         """Write a block's sums and counts; where a lane diverged, its sums are infinite."""

@@ -35,8 +35,9 @@ ARGUMENTS = {
     "weights": "pointer",  # (n_log, n_s) float64
     "squared_thresholds": "pointer",  # (n_s,) float64
     "start_rows": "pointer",  # (n_padded,) int64, read where lanes have windows of their own
-    "sums": "pointer",  # float64, written by what is kept; so are the next three
+    "sums": "pointer",  # float64, written by what is kept; so are the next four
     "counts": "pointer",  # (2, n_padded) int64
+    "inlier_bits": "pointer",  # (n_blocks, n_rows) bytes, a bit a lane
     "series": "pointer",  # (n_lanes, n_rows, width) float64
     "final": "pointer",  # (n_blocks, n_states, 8) float64
     "step": "number",  # seconds, of one sub-step

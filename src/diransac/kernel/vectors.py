@@ -26,6 +26,7 @@ DOUBLE = ir.DoubleType()
 INTEGER = ir.IntType(64)
 BIT = ir.IntType(1)
 BYTE = ir.IntType(8)
+BITS = ir.IntType(LANES)
 POINTER = ir.PointerType()
 NUMBERS = ir.VectorType(DOUBLE, LANES)
 INTEGERS = ir.VectorType(INTEGER, LANES)
@@ -186,8 +187,7 @@ class Vectors:
 
     def any_lane(self, condition: Value) -> Value:
         """Return one bit: whether the condition holds in some lane."""
-        mask = self.builder.bitcast(condition, ir.IntType(LANES))
-        return self.builder.icmp_unsigned("!=", mask, ir.Constant(ir.IntType(LANES), 0))
+        return self.builder.icmp_unsigned("!=", self.builder.bitcast(condition, BITS), ir.Constant(BITS, 0))
 
     def turned_towards(
         self, values: Sequence[Value], targets: Sequence[Value], places: Sequence[int]
@@ -276,6 +276,10 @@ class Vectors:
         """Store a scalar or a vector at element `index` of an array of float64 or int64."""
         address = self.builder.gep(base, [index], source_etype=INTEGER)
         self.builder.store(value, address, align=8)
+
+    def store_bits(self, condition: Value, base: Value, index: Value) -> None:
+        """Store a condition at element `index` of an array of bytes, the first lane in the lowest bit."""
+        self.builder.store(self.builder.bitcast(condition, BITS), self.builder.gep(base, [index], source_etype=BITS))
 
     # Control -------------------------------------------------------------------------------------------------------
     def cell(self, value: Value) -> Cell:

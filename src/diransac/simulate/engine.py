@@ -128,7 +128,7 @@ class Rollouts:
         n_rows: int | None = None,
         threads: int = 1,
     ) -> Scores:
-        """Sums of squared errors and inlier counts of every lane; nothing is stored row by row.
+        """Sums of squared errors and inliers of every lane; row by row, one bit of each is stored.
 
         The squares are added row after row, so `errors` reproduces the sums exactly.
 
@@ -142,16 +142,18 @@ class Rollouts:
         n_signals = len(self.signals)
         lanes = self._lanes(parameters, initial_states, inputs, start_rows, n_rows)
         sums, counts = np.empty((n_signals, lanes.n_padded)), np.empty((2, lanes.n_padded), np.int64)
+        bits = np.zeros((lanes.n_padded // LANES, lanes.n_rows), np.uint8)
         values = {
             **arranged_measurements(lanes, n_signals, measured, valid),
             "squared_thresholds": squared_thresholds(thresholds, n_signals),
             "min_inlier_signals": int(min_inlier_signals),
             "sums": sums,
             "counts": counts,
+            "inlier_bits": bits,
         }
         self._run(kept.Scores, lanes, dt, values, threads)
         n = lanes.n_lanes
-        return Scores(sums[:, :n].T.copy(), counts[0, :n].copy(), counts[1, :n] != 0)
+        return Scores(sums[:, :n].T.copy(), counts[0, :n].copy(), counts[1, :n] != 0, bits)
 
     def errors(
         self,

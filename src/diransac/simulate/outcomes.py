@@ -24,11 +24,18 @@ class Scores:
         every signal where the rollout diverged
     inlier_count : (n_lanes,)   valid rows in which enough signals are near; rows from a divergence on are not
     diverged : (n_lanes,)   whether some state or acceleration became infinite or NaN
+    inlier_bits : (n_lanes / 8, n_rows)   which rows those are, a bit a lane; `inliers` reads them
     """
 
     sum_squares: Floats
     inlier_count: NDArray[np.int64]
     diverged: NDArray[np.bool_]
+    inlier_bits: NDArray[np.uint8]
+
+    def inliers(self, lane: int) -> NDArray[np.bool_]:
+        """Which rows ``(n_rows,)`` are inliers of one lane."""
+        block, place = divmod(lane, 8)
+        return np.asarray(self.inlier_bits[block] & (1 << place) != 0)
 
 
 @dataclass(frozen=True)
