@@ -43,6 +43,19 @@ def test_a_step_is_the_one_of_casadis_integrator():
     np.testing.assert_allclose(found[1, :7], normalised(BODY, expected), rtol=1e-13)
 
 
+@pytest.mark.parametrize("model", [ROTORCRAFT, PENDULUM, BODY], ids=lambda model: model.name)
+def test_fine_steps_agree_with_casadis_cvodes_a_segment_per_row(model):
+    n_x, n_u = len(model.state), model.n_u
+    x, u, p = (ca.SX.sym(name, n) for name, n in (("x", n_x), ("u", n_u), ("p", model.n_p)))
+    problem = {"x": x, "p": ca.vertcat(u, p), "ode": model.dynamics(x, u, p)[0]}
+    segment = ca.integrator("segment", "cvodes", problem, 0, 0.01, {"abstol": 1e-12, "reltol": 1e-12})
+    task = log_of(model, 30)
+    held = np.vstack([task.inputs.T, np.repeat(task.parameters[0][:, None], 30, axis=1)])
+    path = segment.mapaccum(30)(x0=task.states, p=held)["xf"]
+    (found,) = rollouts(model, substeps=20).trajectories(task.parameters[:1], task.states, task.inputs, task.dt)
+    np.testing.assert_allclose(found[1:, :n_x], np.array(path).T[:-1], rtol=0, atol=1e-8)
+
+
 @pytest.mark.parametrize(("integrator", "order"), INTEGRATORS.items())
 def test_integrators_converge_at_their_order(integrator, order):
     task = log_of(BODY, 40)

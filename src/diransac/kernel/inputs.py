@@ -9,17 +9,12 @@ from diransac.kernel.vectors import DOUBLE, Value, integer
 if TYPE_CHECKING:
     from diransac.kernel.time_loop import Block, TimeLoop
 
-__all__ = ["fed_back", "fed_back_alike", "held", "law_width"]
+__all__ = ["fed_back", "fed_back_alike", "held"]
 
 
 def held(loop: TimeLoop, block: Block, row: Value) -> list[Value]:
     """Emit the log's inputs at a row."""
     return loop.logged("inputs", loop.plan.n_inputs, block, row)
-
-
-def law_width(n_inputs: int, n_states: int) -> int:
-    """Numbers a row of a law: u_ref, x_ref, and the gains row by row."""
-    return n_inputs + n_states + n_inputs * n_states
 
 
 def fed_back(loop: TimeLoop, block: Block, row: Value) -> list[Value]:
@@ -34,8 +29,9 @@ def fed_back_alike(loop: TimeLoop, _block: Block, row: Value) -> list[Value]:
 
 
 def _columns(loop: TimeLoop, rows: list[Value]) -> list[list[Value]]:
-    """Numbers of the laws' rows, column by column."""
-    width = law_width(loop.plan.n_inputs, loop.plan.n_states)
+    """Numbers of the laws' rows, column by column: u_ref, x_ref, and the gains row by row."""
+    n_u, n_x = loop.plan.n_inputs, loop.plan.n_states
+    width = n_u + n_x + n_u * n_x
     return [[loop.v.element(loop.arguments["laws"], at, width, k, DOUBLE) for at in rows] for k in range(width)]
 
 

@@ -139,7 +139,7 @@ def arranged_weights(
 
 
 def arranged_laws(
-    lanes: Lanes, table: Floats, n_laws: int | None, law_of_lane: ArrayLike | None, width: int
+    lanes: Lanes, table: Floats, n_laws: int | None, law_of_lane: ArrayLike | None
 ) -> dict[str, NDArray[Any]]:
     """Check which laws steer the lanes, and arrange them: laws, and law_starts (n_padded,) unless one steers all alike.
 
@@ -149,12 +149,8 @@ def arranged_laws(
     n_laws : None if there is one law for all
     law_of_lane : (n_lanes,)
 
-    Raises SettingsError: laws of another model, or not one law for each lane.
+    Raises SettingsError: not one law for each lane.
     """
-    if table.shape[-1] != width:
-        raise SettingsError(
-            f"the law has {table.shape[-1]} numbers a row, but the model's states and inputs need {width}."
-        )
     if n_laws is None and law_of_lane is None and not lanes.has_windows:
         return {"laws": table[0, lanes.window]}
     own = np.zeros(lanes.n_lanes, np.int64) if n_laws is None else np.arange(lanes.n_lanes)

@@ -304,9 +304,13 @@ class Rollouts:
         """
         from diransac.kernel import inputs, kept
 
-        n_signals, n_u = len(self._equations.signals), self._equations.sizes[2]
-        lanes = self._lanes(parameters, initial_states, np.zeros((law.n_rows, law.u_min.size)), start_rows, n_rows)
-        values = arranged_laws(lanes, law.table(), law.n_laws, law_of_lane, inputs.law_width(n_u, self._equations.n_x))
+        n_signals, n_u, n_x = len(self._equations.signals), self._equations.sizes[2], self._equations.n_x
+        if (law.n_x, law.n_u) != (n_x, n_u):
+            raise SettingsError(
+                f"the law is for {law.n_x} states and {law.n_u} inputs, but the model has {n_x} and {n_u}."
+            )
+        lanes = self._lanes(parameters, initial_states, np.zeros((law.n_rows, n_u)), start_rows, n_rows)
+        values = arranged_laws(lanes, law.table(), law.n_laws, law_of_lane)
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_signals + n_u))
         values |= {"limits": np.array([law.u_min, law.u_max]), "series": series}
         source = inputs.fed_back if "law_starts" in values else inputs.fed_back_alike

@@ -45,29 +45,34 @@ class Law:
         u_min: ArrayLike = -np.inf,
         u_max: ArrayLike = np.inf,
     ) -> None:
-        u, x, K = (np.asarray(array, np.float64) for array in (u_ref, x_ref, gains))
+        u, x, K = (np.array(array, np.float64) for array in (u_ref, x_ref, gains))
         fits = u.ndim in (2, 3) and x.ndim == u.ndim and x.shape[:-1] == u.shape[:-1]
         if not fits or K.shape != (*u.shape, x.shape[-1]):
             raise SettingsError(
                 f"a law needs u_ref (n_rows, n_u), x_ref (n_rows, n_x) and gains (n_rows, n_u, n_x), or all of them "
                 f"with a leading axis of n_laws; found {u.shape}, {x.shape} and {K.shape}."
             )
-        for name, array in (("u_ref", u), ("x_ref", x), ("gains", K)):
-            if not np.isfinite(array).all():
+        low, high = _limits(u.shape[-1], u_min, u_max)
+        for name, array in {"u_ref": u, "x_ref": x, "gains": K, "u_min": low, "u_max": high}.items():
+            if not (name.startswith("u_m") or np.isfinite(array).all()):
                 raise SettingsError(f"the law's {name} holds a NaN or an infinity.")
-        try:
-            low, high = (np.broadcast_to(np.asarray(x, np.float64), u.shape[-1:]) for x in (u_min, u_max))
-        except ValueError as error:
-            raise SettingsError(f"u_min and u_max must be {u.shape[-1]} numbers each: {error}.") from error
-        if not (low <= high).all():
-            raise SettingsError(f"the law's limits leave no room: u_min {low.tolist()}, u_max {high.tolist()}.")
-        for name, array in zip(("u_ref", "x_ref", "gains", "u_min", "u_max"), (u, x, K, low, high), strict=True):
+            array.flags.writeable = False
             object.__setattr__(self, name, array)
 
     @property
     def n_rows(self) -> int:
         """Rows of each law."""
         return int(self.u_ref.shape[-2])
+
+    @property
+    def n_u(self) -> int:
+        """Inputs that it gives."""
+        return int(self.u_ref.shape[-1])
+
+    @property
+    def n_x(self) -> int:
+        """States that it answers to."""
+        return int(self.x_ref.shape[-1])
 
     @property
     def n_laws(self) -> int | None:
@@ -79,3 +84,14 @@ class Law:
         gains = self.gains.reshape(*self.gains.shape[:-2], -1)
         rows = np.concatenate([self.u_ref, self.x_ref, gains], axis=-1)
         return np.ascontiguousarray(rows.reshape(-1, *rows.shape[-2:]))
+
+
+def _limits(n_u: int, u_min: ArrayLike, u_max: ArrayLike) -> tuple[Floats, Floats]:
+    """Smallest and largest inputs (n_u,)."""
+    try:
+        low, high = (np.broadcast_to(np.array(limit, np.float64), (n_u,)).copy() for limit in (u_min, u_max))
+    except ValueError as error:
+        raise SettingsError(f"u_min and u_max must be {n_u} numbers each: {error}.") from error
+    if not (low <= high).all():
+        raise SettingsError(f"the law's limits leave no room: u_min {low.tolist()}, u_max {high.tolist()}.")
+    return low, high
