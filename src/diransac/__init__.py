@@ -3,6 +3,8 @@
 ``import diransac as dr``: equations in a `Model`, measurements in a `Log`, `identify` in between, a `Result` out.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from diransac import models
 from diransac.errors import (
     DiransacError,
@@ -19,10 +21,12 @@ from diransac.model import Model, Parameter, Plant
 from diransac.nonlinear import NonlinearLeastSquares
 from diransac.prepare import despike, differentiate, rename, resample, scale, shift
 from diransac.readers import read_log
-from diransac.report import write_report
 from diransac.result import Result
 from diransac.settings import Settings
 from diransac.validate import Validation, validate
+
+if TYPE_CHECKING:
+    from diransac.report import write_report
 
 __all__ = [
     "METHODS",
@@ -55,3 +59,17 @@ __all__ = [
     "validate",
     "write_report",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """What is imported when it is first asked for: identifying needs no page."""
+    if name == "write_report":
+        from diransac.report import write_report
+
+        return write_report
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Everything, imported or not."""
+    return sorted({*globals(), *__all__} - {"TYPE_CHECKING", "Any"})

@@ -16,6 +16,7 @@ from diransac.atomic import write_text
 from diransac.errors import DiransacError, ResultError, SettingsError
 from diransac.model import Model
 from diransac.settings import Settings
+from diransac.student_t import student_t_quantile
 from diransac.text_table import aligned
 
 __all__ = ["LogSummary", "Result"]
@@ -104,11 +105,9 @@ class Result:
 
         Raises SettingsError: the level is not between 0 and 1.
         """
-        from scipy.special import stdtrit
-
         if not 0.0 < level < 1.0:
             raise SettingsError(f"level is {level}; give a number between 0 and 1, such as 0.95")
-        width = float(stdtrit(self.degrees_of_freedom, 0.5 + level / 2.0))
+        width = student_t_quantile(0.5 + level / 2.0, self.degrees_of_freedom)
         errors = self.standard_errors
         return {n: (x - width * errors[n], x + width * errors[n]) for n, x in self.parameters.items()}
 

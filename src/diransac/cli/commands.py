@@ -27,7 +27,6 @@ from diransac.cli.outputs import staged
 from diransac.cli.views import Equations, ModelList, compare_methods
 from diransac.identify import METHODS, identify
 from diransac.inspection import inspect
-from diransac.report import write_report
 from diransac.result import Result
 from diransac.validate import validate
 
@@ -80,6 +79,8 @@ def _identify(
         if output:
             result.save(saved)
         if report:
+            from diransac.report import write_report
+
             write_report(result, log, page)
     screen.show(result, as_json)
 
@@ -103,6 +104,8 @@ def _compare(
         plant, log = load_model(model), preparation.read(file)
         comparison = compare_methods(plant, log, wanted, arguments)
         if report:
+            from diransac.report import write_report
+
             write_report(comparison.results, log, page)
     screen.show(comparison, as_json)
 

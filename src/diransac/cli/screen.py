@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -46,14 +48,13 @@ def _finite(data: object) -> object:
 @contextmanager
 def bar(label: str) -> Iterator[Progress | None]:
     """What a search reports its progress to: a bar on a terminal's stderr, nothing elsewhere."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
         yield None
         return
     from rich import progress
+    from rich.console import Console
 
+    console = Console(stderr=True)
     with progress.Progress(console=console, transient=True) as shown:
         task = shown.add_task(label, total=None)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -15,6 +14,7 @@ from diransac.errors import SettingsError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
+    from concurrent.futures import ThreadPoolExecutor
 
 __all__ = ["LANES", "MachineCode", "Target", "compile_function", "default_threads", "run_blocks"]
 
@@ -151,4 +151,6 @@ def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: in
 @lru_cache(maxsize=4)
 def _pool(_process: int, threads: int) -> ThreadPoolExecutor:
     """Threads of this process, made when first needed; a forked process makes its own."""
+    from concurrent.futures import ThreadPoolExecutor
+
     return ThreadPoolExecutor(threads, thread_name_prefix="diransac")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import zipfile
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -58,6 +57,8 @@ def _write_parquet(columns: Mapping[str, FloatArray], file: Path) -> None:
 
 
 def _write_npz(columns: Mapping[str, FloatArray], file: Path) -> None:
+    import zipfile
+
     with zipfile.ZipFile(file, "w") as archive:
         for name, values in columns.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as entry:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import platform
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -361,5 +360,7 @@ def _call(run: Run) -> str:
 
 
 def _versions() -> str:
+    from importlib.metadata import version
+
     packages = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
     return f"{packages}, Python {platform.python_version()} on {platform.system()} {platform.machine()}"
