@@ -8,7 +8,9 @@
 | `operations.py` | the vector form of every operation, in one table; emits a graph by it |
 | `machine_code.py` | LLVM module -> callable machine code; threads |
 | `map_loop.py`, `row_map.py` | one function over many rows |
-| `lanes.py`, `time_loop.py` | the time loop of a simulation; `diransac.simulate` is its face |
+| `time_loop.py` | the time loop of a simulation; `diransac.simulate` is its face |
+| `inputs.py`, `kept.py` | variants of the loop: where inputs come from; what is kept of rollouts |
+| `lanes.py` | arrays of many rollouts, checked and arranged for the loop |
 
 LLVM is loaded when something is first compiled.
 """

@@ -21,7 +21,7 @@ from diransac.kernel.lanes import (
     squared_thresholds,
 )
 from diransac.kernel.machine_code import LANES, MachineCode, Target, compile_function, run_blocks
-from diransac.simulate.outcomes import Flights, GaussNewton, LinearizedErrors, Scores
+from diransac.simulate.outcomes import Flights, GaussNewton, LinearizedErrors, Scores, gauss_newton_of
 from diransac.simulate.steps import INTEGRATORS, Equations, Sensitivities, plan_of, sensitivities_of
 
 if TYPE_CHECKING:
@@ -234,22 +234,14 @@ class Rollouts:
         sums = aligned((n_blocks, 1 + n_z + n_z * (n_z + 1) // 2, LANES))
         final = aligned((n_blocks, self._equations.n_x + int(sensitivities.varying.sum()), LANES))
         weighted = arranged_weights(lanes, len(self.signals), measured, valid, weights)
-        values = {**weighted, **_augmented(lanes, sensitivities), "sums": sums, "final": final}
+        values = {
+            **weighted,
+            "initial_states": sensitivities.appended(lanes.arrays["initial_states"]),
+            "sums": sums,
+            "final": final,
+        }
         self._run(kept.Sums, lanes, dt, values, threads, unknowns=names)
-        return self._gauss_newton(sensitivities, _by_lane(lanes, sums), _by_lane(lanes, final))
-
-    def _gauss_newton(self, sensitivities: Sensitivities, sums: Floats, final: Floats) -> GaussNewton:
-        """Sums (n_lanes, n_sums) and final states (n_lanes, n_states) by their names."""
-        n_z, n_x = len(sensitivities.unknowns), self._equations.n_x
-        upper = np.triu_indices(n_z)
-        normal = np.empty((len(sums), n_z, n_z))
-        normal[:, *upper] = normal[:, *upper[::-1]] = sums[:, 1 + n_z :]
-        cost, diverged = sums[:, 0].copy(), np.isinf(sums[:, 0])
-        slopes = sensitivities.matrix(final[:, n_x:])
-        slopes[diverged] = np.nan
-        return GaussNewton(
-            sensitivities.unknowns, cost, sums[:, 1 : 1 + n_z].copy(), normal, final[:, :n_x].copy(), slopes, diverged
-        )
+        return gauss_newton_of(sensitivities, lanes.n_lanes, sums, final)
 
     def linearized_errors(
         self,
@@ -278,7 +270,11 @@ class Rollouts:
         n_s, n_z = len(self.signals), len(names)
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_s * (1 + n_z)))
         measurements = arranged_measurements(lanes, n_s, measured, valid)
-        values = {**measurements, **_augmented(lanes, sensitivities), "series": series}
+        values = {
+            **measurements,
+            "initial_states": sensitivities.appended(lanes.arrays["initial_states"]),
+            "series": series,
+        }
         self._run(kept.LinearizedErrors, lanes, dt, values, threads, unknowns=names)
         jacobian = series[..., n_s:].reshape(*series.shape[:2], n_s, n_z)
         return LinearizedErrors(names, series[..., :n_s], jacobian)
@@ -387,15 +383,3 @@ class Rollouts:
                 module = emit_time_loop(self._plan(unknowns)[0], kept, inputs, windows=windows)
                 self._code[variant] = compile_function(module, "time_loop", ARGUMENTS.values(), self._target)
             return self._code[variant]
-
-
-def _augmented(lanes: Lanes, sensitivities: Sensitivities) -> dict[str, Floats]:
-    """Initial states (n_states, n_padded) of the lanes, with their derivatives."""
-    states = lanes.arrays["initial_states"]
-    slopes = np.repeat(sensitivities.initial_values[:, None], states.shape[1], axis=1)
-    return {"initial_states": np.concatenate([states, slopes])}
-
-
-def _by_lane(lanes: Lanes, blocks: Floats) -> Floats:
-    """What each lane has, (n_lanes, width), from what is stored block by block, (n_blocks, width, 8)."""
-    return blocks.swapaxes(1, 2).reshape(lanes.n_padded, blocks.shape[1])[: lanes.n_lanes]

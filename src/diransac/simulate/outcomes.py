@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diransac.kernel.lanes import squared_thresholds
+from diransac.kernel.machine_code import LANES
 
-__all__ = ["Flights", "GaussNewton", "LinearizedErrors", "Scores", "inlier_mask"]
+if TYPE_CHECKING:
+    from diransac.simulate.steps import Sensitivities
+
+__all__ = ["Flights", "GaussNewton", "LinearizedErrors", "Scores", "gauss_newton_of", "inlier_mask"]
 
 Floats = NDArray[np.float64]
 
@@ -60,6 +65,30 @@ class GaussNewton:
     final_states: Floats
     final_slopes: Floats
     diverged: NDArray[np.bool_]
+
+
+def gauss_newton_of(sensitivities: Sensitivities, n_lanes: int, sums: Floats, final: Floats) -> GaussNewton:
+    """What the compiled loop wrote block by block, by its names.
+
+    Parameters
+    ----------
+    sensitivities : what was differentiated
+    n_lanes : without those that fill the last block
+    sums : (n_blocks, 1 + n_z + n_z (n_z + 1) / 2, 8)   e' W e, J' W e, and the upper triangle of J' W J
+    final : (n_blocks, n_states, 8)   state, then its varying derivatives
+    """
+    sums, final = (
+        array.swapaxes(1, 2).reshape(len(array) * LANES, array.shape[1])[:n_lanes] for array in (sums, final)
+    )
+    n_x, n_z = sensitivities.initial.shape
+    upper = np.triu_indices(n_z)
+    normal_matrix = np.empty((n_lanes, n_z, n_z))
+    normal_matrix[:, *upper] = normal_matrix[:, *upper[::-1]] = sums[:, 1 + n_z :]
+    cost, gradient = sums[:, 0].copy(), sums[:, 1 : 1 + n_z].copy()
+    diverged = np.isinf(cost)
+    slopes = sensitivities.matrix(final[:, n_x:])
+    slopes[diverged] = np.nan
+    return GaussNewton(sensitivities.unknowns, cost, gradient, normal_matrix, final[:, :n_x].copy(), slopes, diverged)
 
 
 @dataclass(frozen=True)

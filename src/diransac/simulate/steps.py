@@ -109,10 +109,10 @@ class Sensitivities:
         """Row and column of each varying one, in the order in which they follow the state."""
         return [(int(i), int(j)) for i, j in np.argwhere(self.varying)]
 
-    @property
-    def initial_values(self) -> NDArray[np.float64]:
-        """Initial values of the varying ones."""
-        return np.asarray(self.initial[self.varying])
+    def appended(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Initial states (n_x, n), and below them the initial values of the varying ones."""
+        values = self.initial[self.varying]
+        return np.concatenate([states, np.repeat(values[:, None], states.shape[1], axis=1)])
 
     def matrix(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Whole matrices (n, n_x, n_z) from the varying entries (n, n_varying)."""
