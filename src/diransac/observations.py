@@ -23,7 +23,10 @@ __all__ = ["Observations", "observe"]
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-_ROBUST_START_ROWS = 25
+# A line through seven samples bears two outliers, and is short against any motion that is sampled well; the slope that
+# stands for a missing velocity needs a longer one.
+_ROWS_FOR_VALUE, _ROWS_FOR_SLOPE = 7, 25
+_FAR = 5.0
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,7 @@ class Observations:
             if name in given:
                 start[i] = given[name]
             elif name in self.signals:
-                start[i] = self._first(name) if rule != "robust" else self._line(name)[0]
+                start[i] = self._first(name) if rule != "robust" else self._robust(name)
             elif name in matter:
                 start[i] = self._start_of_missing(name, rule)
         return start
@@ -128,7 +131,7 @@ class Observations:
     def _start_of_missing(self, name: str, rule: str | Mapping[str, float]) -> float:
         coordinate = name.removesuffix("_dot")
         if rule == "robust" and self.model.kinematics is None and coordinate in self.signals:
-            return self._line(coordinate)[1]
+            return self._line(coordinate, _ROWS_FOR_SLOPE)[1]
         raise LogError(
             f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; pass '
             f"--differentiate, or give initial_state = {{{name} = ...}}"
@@ -138,12 +141,20 @@ class Observations:
         column = self.column(name)
         return float(column[np.flatnonzero(np.isfinite(column))[0]])
 
-    def _line(self, name: str) -> tuple[float, float]:
+    def _robust(self, name: str) -> float:
+        """The first sample, unless it is far from the line through the first few: then the line's value at row 0."""
+        column = self.column(name)
+        rows = np.flatnonzero(np.isfinite(column))[:_ROWS_FOR_VALUE]
+        value, slope = self._line(name, _ROWS_FOR_VALUE)
+        distances = np.abs(column[rows] - value - slope * rows * self.log.dt)
+        return float(column[rows[0]]) if distances[0] <= _FAR * np.median(distances) else value
+
+    def _line(self, name: str, n_rows: int) -> tuple[float, float]:
         """Value and slope at row 0 of the line through a signal's first samples, by Theil and Sen."""
         from scipy.stats import theilslopes
 
         column = self.column(name)
-        rows = np.flatnonzero(np.isfinite(column))[:_ROBUST_START_ROWS]
+        rows = np.flatnonzero(np.isfinite(column))[:n_rows]
         slope, intercept, *_ = theilslopes(column[rows], rows * self.log.dt)
         return float(intercept), float(slope)
 

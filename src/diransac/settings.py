@@ -37,8 +37,8 @@ class Settings:
     refit : "inliers" (Algorithm 1, lines 25-31) or "none"
     integrator : "rk4", "euler" or "semi-implicit-euler"
     substeps : integration steps per sample
-    initial_state : Y_0; "first" (the paper's: the first row), "robust" (a line through the first samples of each
-        signal, by Theil and Sen), or values by name, which replace those of the first row
+    initial_state : Y_0; "first" (the paper's: the first row), "robust" (the same, but a first sample far from the line
+        through the first seven gives way to it), or values by name, which replace those of the first row
     threads : threads of the simulation; None: one a core.  Never changes an answer
     batch_size : hypotheses simulated at once.  Never changes an answer
 
