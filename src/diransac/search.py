@@ -119,8 +119,9 @@ def search(
 
 
 def _batches(settings: Settings) -> Iterator[IntArray]:
-    """Iterations in batches that grow from a few, because many searches stop early, to ``batch_size``."""
-    start, size = 0, min(_FIRST_BATCH, settings.batch_size)
+    """Iterations in batches that grow from a few to ``batch_size`` where the search may stop early, as many do."""
+    may_stop = settings.stop_inlier_fraction is not None
+    start, size = 0, min(_FIRST_BATCH, settings.batch_size) if may_stop else settings.batch_size
     while start < settings.max_iterations:
         stop = min(start + size, settings.max_iterations)
         yield np.arange(start, stop)
@@ -148,13 +149,16 @@ def _speculate(
 def _grow(sample: IntArray, k: IntArray, estimator: BoundEstimator, sampler: Sampler, seed: int) -> IntArray:
     """The sample with as many more random observations as make it well-defined (lines 6-10).
 
-    Adding an observation never lowers the smallest eigenvalue, so the least number is found by bisection.
+    Adding an observation never lowers the smallest eigenvalue, so the least number is found by doubling, then bisection.
     """
-    rest = sampler(seed, k, estimator.n_rows, len(sample), estimator.n_rows)[0]
-    whole = np.concatenate([sample, rest])
-    low, high = len(sample), len(whole)
-    if not estimator.well_defined([whole])[0]:
-        raise IdentificationError("the whole log is not well-defined: it does not determine the parameters")
+    low, whole = len(sample), sample
+    while not estimator.well_defined([whole])[0]:
+        low = len(whole)
+        if low == estimator.n_rows:
+            raise IdentificationError("the whole log is not well-defined: it does not determine the parameters")
+        more = sampler(seed, k, estimator.n_rows, low, min(2 * low, estimator.n_rows))[0]
+        whole = np.concatenate([whole, more])
+    high = len(whole)
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if estimator.well_defined([whole[:middle]])[0] else (middle, high)
