@@ -149,7 +149,7 @@ def _speculate(
 def _grow(sample: IntArray, k: IntArray, estimator: BoundEstimator, sampler: Sampler, seed: int) -> IntArray:
     """The sample with as many more random observations as make it well-defined (lines 6-10).
 
-    Adding an observation never lowers the smallest eigenvalue, so the least number is found by doubling, then bisection.
+    Adding an observation never lowers the smallest eigenvalue: the least number is found by doubling, then bisection.
     """
     low, whole = len(sample), sample
     while not estimator.well_defined([whole])[0]:
