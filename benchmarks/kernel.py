@@ -1,7 +1,8 @@
 """The compiled kernel against the same loops written by hand in C (`kernel_loops.c`), in one run; medians.
 
-Run it as ``python benchmarks/kernel.py``; without gcc it leaves C out. Both compute the same sums and counts, which is checked. The C
-loops do less: every row counts, no divergence is looked for, and angles of many thousand radians are wrong.
+Run it as ``python benchmarks/kernel.py``; without gcc it leaves C out. Both compute the same sums and counts, which is
+checked. The C loops do less: every row counts, no divergence is looked for, and angles of many thousand radians are
+wrong.
 """
 
 import ctypes
