@@ -1,8 +1,8 @@
 """How fast identification is: the whole table in one run, each row as a ratio of medians that were measured in turns.
 
 Run it as ``python benchmarks/speed.py [--without-hour]``.  The log is a lively rotorcraft flight of 25 s at 100 Hz with
-one value in ten an outlier of up to 80; settings of Table IV, with all 1,000 iterations forced; 2 threads.  A C compiler
-and the packages of ``pip install .[bench]`` are compared with where they are there; what is absent is said.
+one value in ten an outlier of up to 80; settings of Table IV, with all 1,000 iterations forced; 2 threads.  gcc and the
+packages of ``pip install .[bench]`` are compared with where they are there; what is absent is said.
 """
 
 import argparse
@@ -28,9 +28,9 @@ from diransac.sampling import sample_rows
 from diransac.simulate import rollouts
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path += [str(ROOT / "tests"), str(ROOT / "examples")]
+sys.path.append(str(ROOT / "tests"))
+sys.path.append(str(ROOT / "examples"))
 import demo
-
 from algorithm1 import Choices, algorithm1
 from algorithm1 import Problem as Listing
 from simulated import ROTORCRAFT, as_log, flight, rollout, with_outliers
@@ -159,10 +159,8 @@ def compare_lengths(bench: Bench) -> None:
     """Row (e): the same flight sampled ten times as often, with the same number of hypotheses."""
     long = replace(bench, log=spoilt_log(10 * N_ROWS))
     calls = {
-        name: partial(at.identify, refit=refit)
-        for name, at, refit in (
-            ("short", bench, "none"), ("long", long, "none"), ("short refits", bench, "inliers"), ("long refits", long, "inliers"),
-        )
+        "short": partial(bench.identify, refit="none"), "short refits": bench.identify,
+        "long": partial(long.identify, refit="none"), "long refits": long.identify,
     }  # fmt: skip
     found = medians(calls)
     times = milliseconds(short=found["short"], long=found["long"])
@@ -181,8 +179,8 @@ def measure_hour() -> None:
         demo.spoil(demo.fly(model), model).write(path)
         code = (
             "import json, resource, sys, time, diransac as dr; log = dr.read_log(sys.argv[1]); begin = time.time();"
-            "result = dr.identify(dr.models.planar_rotorcraft(), log); memory = resource.getrusage(resource.RUSAGE_SELF);"
-            "print(json.dumps([time.time() - begin, memory.ru_maxrss, result.evaluated]))"
+            "result = dr.identify(dr.models.planar_rotorcraft(), log); used = resource.getrusage(resource.RUSAGE_SELF);"
+            "print(json.dumps([time.time() - begin, used.ru_maxrss, result.evaluated]))"
         )
         done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
     seconds, kibibytes, evaluated = json.loads(done.stdout)
