@@ -405,6 +405,9 @@ def test_outputs_take_their_places_together_or_not_at_all(folder: Path):
     [
         (["-o", "nowhere/model.json"], "does not exist"),
         (["-o", "swim.csv"], "reads"),
+        (["-o", "s.toml", "--settings", "s.toml"], "reads"),
+        (["--report", "bent.py", "--model", "bent.py"], "reads"),
+        (["-o", "./bent.py", "--model", "bent.py:other"], "reads"),
         (["-o", "."], "not an ordinary file"),
         (["-o", "same", "--report", "./same"], "two outputs"),
     ],
@@ -413,6 +416,7 @@ def test_outputs_are_checked_before_the_work(
     folder: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], message: str
 ):
     monkeypatch.setattr("diransac.cli.commands.identify", lambda *_, **__: pytest.fail("the work has begun"))
+    Path("s.toml").write_text("sample_size = 20\n")
     before = contents(folder)
     done = run("identify", "swim.csv", *MODEL, *words)
     assert done.exit_code == 1

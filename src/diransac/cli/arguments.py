@@ -19,7 +19,9 @@ from diransac.errors import DiransacError, ModelError, SettingsError
 from diransac.model import Model
 from diransac.settings import Settings
 
-__all__ = ["load_model", "load_settings", "names", "numbers", "pairs"]
+__all__ = ["load_model", "load_settings", "model_file", "names", "numbers", "pairs"]
+
+_MODEL_FILE = re.compile(r"(.+\.py)(?::(\w+))?")
 
 
 # ---------------------------------------------------------------------- lists of pairs
@@ -122,12 +124,18 @@ def _none_where_meant(key: str, value: object) -> object:
 # ---------------------------------------------------------------------- models
 
 
+def model_file(text: str) -> Path | None:
+    """The file of ``file.py[:name]``; None for a built-in model's name."""
+    match = _MODEL_FILE.fullmatch(text)
+    return None if match is None else Path(match[1])
+
+
 def load_model(text: str) -> Model:
     """The built-in model of that name, or the one that ``file.py[:name]`` defines.
 
     Raises ModelError: there is none of that name, the file cannot be run, or what it defines is no model.
     """
-    match = re.fullmatch(r"(.+\.py)(?::(\w+))?", text)
+    match = _MODEL_FILE.fullmatch(text)
     if match is None:
         from diransac.models import builtin
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from diransac.cli import screen
-from diransac.cli.arguments import load_model, names
+from diransac.cli.arguments import load_model, model_file, names
 from diransac.cli.group import Group, grouped
 from diransac.cli.options import (
     Derivation,
@@ -72,7 +72,7 @@ def _identify(
 ) -> None:
     """Identify the parameters of a model from a log."""
     arguments = search.arguments() | derivation.arguments()
-    with staged([output, report], inputs=[file]) as (saved, page):
+    with staged([output, report], [file, model_file(model), search.settings]) as (saved, page):
         plant, log = load_model(model), preparation.read(file)
         with screen.bar(method) as progress:
             result = identify(plant, log, method, progress=progress, **arguments)
@@ -100,7 +100,7 @@ def _compare(
     """Identify by every method from one log, side by side."""
     wanted = [known_method(name) for name in names(methods)]
     arguments = search.arguments() | derivation.arguments()
-    with staged([report], inputs=[file]) as (page,):
+    with staged([report], [file, model_file(model), search.settings]) as (page,):
         plant, log = load_model(model), preparation.read(file)
         comparison = compare_methods(plant, log, wanted, arguments)
         if report:

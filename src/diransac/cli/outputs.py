@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,17 +13,18 @@ __all__ = ["staged"]
 
 
 @contextmanager
-def staged(outputs: Sequence[Path | None], inputs: Sequence[Path] = ()) -> Iterator[list[Path]]:
+def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -> Iterator[list[Path]]:
     """Temporary files beside the outputs that are asked for; they replace them together once the block has succeeded.
 
     Parameters
     ----------
     outputs : where to write; a None has a temporary file of no meaning, which is never asked for
-    inputs : files that the command reads, none of which may be written
+    inputs : files that the command reads, none of which may be written; a None is none
 
     Raises ResultError: an output's folder is missing or closed to us, it is no ordinary file, or an input.
     """
-    targets = [None if path is None else _checked(path, inputs) for path in outputs]
+    sources = {path.resolve() for path in inputs if path is not None}
+    targets = [None if path is None else _checked(path, sources) for path in outputs]
     named = [path for path in targets if path is not None]
     if len(set(named)) < len(named):
         raise ResultError(f'two outputs go to "{named[0]}"; give each a file of its own')
@@ -46,7 +47,7 @@ def _draft(target: Path) -> Path:
     return target.with_name(f".{os.getpid()}-{target.name}")
 
 
-def _checked(path: Path, inputs: Sequence[Path]) -> Path:
+def _checked(path: Path, sources: Set[Path]) -> Path:
     target = path.resolve()
     if target.exists() and not target.is_file():
         raise ResultError(f'output "{path}" is not an ordinary file; give the name of a file')
@@ -54,6 +55,6 @@ def _checked(path: Path, inputs: Sequence[Path]) -> Path:
         raise ResultError(f'output "{path}": the folder "{target.parent}" does not exist; make it first')
     if not os.access(target.parent, os.W_OK | os.X_OK) or (target.exists() and not os.access(target, os.W_OK)):
         raise ResultError(f'output "{path}" cannot be written: permission denied; choose another folder')
-    if target in {source.resolve() for source in inputs}:
+    if target in sources:
         raise ResultError(f'output "{path}" is a file that this command reads; give it another name')
     return target
