@@ -63,6 +63,16 @@ def test_attitude_as_a_quaternion_is_identified_whatever_its_sign():
     assert result.inliers.all()
 
 
+def test_attitude_that_nothing_measured_depends_on_need_not_be_in_the_log():
+    truth, t = {"Jx": 0.02, "Jy": 0.05, "Jz": 0.04}, np.arange(400) * 0.01
+    torques = 0.02 * np.column_stack([np.sin(3 * t), np.cos(2.3 * t), np.sin(5.1 * t + 1.0)])
+    columns = {n: x for n, x in tumble(truth, torques, 0.01).items() if not n.startswith("q")}
+    log = dr.Log.from_arrays(t, columns | dict(zip(("tx", "ty", "tz"), torques.T, strict=True)))
+    result = dr.identify(tumbling(), log, "i-diransac", settings=QUICK)
+    assert result.parameters == pytest.approx(truth, rel=1e-8)
+    assert result.inliers.all()
+
+
 def tumble(truth, torques, dt):
     """Columns of a body that turns under held torques: plain Runge-Kutta, its quaternion normalised each step."""
     J = np.array(list(truth.values()))

@@ -272,3 +272,15 @@ def test_printed_result_says_what_is_not_as_it_should_be(results):
     assert "mass" in text.split("!", 1)[1].splitlines()[0]
     assert "two rows were skipped" in text
     assert "unknown" in text
+
+
+def test_printed_result_warns_of_a_fit_that_explains_little_of_the_log(result):
+    poor = dataclasses.replace(result, inlier_fraction=0.2, covariance=np.full((3, 3), np.inf), fitted_rows=2)
+    warnings = [line for line in str(poor).splitlines() if line.startswith("!")]
+    for part in ("less than half of the log", "short of the 85 % inliers", "2 fitted rows are too few"):
+        assert any(part in line for line in warnings), part
+
+
+def test_arrays_of_a_result_cannot_be_changed(result):
+    assert not result.inliers.flags.writeable
+    assert not result.covariance.flags.writeable

@@ -85,8 +85,10 @@ def choose_scoring(observations: Observations, settings: Settings) -> Scoring:
         raise SettingsError(
             f"min_inlier_signals = {needed}, but {n_signals} signals have an inlier threshold: nothing can be an inlier"
         )
-    notes = tuple(f"{n} is constant and judges nothing" for n in constant)
-    return Scoring(w, eps, needed, notes)
+    judging = ", ".join(n for n, x in zip(observations.signals, eps, strict=True) if x > 0.0)
+    notes = [f"{n} is constant and judges nothing" for n in constant]
+    notes.append(f"a row is an inlier if {needed} of its {n_signals} judging signals are near: {judging}")
+    return Scoring(w, eps, needed, tuple(notes))
 
 
 class Simulation:

@@ -110,7 +110,7 @@ class Observations:
     def initial_state(self, rule: str | Mapping[str, float]) -> FloatArray:
         """State ``(n_x,)`` at row 0, by ``Settings.initial_state``'s rule.
 
-        A state that the log lacks and on which nothing measured depends starts at 0.
+        A state that the log lacks and on which nothing measured depends starts at 0, a quaternion at (1, 0, 0, 0).
         Raises LogError: another state is missing; it is named.
         """
         given = rule if isinstance(rule, Mapping) else {}
@@ -119,6 +119,7 @@ class Observations:
             raise SettingsError(f'initial_state names "{unknown[0]}"; the state is {", ".join(self.model.state)}')
         matter = self.model.states_behind(self.signals)
         start = np.zeros(len(self.model.state))
+        start[[four[0] for four in self.model.quaternions]] = 1.0
         for i, name in enumerate(self.model.state):
             if name in given:
                 start[i] = given[name]
@@ -198,6 +199,8 @@ def _raise_missing(model: Model, log: Log, name: str) -> None:
     hint = (
         "pass --differentiate to estimate velocities and accelerations" if derivable else "name its column with --map"
     )
+    if name in log.unusable:
+        raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; mend the column, or {hint}')
     found = ", ".join(("t", *log.names))
     raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}.')
 

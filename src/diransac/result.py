@@ -25,6 +25,7 @@ BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
 
 _FORMAT = 1
+_FEW_INLIERS = 0.5
 _PLAIN = {
     "method": str,
     "estimator": str,
@@ -94,6 +95,12 @@ class Result:
     preparation: tuple[Mapping[str, Any], ...] = ()
     notes: tuple[str, ...] = ()
     sensitivity: Mapping[str, tuple[float, float]] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("covariance", "inliers"):
+            array = np.array(getattr(self, name))
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
 
     @property
     def standard_errors(self) -> dict[str, float]:
@@ -252,6 +259,13 @@ class Result:
 
     def _warnings(self) -> list[str]:
         lines = [f"! {n} = {self.parameters[n]:.6g} is outside its bounds" for n in self.violations]
+        if self.inlier_fraction < _FEW_INLIERS:
+            lines.append("! the simulation agrees with less than half of the log: do not rely on these parameters")
+        wanted = self.settings.stop_inlier_fraction
+        if self.iterations and wanted is not None and self.inlier_fraction < wanted:
+            lines.append(f"! the search ended short of the {100 * wanted:.3g} % inliers that it was to reach")
+        if not np.isfinite(self.covariance).all():
+            lines.append(f"! intervals are unknown: {self.fitted_rows} fitted rows are too few to tell")
         for name, (half, double) in (self.sensitivity or {}).items():
             lines.append(
                 f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice"

@@ -39,7 +39,8 @@ class Settings:
     substeps : integration steps per sample
     initial_state : Y_0; "first" (the paper's: the first row), "robust" (the same, but a first sample far from the line
         through the first seven gives way to it), or values by name, which replace those of the first row
-    threads : threads of the simulation; None: one a core.  Never changes an answer
+    threads : threads of the simulation; None: one a core, one in a worker process (`simulate.default_threads`).  Never
+        changes an answer
     batch_size : hypotheses simulated at once.  Never changes an answer
 
     Raises SettingsError: a value has no meaning.
