@@ -27,10 +27,10 @@ from diransac.observations import observe
 from diransac.sampling import sample_rows
 from diransac.simulate import rollouts
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.append(str(ROOT / "tests"))
-sys.path.append(str(ROOT / "examples"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "examples"))
 import demo
+
 from algorithm1 import Choices, algorithm1
 from algorithm1 import Problem as Listing
 from simulated import ROTORCRAFT, as_log, flight, rollout, with_outliers
