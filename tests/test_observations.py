@@ -1,5 +1,7 @@
 """One model over one log: which rows count, what is held, what is refused, where a simulation starts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,13 @@ def test_missing_signal_is_refused_with_what_was_found_and_what_to_try(name, hin
     with pytest.raises(LogError, match=f'"{name}" is missing; found t, x, .*{hint}') as caught:
         observe(MODEL, plane_log(without=[name]))
     assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(("name", "hint"), [("theta_ddot", "--differentiate"), ("moment", "--map")])
+def test_column_that_is_no_signal_is_refused_with_the_reason(name, hint):
+    log = replace(plane_log(without=[name]), unusable={name: 'is not numeric: line 9 holds "--"'})
+    with pytest.raises(LogError, match=f'signal "{name}" is not numeric: line 9 holds "--"; .*{hint}'):
+        observe(MODEL, log)
 
 
 def test_signals_that_no_equation_names_may_be_missing():
