@@ -1,5 +1,6 @@
 """The command line: what it prints, what it writes, how it ends."""
 
+import errno
 import importlib
 import json
 import subprocess
@@ -378,6 +379,19 @@ def test_a_failing_command_leaves_outputs_as_they_were(folder: Path, existing: b
     before = contents(folder)
     done = run("identify", "swim.csv", *MODEL, "--set", "sample_size=5000", "-o", "model.json", "--report", "page.html")
     assert done.exit_code == 1
+    assert contents(folder) == before
+
+
+def test_outputs_stay_as_they_were_where_the_result_cannot_be_printed(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    def show(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("diransac.cli.screen.show", show)
+    before = contents(folder)
+    found = run("identify", "swim.csv", *MODEL, *QUICK, "-o", "model.json", "--report", "page.html")
+    compared = run("compare", "swim.csv", *MODEL, "--methods", "ols", "--report", "page.html")
+    assert found.exit_code == compared.exit_code == 1
+    assert "No space left" in found.stderr
     assert contents(folder) == before
 
 

@@ -82,7 +82,7 @@ def _identify(
             from diransac.report import write_report
 
             write_report(result, log, page)
-    screen.show(result, as_json)
+        screen.show(result, as_json)
 
 
 @app.command("compare")
@@ -107,7 +107,7 @@ def _compare(
             from diransac.report import write_report
 
             write_report(comparison.results, log, page)
-    screen.show(comparison, as_json)
+        screen.show(comparison, as_json)
 
 
 @app.command("validate")
