@@ -84,6 +84,12 @@ def test_resample_at_the_same_rate_keeps_every_sample_and_every_hole():
     assert np.allclose(new["x"], x, atol=1e-12, equal_nan=True)
 
 
+@pytest.mark.parametrize("rate", [1e7, 1e12, 1e308])
+def test_resample_refuses_more_rows_than_fit_before_it_makes_them(rate):
+    with pytest.raises(LogError, match=r"would make .* rows; at most 10,000,000 are made: give a lower rate"):
+        prepare.resample(log_of(x=T), rate)
+
+
 def test_resample_says_what_it_folds():
     new = prepare.resample(log_of(x=T), 20.0)
     assert new.notes[-1] == "no filter went before it: motion and noise above 10 Hz now appear below"

@@ -308,6 +308,7 @@ def test_a_renamed_column_keeps_the_reason_why_it_is_unusable(tmp_path):
         ({"rename": {"t": "t_ms"}, "resample": -1.0}, SettingsError, "give a rate in Hz"),
         ({"rename": {"t": "t_ms"}, "resample": "mean"}, SettingsError, "give a rate in Hz"),
         ({"rename": {"t": "t_ms"}, "resample": 1e-9}, LogError, "leaves 1 row"),
+        ({"rename": {"t": "t_ms"}, "resample": 1e7}, LogError, r"would make 2e\+08 rows; at most 10,000,000"),
     ],
 )
 def test_options_without_meaning_are_refused(tmp_path, options, error, message):

@@ -34,6 +34,7 @@ BoolArray = npt.NDArray[np.bool_]
 Column = TypeVar("Column")
 
 _BRIDGED_INTERVALS = 3.5
+_MOST_ROWS = 10_000_000
 _ROUNDING = 1e-6
 _MAD_TO_STD, _MEAN_TO_STD = 1.4826, 1.2533
 _COUNT_ROUNDING, _USUAL = 1e-3, 0.01
@@ -110,7 +111,8 @@ def resample(log: Log, rate: float | str = "median") -> Log:
 
     A signal is NaN where its samples are, and in gaps of the clock.  Nothing is filtered: at a lower rate, what moves
     faster than half of it is folded to lower frequencies, and said.
-    Raises SettingsError: the rate has no meaning.  LogError: fewer than 2 samples are left.
+    Raises SettingsError: the rate has no meaning.  LogError: fewer than 2 samples are left, or
+    more than ten million are made.
     """
     time, signals, step, notes = resample_columns(log.time, log.signals, rate, log.source)
     return log.with_step(step, time=time, signals=signals, notes=notes)
@@ -127,9 +129,7 @@ def resample_columns(
     steps = np.diff(time)
     usual = float(np.median(steps))
     hertz = _rate(rate, usual)
-    n = math.floor((time[-1] - time[0]) * hertz * (1.0 + 1e-12) + 1e-9) + 1
-    if n < 2:
-        raise LogError(f"{source}: resampling at {hertz:.6g} Hz leaves {n} row of {time[-1] - time[0]:.6g} s")
+    n = _new_rows(float(time[-1] - time[0]), hertz, source)
     grid = time[0] + np.arange(n) / hertz
     left = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, len(time) - 2)
     weight = np.clip((grid - time[left]) / steps[left], 0.0, 1.0)
@@ -146,6 +146,19 @@ def _rate(rate: float | str, usual: float) -> float:
     if isinstance(rate, str) or not 0.0 < rate < math.inf:
         raise SettingsError(f'resampling to {rate!r} has no meaning; give a rate in Hz, or "median"')
     return float(rate)
+
+
+def _new_rows(seconds: float, hertz: float, source: str) -> int:
+    """How many rows a rate makes.  Raises LogError: fewer than 2, or more than `_MOST_ROWS`."""
+    rows = seconds * hertz * (1.0 + 1e-12) + 1e-9
+    if rows < 1.0:
+        raise LogError(f"{source}: resampling at {hertz:.6g} Hz leaves 1 row of {seconds:.6g} s")
+    if rows >= _MOST_ROWS:
+        raise LogError(
+            f"{source}: resampling {seconds:.6g} s at {hertz:.6g} Hz would make {rows:.4g} rows; at most "
+            f"{_MOST_ROWS:,} are made: give a lower rate, or --scale t=FACTOR if t is not in seconds"
+        )
+    return math.floor(rows) + 1
 
 
 def _between(values: FloatArray, left: npt.NDArray[np.intp], weight: FloatArray) -> FloatArray:
