@@ -208,9 +208,9 @@ def test_model_file_serves_like_a_built_in_model(folder: Path):
     assert json.loads(mine.stdout)["parameters"] == json.loads(built_in.stdout)["parameters"]
 
 
-def test_model_file_may_import_its_neighbours_and_print(folder: Path):
+def test_model_file_may_import_its_neighbours(folder: Path):
     Path("neighbour.py").write_text("NAME = 'model'\n")
-    Path("near.py").write_text("from neighbour import NAME\nprint('loading')\n" + NONLINEAR)
+    Path("near.py").write_text("from neighbour import NAME\n" + NONLINEAR)
     before = list(sys.path)
     done = run("models", "near.py", "--json")
     sys.modules.pop("neighbour")

@@ -11,8 +11,12 @@ def main() -> None:
     if "--debug" not in sys.argv:
         sys.excepthook = _say_that_it_is_our_fault
     from diransac.cli.commands import app
+    from diransac.cli.silence import leave_stdout
 
-    app()
+    try:
+        app()
+    finally:
+        leave_stdout()
 
 
 def _say_that_it_is_our_fault(kind: type[BaseException], error: BaseException, _: TracebackType | None) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import typer
 
+from diransac.cli.silence import silenced
 from diransac.errors import DiransacError, ModelError, SettingsError
 from diransac.model import Model
 from diransac.settings import Settings
@@ -155,11 +156,11 @@ def load_model(text: str) -> Model:
 
 
 def _run(file: Path) -> Mapping[str, object]:
-    """Names that a user's file defines; it may import its neighbours, and what it prints stays off stdout."""
+    """Names that a user's file defines; it may import its neighbours, and what it prints is not shown."""
     if not file.is_file():
         raise ModelError(f'model file "{file}" does not exist; give a built-in name or file.py[:name]')
     try:
-        with _importable(file.resolve().parent), contextlib.redirect_stdout(sys.stderr):
+        with _importable(file.resolve().parent), silenced():
             return runpy.run_path(str(file), run_name="diransac_model_file")
     except DiransacError as error:
         raise ModelError(f'model file "{file}"{_line(error, file)}: {error}') from error

@@ -1,0 +1,58 @@
+"""The command line as a process of its own: what reaches its stdout and stderr, and nothing else."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+QUIET_MODEL = """
+import numpy as np
+from diransac import Model, Parameter
+model = Model(
+    name="chatty", coordinates={"x": "m"}, inputs={"thrust": "N"},
+    parameters={"mass": Parameter("kg", positive=True)},
+    equations=lambda q, v, a, u, p: [p.mass * a.x + np.sin(q.x) - u.thrust],
+)
+"""
+CHATTER = """
+import atexit, os, subprocess, sys, warnings
+print("printed")
+sys.stdout.write("left in the buffer")
+os.write(1, b"written past Python\\n")
+subprocess.run(["echo", "said by a child"])
+warnings.warn("careful")
+for line in range(20):
+    print("a line", file=sys.stderr)
+atexit.register(print, "printed at exit")
+"""
+
+
+def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "diransac", *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_what_a_model_file_prints_reaches_neither_stdout_nor_stderr(tmp_path: Path):
+    (tmp_path / "chatty.py").write_text(CHATTER + QUIET_MODEL)
+    done = run(tmp_path, "models", "chatty.py", "--json")
+    assert json.loads(done.stdout)["name"] == "chatty"
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("content", [CHATTER + "1 / 0", CHATTER + QUIET_MODEL])
+def test_a_failing_command_says_its_own_lines_alone(tmp_path: Path, content: str):
+    (tmp_path / "chatty.py").write_text(content)
+    done = run(tmp_path, "identify", "absent.csv", "--model", "chatty.py")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("error: ")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_debug_shows_what_a_model_file_prints_on_stderr(tmp_path: Path):
+    (tmp_path / "chatty.py").write_text(CHATTER + QUIET_MODEL)
+    done = run(tmp_path, "models", "chatty.py", "--json", "--debug")
+    assert json.loads(done.stdout)["name"] == "chatty"
+    for text in ("printed\n", "left in the buffer", "written past Python", "said by a child", "careful", "a line"):
+        assert text in done.stderr
