@@ -158,13 +158,19 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
 def _signal_facts(log: Log, name: str) -> SignalFacts:
     values = log[name]
     finite = values[np.isfinite(values)]
-    low, high, spread = (finite.min(), finite.max(), finite.std()) if len(finite) else (np.nan,) * 3
+    low, high, spread = (finite.min(), finite.max(), _spread(finite)) if len(finite) else (np.nan,) * 3
     run = _longest_run(values)
     frozen = run * log.dt if run >= _FROZEN_SAMPLES else 0.0
     n_spikes = int(prepare.spikes(values).sum())
     return SignalFacts(
         log.units.get(name), float(low), float(high), float(spread), int(np.isnan(values).sum()), n_spikes, frozen
     )
+
+
+def _spread(values: FloatArray) -> float:
+    """Standard deviation, of numbers whose squares may overflow too."""
+    scale = max(np.abs(values).max(), np.finfo(np.float64).tiny)
+    return float(scale * (values / scale).std())
 
 
 def _longest_run(values: FloatArray) -> int:
