@@ -111,6 +111,26 @@ def test_small_jitter_is_said_with_size_and_place():
     assert "10.0% of a sample (at t = 0.39 s)" in note
 
 
+@pytest.mark.parametrize("hertz", [20.0, 100.0, 500.0])
+@pytest.mark.parametrize(("unit", "tick"), [("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9)])
+def test_a_clock_that_does_not_count_seconds_is_said_with_its_scale(hertz, unit, tick):
+    time = np.arange(50) / hertz / tick
+    (note,) = Log.from_arrays(time, {"x": time}).notes
+    assert note == f"rows are {1 / hertz / tick:.4g} s apart: if t is in {unit}, pass --scale t={tick:g}"
+
+
+@pytest.mark.parametrize("dt", [1e-6, 1e-3, 0.5, 1.0])
+def test_a_clock_that_may_count_seconds_is_silent(dt):
+    time = np.arange(50) * dt
+    assert Log.from_arrays(time, {"x": time}).notes == ()
+
+
+def test_a_clock_too_fast_for_seconds_is_said():
+    time = np.arange(50) * 1e-9
+    (note,) = Log.from_arrays(time, {"x": time}).notes
+    assert note.startswith("rows are 1e-09 s apart: check the unit of t")
+
+
 def test_missing_and_infinite_samples_are_said_once_for_all_signals_that_share_them():
     x = np.arange(10.0)
     x[[3, 5]] = np.nan

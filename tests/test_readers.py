@@ -330,6 +330,13 @@ def test_uneven_time_is_resampled_only_when_asked(tmp_path):
     assert "1 gap in time, the longest 0.1" in " ".join(log.notes)
 
 
+@pytest.mark.parametrize("resample", [None, "median", 2.0])
+def test_a_clock_in_milliseconds_is_said_whatever_the_rate_asked_for(tmp_path, resample):
+    notes = read(tmp_path, "t,x\n0,1\n10,2\n20,3\n", resample=resample).notes
+    assert notes[0] == "rows are 10 s apart: if t is in milliseconds, pass --scale t=0.001"
+    assert sum("apart" in note for note in notes) == 1
+
+
 def test_duplicates_are_refused_even_when_resampling_is_asked(tmp_path):
     with pytest.raises(LogError, match="repeats at row 2"):
         read(tmp_path, "t,x\n0,1\n1,2\n1,3\n2,4\n", resample="median")

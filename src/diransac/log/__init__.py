@@ -142,7 +142,7 @@ class Log:
         if unknown:
             raise LogError(f'{source}: a unit is given for "{unknown[0]}"; found {", ".join(columns)}')
         log = cls(time, columns, units, source, unusable=unusable or {})
-        return replace(log, notes=log.findings())
+        return replace(log, notes=(*checks.say_clock(log.time), *log.findings()))
 
     def findings(self) -> tuple[str, ...]:
         """What is worth saying: columns left out, an uneven clock, missing values, infinities; a sentence each."""

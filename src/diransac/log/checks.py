@@ -19,6 +19,7 @@ __all__ = [
     "check_names",
     "check_time_order",
     "numeric_columns",
+    "say_clock",
     "say_gaps",
     "say_jitter",
 ]
@@ -28,6 +29,11 @@ FloatArray = npt.NDArray[np.float64]
 # Of a sample: the jitter that is not worth a word, and the one that is an error; of a usual interval: a gap.
 _SILENT_JITTER, _TOLERATED_JITTER, _GAP = 1e-3, 0.2, 1.5
 _ROUNDING = 1e-6
+
+# Seconds from row to row that are likely; and the clocks that explain longer ones: a tick in seconds, and the number of
+# ticks from row to row above which it is this clock rather than the next.
+_SHORTEST, _LONGEST = 1e-7, 1.0
+_CLOCKS = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("milliseconds", 1e-3, _LONGEST))
 
 
 # ---------------------------------------------------------------------- columns
@@ -138,6 +144,18 @@ def check_even(time: FloatArray, source: str) -> None:
         f"{source}: time is not uniform: {what} after t = {time[row]:.6g} s (row {row}) is {steps[row]:.4g} s long, "
         f"the usual interval {usual:.4g} s; resample it: --resample {1.0 / usual:.4g}, or read_log(..., resample=...)"
     )
+
+
+def say_clock(time: FloatArray) -> list[str]:
+    """Whether the usual interval tells of a time that is not in seconds, and the scale that would make it so."""
+    dt = float(np.median(np.diff(time)))
+    if _SHORTEST <= dt <= _LONGEST * (1.0 + _ROUNDING):
+        return []
+    apart = f"rows are {dt:.4g} s apart"
+    if dt < _SHORTEST:
+        return [f"{apart}: check the unit of t, and pass --scale t=FACTOR if it is not in seconds"]
+    unit, tick = next((unit, tick) for unit, tick, least in _CLOCKS if dt > least)
+    return [f"{apart}: if t is in {unit}, pass --scale t={tick:g}"]
 
 
 def say_jitter(time: FloatArray) -> list[str]:

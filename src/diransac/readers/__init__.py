@@ -10,7 +10,7 @@ import numpy as np
 
 from diransac.errors import LogError
 from diransac.log import Log
-from diransac.log.checks import check_names, check_time_order
+from diransac.log.checks import check_names, check_time_order, say_clock
 from diransac.prepare.steps import check_factor, rename_columns, resample_columns
 from diransac.readers.comma_separated import read_csv, read_csv_gz
 from diransac.readers.mat import read_mat
@@ -71,9 +71,9 @@ def read_log(
     if factors:
         time, signals = time * factors.get("t", 1.0), {n: x * factors.get(n, 1.0) for n, x in signals.items()}
         history.append({"step": "scale", "factors": factors})
-    notes = list(table.notes)
+    check_time_order(time, source)
+    notes = [*table.notes, *say_clock(time)]
     if resample is not None:
-        check_time_order(time, source)
         time, signals, step, said = resample_columns(time, signals, resample, source)
         history.append(step)
         notes += said
