@@ -172,6 +172,13 @@ def test_batch_size_and_threads_never_change_an_answer(method):
         assert replace(other, settings=usual.settings) == usual
 
 
+def test_systems_that_do_not_say_which_cores_are_ours_serve_too(monkeypatch):
+    """MacOS and Windows know no affinity."""
+    monkeypatch.delattr("os.sched_getaffinity", raising=False)
+    log = as_log(PLANE, *spoilt(), 0.02)
+    assert dr.identify(MODEL, log, settings=QUICK).iterations == 40
+
+
 @pytest.mark.parametrize("seed", [-1, 2**80, np.int64(3)])
 def test_any_whole_number_is_a_seed(seed):
     assert dr.identify(MODEL, as_log(PLANE, *spoilt(), 0.02), seed=seed, settings=QUICK).seed == int(seed)
