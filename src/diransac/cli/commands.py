@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from diransac.cli import screen
-from diransac.cli.arguments import load_model, model_file, names
+from diransac.cli.arguments import load_model, model_file
 from diransac.cli.group import Group, grouped
 from diransac.cli.options import (
     Derivation,
@@ -21,7 +21,7 @@ from diransac.cli.options import (
     Preparation,
     Report,
     Search,
-    known_method,
+    known_methods,
 )
 from diransac.cli.outputs import staged
 from diransac.cli.views import Equations, ModelList, compare_methods
@@ -98,7 +98,7 @@ def _compare(
     as_json: JsonFlag = False,
 ) -> None:
     """Identify by every method from one log, side by side."""
-    wanted = [known_method(name) for name in names(methods)]
+    wanted = known_methods(methods)
     arguments = search.arguments() | derivation.arguments()
     with staged([report], [file, model_file(model), search.settings]) as (page,):
         plant, log = load_model(model), preparation.read(file)

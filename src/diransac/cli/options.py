@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import inf
+from math import inf, isnan
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,7 +28,7 @@ __all__ = [
     "Preparation",
     "Report",
     "Search",
-    "known_method",
+    "known_methods",
 ]
 
 
@@ -49,6 +49,28 @@ def _rate(text: str | None) -> str | float | None:
         raise typer.BadParameter(f"--resample: {text!r} is no rate; give a number in Hz, or median") from error
 
 
+def known_methods(text: str) -> list[str]:
+    """``"a, b"`` as methods.  Raises typer.BadParameter: no method goes by a name, or none is named."""
+    wanted = [known_method(name) for name in names(text)]
+    if not wanted:
+        raise typer.BadParameter(f"--methods: none is named; there are {', '.join(METHODS)}")
+    return wanted
+
+
+def _file(text: str) -> Path:
+    """A file to write.  Raises typer.BadParameter: the name is empty, which `Path` takes for the folder we are in."""
+    if not text:
+        raise typer.BadParameter("the name is empty; give the name of a file")
+    return Path(text)
+
+
+def _moment(seconds: float | None) -> float | None:
+    """The number itself.  Raises typer.BadParameter: it is NaN."""
+    if seconds is not None and isnan(seconds):
+        raise typer.BadParameter("nan is no moment; give a number of seconds")
+    return seconds
+
+
 _LOG_HELP = "CSV(.gz), Parquet, NPZ or MAT: time t in seconds and one column a signal."
 _MODEL = typer.Option("--model", metavar="NAME|FILE.py[:NAME]", help="A built-in model, or one of yours.")
 
@@ -56,14 +78,18 @@ LogFile = Annotated[Path, typer.Argument(metavar="LOG", help=_LOG_HELP)]
 ModelName = Annotated[str, _MODEL]
 OptionalModelName = Annotated[str | None, _MODEL]
 MethodName = Annotated[str, typer.Option("--method", callback=known_method, help=f"One of {', '.join(METHODS)}.")]
-Output = Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE.json", help="Where to save the result.")]
-Report = Annotated[Path | None, typer.Option("--report", metavar="FILE.html", help="Where to write a page to look at.")]
+Output = Annotated[
+    Path | None, typer.Option("--output", "-o", parser=_file, metavar="FILE.json", help="Where to save the result.")
+]
+Report = Annotated[
+    Path | None, typer.Option("--report", parser=_file, metavar="FILE.html", help="Where to write a page to look at.")
+]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")]
 
 
-def _option(*names: str, metavar: str | None = None, help: str) -> Any:  # noqa: A002  typer's own word
+def _option(*names: str, **about: Any) -> Any:
     """An option on the preparation of the log."""
-    return typer.Option(*names, metavar=metavar, help=help, rich_help_panel="Preparation of the log, in this order")
+    return typer.Option(*names, rich_help_panel="Preparation of the log, in this order", **about)
 
 
 @dataclass(frozen=True)
@@ -118,8 +144,12 @@ class Preparation:
         str | None,
         _option("--resample", metavar="HZ|median", help="Resample at a uniform rate; median: the clock's usual one."),
     ] = None
-    start: Annotated[float | None, _option("--from", metavar="S", help="Leave out what comes before.")] = None
-    stop: Annotated[float | None, _option("--until", metavar="S", help="Leave out what comes after.")] = None
+    start: Annotated[
+        float | None, _option("--from", callback=_moment, metavar="S", help="Leave out what comes before.")
+    ] = None
+    stop: Annotated[
+        float | None, _option("--until", callback=_moment, metavar="S", help="Leave out what comes after.")
+    ] = None
     despike: Annotated[
         str | None, _option("--despike", metavar="all|NAME,...", help="Signals to take spikes out of.")
     ] = None
