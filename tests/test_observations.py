@@ -64,6 +64,21 @@ def test_nan_of_an_input_is_held_from_the_last_good_sample_and_counted():
     assert any("held" in note and "2 rows" in note for note in observations.notes)
 
 
+def test_gap_in_the_inputs_is_said_with_what_it_spoils():
+    """A few samples are bridged; where more are missing, what is simulated is no longer what flew."""
+    two, ten = tuple(range(5, 7)), tuple(range(30, 40))
+    notes = observe(MODEL, plane_log({(two, "thrust"): np.nan, (ten, "moment"): np.nan})).notes
+    assert notes[-2] == "inputs were held from the last good sample in 12 rows, where they are NaN"
+    assert notes[-1].startswith(
+        "inputs are unknown in 1 gap, the longest 0.22 s after t = 0.58 s: a simulation through it"
+    )
+    assert not any("gap" in note for note in observe(MODEL, plane_log({(two, "thrust"): np.nan})).notes)
+
+
+def test_input_unknown_from_the_start_is_not_held():
+    assert not any("held" in note for note in observe(MODEL, plane_log({(range(5), "thrust"): np.nan})).notes)
+
+
 def test_log_starts_where_everything_in_use_is_known():
     """An input that has no good sample yet cannot be held; a simulation cannot start without a state."""
     observations = observe(MODEL, plane_log({(0, "thrust"): np.nan, (1, "z_dot"): np.nan}))

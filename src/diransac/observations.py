@@ -27,6 +27,8 @@ BoolArray = npt.NDArray[np.bool_]
 # stands for a missing velocity needs a longer one.
 _ROWS_FOR_VALUE, _ROWS_FOR_SLOPE = 7, 25
 _FAR = 5.0
+# Rows that an input is held for, beyond which the motion is no longer the one that it made.
+_LONG_HOLD = 3
 
 
 @dataclass(frozen=True)
@@ -190,7 +192,7 @@ def observe(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: bool
             f"{log.source}: no row has a value in every signal in use ({', '.join(used)}); found NaN in each"
         )
     offset = int(np.argmax(valid))
-    notes = [*log.notes, *_row_notes(valid, held)]
+    notes = [*log.notes, *_row_notes(log, valid, held)]
     return Observations(model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], tuple(notes))
 
 
@@ -215,27 +217,42 @@ def _check_units(model: Model, log: Log, names: Sequence[str]) -> None:
         raise LogError(f'{log.source}: signal "{name}" is in {found}, the model needs {wanted}; {hint}')
 
 
-def _held_inputs(model: Model, log: Log) -> tuple[FloatArray, int]:
-    """Inputs ``(N, n_u)`` with NaN held from the last good sample, and how many were."""
-    missing = np.zeros(len(log), dtype=bool)
+def _held_inputs(model: Model, log: Log) -> tuple[FloatArray, BoolArray]:
+    """Inputs ``(N, n_u)`` with NaN held from the last good sample, and in which rows (N,) one was."""
+    held = np.zeros(len(log), dtype=bool)
     columns = []
     for name in model.inputs:
         column = log[name] if name in log else np.zeros(len(log))
         good = np.isfinite(column)
-        missing |= ~good
         last = np.maximum.accumulate(np.where(good, np.arange(len(column)), -1))
+        held |= ~good & (last >= 0)
         columns.append(np.where(last >= 0, column[last], np.nan))
-    return np.column_stack(columns) if columns else np.zeros((len(log), 0)), int(missing.sum())
+    return np.column_stack(columns) if columns else np.zeros((len(log), 0)), held
 
 
-def _row_notes(valid: BoolArray, held: int) -> list[str]:
+def _row_notes(log: Log, valid: BoolArray, held: BoolArray) -> list[str]:
     notes = []
     skipped = int((~valid).sum())
     if skipped:
         notes.append(f"{skipped} of {len(valid)} rows were skipped: a signal in use is NaN there")
-    if held:
-        notes.append(f"inputs were held from the last good sample in {held} rows, where they are NaN")
-    return notes
+    if held.any():
+        notes.append(f"inputs were held from the last good sample in {held.sum()} rows, where they are NaN")
+    return [*notes, *_gap_notes(log, held)]
+
+
+def _gap_notes(log: Log, held: BoolArray) -> list[str]:
+    """That inputs were held for too long to believe a simulation from there on, where they were."""
+    edges = np.flatnonzero(np.diff(np.r_[False, held, False]))
+    first, length = edges[::2], edges[1::2] - edges[::2]
+    n_gaps = int((length >= _LONG_HOLD).sum())
+    if not n_gaps:
+        return []
+    longest = int(length.argmax())
+    return [
+        f"inputs are unknown in {n_gaps} gap{'s' * (n_gaps > 1)}, the longest {(length[longest] + 1) * log.dt:.4g} s "
+        f"after t = {log.time[first[longest] - 1]:.6g} s: a simulation through it drifts, which fit error and "
+        "inliers count; a log cut there is scored without it"
+    ]
 
 
 def _spread(values: FloatArray) -> float:
