@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence, Set
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from diransac.errors import ResultError
@@ -30,6 +30,9 @@ def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -
         raise ResultError(f'two outputs go to "{named[0]}"; give each a file of its own')
     drafts = [Path() if path is None else _draft(path) for path in targets]
     try:
+        for draft, target in zip(drafts, targets, strict=True):
+            if target is not None:
+                _make(draft, target)
         yield drafts
         for draft, target in zip(drafts, targets, strict=True):
             if target is not None:
@@ -39,12 +42,20 @@ def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -
     finally:
         for draft, target in zip(drafts, targets, strict=True):
             if target is not None:
-                draft.unlink(missing_ok=True)
+                with suppress(OSError):  # where it could not be made
+                    draft.unlink()
 
 
 def _draft(target: Path) -> Path:
     """A name beside the target that keeps its ending, which chooses the format."""
     return target.with_name(f".{os.getpid()}-{target.name}")
+
+
+def _make(draft: Path, target: Path) -> None:
+    try:
+        draft.touch()
+    except OSError as error:
+        raise ResultError(f'output "{target}" cannot be written: {error.strerror}; choose another place') from error
 
 
 def _checked(path: Path, sources: Set[Path]) -> Path:
