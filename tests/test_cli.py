@@ -145,7 +145,7 @@ def test_settings_file_gives_way_to_what_is_set_on_the_command_line(folder: Path
     )
     settings = arguments.load_settings(
         Path("s.toml"),
-        ["sample_size=40", "inlier_thresholds.x_ddot=.25", "stop_inlier_fraction=none", "acceptance_weights=1,0.1"],
+        ["sample-size=40", "inlier_thresholds.x_ddot=.25", "stop_inlier_fraction=none", "acceptance_weights=1,0.1"],
     )
     assert settings == dr.Settings(
         max_iterations=30,
@@ -175,7 +175,7 @@ def test_set_reads_toml_values_bare_words_and_none(text: str, expected: dict[str
 @pytest.mark.parametrize(
     ("text", "code", "message"),
     [
-        ("max_iteration=3", 1, "max_iterations"),
+        ("max_iteration=3", 2, "max_iterations"),
         ("sample_size=0", 1, "sample_size"),
         ("sample_size", 2, "key=value"),
         ("=3", 2, "key=value"),
@@ -187,7 +187,7 @@ def test_set_refuses_what_it_cannot_mean(folder: Path, text: str, code: int, mes
     assert message in done.stderr
 
 
-@pytest.mark.parametrize("content", [None, b"sample_size = ", b"\xff\xfe", b"[[sample_size]]\na = 1"])
+@pytest.mark.parametrize("content", [None, b"sample_size = ", b"\xff\xfe", b"[[sample_size]]\na = 1", b"sample_sizes = 3"])
 def test_settings_file_that_cannot_be_used_is_named(folder: Path, content: bytes | None):
     if content is not None:
         Path("s.toml").write_bytes(content)

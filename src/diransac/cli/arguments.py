@@ -70,19 +70,26 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> Settings:
     Raises
     ------
     SettingsError
-        the file cannot be read, or a setting is unknown or has no meaning.
+        the file cannot be read or has an unknown setting, or a value has no meaning.
     typer.BadParameter
-        an assignment is not ``key=value``.
+        an assignment is not ``key=value``, or its key is no setting.
     """
-    table = {} if file is None else _read_toml(file)
+    table = {} if file is None else {key.replace("-", "_"): value for key, value in _read_toml(file).items()}
     for text in assignments:
         key, equals, value = text.partition("=")
         keys = [part.strip() for part in key.split(".")]
         if not equals or not all(keys):
             raise typer.BadParameter(f"--set: {text!r} is not key=value")
-        _assign(table, keys, _toml_value(value.strip()))
-    plain = {key.replace("-", "_"): value for key, value in table.items()}
-    return Settings.from_dict({key: _none_where_meant(key, value) for key, value in plain.items()})
+        _assign(table, [_known_setting(keys[0]), *keys[1:]], _toml_value(value.strip()))
+    return Settings.from_dict({key: _none_where_meant(key, value) for key, value in table.items()})
+
+
+def _known_setting(key: str) -> str:
+    name = key.replace("-", "_")
+    known = [field.name for field in dataclasses.fields(Settings)]
+    if name not in known:
+        raise typer.BadParameter(f'--set: there is no setting "{key}"; there are {", ".join(known)}')
+    return name
 
 
 def _read_toml(file: Path) -> dict[str, Any]:
