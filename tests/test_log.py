@@ -179,10 +179,16 @@ def test_split_parts_make_the_whole():
     assert np.array_equal(np.concatenate([first["u"], second["u"]]), log["u"])
 
 
-@pytest.mark.parametrize("part", [lambda x: x[3:4], lambda x: x.between(5.0, 6.0), lambda x: x.split(0.0)])
+@pytest.mark.parametrize("part", [lambda x: x[3:4], lambda x: x.between(5.0, 6.0), lambda x: x.split(0.001)])
 def test_a_part_without_two_rows_is_refused(part):
     with pytest.raises(LogError, match="2 rows"):
         part(example())
+
+
+@pytest.mark.parametrize("fraction", [np.nan, -0.5, 0.0, 1.0, np.inf])
+def test_split_refuses_what_is_no_fraction(fraction):
+    with pytest.raises(LogError, match=r"fraction is .*; give a number between 0 and 1"):
+        example().split(fraction)
 
 
 # ---------------------------------------------------------------------- identity
@@ -239,6 +245,12 @@ def test_missing_values_of_frames_are_nan():
 def test_a_frame_without_its_time_column_is_refused():
     with pytest.raises(LogError, match='no time column "t"; found a, b'):
         Log.from_frame(pl.DataFrame({"a": [0, 1], "b": [0, 1]}))
+
+
+@pytest.mark.parametrize("frame", [3, "a.csv", {"t": [0, 1]}])
+def test_what_is_no_frame_is_refused(frame):
+    with pytest.raises(LogError, match=r"frame is a .*; give a polars or pandas data frame"):
+        Log.from_frame(frame)
 
 
 def test_a_frame_with_two_columns_of_one_name_is_refused():

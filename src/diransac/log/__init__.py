@@ -114,8 +114,10 @@ class Log:
 
         A column ``theta [deg]`` is the signal ``theta`` in degrees; one that does not hold numbers is left out, and
         said in the notes.
-        Raises LogError: as `Log`; there is no such time column.
+        Raises LogError: as `Log`; it is no data frame; there is no such time column.
         """
+        if not hasattr(frame, "columns"):
+            raise LogError(f"{source}: frame is a {type(frame).__name__}; give a polars or pandas data frame")
         headers = [split_unit(str(column)) for column in frame.columns]
         columns = {name: frame[column].to_numpy() for (name, _), column in zip(headers, frame.columns, strict=True)}
         if len(columns) < len(headers):
@@ -244,8 +246,10 @@ class Log:
     def split(self, fraction: float) -> tuple[Log, Log]:
         """The log's first ``fraction`` of rows and the rest, such as for identifying and validating.
 
-        Raises LogError: either part would have fewer than 2 rows.
+        Raises LogError: it is no number between 0 and 1, or either part would have fewer than 2 rows.
         """
+        if not 0.0 < fraction < 1.0:
+            raise LogError(f"{self.source}: fraction is {fraction}; give a number between 0 and 1")
         row = round(fraction * len(self))
         return self[:row], self[row:]
 
