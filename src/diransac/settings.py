@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from diransac.errors import SettingsError
+from diransac.simulate import INTEGRATORS
 
-__all__ = ["INTEGRATORS", "Settings"]
+__all__ = ["Settings"]
 
-INTEGRATORS = ("rk4", "euler", "semi-implicit-euler")
 REFITS = ("inliers", "none")
 INITIAL_STATES = ("first", "robust")
 
@@ -75,7 +75,7 @@ class Settings:
                 object.__setattr__(self, name, _by_name(name, getattr(self, name), 0.0))
         self._check_acceptance()
         _one_of("refit", self.refit, REFITS)
-        _one_of("integrator", self.integrator, INTEGRATORS)
+        _one_of("integrator", self.integrator, tuple(INTEGRATORS))
         if isinstance(self.initial_state, Mapping):
             object.__setattr__(self, "initial_state", _by_name("initial_state", self.initial_state, -np.inf))
         else:
