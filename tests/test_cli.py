@@ -121,6 +121,15 @@ def test_identify_derives_only_when_asked(folder: Path):
     assert json.loads(done.stdout)["parameters"]["mass"] == pytest.approx(TRUE["mass"], rel=0.02)
 
 
+def test_a_bandwidth_without_differentiation_is_refused_in_the_command_line_s_words(folder: Path):
+    run("identify", "swim.csv", *MODEL, "--method", "ols", "-o", "model.json")
+    for words in (["identify", "swim.csv", *MODEL], ["validate", "model.json", "swim.csv"]):
+        done = run(*words, "--bandwidth", 3)
+        assert done.exit_code == 1
+        assert "--bandwidth" in done.stderr
+        assert "--differentiate" in done.stderr
+
+
 def test_progress_is_shown_on_a_terminal_and_never_on_stdout(folder: Path, monkeypatch: pytest.MonkeyPatch):
     silent = run("identify", "swim.csv", *MODEL, *QUICK, "--json")
     monkeypatch.setenv("FORCE_COLOR", "1")
@@ -187,7 +196,9 @@ def test_set_refuses_what_it_cannot_mean(folder: Path, text: str, code: int, mes
     assert message in done.stderr
 
 
-@pytest.mark.parametrize("content", [None, b"sample_size = ", b"\xff\xfe", b"[[sample_size]]\na = 1", b"sample_sizes = 3"])
+@pytest.mark.parametrize(
+    "content", [None, b"sample_size = ", b"\xff\xfe", b"[[sample_size]]\na = 1", b"sample_sizes = 3"]
+)
 def test_settings_file_that_cannot_be_used_is_named(folder: Path, content: bytes | None):
     if content is not None:
         Path("s.toml").write_bytes(content)
@@ -225,8 +236,9 @@ def test_model_file_may_import_its_neighbours(folder: Path):
         ("no-such-model", None, "planar-rotorcraft"),
         ("absent.py", None, 'model file "absent.py" does not exist'),
         ("bent.py:boat", None, "models found: model"),
-        ("bent.py:other", None, "is a int, not a Model"),
+        ("bent.py:other", None, "is of type int, not a Model"),
         ("bent.py:make", None, "call it there: model = make()"),
+        ("broken.py", "x = 1\0", 'broken.py": SyntaxError'),
         ("broken.py", "x = 1\nx +\n", "line 2: SyntaxError"),
         ("broken.py", "x = 1\n\n1 / 0\n", "line 3: ZeroDivisionError"),
         ("broken.py", "import sys\nsys.exit(0)\n", "line 2: SystemExit"),

@@ -158,7 +158,7 @@ def load_model(text: str) -> Model:
     value = defined[name]
     if not isinstance(value, Model):
         hint = f"call it there: model = {name}()" if callable(value) else "assign a diransac.Model to it"
-        raise ModelError(f'model file "{file}": "{name}" is a {type(value).__name__}, not a Model; {hint}')
+        raise ModelError(f'model file "{file}": "{name}" is of type {type(value).__name__}, not a Model; {hint}')
     return value
 
 
@@ -191,6 +191,6 @@ def _importable(folder: Path) -> Iterator[None]:
 def _line(error: BaseException, file: Path) -> str:
     """``, line 12``: where in the user's file an error arose; nothing where it did not."""
     if isinstance(error, SyntaxError):
-        return f", line {error.lineno}"
+        return f", line {error.lineno}" if error.lineno else ""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)]
     return f", line {lines[-1]}" if lines else ""

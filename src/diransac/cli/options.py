@@ -11,7 +11,7 @@ import typer
 
 from diransac import prepare
 from diransac.cli.arguments import load_settings, names, numbers, pairs
-from diransac.errors import LogError
+from diransac.errors import LogError, SettingsError
 from diransac.identify import METHODS
 from diransac.log import Log
 from diransac.model import Model
@@ -120,12 +120,18 @@ class Derivation:
     ] = None
 
     def arguments(self) -> dict[str, Any]:
-        """What `diransac.identify` is called with."""
+        """What `diransac.identify` is called with.  Raises SettingsError: there is a bandwidth of nothing."""
+        self._check()
         return {"differentiate": self.differentiate, "bandwidth": self.bandwidth}
 
     def derive(self, log: Log, model: Model) -> Log:
-        """The log with what it lacks, if that is wanted.  Raises LogError: it cannot be derived."""
+        """The log with what it lacks, if that is wanted.  Raises LogError: it cannot; SettingsError: as `arguments`."""
+        self._check()
         return prepare.differentiate(log, model, self.bandwidth) if self.differentiate else log
+
+    def _check(self) -> None:
+        if self.bandwidth is not None and not self.differentiate:
+            raise SettingsError("--bandwidth is that of --differentiate, which is not given; give both or neither")
 
 
 @dataclass(frozen=True)
