@@ -98,6 +98,10 @@ def _check_ragged(lines: list[str], separator: str, source: str) -> None:
         counts = [(row + 1, line.count(separator) + 1) for row, line in enumerate(lines)]
     expected = counts[0][1]
     for number, count in counts:
+        if count != expected and not lines[number - 1].strip():
+            n = sum(not line.strip() for line in lines)
+            which = f"line {number} is blank, the first of {n}" if n > 1 else f"line {number} is blank"
+            raise LogError(f"{source}: {which}; remove blank lines")
         if count != expected:
             raise LogError(f"{source}: line {number} has {count} fields, the header has {expected}")
 
