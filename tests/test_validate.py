@@ -92,6 +92,20 @@ def test_horizon_shorter_than_a_sample_is_refused(horizon):
         dr.validate(TRUE, as_log(PLANE, *noisy_flight(), DT), horizon=horizon)
 
 
+@pytest.mark.parametrize(
+    ("plant", "log", "horizon", "says"),
+    [
+        (TRUE, "clean.csv", None, "log is a str; give a dr.Log"),
+        ("model.json", None, None, "plant is 'model.json'; give a dr.Plant or a dr.Result"),
+        (TRUE.model, None, None, "plant is Model.*; give a dr.Plant or a dr.Result"),
+        (TRUE, None, "x", "horizon is 'x'; give seconds"),
+    ],
+)
+def test_argument_of_another_kind_is_refused(plant, log, horizon, says):
+    with pytest.raises(SettingsError, match=says):
+        dr.validate(plant, log or as_log(PLANE, *flight(PLANE, N, DT), DT), horizon)
+
+
 def test_horizon_longer_than_the_log_is_the_whole_log():
     validation = dr.validate(TRUE, as_log(PLANE, *noisy_flight(), DT), horizon=1e6)
     assert [scores.horizon for scores in validation.horizons] == [np.inf]

@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.errors import LogError, SettingsError
+from diransac.log import Log
 from diransac.observations import Observations, observe
 from diransac.simulate import Rollouts, rollouts
 from diransac.text_table import aligned
 
 if TYPE_CHECKING:
-    from diransac.log import Log
     from diransac.model import Model
 
 __all__ = ["Scores", "Validation", "validate"]
@@ -125,8 +125,10 @@ def validate(
     integrator, substeps : as in `Settings`
 
     The first row of a window, where the state is the measured one, is not scored.
-    Raises LogError: the log lacks an input or an initial state; SettingsError: a horizon shorter than a sample.
+    Raises LogError: the log lacks an input or an initial state; SettingsError: an argument is of another kind, a
+    horizon shorter than a sample.
     """
+    _check_arguments(plant, log, horizon)
     observations = observe(plant.model, log, pointwise=False)
     parameters = plant.model.parameter_vector(plant.parameters)
     engine = rollouts(plant.model, observations.signals, integrator=integrator, substeps=substeps)
@@ -142,6 +144,15 @@ def validate(
     asked = 0 if horizon is not None else len(scores) - 1
     units = {n: plant.model.units[n] for n in observations.signals}
     return Validation(log.source, units, tuple(scores), asked, observations.notes)
+
+
+def _check_arguments(plant: object, log: object, horizon: object) -> None:
+    if not hasattr(plant, "model") or not hasattr(plant, "parameters"):
+        raise SettingsError(f"plant is {plant!r:.60}; give a dr.Plant or a dr.Result, such as dr.Result.load(path)")
+    if not isinstance(log, Log):
+        raise SettingsError(f"log is a {type(log).__name__}; give a dr.Log, such as dr.read_log(path)")
+    if horizon is not None and not isinstance(horizon, (int, float, np.number)):
+        raise SettingsError(f"horizon is {horizon!r:.60}; give seconds")
 
 
 def _score(
