@@ -31,6 +31,13 @@ other = 3
 def make():
     return model
 """
+HOVER = """
+from diransac import Model, Parameter
+model = Model(
+    name="hover", coordinates={"x": "m"}, inputs={"thrust": "N"}, parameters={"mass": Parameter("kg", positive=True)},
+    equations=lambda q, v, a, u, p: [p.mass * (a.x + 9.81) - u.thrust],
+)
+"""
 
 
 def run(*words: object) -> Result:
@@ -366,6 +373,29 @@ def test_inspect_says_which_parameters_the_motion_shows(folder: Path):
     assert set(dull["verdicts"].values()) == {"not"}
     assert "mass" in dull["verdicts"]
     assert "is missing" in dull["reason"]
+
+
+def test_inspect_doubts_an_estimate_from_a_log_with_spikes(folder: Path):
+    t = np.arange(600) * 0.01
+    log = swim(t)
+    log["thrust"][np.random.default_rng(0).choice(600, 60, replace=False)] += 500.0
+    dr.Log.from_arrays(t, log).write("spiky.csv")
+    spiky = json.loads(run("inspect", "spiky.csv", *MODEL, "--json").stdout)["fitness"]
+    clean = json.loads(run("inspect", "swim.csv", *MODEL, "--json").stdout)["fitness"]
+    assert "spikes in thrust" in spiky["caveat"]
+    assert spiky["caveat"] in run("inspect", "spiky.csv", *MODEL).stdout
+    assert clean["caveat"] == ""
+
+
+def test_inspect_agrees_with_identify_that_nothing_moves(folder: Path):
+    Path("hover.py").write_text(HOVER)
+    rest = {"x": np.zeros(600), "x_dot": np.zeros(600), "x_ddot": np.zeros(600), "thrust": np.full(600, 9.81)}
+    dr.Log.from_arrays(np.arange(600) * 0.01, rest).write("rest.csv")
+    fitness = json.loads(run("inspect", "rest.csv", "--model", "hover.py", "--json").stdout)["fitness"]
+    refused = run("identify", "rest.csv", "--model", "hover.py", "--method", "ols")
+    assert (fitness["excitation"], refused.exit_code) == ({}, 1)
+    assert "nothing moves" in fitness["reason"]
+    assert "nothing moves" in refused.stderr
 
 
 def test_inspect_shows_a_log_whose_clock_is_uneven(folder: Path):

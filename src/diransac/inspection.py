@@ -13,7 +13,9 @@ import numpy.typing as npt
 from diransac import prepare
 from diransac.errors import LogError
 from diransac.estimators import OrdinaryLeastSquares
+from diransac.evaluation import choose_scoring
 from diransac.observations import observe
+from diransac.settings import Settings
 from diransac.text_table import aligned
 from diransac.uncertainty import jackknife_covariance
 
@@ -84,6 +86,7 @@ class Fitness:
     derivable : those of them that differentiation supplies
     excitation : by parameter; empty where it cannot be said
     reason : why it cannot be said
+    caveat : what makes it doubtful
     """
 
     model: str
@@ -91,6 +94,7 @@ class Fitness:
     derivable: tuple[str, ...]
     excitation: Mapping[str, Excitation]
     reason: str = ""
+    caveat: str = ""
 
 
 @dataclass(frozen=True)
@@ -139,7 +143,7 @@ class Inspection:
             for name, x in found.excitation.items():
                 rows.append((name, f"{x.estimate:.4g}", x.unit, f"{100 * x.relative_error:.2g} %", x.verdict))
             lines += aligned(rows)
-        return lines
+        return lines + ([f"  {found.caveat}"] if found.caveat else [])
 
 
 def inspect(log: Log, model: Model | None = None) -> Inspection:
@@ -149,6 +153,8 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
     """
     signals = {name: _signal_facts(log, name) for name in log.names}
     fitness = None if model is None else _fitness(log, model)
+    if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
+        fitness = dataclasses.replace(fitness, caveat=_caveat(signals, model))
     return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, log.notes, fitness)
 
 
@@ -201,10 +207,21 @@ def _fitness(log: Log, model: Model) -> Fitness:
             model.name, missing, derivable, {}, f"not affine in {names}: only a search can tell what is excited"
         )
     try:
-        bound = OrdinaryLeastSquares().bind(observe(model, derived))
+        observations = observe(model, derived)
+        excitation, reason = _excitation(OrdinaryLeastSquares().bind(observations), model)
+        if not reason:
+            choose_scoring(observations, Settings())  # refuses a log in which nothing moves, as identify does
     except LogError as error:
         return Fitness(model.name, missing, derivable, {}, str(error))
-    return Fitness(model.name, missing, derivable, *_excitation(bound, model))
+    return Fitness(model.name, missing, derivable, excitation, reason)
+
+
+def _caveat(signals: Mapping[str, SignalFacts], model: Model) -> str:
+    """What spikes in the signals of the equations do to an estimate that believes every row; nothing without them."""
+    spiked = [name for name in model.required_signals if name in signals and signals[name].n_spikes]
+    if not spiked:
+        return ""
+    return f"spikes in {', '.join(spiked)} bend these estimates and errors: --despike them, or trust identify alone"
 
 
 def _derived(log: Log, model: Model) -> Log:
