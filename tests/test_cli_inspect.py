@@ -99,8 +99,11 @@ def test_inspect_shows_a_log_whose_clock_is_uneven(folder: Path):
 
 def test_inspect_shows_numbers_whose_squares_overflow(folder: Path):
     t = np.arange(600) * 0.01
-    dr.Log.from_arrays(t, {"x": 1e200 * np.sin(t), "y": 0 * t, "z": np.sin(t)}).write("huge.csv")
+    dr.Log.from_arrays(t, {"x": 1e200 * np.sin(t), "y": 0 * t, "z": np.sin(t), "w": 1.7e308 * np.cos(t)}).write(
+        "huge.csv"
+    )
     signals = json.loads(run("inspect", "huge.csv", "--json").stdout)["signals"]
     assert signals["x"]["standard_deviation"] == pytest.approx(1e200 * np.sin(t).std())
+    assert signals["w"]["standard_deviation"] == pytest.approx(1.7e308 * np.cos(t).std())
     assert signals["y"]["standard_deviation"] == 0.0
     assert signals["z"]["standard_deviation"] == pytest.approx(np.sin(t).std())

@@ -167,7 +167,8 @@ def _signal_facts(log: Log, name: str) -> SignalFacts:
     low, high, spread = (finite.min(), finite.max(), _spread(finite)) if len(finite) else (np.nan,) * 3
     run = _longest_run(values)
     frozen = run * log.dt if run >= _FROZEN_SAMPLES else 0.0
-    n_spikes = int(prepare.spikes(values).sum())
+    with np.errstate(over="ignore"):  # a bound that overflows is infinite, and nothing is beyond it
+        n_spikes = int(prepare.spikes(values).sum())
     return SignalFacts(
         log.units.get(name), float(low), float(high), float(spread), int(np.isnan(values).sum()), n_spikes, frozen
     )
