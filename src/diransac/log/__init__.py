@@ -101,7 +101,8 @@ class Log:
     ) -> Log:
         """A log of arrays ``(N,)`` in memory; ``time`` in seconds.
 
-        Raises LogError: as `Log`; a column that does not hold real numbers; a unit for a signal that is not there.
+        Raises LogError: as `Log`; a column that does not hold real numbers; a unit for a signal that is not there;
+        rows so far apart that the time cannot be in seconds.
         """
         columns = {name: np.asarray(values) for name, values in signals.items()}
         return cls._from_columns(np.asarray(time), columns, units or {}, source)
@@ -144,7 +145,7 @@ class Log:
         if unknown:
             raise LogError(f'{source}: a unit is given for "{unknown[0]}"; found {", ".join(columns)}')
         log = cls(time, columns, units, source, unusable=unusable or {})
-        return replace(log, notes=(*checks.say_clock(log.time), *log.findings()))
+        return replace(log, notes=(*checks.check_clock(log.time, source), *log.findings()))
 
     def findings(self) -> tuple[str, ...]:
         """What is worth saying: columns left out, an uneven clock, missing values, infinities; a sentence each."""

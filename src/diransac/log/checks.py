@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 __all__ = [
     "as_column",
     "as_numbers",
+    "check_clock",
     "check_even",
     "check_names",
     "check_time_order",
     "numeric_columns",
-    "say_clock",
     "say_gaps",
     "say_jitter",
 ]
@@ -30,9 +30,9 @@ FloatArray = npt.NDArray[np.float64]
 _SILENT_JITTER, _TOLERATED_JITTER, _GAP = 1e-3, 0.2, 1.5
 _ROUNDING = 1e-6
 
-# Seconds from row to row that are likely; and the clocks that explain longer ones: a tick in seconds, and the number of
-# ticks from row to row above which it is this clock rather than the next.
-_SHORTEST, _LONGEST = 1e-7, 1.0
+# Seconds from row to row that are likely, and those beyond which there is no log.  Clocks that explain longer ones: a
+# tick in seconds, and the number of ticks from row to row above which it is this clock rather than the next.
+_SHORTEST, _LONGEST, _ABSURD = 1e-7, 1.0, 1e3
 _CLOCKS = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("milliseconds", 1e-3, _LONGEST))
 
 
@@ -146,8 +146,11 @@ def check_even(time: FloatArray, source: str) -> None:
     )
 
 
-def say_clock(time: FloatArray) -> list[str]:
-    """Whether the usual interval tells of a time that is not in seconds, and the scale that would make it so."""
+def check_clock(time: FloatArray, source: str) -> list[str]:
+    """Whether the usual interval tells of a time that is not in seconds, and the scale that would make it so.
+
+    Raises LogError: the interval is longer than any machine's log has.
+    """
     dt = float(np.median(np.diff(time)))
     if _SHORTEST <= dt <= _LONGEST * (1.0 + _ROUNDING):
         return []
@@ -155,7 +158,10 @@ def say_clock(time: FloatArray) -> list[str]:
     if dt < _SHORTEST:
         return [f"{apart}: check the unit of t, and pass --scale t=FACTOR if it is not in seconds"]
     unit, tick = next((unit, tick) for unit, tick, least in _CLOCKS if dt > least)
-    return [f"{apart}: if t is in {unit}, pass --scale t={tick:g}"]
+    finding = f"{apart}: if t is in {unit}, pass --scale t={tick:g}"
+    if dt > _ABSURD:
+        raise LogError(f"{source}: {finding}, or read_log(..., scale={{'t': {tick:g}}})")
+    return [finding]
 
 
 def say_jitter(time: FloatArray) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from diransac.errors import LogError
 from diransac.log import Log
-from diransac.log.checks import check_names, check_time_order, say_clock
+from diransac.log.checks import check_clock, check_names, check_time_order
 from diransac.prepare.steps import check_factor, rename_columns, resample_columns
 from diransac.readers.comma_separated import read_csv, read_csv_gz
 from diransac.readers.mat import read_mat
@@ -72,7 +72,7 @@ def read_log(
         time, signals = time * factors.get("t", 1.0), {n: x * factors.get(n, 1.0) for n, x in signals.items()}
         history.append({"step": "scale", "factors": factors})
     check_time_order(time, source)
-    notes = [*table.notes, *say_clock(time)]
+    notes = [*table.notes, *check_clock(time, source)]
     if resample is not None:
         time, signals, step, said = resample_columns(time, signals, resample, source)
         history.append(step)
