@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from command_line import MODEL, QUICK, contents, run, working_folder
-from diransac.cli import outputs
+from diransac.cli import outputs, screen
 
 
 @pytest.fixture
@@ -79,6 +79,13 @@ def test_outputs_are_checked_before_the_work(
     assert done.exit_code == 1
     assert message in done.stderr
     assert contents(folder) == before
+
+
+def test_a_process_without_stderr_works_in_silence(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    with monkeypatch.context() as patched:
+        patched.setattr("sys.stderr", None)
+        with screen.bar("ols") as progress:
+            assert progress is None
 
 
 def test_report_is_one_page(folder: Path):

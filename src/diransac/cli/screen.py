@@ -48,7 +48,7 @@ def _finite(data: object) -> object:
 @contextmanager
 def bar(label: str) -> Iterator[Progress | None]:
     """What a search reports its progress to: a bar on a terminal's stderr, nothing elsewhere."""
-    if not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
+    if sys.stderr is None or not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
         yield None
         return
     from rich import progress
