@@ -28,7 +28,7 @@ coverage: $(ENVIRONMENT)
 	$(BIN)/pytest -q --cov --cov-report=term
 
 lock: $(ENVIRONMENT)  ## pin every dependency anew
-	$(BIN)/pip-compile --quiet --all-extras --strip-extras --upgrade --no-emit-index-url --no-emit-trusted-host \
+	$(BIN)/pip-compile --quiet --extra dev --strip-extras --upgrade --no-emit-index-url --no-emit-trusted-host \
 		--no-emit-find-links --no-annotate --no-header --output-file requirements.lock pyproject.toml
 
 clean:
