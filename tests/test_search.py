@@ -338,9 +338,14 @@ def test_chain_that_meets_a_set_again_ends():
     assert script.fitted == [(0, 1), (1, 2), (2, 3, 4), (5, 6, 7, 8), (2, 3, 4, 5)]
 
 
-def test_inliers_that_are_the_sample_itself_are_not_fitted_again():
+def test_inliers_that_are_the_sample_itself_in_whatever_order_are_not_fitted_again():
+    def backwards(*arguments):
+        return first_two(*arguments)[:, ::-1]
+
     script = Script({(0, 1): 1.0}, {1.0: (5.0, [0, 1])})
-    assert run_script(script, max_iterations=1).evaluated == 1
+    settings = Settings(sample_size=2, max_iterations=2, stop_inlier_fraction=None)
+    search(InlierBiasedDiransac(), settings, script, script, backwards, seed=0)
+    assert script.fitted == [(0, 1), (1, 2)]
 
 
 @pytest.mark.parametrize("variant", [InlierBiasedDiransac((1.0, 0.0)), Diransac()], ids=lambda v: v.name)
