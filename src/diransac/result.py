@@ -253,7 +253,7 @@ class Result:
         parts.append(f"fitted to {self.fitted_rows} rows")
         if self.iterations:
             skipped = ", ".join(f"{n} {reason}" for reason, n in self.skipped.items())
-            parts.append(f"{self.iterations} samples, {self.stop_reason}")
+            parts.append(f"{self.iterations} sample{'s' if self.iterations > 1 else ''}, {self.stop_reason}")
             parts.append(f"{self.evaluated} hypotheses" + (f" ({skipped})" if skipped else ""))
         return "; ".join(parts)
 
