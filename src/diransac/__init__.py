@@ -1,8 +1,10 @@
 """From the messy log of a real machine to a dynamical model that can be simulated, flown and trusted.
 
 ``import diransac as dr``: equations in a `Model`, measurements in a `Log`, `identify` in between, a `Result` out.
+Models and errors are here at once; everything else is imported when it is first asked for.
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from diransac import models
@@ -14,19 +16,19 @@ from diransac.errors import (
     ResultError,
     SettingsError,
 )
-from diransac.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
-from diransac.identify import METHODS, identify
-from diransac.log import Log
 from diransac.model import Model, Parameter, Plant
-from diransac.nonlinear import NonlinearLeastSquares
-from diransac.prepare import despike, differentiate, rename, resample, scale, shift
-from diransac.readers import read_log
-from diransac.result import Result
-from diransac.settings import Settings
-from diransac.validate import Validation, validate
 
 if TYPE_CHECKING:
+    from diransac.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
+    from diransac.identification import METHODS, identify
+    from diransac.log import Log
+    from diransac.nonlinear import NonlinearLeastSquares
+    from diransac.prepare import despike, differentiate, rename, resample, scale, shift
+    from diransac.readers import read_log
     from diransac.report import write_report
+    from diransac.result import Result
+    from diransac.settings import Settings
+    from diransac.validation import Validation, validate
 
 __all__ = [
     "METHODS",
@@ -60,14 +62,31 @@ __all__ = [
     "write_report",
 ]
 
+_FOUND_IN = {
+    "estimators": ("OrdinaryLeastSquares", "ScikitLearnEstimator", "TotalLeastSquares"),
+    "identification": ("METHODS", "identify"),
+    "log": ("Log",),
+    "nonlinear": ("NonlinearLeastSquares",),
+    "prepare": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
+    "readers": ("read_log",),
+    "report": ("write_report",),
+    "result": ("Result",),
+    "settings": ("Settings",),
+    "validation": ("Validation", "validate"),
+}
+_LATER = {name: module for module, names in _FOUND_IN.items() for name in names}
+_SUBMODULES = ("prepare", "simulate")
+
 
 def __getattr__(name: str) -> Any:
-    """What is imported when it is first asked for: identifying needs no page."""
-    if name == "write_report":
-        from diransac.report import write_report
-
-        return write_report
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """What is imported when it is first asked for."""
+    if name in _SUBMODULES:
+        return importlib.import_module(f"diransac.{name}")
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"diransac.{_LATER[name]}"), name)
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

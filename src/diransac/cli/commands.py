@@ -25,10 +25,10 @@ from diransac.cli.options import (
 )
 from diransac.cli.outputs import staged
 from diransac.cli.views import Equations, ModelList, compare_methods
-from diransac.identify import METHODS, identify
+from diransac.identification import METHODS, identify
 from diransac.inspection import inspect
 from diransac.result import Result
-from diransac.validate import validate
+from diransac.validation import validate
 
 __all__ = ["app"]
 

@@ -12,7 +12,7 @@ import typer
 from diransac import prepare
 from diransac.cli.arguments import load_settings, names, numbers, pairs
 from diransac.errors import LogError, SettingsError
-from diransac.identify import METHODS
+from diransac.identification import METHODS
 from diransac.log import Log
 from diransac.model import Model
 from diransac.readers import read_log

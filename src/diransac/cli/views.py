@@ -9,7 +9,7 @@ from typing import Any
 
 from diransac.cli.screen import bar
 from diransac.errors import DiransacError
-from diransac.identify import identify
+from diransac.identification import identify
 from diransac.log import Log
 from diransac.model import Model, Parameter
 from diransac.models import BUILTIN

@@ -18,7 +18,7 @@ from diransac.observations import Observations, observe
 from diransac.result import Result
 from diransac.settings import Settings
 from diransac.simulate import inlier_mask, rollouts
-from diransac.validate import Validation, validate
+from diransac.validation import Validation, validate
 
 __all__ = ["Run", "bulk", "labelled", "simulate_on"]
 

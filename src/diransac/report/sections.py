@@ -16,7 +16,7 @@ from diransac.report.judgement import bounds_text, findings, verdict, worst
 from diransac.report.markup import Html, join, number, percent, plural, table, tag
 from diransac.report.runs import Run
 from diransac.settings import Settings
-from diransac.validate import Scores, Validation
+from diransac.validation import Scores, Validation
 
 __all__ = ["equations", "heading", "making", "parameters", "scores", "short"]
 
