@@ -13,6 +13,7 @@ from diransac.errors import (
     IdentificationError,
     LogError,
     ModelError,
+    PlanningError,
     ResultError,
     SettingsError,
 )
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from diransac.report import write_report
     from diransac.result import Result
     from diransac.settings import Settings
+    from diransac.trajectory import Trajectory
     from diransac.validation import Validation, validate
 
 __all__ = [
@@ -41,6 +43,7 @@ __all__ = [
     "NonlinearLeastSquares",
     "OrdinaryLeastSquares",
     "Parameter",
+    "PlanningError",
     "Plant",
     "Result",
     "ResultError",
@@ -48,6 +51,7 @@ __all__ = [
     "Settings",
     "SettingsError",
     "TotalLeastSquares",
+    "Trajectory",
     "Validation",
     "despike",
     "differentiate",
@@ -72,6 +76,7 @@ _FOUND_IN = {
     "report": ("write_report",),
     "result": ("Result",),
     "settings": ("Settings",),
+    "trajectory": ("Trajectory",),
     "validation": ("Validation", "validate"),
 }
 _LATER = {name: module for module, names in _FOUND_IN.items() for name in names}

@@ -7,6 +7,7 @@
     ├── LogError               a log, or a file that should hold one, cannot be used
     ├── SettingsError          a setting, or an argument of a call, has no meaning here
     ├── IdentificationError    the search ended without parameters
+    ├── PlanningError          no trajectory, or no controller, does what was asked for
     └── ResultError            a saved result cannot be read back, or does not fit what it is used with
 
 A message says what was wrong, what was found, and what to try.
@@ -17,6 +18,7 @@ __all__ = [
     "IdentificationError",
     "LogError",
     "ModelError",
+    "PlanningError",
     "ResultError",
     "SettingsError",
 ]
@@ -40,6 +42,10 @@ class SettingsError(DiransacError):
 
 class IdentificationError(DiransacError):
     """The search ended without parameters."""
+
+
+class PlanningError(DiransacError):
+    """No trajectory, or no controller, does what was asked for."""
 
 
 class ResultError(DiransacError):
