@@ -9,6 +9,7 @@
 | `machine_code.py` | LLVM module -> callable machine code; threads |
 | `map_loop.py`, `row_map.py` | one function over many rows |
 | `time_loop.py` | the time loop of a simulation; `diransac.simulate` is its face |
+| `scan.py` | any other recurrence over rows, by the same loop |
 | `inputs.py`, `kept.py` | variants of the loop: where inputs come from; what is kept of rollouts |
 | `lanes.py` | arrays of many rollouts, checked and arranged for the loop |
 
@@ -17,5 +18,6 @@ LLVM is loaded when something is first compiled.
 
 from diransac.kernel.machine_code import Target
 from diransac.kernel.row_map import Map, compile_map
+from diransac.kernel.scan import Scan, compile_scan
 
-__all__ = ["Map", "Target", "compile_map"]
+__all__ = ["Map", "Scan", "Target", "compile_map", "compile_scan"]

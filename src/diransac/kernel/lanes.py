@@ -8,10 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.errors import SettingsError
-from diransac.kernel.machine_code import LANES
+from diransac.kernel.machine_code import LANES, run_blocks
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike, NDArray
+
+    from diransac.kernel.machine_code import MachineCode
 
     Floats = NDArray[np.float64]
 
@@ -22,6 +26,7 @@ __all__ = [
     "arranged_laws",
     "arranged_measurements",
     "arranged_weights",
+    "run_time_loop",
     "squared_thresholds",
 ]
 
@@ -178,6 +183,22 @@ def squared_thresholds(thresholds: ArrayLike, n_signals: int) -> Floats:
         raise SettingsError(f"thresholds are {limits.tolist()}, but each must be 0 (off) or positive.")
     with np.errstate(over="ignore", under="ignore"):
         return np.asarray(np.square(limits))
+
+
+def run_time_loop(code: MachineCode, lanes: Lanes, values: Mapping[str, Any], threads: int) -> None:
+    """Run a compiled time loop over all blocks of lanes; `values` are its other arguments by name, 0 where absent."""
+    from diransac.kernel.time_loop import ARGUMENTS
+
+    if not lanes.n_lanes:
+        return
+    sizes = {"n_lanes": lanes.n_lanes, "n_padded": lanes.n_padded, "n_rows": lanes.n_rows}
+    known = {**lanes.arrays, **values, **sizes}
+    arguments = [
+        array.ctypes.data if isinstance(array := known.get(name), np.ndarray) else array or 0
+        for name in ARGUMENTS
+        if not name.endswith("_block")
+    ]
+    run_blocks(code.call, arguments, lanes.n_padded // LANES, threads)
 
 
 def _windows(

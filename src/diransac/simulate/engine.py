@@ -18,9 +18,10 @@ from diransac.kernel.lanes import (
     arranged_laws,
     arranged_measurements,
     arranged_weights,
+    run_time_loop,
     squared_thresholds,
 )
-from diransac.kernel.machine_code import LANES, MachineCode, Target, compile_function, run_blocks
+from diransac.kernel.machine_code import LANES, MachineCode, Target, compile_function
 from diransac.simulate.outcomes import Flights, GaussNewton, LinearizedErrors, Scores, gauss_newton_of
 from diransac.simulate.steps import INTEGRATORS, Equations, Sensitivities, plan_of, sensitivities_of
 
@@ -349,21 +350,12 @@ class Rollouts:
     ) -> None:
         """Run the time loop over all blocks of lanes; `values` are its other arguments by name."""
         from diransac.kernel.inputs import held
-        from diransac.kernel.time_loop import ARGUMENTS
 
         if not (np.isfinite(dt) and dt > 0):
             raise SettingsError(f"dt is {dt}, but the time from row to row must be positive seconds.")
-        if not lanes.n_lanes:
-            return
-        values = {"step": dt / self._equations.substeps, "n_lanes": lanes.n_lanes, **lanes.arrays, **values}
-        values |= {"n_padded": lanes.n_padded, "n_rows": lanes.n_rows}
-        arguments = [
-            array.ctypes.data if isinstance(array := values.get(name), np.ndarray) else array or 0
-            for name in ARGUMENTS
-            if not name.endswith("_block")
-        ]
-        code = self._compiled(kept, inputs or held, unknowns, lanes.has_windows)
-        run_blocks(code.call, arguments, lanes.n_padded // LANES, threads)
+        if lanes.n_lanes:
+            code = self._compiled(kept, inputs or held, unknowns, lanes.has_windows)
+            run_time_loop(code, lanes, {"step": dt / self._equations.substeps, **values}, threads)
 
     def _plan(self, unknowns: tuple[str, ...]) -> tuple[Plan, Sensitivities]:
         """Expressions of a row and their derivatives with respect to some unknowns, made when first needed."""
