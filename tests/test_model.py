@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from diransac.errors import ModelError, ResultError
-from diransac.model import Model, Parameter, Plant
+from diransac.model import Model, Parameter
 from diransac.models import BUILTIN, builtin
+from diransac.plant import Plant
 from simulated import MACHINES
 from user_models import tumbling
 

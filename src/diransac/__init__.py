@@ -17,7 +17,8 @@ from diransac.errors import (
     ResultError,
     SettingsError,
 )
-from diransac.model import Model, Parameter, Plant
+from diransac.model import Model, Parameter
+from diransac.plant import Disturbance, Plant
 
 if TYPE_CHECKING:
     from diransac.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = [
     "METHODS",
     "DiransacError",
+    "Disturbance",
     "IdentificationError",
     "Log",
     "LogError",

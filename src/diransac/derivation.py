@@ -139,8 +139,16 @@ def check_kinematics(label: str, kinematics: ca.Function) -> None:
         raise ModelError(
             f"{label}: kinematics return {kinematics.numel_out(0)} rates; return one for each of {n} coordinates"
         )
-    for i, _ in _nan_outputs(kinematics):
-        raise ModelError(f"{label}: kinematics {i + 1} of {n} contains NaN; use casadi's functions, not Python's math")
+    check_constants(label, "kinematics", kinematics)
+
+
+def check_constants(label: str, what: str, function: ca.Function) -> None:
+    """Raises ModelError: a NaN constant in one of the function's results."""
+    for i, _ in _nan_outputs(function):
+        raise ModelError(
+            f"{label}: {what} {i + 1} of {function.numel_out(0)} contains NaN; use casadi's functions, not "
+            "Python's math"
+        )
 
 
 def _nan_outputs(function: ca.Function) -> Iterator[tuple[int, str]]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -25,7 +25,7 @@ from diransac import derivation
 from diransac.derivation import Probe, Symbols
 from diransac.errors import ModelError, ResultError
 
-__all__ = ["Model", "Parameter", "Plant"]
+__all__ = ["Model", "Parameter"]
 
 FloatArray = npt.NDArray[np.float64]
 Equations = Callable[[Symbols, Symbols, Symbols, Symbols, Symbols], Sequence[Any]]
@@ -102,18 +102,11 @@ class Model:
             given, missing = ("velocities", "kinematics") if kinematics is None else ("kinematics", "velocities")
             raise ModelError(f'model "{name}": {given} without {missing}; give both, or neither')
         q, v, a, u, p = self._symbols()
-        residual = derivation.call_user(
-            self._label,
-            "equations",
-            equations,
-            *(Symbols(self._label, kind, s) for kind, s in self._by_kind(q, v, a, u, p)),
-        )
+        residual = derivation.call_user(self._label, "equations", equations, *self.named(q, v, a, u, p))
         self.residual = ca.Function("residual", [q, v, a, u, p], [residual], list("qvaup"), ["r"])
         self.kinematics: ca.Function | None = None
         if kinematics is not None:
-            rates = derivation.call_user(
-                self._label, "kinematics", kinematics, *(Symbols(self._label, k, s) for k, s in self._by_kind(q, v))
-            )
+            rates = derivation.call_user(self._label, "kinematics", kinematics, *self.named(q, v))
             self.kinematics = ca.Function("kinematics", [q, v], [rates], list("qv"), ["q_dot"])
         self._check()
 
@@ -184,17 +177,24 @@ class Model:
         q, v, a, u, p = (ca.vertcat(*(ca.SX.sym(n) for n in names)) for names in groups)
         return q, v, a, u, p
 
-    def _by_kind(self, *vectors: ca.SX) -> list[tuple[str, dict[str, ca.SX]]]:
-        """The names that equations use for each vector: a derived velocity goes by its coordinate's name."""
-        own = list(self.coordinates) if self._velocities_are_derivatives else list(self.velocities)
+    @property
+    def rate_names(self) -> tuple[str, ...]:
+        """Names that equations use for velocities and accelerations: ``theta``, not ``theta_dot``."""
+        return tuple(self.coordinates if self._velocities_are_derivatives else self.velocities)
+
+    def named(self, *vectors: ca.SX) -> tuple[Symbols, ...]:
+        """The vectors q, v, a, u and p, or the first few of them, with components by name: as equations see them."""
         names = {
-            "coordinates": list(self.coordinates),
-            "velocities": own,
-            "accelerations": own,
-            "inputs": list(self.inputs),
-            "parameters": list(self.parameters),
+            "coordinates": self.coordinates,
+            "velocities": self.rate_names,
+            "accelerations": self.rate_names,
+            "inputs": self.inputs,
+            "parameters": self.parameters,
         }
-        return [(k, dict(zip(names[k], ca.vertsplit(x), strict=True))) for k, x in zip(names, vectors, strict=False)]
+        return tuple(
+            Symbols(self._label, kind, dict(zip(names[kind], ca.vertsplit(x), strict=True)))
+            for kind, x in zip(names, vectors, strict=False)
+        )
 
     @property
     def _velocities_are_derivatives(self) -> bool:
@@ -289,6 +289,22 @@ class Model:
         names = ["dx", "du", "dp"]
         return ca.Function("rate_jacobians", [x, u, p], ca.cse(ca.horzsplit(both, edges)), ["x", "u", "p"], names)
 
+    @cached_property
+    def force_response(self) -> ca.Function:
+        """Function ``(q, v, u, p, f) -> M^-1 f (n_v)``: what generalised forces add, ``M a + c = f``.
+
+        Raises ModelError: ``M`` is not symmetric and definite, so that residuals are no balance of forces.
+        """
+        if self._definite == 0:
+            raise ModelError(
+                f"{self._label}: the mass matrix dr/da is not symmetric and definite, so the equations are no "
+                "balance of forces that others could join; write them as such, or give accelerations"
+            )
+        q, v, _, u, p = self._symbols()
+        f = ca.SX.sym("f", self.n_v)
+        a = self._definite * self._solve_mass(q, v, u, p, f)
+        return ca.Function("force_response", [q, v, u, p, f], [ca.densify(a)], list("qvupf"), ["a"])
+
     def _solve_mass(self, q: ca.SX, v: ca.SX, u: ca.SX, p: ca.SX, rhs: ca.SX) -> ca.SX:
         """``M^-1 rhs``: LDL^T where the probe found ``M`` symmetric and definite, CasADi's solve elsewhere."""
         M = self._mass_matrix(q, v, u, p)
@@ -373,22 +389,6 @@ class Model:
 
     def __repr__(self) -> str:
         return f"Model({self.name!r}, coordinates={list(self.coordinates)}, parameters={list(self.parameters)})"
-
-
-@dataclass(frozen=True)
-class Plant:
-    """A model with its parameters: what can be simulated, planned for and flown.  A `Result` serves as one, too.
-
-    Raises ModelError: a parameter is missing, unknown or not finite.
-    """
-
-    model: Model
-    parameters: Mapping[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        values = self.model.parameter_vector(self.parameters)
-        ordered = {n: float(x) for n, x in zip(self.model.parameters, values, strict=True)}
-        object.__setattr__(self, "parameters", ordered)
 
 
 def _per_second(unit: str, order: int = 1) -> str:

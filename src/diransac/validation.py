@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,11 +12,9 @@ import numpy.typing as npt
 from diransac.errors import LogError, SettingsError
 from diransac.log import Log
 from diransac.observations import Observations, observe
+from diransac.plant import ModelWithParameters, as_plant
 from diransac.simulate import Rollouts, rollouts
 from diransac.text_table import aligned
-
-if TYPE_CHECKING:
-    from diransac.model import Model
 
 __all__ = ["Scores", "Validation", "validate"]
 
@@ -24,18 +22,6 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 _NICE = (1.0, 2.0, 5.0)
-
-
-class HasParameters(Protocol):
-    """A `Plant` or a `Result`."""
-
-    @property
-    def model(self) -> Model:
-        """Equations of motion."""
-
-    @property
-    def parameters(self) -> Mapping[str, float]:
-        """Their parameters."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +100,9 @@ class Validation:
 
 
 def validate(
-    plant: HasParameters, log: Log, horizon: float | None = None, *, integrator: str = "rk4", substeps: int = 1
+    plant: ModelWithParameters, log: Log, horizon: float | None = None, *, integrator: str = "rk4", substeps: int = 1
 ) -> Validation:
-    """Open-loop prediction of a log by a plant (a `Plant`, or a `Result`).
+    """Open-loop prediction of a log by a plant (a `Plant`, or a `Result`), as far as its model knows it.
 
     Parameters
     ----------
@@ -128,7 +114,8 @@ def validate(
     Raises LogError: the log lacks an input or an initial state; SettingsError: an argument is of another kind, a
     horizon shorter than a sample.
     """
-    _check_arguments(plant, log, horizon)
+    _check_arguments(log, horizon)
+    plant = as_plant(plant)
     observations = observe(plant.model, log, pointwise=False)
     parameters = plant.model.parameter_vector(plant.parameters)
     engine = rollouts(plant.model, observations.signals, integrator=integrator, substeps=substeps)
@@ -146,9 +133,7 @@ def validate(
     return Validation(log.source, units, tuple(scores), asked, observations.notes)
 
 
-def _check_arguments(plant: object, log: object, horizon: object) -> None:
-    if not hasattr(plant, "model") or not hasattr(plant, "parameters"):
-        raise SettingsError(f"plant is {plant!r:.60}; give a dr.Plant or a dr.Result, such as dr.Result.load(path)")
+def _check_arguments(log: object, horizon: object) -> None:
     if not isinstance(log, Log):
         raise SettingsError(f"log is a {type(log).__name__}; give a dr.Log, such as dr.read_log(path)")
     if horizon is not None and not isinstance(horizon, (int, float, np.number)):

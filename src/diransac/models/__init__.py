@@ -5,11 +5,22 @@ from collections.abc import Callable
 from diransac.errors import ModelError
 from diransac.model import Model
 from diransac.models.double_pendulum import double_pendulum
+from diransac.models.extended_rotorcraft import BLADE_FLAPPING, TABLE_I, extended_rotorcraft
 from diransac.models.planar_rotorcraft import planar_rotorcraft
 from diransac.models.servo_axis import servo_axis
 from diransac.models.underwater_vehicle import underwater_vehicle
 
-__all__ = ["BUILTIN", "builtin", "double_pendulum", "planar_rotorcraft", "servo_axis", "underwater_vehicle"]
+__all__ = [
+    "BLADE_FLAPPING",
+    "BUILTIN",
+    "TABLE_I",
+    "builtin",
+    "double_pendulum",
+    "extended_rotorcraft",
+    "planar_rotorcraft",
+    "servo_axis",
+    "underwater_vehicle",
+]
 
 BUILTIN: dict[str, Callable[[], Model]] = {
     "planar-rotorcraft": planar_rotorcraft,

@@ -28,6 +28,7 @@ from diransac.simulate.steps import INTEGRATORS, Equations, Sensitivities, plan_
 if TYPE_CHECKING:
     from diransac.kernel.time_loop import Inputs, Kept, Plan
     from diransac.model import Model
+    from diransac.plant import DisturbedModel
     from diransac.simulate.law import Law
 
 __all__ = ["Rollouts", "rollouts"]
@@ -36,7 +37,7 @@ Floats = NDArray[np.float64]
 
 
 def rollouts(
-    model: Model,
+    model: Model | DisturbedModel,
     signals: Sequence[str] | None = None,
     *,
     integrator: str = "rk4",
@@ -47,7 +48,7 @@ def rollouts(
 
     Parameters
     ----------
-    model : what is simulated: its `dynamics`, an SX function (x, u, p) -> (dx/dt, accelerations)
+    model : what is simulated, a `Model` or what `Plant.simulated` gives: its `dynamics`, an SX function (x, u, p) -> (dx/dt, accelerations)
     signals : those that are compared with measurements, in the order of their columns; all by default
     integrator : `rk4`, `euler` or `semi-implicit-euler` (velocities first, then coordinates with the new velocities)
     substeps : integration steps from one row to the next

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from diransac.kernel.time_loop import Plan
     from diransac.model import Model
+    from diransac.plant import DisturbedModel
 
 __all__ = ["INTEGRATORS", "Equations", "Sensitivities", "plan_of", "sensitivities_of"]
 
@@ -51,7 +52,7 @@ class Equations:
     quaternions: tuple[tuple[int, ...], ...]
     integrator: str
     substeps: int
-    model: Model = field(compare=False, repr=False)
+    model: Model | DisturbedModel = field(compare=False, repr=False)
 
     @property
     def n_x(self) -> int:
