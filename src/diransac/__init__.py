@@ -21,6 +21,7 @@ from diransac.model import Model, Parameter
 from diransac.plant import Disturbance, Plant
 
 if TYPE_CHECKING:
+    from diransac.controller import Controller, tvlqr, tvlqr_all
     from diransac.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
     from diransac.identification import METHODS, identify
     from diransac.log import Log
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "METHODS",
+    "Controller",
     "DiransacError",
     "Disturbance",
     "IdentificationError",
@@ -64,11 +66,14 @@ __all__ = [
     "resample",
     "scale",
     "shift",
+    "tvlqr",
+    "tvlqr_all",
     "validate",
     "write_report",
 ]
 
 _FOUND_IN = {
+    "controller": ("Controller", "tvlqr", "tvlqr_all"),
     "estimators": ("OrdinaryLeastSquares", "ScikitLearnEstimator", "TotalLeastSquares"),
     "identification": ("METHODS", "identify"),
     "log": ("Log",),

@@ -15,7 +15,7 @@ from diransac.kernel.machine_code import default_threads
 from diransac.simulate.engine import Rollouts, rollouts
 from diransac.simulate.law import Law
 from diransac.simulate.outcomes import Flights, GaussNewton, LinearizedErrors, Scores, inlier_mask
-from diransac.simulate.steps import INTEGRATORS
+from diransac.simulate.steps import INTEGRATORS, linearized_step
 
 __all__ = [
     "INTEGRATORS",
@@ -27,5 +27,6 @@ __all__ = [
     "Scores",
     "default_threads",
     "inlier_mask",
+    "linearized_step",
     "rollouts",
 ]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.plant import DisturbedModel
 
-__all__ = ["INTEGRATORS", "Equations", "Sensitivities", "plan_of", "sensitivities_of"]
+__all__ = ["INTEGRATORS", "Equations", "Sensitivities", "linearized_step", "plan_of", "sensitivities_of"]
 
 Dynamics = Callable[[ca.SX], ca.SX]
 """State and derivatives of it, in columns -> their rates, with inputs and parameters held."""
@@ -245,3 +245,23 @@ def _scored_quaternions(equations: Equations, signals: tuple[str, ...]) -> tuple
     """Positions among the scored signals of the quaternions that are scored whole."""
     named = [[equations.signals[k] for k in four] for four in equations.quaternions]
     return tuple(tuple(signals.index(name) for name in four) for four in named if set(four) <= set(signals))
+
+
+# A step alone --------------------------------------------------------------------------------------------------------
+def linearized_step(model: Model, integrator: str = "rk4") -> ca.Function:
+    """Function (x, u, p, h) -> (x after h seconds, A = d(x after)/dx, B = d(x after)/du), the matrices sparse.
+
+    It is the step that a simulation takes, u held and quaternions scaled to length one, and its exact derivatives.
+    """
+    n_x, n_u = len(model.state), model.n_u
+    x, u, p, h = (ca.SX.sym(name, n) for name, n in (("x", n_x), ("u", n_u), ("p", model.n_p), ("h", 1)))
+
+    def rates(columns: ca.SX) -> ca.SX:
+        A, B, _ = model.rate_jacobians(columns[:, 0], u, p)
+        driving = ca.horzcat(ca.SX(n_x, n_x), B)
+        return ca.horzcat(model.dynamics(columns[:, 0], u, p)[0], A @ columns[:, 1:] + driving)
+
+    columns = ca.horzcat(x, ca.SX.eye(n_x), ca.SX(n_x, n_u))
+    after = INTEGRATORS[integrator](rates, columns, h, rates(columns), model.n_q)
+    results = ca.cse(ca.horzsplit(_normalised(after, model.quaternions), [0, 1, 1 + n_x, 1 + n_x + n_u]))
+    return ca.Function("linearized_step", [x, u, p, h], results, ["x", "u", "p", "h"], ["after", "A", "B"])
