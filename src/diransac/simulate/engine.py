@@ -48,7 +48,8 @@ def rollouts(
 
     Parameters
     ----------
-    model : what is simulated, a `Model` or what `Plant.simulated` gives: its `dynamics`, an SX function (x, u, p) -> (dx/dt, accelerations)
+    model : what is simulated, a `Model` or what `Plant.simulated` gives: its `dynamics`, an SX function (x, u, p) ->
+        (dx/dt, accelerations)
     signals : those that are compared with measurements, in the order of their columns; all by default
     integrator : `rk4`, `euler` or `semi-implicit-euler` (velocities first, then coordinates with the new velocities)
     substeps : integration steps from one row to the next
