@@ -226,14 +226,15 @@ class DisturbedModel:
 
     def _effects(self, q: ca.SX, v: ca.SX, own: ca.SX, u: ca.SX, p: ca.SX) -> list[tuple[ca.SX, ca.SX, ca.SX]]:
         """Forces, accelerations and rates of every disturbance."""
-        n_p, effects = self.model.n_p, list[tuple[ca.SX, ca.SX, ca.SX]]()
-        time = own[-1] if "t" in self.own_states else ca.SX(0)
-        i, j = n_p, 0
-        for one in self.disturbances:
-            constants, states = p[i : i + len(one.constants)], own[j : j + len(one.states)]
-            forces, accelerations, rates = one.effect(q, v, u, p[:n_p], ca.vertcat(constants, states, time))
+        constants, states = iter(ca.vertsplit(p)[self.model.n_p :]), iter(ca.vertsplit(own))
+        own_of = [
+            ([next(constants) for _ in one.constants], [next(states) for _ in one.states]) for one in self.disturbances
+        ]
+        time = next(states, ca.SX(0))
+        effects = list[tuple[ca.SX, ca.SX, ca.SX]]()
+        for one, (values, state) in zip(self.disturbances, own_of, strict=True):
+            forces, accelerations, rates = one.effect(q, v, u, p[: self.model.n_p], ca.vertcat(*values, *state, time))
             effects.append((forces, accelerations, rates))
-            i, j = i + len(one.constants), j + len(one.states)
         return effects
 
     @cached_property
