@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from diransac.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
     from diransac.identification import METHODS, identify
     from diransac.log import Log
+    from diransac.noise import CorruptedLog, Noise, corrupt
     from diransac.nonlinear import NonlinearLeastSquares
     from diransac.prepare import despike, differentiate, rename, resample, scale, shift
     from diransac.readers import read_log
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 __all__ = [
     "METHODS",
     "Controller",
+    "CorruptedLog",
     "DiransacError",
     "Disturbance",
     "IdentificationError",
@@ -44,6 +46,7 @@ __all__ = [
     "LogError",
     "Model",
     "ModelError",
+    "Noise",
     "NonlinearLeastSquares",
     "OrdinaryLeastSquares",
     "Parameter",
@@ -57,6 +60,7 @@ __all__ = [
     "TotalLeastSquares",
     "Trajectory",
     "Validation",
+    "corrupt",
     "despike",
     "differentiate",
     "identify",
@@ -77,6 +81,7 @@ _FOUND_IN = {
     "estimators": ("OrdinaryLeastSquares", "ScikitLearnEstimator", "TotalLeastSquares"),
     "identification": ("METHODS", "identify"),
     "log": ("Log",),
+    "noise": ("CorruptedLog", "Noise", "corrupt"),
     "nonlinear": ("NonlinearLeastSquares",),
     "prepare": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
     "readers": ("read_log",),
