@@ -1,24 +1,19 @@
-"""`tvlqr`: the feedback that holds a plant to a trajectory, and `Controller`, which it gives.
-
-The sweep runs backward in time: the one compiled recurrence serves hundreds of controllers at once, a lane each.
-"""
+"""`tvlqr`: the feedback that holds a plant to a trajectory, and `Controller`, which it gives."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass
 from typing import TypeAlias
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from diransac.errors import PlanningError, SettingsError
-from diransac.kernel import Map, Scan, compile_map, compile_scan
+from diransac.errors import SettingsError
 from diransac.model import Model
 from diransac.plant import ModelWithParameters, as_plant
-from diransac.simulate import Law, linearized_step
+from diransac.riccati import Problem, gains_of
+from diransac.simulate import Law
 from diransac.trajectory import Trajectory
 
 __all__ = ["Controller", "tvlqr", "tvlqr_all"]
@@ -216,79 +211,53 @@ def tvlqr_all(
     model = known[0].model
     if any(plant.model.fingerprint != model.fingerprint for plant in known):
         raise SettingsError("the plants have different models; call tvlqr_all for each model's own")
-    tasks = [
-        _task(model, np.array(list(plant.parameters.values())), trajectory, limits)
-        for plant, trajectory in zip(known, trajectories, strict=True)
+    weights = _Weights(model, Q, R, Qf)
+    edges = [_edges(model, trajectory, limits) for trajectory in trajectories]
+    problems = [
+        Problem(np.array(list(plant.parameters.values())), trajectory, weights.Q, weights.effort(low, high), weights.Qf)
+        for plant, trajectory, (low, high) in zip(known, trajectories, edges, strict=True)
     ]
-    weights = [_weights(model, task, Q, R, Qf) for task in tasks]
-    gains = _sweep(_Equations(model.fingerprint, model)).gains(tasks, weights, threads)
-    return [_controller(model, task, K) for task, K in zip(tasks, gains, strict=True)]
+    names = (model.state, tuple(model.inputs))
+    return [
+        Controller(reference.time, reference.states, reference.inputs, K, low, high, *names)
+        for reference, K, (low, high) in zip(trajectories, gains_of(model, problems, threads), edges, strict=True)
+    ]
 
 
-# One of many ---------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class _Task:
-    """A controller to be made: parameters (n_p,), trajectory, limits (n_u,) each."""
+# Limits and weights --------------------------------------------------------------------------------------------------
+def _edges(model: Model, trajectory: Trajectory, limits: Limits | None) -> tuple[Floats, Floats]:
+    """Lowest and highest inputs (n_u,).
 
-    parameters: Floats
-    trajectory: Trajectory
-    u_min: Floats
-    u_max: Floats
-
-
-def _task(model: Model, parameters: Floats, trajectory: Trajectory, limits: Limits | None) -> _Task:
-    """Check that a trajectory is the model's, and find its limits."""
-    for kind, names, found, array in (
-        ("states", model.state, trajectory.state_names, trajectory.states),
-        ("inputs", tuple(model.inputs), trajectory.input_names, trajectory.inputs),
-    ):
-        if array.shape[1] != len(names) or (found and found != names):
-            has = ", ".join(found) or f"{array.shape[1]} columns"
-            raise SettingsError(
-                f'the trajectory\'s {kind} are {has}, but model "{model.name}" has {", ".join(names)}; give a '
-                "trajectory of this model"
-            )
-    given = trajectory.input_limits if limits is None else limits
-    unknown = [name for name in given if name not in model.inputs]
+    Raises SettingsError: a name that isn't an input's, or limits that are no pair in order.
+    """
+    limits = trajectory.input_limits if limits is None else limits
+    unknown = [name for name in limits if name not in model.inputs]
     if unknown:
         raise SettingsError(f'limits name "{unknown[0]}"; inputs are {", ".join(model.inputs)}')
-    edges = np.array([given.get(name, (-np.inf, np.inf)) for name in model.inputs], np.float64).reshape(-1, 2)
-    if not (edges[:, 0] <= edges[:, 1]).all():
-        raise SettingsError(f"limits are {dict(given)}, but each must be (lowest, highest)")
-    return _Task(parameters, trajectory, edges[:, 0], edges[:, 1])
+    pairs = [limits.get(name, (-np.inf, np.inf)) for name in model.inputs]
+    if not all(np.shape(pair) == (2,) and pair[0] <= pair[1] for pair in pairs):
+        raise SettingsError(f"limits are {dict(limits)}, but each must be (lowest, highest)")
+    low, high = np.array(pairs, np.float64).T
+    return low, high
 
 
-def _controller(model: Model, task: _Task, gains: Floats) -> Controller:
-    """The controller with these gains (K, n_u, n_x).
+class _Weights:
+    """Matrices Q and Qf, and R where it is given."""
 
-    Raises PlanningError: some of them are not finite.
-    """
-    trajectory = task.trajectory
-    lost = np.flatnonzero(~np.isfinite(gains).all(axis=(1, 2)))
-    if len(lost):
-        raise PlanningError(
-            f'the Riccati sweep of model "{model.name}" did not stay finite and positive: back from the end it was '
-            f"lost at t = {trajectory.time[lost[-1]]:g} s; give R larger or Q and Qf smaller numbers, or a shorter "
-            "trajectory"
-        )
-    names = (model.state, tuple(model.inputs))
-    return Controller(trajectory.time, trajectory.states, trajectory.inputs, gains, task.u_min, task.u_max, *names)
+    def __init__(self, model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None) -> None:
+        errors = np.repeat([COORDINATE_ERROR, VELOCITY_ERROR], [model.n_q, model.n_v])
+        self.Q = _matrix("Q", errors**-2.0 if Q is None else Q, model.state)
+        self.Qf = FINAL_SECONDS * self.Q if Qf is None else _matrix("Qf", Qf, model.state)
+        self._R = None if R is None else _matrix("R", R, tuple(model.inputs))
+        if self._R is not None and np.linalg.eigvalsh(self._R).min(initial=np.inf) <= 0:
+            found = self._R.tolist()
+            raise SettingsError(f"R must be positive definite: each input needs a positive weight; found {found}")
 
-
-# Weights -------------------------------------------------------------------------------------------------------------
-def _weights(
-    model: Model, task: _Task, Q: Weights | None, R: Weights | None, Qf: Weights | None
-) -> tuple[Floats, Floats, Floats]:
-    """Matrices Q, R and Qf."""
-    inputs, states = tuple(model.inputs), model.state
-    errors = np.repeat([COORDINATE_ERROR, VELOCITY_ERROR], [model.n_q, model.n_v])
-    half = (task.u_max - task.u_min) / 2
-    use = np.where(np.isfinite(half) & (half > 0), half, UNLIMITED_INPUT)
-    running = _matrix("Q", errors**-2.0 if Q is None else Q, states)
-    effort = _matrix("R", use**-2.0 if R is None else R, inputs)
-    if len(inputs) and np.linalg.eigvalsh(effort)[0] <= 0:
-        raise SettingsError(f"R must be positive definite, every input with a positive weight; found {effort.tolist()}")
-    return running, effort, FINAL_SECONDS * running if Qf is None else _matrix("Qf", Qf, states)
+    def effort(self, low: Floats, high: Floats) -> Floats:
+        """R; if none is given, that for which the full use of each input within these limits is worth 1."""
+        half = (high - low) / 2
+        use = np.where(np.isfinite(half) & (half > 0), half, UNLIMITED_INPUT)
+        return np.diag(use**-2.0) if self._R is None else self._R
 
 
 def _matrix(name: str, weights: Weights, names: Sequence[str]) -> Floats:
@@ -301,129 +270,20 @@ def _matrix(name: str, weights: Weights, names: Sequence[str]) -> Floats:
         if unknown:
             raise SettingsError(f'{name} weighs "{unknown[0]}", which is none of {", ".join(names)}')
         weights = [weights.get(key, 0.0) for key in names]
-    array, n = np.array(weights, np.float64), len(names)
+    try:
+        array, n = np.array(weights, np.float64), len(names)
+    except (TypeError, ValueError) as error:
+        raise SettingsError(f"{name} is {weights!r:.80}, which is no array of numbers: {error}") from error
     if array.shape not in ((), (n,), (n, n)):
         raise SettingsError(
             f"{name} must be a matrix ({n}, {n}), its diagonal ({n},), one number, or numbers by name; found shape "
             f"{array.shape}"
         )
     matrix = array if array.ndim == 2 else np.diag(np.broadcast_to(array, n))
-    if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
+    largest = np.abs(matrix).max(initial=0.0)
+    if not np.isfinite(largest) or (np.abs(matrix - matrix.T) > 1e-9 * largest).any():
         raise SettingsError(f"{name} must be finite and symmetric; found {matrix.tolist()}")
-    eigenvalues = np.linalg.eigvalsh(matrix)
-    if n and eigenvalues[0] < -1e-12 * np.abs(eigenvalues).max():
-        raise SettingsError(
-            f"{name} must not be negative in any direction; its smallest eigenvalue is {eigenvalues[0]:g}"
-        )
+    lowest = np.linalg.eigvalsh(matrix)[0] if array.ndim == 2 else array.min(initial=0.0)
+    if lowest < -1e-12 * largest:
+        raise SettingsError(f"{name} must weigh no direction negatively; its smallest eigenvalue is {lowest:g}")
     return matrix
-
-
-# The sweep -----------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class _Equations:
-    """A model as a value: equal ones are compiled once."""
-
-    fingerprint: str
-    model: Model = field(compare=False, repr=False)
-
-
-@dataclass(frozen=True)
-class _Sweep:
-    """Compiled for one model.
-
-    Attributes
-    ----------
-    name : the model's
-    linearize : (x, u, p, h) -> those entries of A and B that vary
-    riccati : S, entries, weights -> S a row earlier, gains
-    n_x, n_u : sizes
-    """
-
-    name: str
-    linearize: Map
-    riccati: Scan
-    n_x: int
-    n_u: int
-
-    def gains(
-        self, tasks: Sequence[_Task], weights: Sequence[tuple[Floats, Floats, Floats]], threads: int
-    ) -> list[Floats]:
-        """Gains (K, n_u, n_x) of each task."""
-        entries = [self._entries(task, threads) for task in tasks]
-        lengths = [len(task.trajectory) for task in tasks]
-        # Backward in time, the shorter ones go on with their first row, and what they give then is left.
-        rows = [np.pad(e[::-1], ((0, max(lengths) - len(e)), (0, 0)), mode="edge") for e in entries]
-        steps = [task.trajectory.dt for task in tasks]
-        constants = [
-            np.concatenate([_upper(Q) * dt, _upper(R) * dt]) for dt, (Q, R, _) in zip(steps, weights, strict=True)
-        ]
-        ends = [_upper(Qf) for _, _, Qf in weights]
-        found = self.riccati(np.array(ends), np.array(rows), np.array(constants), threads=threads)
-        return [
-            one[:length][::-1].reshape(length, self.n_x, self.n_u).swapaxes(1, 2)
-            for one, length in zip(found, lengths, strict=True)
-        ]
-
-    def _entries(self, task: _Task, threads: int) -> Floats:
-        """Varying entries of A and B (K, n_entries).
-
-        Raises PlanningError: one is not finite.
-        """
-        trajectory = task.trajectory
-        arrays = (trajectory.states, trajectory.inputs, task.parameters, np.array([trajectory.dt]))
-        (entries,) = self.linearize(*arrays, threads=threads)
-        lost = np.flatnonzero(~np.isfinite(entries).all(axis=1))
-        if len(lost):
-            raise PlanningError(
-                f'model "{self.name}" has no finite derivatives on the trajectory at '
-                f"t = {trajectory.time[lost[0]]:g} s: x = {trajectory.states[lost[0]].tolist()}, "
-                f"u = {trajectory.inputs[lost[0]].tolist()}, parameters {task.parameters.tolist()}; check the "
-                "parameters, or lead the trajectory around this state"
-            )
-        return entries
-
-
-@lru_cache(maxsize=64)
-def _sweep(equations: _Equations) -> _Sweep:
-    """What is compiled for a model."""
-    model = equations.model
-    step = linearized_step(model)
-    arguments = [ca.SX.sym(name, step.sparsity_in(name)) for name in step.name_in()]
-    _, A, B = step(*arguments)
-    varying = [e for M in (A, B) for e in ca.vertsplit(M.nz[:]) if not e.is_constant()]
-    linearize = compile_map(ca.Function("linearize", arguments, [ca.vertcat(*varying, ca.SX(0, 1))]))
-    return _Sweep(model.name, linearize, compile_scan(_riccati_step(A, B)), len(model.state), model.n_u)
-
-
-def _riccati_step(A: ca.SX, B: ca.SX) -> ca.Function:
-    """Recurrence (S, varying entries of A and B, [Q dt; R dt]) -> (S a row earlier, gains column by column).
-
-    Of symmetric matrices there is the upper triangle alone. A pivot of R dt + B'S B that is not positive becomes NaN:
-    it would be the end of a sweep that has lost its precision.
-    """
-    n_x, n_u = B.shape
-    entries: list[ca.SX] = []
-    A, B = (_with_symbols(M, entries) for M in (A, B))
-    S, Q, R = (ca.SX.sym(name, ca.Sparsity.upper(n)) for name, n in (("S", n_x), ("Q", n_x), ("R", n_u)))
-    SA, SB = ca.triu2symm(S) @ A, ca.triu2symm(S) @ B
-    G = ca.densify(B.T @ SA)
-    D, LT, order = ca.ldl(ca.densify(ca.triu2symm(R) + B.T @ SB))
-    K = ca.ldl_solve(G, ca.if_else(D > 0, D, np.nan), LT, order)
-    before = ca.triu(Q + A.T @ SA - G.T @ K)
-    arguments = [S.nz[:], ca.vertcat(*entries, ca.SX(0, 1)), ca.vertcat(Q.nz[:], R.nz[:])]
-    return ca.Function("riccati", arguments, [before.nz[:], ca.vec(K)], ["S", "row", "weights"], ["before", "K"])
-
-
-def _with_symbols(matrix: ca.SX, entries: list[ca.SX]) -> ca.SX:
-    """The matrix with a new symbol, added to `entries`, in the place of every entry that isn't constant."""
-    values = ca.vertsplit(matrix.nz[:])
-    for k, value in enumerate(values):
-        if not value.is_constant():
-            values[k] = ca.SX.sym(f"e{len(entries)}")
-            entries.append(values[k])
-    return ca.SX(matrix.sparsity(), ca.vertcat(*values, ca.SX(0, 1)))
-
-
-def _upper(matrix: Floats) -> Floats:
-    """Upper triangle, column by column."""
-    return matrix.T[np.tril_indices(len(matrix))]
