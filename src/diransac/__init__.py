@@ -23,6 +23,7 @@ from diransac.plant import Disturbance, Plant
 if TYPE_CHECKING:
     from diransac.controller import Controller, tvlqr, tvlqr_all
     from diransac.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
+    from diransac.flight import fly, fly_all, tracking_error
     from diransac.identification import METHODS, identify
     from diransac.log import Log
     from diransac.noise import CorruptedLog, Noise, corrupt
@@ -63,6 +64,8 @@ __all__ = [
     "corrupt",
     "despike",
     "differentiate",
+    "fly",
+    "fly_all",
     "identify",
     "models",
     "read_log",
@@ -70,6 +73,7 @@ __all__ = [
     "resample",
     "scale",
     "shift",
+    "tracking_error",
     "tvlqr",
     "tvlqr_all",
     "validate",
@@ -77,6 +81,7 @@ __all__ = [
 ]
 
 _FOUND_IN = {
+    "flight": ("fly", "fly_all", "tracking_error"),
     "controller": ("Controller", "tvlqr", "tvlqr_all"),
     "estimators": ("OrdinaryLeastSquares", "ScikitLearnEstimator", "TotalLeastSquares"),
     "identification": ("METHODS", "identify"),

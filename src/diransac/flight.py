@@ -15,8 +15,8 @@ from diransac.plant import ModelWithParameters, Plant, as_plant
 from diransac.simulate import Law, Rollouts, default_threads, rollouts
 
 if TYPE_CHECKING:
-    from diransac.trajectory import Trajectory
     from diransac.controller import Controller
+    from diransac.trajectory import Trajectory
 
 __all__ = ["fly", "fly_all", "tracking_error"]
 
@@ -95,31 +95,35 @@ def fly_all(
             f"{len(flown)} plants, {len(controllers)} controllers and {len(seeds or flown)} seeds do not make flights; "
             "give one of each a flight"
         )
-    starts = np.array(
-        [controller.states[0] for controller in controllers] if initial_states is None else initial_states
-    )
+    _check_names(flown, controllers)
+    starts = [one.states[0] for one in controllers] if initial_states is None else np.asarray(initial_states)
     states = [
         plant.initial_state(x, seed) for plant, x, seed in zip(flown, starts, seeds or [0] * len(flown), strict=True)
     ]
-    _check_names(flown, controllers)
-    steps = substeps or max(plant.substeps(controllers[0].dt) for plant in flown)
-    engine = _engine(flown, steps)
-    laws, law_of_lane = _laws(controllers, np.size(states[0]))
-    constants = np.array([plant.constants for plant in flown])
-    flights = engine.fly(
-        constants,
-        np.array(states),
-        laws,
-        controllers[0].dt,
-        law_of_lane=law_of_lane,
-        threads=threads or default_threads(),
-    )
-    n_x = len(flown[0].model.state)
-    own = np.size(states[0]) - n_x
-    signals = np.delete(flights.signals, np.s_[n_x : n_x + own], axis=-1)
+    steps = np.array([substeps or plant.substeps(one.dt) for plant, one in zip(flown, controllers, strict=True)])
+    logs: dict[int, Log] = {}
+    for n in np.unique(steps):
+        lanes = np.flatnonzero(steps == n).tolist()
+        together = _flown_together(
+            [flown[k] for k in lanes], [controllers[k] for k in lanes], [states[k] for k in lanes], int(n),
+            threads or default_threads(),
+        )  # fmt: skip
+        logs |= zip(lanes, together, strict=True)
+    return [logs[k] for k in range(len(flown))]
+
+
+def _flown_together(
+    plants: list[Plant], controllers: list[Controller], states: list[Floats], substeps: int, threads: int
+) -> list[Log]:
+    """Logs of flights with equally many integration steps a sample."""
+    engine, n_x = _engine(plants, substeps), len(plants[0].model.state)
+    laws, law_of_lane = _laws(controllers, len(states[0]))
+    constants = np.array([plant.constants for plant in plants])
+    flights = engine.fly(constants, np.array(states), laws, controllers[0].dt, law_of_lane=law_of_lane, threads=threads)
+    signals = np.delete(flights.signals, np.s_[n_x : len(states[0])], axis=-1)
     return [
-        _log(plant, controller, x, u, steps)
-        for plant, controller, x, u in zip(flown, controllers, signals, flights.inputs, strict=True)
+        _log(plant, controller, x, u, substeps)
+        for plant, controller, x, u in zip(plants, controllers, signals, flights.inputs, strict=True)
     ]
 
 
