@@ -189,8 +189,6 @@ def run_time_loop(code: MachineCode, lanes: Lanes, values: Mapping[str, Any], th
     """Run a compiled time loop over all blocks of lanes; `values` are its other arguments by name, 0 where absent."""
     from diransac.kernel.time_loop import ARGUMENTS
 
-    if not lanes.n_lanes:
-        return
     sizes = {"n_lanes": lanes.n_lanes, "n_padded": lanes.n_padded, "n_rows": lanes.n_rows}
     known = {**lanes.arrays, **values, **sizes}
     arguments = [

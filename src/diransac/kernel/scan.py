@@ -65,6 +65,8 @@ class Scan:
                 f"{row.shape} and {constant.shape}."
             )
         series = np.empty((n_lanes, n_rows, self._function.numel_out(1)))
+        if not n_lanes:
+            return series
         own = np.arange(n_lanes) * n_rows if row.ndim == 3 and n_lanes > 1 else None
         lanes = arranged_lanes((n_k, n_c, n_r), constant, start, row.reshape(-1, n_r), own, n_rows)
         run_time_loop(self._compiled(lanes.has_windows), lanes, {"series": series}, threads)
