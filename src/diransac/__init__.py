@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from diransac.log import Log
     from diransac.noise import CorruptedLog, Noise, corrupt
     from diransac.nonlinear import NonlinearLeastSquares
+    from diransac.planning import plan, sine, square, star
     from diransac.prepare import despike, differentiate, rename, resample, scale, shift
     from diransac.readers import read_log
     from diransac.report import write_report
@@ -68,11 +69,15 @@ __all__ = [
     "fly_all",
     "identify",
     "models",
+    "plan",
     "read_log",
     "rename",
     "resample",
     "scale",
     "shift",
+    "sine",
+    "square",
+    "star",
     "tracking_error",
     "tvlqr",
     "tvlqr_all",
@@ -88,6 +93,7 @@ _FOUND_IN = {
     "log": ("Log",),
     "noise": ("CorruptedLog", "Noise", "corrupt"),
     "nonlinear": ("NonlinearLeastSquares",),
+    "planning": ("plan", "sine", "square", "star"),
     "prepare": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
     "readers": ("read_log",),
     "report": ("write_report",),

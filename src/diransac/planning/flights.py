@@ -1,0 +1,146 @@
+"""The flights that the paper judges identified models by: square, star and sine in the plane of x and z.
+
+Fixed choices, made once, before any figure was looked at, because the paper doesn't give them:
+
+- segments last as long as their length takes at a mean speed of `MEAN_SPEED`, rounded to rows of 0.01 s;
+- from rest to rest;
+- the sine is two periods of `WAVELENGTH` along x, from the origin, in `SINE_DURATION`, and an error of 0.1 m costs as
+  much as full use of an input (`POSITION_WEIGHT`);
+- a rotorcraft's inputs keep to `ROTORCRAFT_LIMITS`, of which a plan uses the middle share `PLANNED_SHARE`, so that
+  feedback keeps some authority.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from diransac.errors import SettingsError
+from diransac.planning.planner import TIME_STEP, plan
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from diransac.model import Model
+    from diransac.plant import ModelWithParameters
+    from diransac.trajectory import Trajectory
+
+    Floats = NDArray[np.float64]
+
+__all__ = ["MEAN_SPEED", "PLANNED_SHARE", "ROTORCRAFT_LIMITS", "sine", "square", "star"]
+
+CORNERS = ((2.0, 2.0), (2.0, -2.0), (-2.0, -2.0), (-2.0, 2.0))
+"""m, x and z: 4 m a side, as far from the origin as from each other's neighbours' middle."""
+
+MEAN_SPEED = 1.6
+"""m/s: a star takes 25 s, about 2,500 observations at 100 Hz."""
+
+ROTORCRAFT_LIMITS = {"thrust": (0.0, 5.0), "moment": (-1.0, 1.0)}
+"""N: twice the weight of the paper's rotorcraft, and as much as its rotors may differ by."""
+
+PLANNED_SHARE = 0.8
+
+AMPLITUDE = 2.0
+"""m."""
+
+WAVELENGTH = 4.0
+"""m."""
+
+PERIODS = 2
+
+SINE_DURATION = 12.0
+"""s."""
+
+POSITION_WEIGHT = 1.0 / 0.1**2
+"""1/(m^2 s)."""
+
+Limits = Mapping[str, tuple[float, float]]
+
+
+def square(plant: ModelWithParameters, *, input_limits: Limits | None = None, **options: Any) -> Trajectory:
+    """From rest at the origin to the four corners of a square of 4 m, and on to rest at the first: 5 segments, 12 s.
+
+    Parameters
+    ----------
+    plant : with coordinates x and z, m
+    input_limits : name -> (lowest, highest); 0 to 5 N of thrust and -1 to 1 N of moment for a model with these inputs
+    options : of `plan`, such as solver or guess
+
+    Segments take their length at a mean speed of 1.6 m/s; the plan uses the middle 80 % of the inputs' ranges.
+
+    Raises SettingsError: a model without coordinates x and z.
+    Raises PlanningError: no such trajectory; it says why.
+
+    References: Dimmig et al. 2023, section V-A.
+    """
+    return _through(plant, [(0.0, 0.0), *CORNERS, CORNERS[0]], input_limits, options)
+
+
+def star(plant: ModelWithParameters, *, input_limits: Limits | None = None, **options: Any) -> Trajectory:
+    """The square, back to the origin, and the square turned by 45 degrees: 11 segments, 25 s.
+
+    Parameters, choices and errors are those of `square`.
+
+    References: Dimmig et al. 2023, section V-A.
+    """
+    half = np.sqrt(0.5)
+    turned = [(half * (x - z), half * (x + z)) for x, z in CORNERS]
+    first = [(0.0, 0.0), *CORNERS, CORNERS[0], (0.0, 0.0)]
+    return _through(plant, [*first, *turned, turned[0]], input_limits, options)
+
+
+def sine(plant: ModelWithParameters, *, input_limits: Limits | None = None, **options: Any) -> Trajectory:
+    """As near as can be to z = 2 sin(2 pi x / 4 m) along two periods of x, from rest to rest in 12 s.
+
+    Parameters and errors are those of `square`. The reference moves along x evenly; an error of 0.1 m in x or z costs
+    as much as full use of an input; the plan uses the middle 80 % of the inputs' ranges.
+
+    References: Dimmig et al. 2023, section V-A.
+    """
+    _check_plane(plant.model)
+    speed = PERIODS * WAVELENGTH / SINE_DURATION
+
+    def along(time: Floats) -> Floats:
+        return speed * time
+
+    def height(time: Floats) -> Floats:
+        return AMPLITUDE * np.sin(2.0 * np.pi * speed * time / WAVELENGTH)
+
+    fixed: dict[str, Any] = {
+        "reference": {"x": along, "z": height},
+        "duration": SINE_DURATION,
+        "tracking": {"x": POSITION_WEIGHT, "z": POSITION_WEIGHT},
+    }
+    return plan(plant, **fixed, **_limits(plant.model, input_limits), **options)
+
+
+def _through(
+    plant: ModelWithParameters,
+    places: Sequence[tuple[float, float]],
+    input_limits: Limits | None,
+    options: Mapping[str, Any],
+) -> Trajectory:
+    """Through places in the plane at the mean speed, rest to rest."""
+    _check_plane(plant.model)
+    lengths = np.linalg.norm(np.diff(np.array(places), axis=0), axis=1)
+    rows = np.rint(lengths / MEAN_SPEED / TIME_STEP)
+    times = TIME_STEP * np.concatenate([[0.0], np.cumsum(rows)])
+    waypoints = [{"x": float(x), "z": float(z)} for x, z in places]
+    return plan(plant, waypoints=waypoints, times=times.tolist(), **_limits(plant.model, input_limits), **options)
+
+
+def _limits(model: Model, given: Limits | None) -> dict[str, Any]:
+    if given is None:
+        given = ROTORCRAFT_LIMITS if set(ROTORCRAFT_LIMITS) <= set(model.inputs) else {}
+    return {"input_limits": given, "input_share": PLANNED_SHARE}
+
+
+def _check_plane(model: Model) -> None:
+    missing = [name for name in ("x", "z") if name not in model.coordinates]
+    if missing:
+        raise SettingsError(
+            f'square, star and sine are flown in x and z; model "{model.name}" has no coordinate {missing[0]}: it has '
+            f"{', '.join(model.coordinates)}. Use plan(plant, waypoints=...)"
+        )

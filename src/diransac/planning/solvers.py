@@ -1,0 +1,297 @@
+"""The interior-point solvers that come with CasADi, given a `Program`'s own derivatives.
+
+An `nlpsol` object is built once for a layout and solved for many numbers: its functions are looked up in the program
+that is being solved. CasADi's function cache hands them over, so that nothing is differentiated a second time.
+
+References: Waechter and Biegler 2006 (IPOPT); Vanroye et al. 2023, "FATROP" (structure-exploiting interior point).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from diransac.planning.transcription import Layout, Program
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Integers = NDArray[np.int64]
+
+__all__ = ["Outcome", "SearchLimits", "interior_point"]
+
+_QUIET: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
+_TOLERANCE = 1e-8
+
+
+@dataclass(frozen=True)
+class SearchLimits:
+    """How long a solver may try.
+
+    Parameters
+    ----------
+    iterations : at most
+    seconds : at most
+    """
+
+    iterations: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a solver found.
+
+    Parameters
+    ----------
+    unknowns : (n_unknowns,)   the solution, or where the solver gave up
+    success : whether it is a solution
+    status : the solver's own words
+    iterations : that it took
+    solver : its name
+    """
+
+    unknowns: Floats
+    success: bool
+    status: str
+    iterations: int
+    solver: str
+
+
+def interior_point(name: str, program: Program, guess: Floats, limits: SearchLimits, *, near: bool = False) -> Outcome:
+    """Solve by ``ipopt`` or ``fatrop``.
+
+    Parameters
+    ----------
+    guess : (n_unknowns,)   where to start
+    near : whether the guess is close to the solution: the barrier then starts small
+
+    Raises KeyboardInterrupt: the user stopped it.
+    """
+    return _solver(name, program.layout, limits.iterations, near).solve(program, guess, limits.seconds)
+
+
+@lru_cache(maxsize=64)
+def _solver(name: str, layout: Layout, iterations: int, near: bool) -> _Solver:
+    return _Solver(name, layout, iterations, near)
+
+
+class _Stopped(Exception):
+    """The solver's time is over."""
+
+
+class _Solver:
+    """An `nlpsol` object of one layout; one solve at a time."""
+
+    def __init__(self, name: str, layout: Layout, iterations: int, near: bool) -> None:
+        self._name, self._layout = name, layout
+        self._options = {"ipopt": _ipopt_options, "fatrop": _fatrop_options}[name](layout, iterations, near)
+        self._lock = Lock()
+        self._program: Program | None = None
+        self._nlpsol: ca.Function | None = None
+        self._functions: dict[str, _Evaluation] = {}
+        self._deadline = 0.0
+        self._stopped: BaseException | None = None
+
+    def solve(self, program: Program, guess: Floats, seconds: float) -> Outcome:
+        """Solve one program of this layout."""
+        with self._lock:
+            self._program, self._stopped, self._deadline = program, None, time.monotonic() + seconds
+            try:
+                return self._run(program, guess)
+            finally:
+                self._program = None
+
+    def _run(self, program: Program, guess: Floats) -> Outcome:
+        if self._nlpsol is None:
+            self._build(program)
+        assert self._nlpsol is not None
+        numbers = program.numbers
+        try:
+            found = self._nlpsol(x0=guess, lbx=numbers.lower, ubx=numbers.upper, lbg=0.0, ubg=0.0)
+        finally:
+            if self._stopped is not None and not isinstance(self._stopped, _Stopped):
+                raise self._stopped
+        stats = self._nlpsol.stats()
+        status = "time limit reached" if self._stopped else str(stats["return_status"])
+        unknowns = np.array(found["x"]).ravel()
+        success = bool(stats["success"]) and self._stopped is None and bool(np.isfinite(unknowns).all())
+        return Outcome(unknowns, success, status, int(stats["iter_count"]), self._name)
+
+    def _build(self, program: Program) -> None:
+        outputs = _Outputs(program)
+        signatures = _SIGNATURES[self._name]
+        self._functions = {
+            name: _Evaluation(name, results, outputs, self._values) for name, results in signatures.items()
+        }
+        nlp = _Evaluation("nlp", ("f", "g"), outputs, self._values)
+        self._functions["nlp"] = nlp
+        cache = {name: function for name, function in self._functions.items() if name != "nlp"}
+        self._nlpsol = ca.nlpsol("plan", self._name, nlp, {**_QUIET, **self._options, "cache": cache})
+
+    def _values(self, name: str, x: Floats, objective_factor: float, multipliers: Floats) -> Floats:
+        """One of `_Outputs` at a point.
+
+        Raises whatever stopped the solver: from then on no function has a value, which ends the solver's search.
+        """
+        if self._stopped is None and time.monotonic() > self._deadline:
+            self._stopped = _Stopped()
+        if self._stopped is not None or self._program is None:
+            raise _Stopped
+        try:
+            return _Outputs.values(self._program, name, x, objective_factor, multipliers)
+        except BaseException as error:
+            self._stopped = error
+            raise
+
+
+class _Outputs:
+    """Sparsity of everything that a solver asks for, and how its entries are ordered."""
+
+    def __init__(self, program: Program) -> None:
+        n, m = program.layout.n_unknowns, program.layout.n_constraints
+        self.n_unknowns, self.n_constraints = n, m
+        triangle = _upper(program)
+        jacobian, hessian = program.jacobian_entries, program.hessian_entries
+        sorted_jacobian = _sorted(jacobian, (m, n))
+        sorted_hessian = _sorted(hessian, (n, n))
+        sorted_triangle = _sorted((hessian[0][triangle], hessian[1][triangle]), (n, n))
+        every = slice(None)
+        self.parts: dict[str, tuple[ca.Sparsity, Any]] = {
+            "f": (ca.Sparsity.dense(1, 1), every),
+            "g": (ca.Sparsity.dense(m, 1), every),
+            "grad_f_x": (ca.Sparsity.dense(n, 1), every),
+            "grad_gamma_x": (ca.Sparsity.dense(n, 1), every),
+            "grad_gamma_p": (ca.Sparsity.dense(0, 1), every),
+            "jac_g_x": sorted_jacobian,
+            "hess_gamma_x_x": sorted_hessian,
+            "triu_hess_gamma_x_x": (sorted_triangle[0], np.flatnonzero(triangle)[sorted_triangle[1]]),
+        }
+
+    @staticmethod
+    def values(program: Program, name: str, x: Floats, objective_factor: float, multipliers: Floats) -> Floats:
+        """Entries of one part, in the program's order."""
+        compute = _COMPUTE[name]
+        return np.asarray(compute(program, x, objective_factor, multipliers))
+
+
+def _lagrangian_gradient(program: Program, x: Floats, objective_factor: float, multipliers: Floats) -> Floats:
+    rows, columns = program.jacobian_entries
+    sums = np.bincount(columns, program.jacobian(x) * multipliers[rows], program.layout.n_unknowns)
+    return np.asarray(objective_factor * program.gradient(x) + sums)
+
+
+_COMPUTE: Mapping[str, Callable[[Program, Floats, float, Floats], Any]] = {
+    "f": lambda program, x, _factor, _multipliers: [program.objective(x)],
+    "g": lambda program, x, _factor, _multipliers: program.constraints(x),
+    "grad_f_x": lambda program, x, _factor, _multipliers: program.gradient(x),
+    "grad_gamma_x": _lagrangian_gradient,
+    "grad_gamma_p": lambda _program, _x, _factor, _multipliers: np.zeros(0),
+    "jac_g_x": lambda program, x, _factor, _multipliers: program.jacobian(x),
+    "hess_gamma_x_x": Program.hessian,
+    "triu_hess_gamma_x_x": Program.hessian,
+}
+
+_SIGNATURES: dict[str, dict[str, tuple[str, ...]]] = {
+    "ipopt": {
+        "nlp_f": ("f",),
+        "nlp_g": ("g",),
+        "nlp_grad_f": ("f", "grad_f_x"),
+        "nlp_jac_g": ("g", "jac_g_x"),
+        "nlp_hess_l": ("triu_hess_gamma_x_x",),
+        "nlp_grad": ("f", "g", "grad_gamma_x", "grad_gamma_p"),
+    },
+    "fatrop": {
+        "nlp_f": ("f",),
+        "nlp_g": ("g",),
+        "nlp_grad_f": ("grad_f_x",),
+        "nlp_jac_g": ("g", "jac_g_x"),
+        "nlp_hess_l": ("grad_gamma_x", "hess_gamma_x_x"),
+        "nlp_grad": ("f", "g", "grad_gamma_x", "grad_gamma_p"),
+    },
+}
+"""What each solver asks for under which name; multipliers go in where their name says that they matter."""
+
+
+class _Evaluation(ca.Callback):
+    """One function of the nonlinear program for CasADi: (x, p, lam_f, lam_g) or (x, p) -> some of `_Outputs`."""
+
+    def __init__(self, name: str, results: tuple[str, ...], outputs: _Outputs, values: Callable[..., Floats]) -> None:
+        ca.Callback.__init__(self)
+        self._results, self._outputs, self._values = results, outputs, values
+        weighted = name in ("nlp_hess_l", "nlp_grad")
+        sizes = {"x": outputs.n_unknowns, "p": 0}
+        if weighted:
+            sizes |= {"lam_f": 1, "lam_g": outputs.n_constraints}
+        self._sizes = sizes
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        return len(self._sizes)
+
+    def get_n_out(self) -> int:
+        return len(self._results)
+
+    def get_name_in(self, i: int) -> str:
+        return list(self._sizes)[i]
+
+    def get_name_out(self, i: int) -> str:
+        return self._results[i]
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        return ca.Sparsity.dense(list(self._sizes.values())[i], 1)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        return self._outputs.parts[self._results[i]][0]
+
+    def has_eval_buffer(self) -> bool:
+        return True
+
+    def eval_buffer(self, arguments: Any, results: Any) -> int:
+        """Fill the buffers; 1 where there is no value, which CasADi tells the solver."""
+        sizes = self._sizes.values()
+        given = [np.zeros(n) if a is None else np.frombuffer(a) for a, n in zip(arguments, sizes, strict=True)]
+        factor, multipliers = (float(given[2][0]), given[3]) if len(given) > 2 else (0.0, np.zeros(0))
+        try:
+            for name, buffer in zip(self._results, results, strict=True):
+                if buffer is not None:
+                    order = self._outputs.parts[name][1]
+                    np.frombuffer(buffer)[:] = self._values(name, given[0], factor, multipliers)[order]
+        except BaseException:  # noqa: BLE001 - CasADi would print it; it is raised where the solver was called
+            return 1
+        return 0
+
+
+def _sorted(entries: tuple[Integers, Integers], shape: tuple[int, int]) -> tuple[ca.Sparsity, Integers]:
+    """Column-compressed sparsity of entries, and their order in it."""
+    rows, columns = entries
+    order = np.lexsort((rows, columns))
+    starts = np.searchsorted(columns[order], np.arange(shape[1] + 1))
+    return ca.Sparsity(*shape, starts.tolist(), rows[order].tolist()), order
+
+
+def _upper(program: Program) -> NDArray[np.bool_]:
+    rows, columns = program.hessian_entries
+    return np.asarray(rows <= columns)
+
+
+def _ipopt_options(_layout: Layout, iterations: int, near: bool) -> dict[str, Any]:
+    options = {"print_level": 0, "sb": "yes", "max_iter": iterations, "tol": _TOLERANCE}
+    if near:
+        options |= {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
+    return {"ipopt": options}
+
+
+def _fatrop_options(layout: Layout, iterations: int, near: bool) -> dict[str, Any]:
+    options = {"print_level": 0, "max_iter": iterations, "tol": _TOLERANCE}
+    if near:
+        options |= {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
+    return {"structure_detection": "auto", "equality": [True] * layout.n_constraints, "fatrop": options}

@@ -1,0 +1,212 @@
+"""One stage of a plan: the state an interval later, what the interval costs, and the derivatives of both, compiled.
+
+An interval is a few Runge-Kutta steps with the input held, the very steps of a simulation. One step and its derivatives
+are expressions; the kernel makes machine code of them that takes every stage of a plan at once, and NumPy chains the
+steps. So an exact second derivative through ten steps takes a model no longer to compile than one step's.
+
+Names, of a stage: ``s`` its state, ``u`` its input, ``z = [s; u]``; ``Z = ds/dz`` from the start of the interval on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from diransac.kernel.row_map import Map, compile_map
+from diransac.simulate.steps import INTEGRATORS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from diransac.model import Model
+
+    Floats = NDArray[np.float64]
+
+__all__ = ["Costs", "Interval", "Stage", "stage_of"]
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What every knot and interval costs: ``tau (w_t + sum_i e_i (u_i - trim_i)^2) + sum_j w_j (x_j - ref_j)^2``.
+
+    Parameters
+    ----------
+    reference, weights : (n_knots, n_x)   ref, and w with the length of time that a knot stands for
+    effort : (n_u,)   e, one over each input's unit squared
+    trim : (n_u,)   inputs that cost nothing
+    time : w_t, one over seconds
+    """
+
+    reference: Floats
+    weights: Floats
+    effort: Floats
+    trim: Floats
+    time: float
+
+
+@dataclass(frozen=True)
+class Interval:
+    """All intervals of a plan after integration, with derivatives.
+
+    Parameters
+    ----------
+    states : (n_steps + 1, N, n_s)   at the start of each step, and at the end
+    transitions : (n_steps + 1, N, n_z, n_s)   Z transposed, at the same moments
+    """
+
+    states: Floats
+    transitions: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """Compiled steps, costs and derivatives of one model; made by `stage_of`.
+
+    Shapes: N stages, n_s states (with free time the duration of the segment is the last), n_z = n_s + n_u, M steps.
+    """
+
+    n_s: int
+    n_u: int
+    _step: Map
+    _sensitivities: Map
+    _adjoint: Map
+    _curvature: Map
+    _cost: Map
+
+    @property
+    def n_z(self) -> int:
+        """States and inputs of a stage."""
+        return self.n_s + self.n_u
+
+    def advance(self, states: Floats, inputs: Floats, parameters: Floats, steps: Floats) -> Floats:
+        """States (M + 1, N, n_s) before each step and after the last; steps (N, M) in s, or shares of the duration."""
+        moments = [states]
+        for step in steps.T:
+            moments.append(self._step(moments[-1], inputs, parameters, _column(step))[0])
+        return np.array(moments)
+
+    def linearize(self, states: Floats, inputs: Floats, parameters: Floats, steps: Floats) -> Interval:
+        """The same with derivatives."""
+        identity = np.eye(self.n_z, self.n_s)
+        moments, transitions = [states], [np.broadcast_to(identity, (len(states), *identity.shape))]
+        for step in steps.T:
+            flat = transitions[-1].reshape(len(states), -1)
+            after, moved = self._sensitivities(moments[-1], inputs, parameters, _column(step), flat)
+            moments.append(after)
+            transitions.append(moved.reshape(-1, self.n_z, self.n_s))
+        return Interval(np.array(moments), np.array(transitions))
+
+    def curvature(
+        self, interval: Interval, inputs: Floats, parameters: Floats, steps: Floats, multipliers: Floats
+    ) -> Floats:
+        """Second derivatives (N, n_z, n_z) of ``multipliers . state after the interval``; multipliers (N, n_s)."""
+        n_steps, n_stages = steps.shape[1], len(steps)
+        adjoints = np.empty((n_steps, n_stages, self.n_s))
+        adjoints[-1] = multipliers
+        for j in range(n_steps - 1, 0, -1):
+            adjoints[j - 1] = self._adjoint(interval.states[j], inputs, parameters, _column(steps[:, j]), adjoints[j])[
+                0
+            ]
+        rows = n_steps * n_stages
+        (blocks,) = self._curvature(
+            interval.states[:-1].reshape(rows, self.n_s),
+            np.tile(inputs, (n_steps, 1)),
+            parameters,
+            np.ascontiguousarray(steps.T).reshape(rows, 1),
+            adjoints.reshape(rows, self.n_s),
+            interval.transitions[:-1].reshape(rows, -1),
+        )
+        total: Floats = blocks.reshape(n_steps, n_stages, self.n_z, self.n_z).sum(axis=0)
+        return total
+
+    def cost(self, states: Floats, inputs: Floats, lengths: Floats, costs: Costs) -> tuple[Floats, Floats, Floats]:
+        """Cost (n_knots,), its gradient (n_knots, n_z) and its second derivatives (n_knots, n_z, n_z).
+
+        Parameters
+        ----------
+        lengths : (n_knots,)   of each knot's interval: s, or a share of the duration where time is free
+        """
+        values, gradients, curvatures = self._cost(
+            states, inputs, _column(lengths), costs.reference, costs.weights, costs.effort, costs.trim,
+            np.array([costs.time]),
+        )  # fmt: skip
+        return values[:, 0], gradients, curvatures.reshape(-1, self.n_z, self.n_z)
+
+
+def stage_of(model: Model, free_time: bool) -> Stage:
+    """Compiled stage of a model; the same one again for equal equations."""
+    return _stage(_Equations(model.fingerprint, free_time, model))
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """What defines a stage, as a value."""
+
+    fingerprint: str
+    free_time: bool
+    model: Model = field(compare=False, repr=False)
+
+
+@lru_cache(maxsize=32)
+def _stage(equations: _Equations) -> Stage:
+    model, free_time = equations.model, equations.free_time
+    n_s = len(model.state) + free_time
+    s, u, p, c = (ca.SX.sym(n, size) for n, size in (("s", n_s), ("u", model.n_u), ("p", model.n_p), ("c", 1)))
+    arguments = [s, u, p, c]
+    z = ca.vertcat(s, u)
+    after = _stepped(model, s, u, p, c, free_time)
+    jacobian = ca.jacobian(after, z)
+    multipliers = ca.SX.sym("l", n_s)
+    Z = ca.SX.sym("Z", n_s, z.numel())
+    whole = ca.vertcat(Z, ca.horzcat(ca.SX(model.n_u, n_s), ca.SX.eye(model.n_u)))
+    curved = ca.hessian(ca.dot(multipliers, after), z)[0]
+    functions = {
+        "step": (arguments, [after]),
+        "sensitivities": ([*arguments, Z], [after, jacobian @ whole]),
+        "adjoint": ([*arguments, multipliers], [jacobian[:, :n_s].T @ multipliers]),
+        "curvature": ([*arguments, multipliers, Z], [whole.T @ curved @ whole]),
+        "cost": _cost_of(len(model.state), s, u, free_time),
+    }
+    return Stage(n_s, model.n_u, *(_compiled(name, *parts) for name, parts in functions.items()))
+
+
+def _stepped(model: Model, s: ca.SX, u: ca.SX, p: ca.SX, c: ca.SX, free_time: bool) -> ca.SX:
+    """State one Runge-Kutta step later; the duration, where it is a state, stays."""
+    n_x = len(model.state)
+    x, h = s[:n_x], c * s[n_x] if free_time else c
+
+    def rates(x: ca.SX) -> ca.SX:
+        return model.dynamics(x, u, p)[0]
+
+    after = INTEGRATORS["rk4"](rates, x, h, rates(x), model.n_q)
+    for four in model.quaternions:
+        rows = list(four)
+        after[rows] = after[rows] / ca.norm_2(after[rows])
+    return ca.vertcat(after, s[n_x:])
+
+
+def _cost_of(n_x: int, s: ca.SX, u: ca.SX, free_time: bool) -> tuple[list[ca.SX], list[ca.SX]]:
+    """Arguments and results of the cost of a knot and its interval."""
+    length, time = ca.SX.sym("tau"), ca.SX.sym("w_t")
+    reference, weights = ca.SX.sym("ref", n_x), ca.SX.sym("w", n_x)
+    effort, trim = ca.SX.sym("e", u.numel()), ca.SX.sym("trim", u.numel())
+    tau = length * s[n_x] if free_time else length
+    x = s[:n_x]
+    cost = tau * (time + ca.dot(effort, (u - trim) ** 2)) + ca.dot(weights, (x - reference) ** 2)
+    curved, gradient = ca.hessian(cost, ca.vertcat(s, u))
+    return [s, u, length, reference, weights, effort, trim, time], [cost, gradient, curved]
+
+
+def _compiled(name: str, arguments: Sequence[ca.SX], results: Sequence[ca.SX]) -> Map:
+    dense = [ca.densify(result) for result in results]
+    return compile_map(ca.Function(name, list(arguments), ca.cse(dense)))
+
+
+def _column(values: Floats) -> Floats:
+    return np.ascontiguousarray(values).reshape(-1, 1)
