@@ -172,6 +172,9 @@ def tvlqr(
     ``Qf`` is ``Q`` times 1 s by default. The four numbers of a quaternion are coordinates like others: errors along its
     length, which no input can change, end within a step.
 
+    Gains know the model as it is near the trajectory. Dry friction as a steep function, ``atan(100 v)``, is viscous and
+    strong near ``v = 0``, and gains that rely on it destabilise a machine at rest: give its parameter as 0 here.
+
     Raises SettingsError: a trajectory of another model; weights or limits of other shape, names or definiteness.
     Raises PlanningError: the model has no finite derivatives on the trajectory, or the sweep does not stay finite.
 
