@@ -214,6 +214,8 @@ def tvlqr_all(
     model = known[0].model
     if any(plant.model.fingerprint != model.fingerprint for plant in known):
         raise SettingsError("the plants have different models; call tvlqr_all for each model's own")
+    for trajectory in trajectories:
+        _check_columns(model, trajectory)
     weights = _Weights(model, Q, R, Qf)
     edges = [_edges(model, trajectory, limits) for trajectory in trajectories]
     problems = [
@@ -227,7 +229,23 @@ def tvlqr_all(
     ]
 
 
-# Limits and weights --------------------------------------------------------------------------------------------------
+# What is asked for --------------------------------------------------------------------------------------------------
+def _check_columns(model: Model, trajectory: Trajectory) -> None:
+    """Raises SettingsError: the trajectory is another model's, or the model has no inputs."""
+    if not model.inputs:
+        raise SettingsError(f'model "{model.name}" has no inputs; there is nothing to steer it with')
+    for kind, names, found, array in (
+        ("states", model.state, trajectory.state_names, trajectory.states),
+        ("inputs", tuple(model.inputs), trajectory.input_names, trajectory.inputs),
+    ):
+        if array.shape[1] != len(names) or (found and found != names):
+            has = ", ".join(found) or f"{array.shape[1]} columns"
+            raise SettingsError(
+                f'the trajectory\'s {kind} are {has}, but model "{model.name}" has {", ".join(names)}; give a '
+                "trajectory of this model"
+            )
+
+
 def _edges(model: Model, trajectory: Trajectory, limits: Limits | None) -> tuple[Floats, Floats]:
     """Lowest and highest inputs (n_u,).
 

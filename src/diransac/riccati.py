@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from diransac.errors import PlanningError, SettingsError
+from diransac.errors import PlanningError
 from diransac.kernel import Map, Scan, compile_map, compile_scan
 from diransac.model import Model
 from diransac.simulate import linearized_step
@@ -35,11 +35,8 @@ class Problem:
 def gains_of(model: Model, problems: Sequence[Problem], threads: int) -> list[Floats]:
     """Gains (K, n_u, n_x) of each problem, eight to a vector; what `tvlqr` defines.
 
-    Raises SettingsError: the model has no inputs, or a trajectory is another model's.
     Raises PlanningError: derivatives or gains that are not finite.
     """
-    for problem in problems:
-        _check_columns(model, problem.trajectory)
     compiled = _compiled(_Equations(model.fingerprint, model))
     entries = [_entries(model, compiled.linearize, problem, threads) for problem in problems]
     rows = np.empty((len(problems), max(len(own) for own in entries), entries[0].shape[1]))
@@ -50,22 +47,6 @@ def gains_of(model: Model, problems: Sequence[Problem], threads: int) -> list[Fl
     ends = [_upper(one.Qf) for one in problems]
     found = compiled.recurrence(np.array(ends), rows, np.array(weights), threads=threads)
     return [_checked(model, problem, gains) for problem, gains in zip(problems, found, strict=True)]
-
-
-def _check_columns(model: Model, trajectory: Trajectory) -> None:
-    """Raises SettingsError: the trajectory is another model's, or the model has no inputs."""
-    if not model.inputs:
-        raise SettingsError(f'model "{model.name}" has no inputs; there is nothing to steer it with')
-    for kind, names, found, array in (
-        ("states", model.state, trajectory.state_names, trajectory.states),
-        ("inputs", tuple(model.inputs), trajectory.input_names, trajectory.inputs),
-    ):
-        if array.shape[1] != len(names) or (found and found != names):
-            has = ", ".join(found) or f"{array.shape[1]} columns"
-            raise SettingsError(
-                f'the trajectory\'s {kind} are {has}, but model "{model.name}" has {", ".join(names)}; give a '
-                "trajectory of this model"
-            )
 
 
 def _entries(model: Model, linearize: Map, problem: Problem, threads: int) -> Floats:
