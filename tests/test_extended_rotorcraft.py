@@ -258,3 +258,14 @@ def test_rotors_may_start_anywhere():
 def test_what_makes_no_sense_is_refused(arguments, says):
     with pytest.raises(ModelError, match=says):
         dr.models.extended_rotorcraft(**arguments)
+
+
+def test_flapping_of_a_rotor_that_hardly_turns_stays_small():
+    """The formula has a pole at an advance ratio of sqrt(2); a rotor so slow has no thrust to tilt either."""
+    plant = extended_rotorcraft(blade_flapping=BLADE_FLAPPING, convention="printed")
+    x = np.array([0, 0, 0, 5.0, 0, 0, 0, 0])
+    without = extended_rotorcraft(convention="printed")
+    for moment in np.linspace(0.2, 0.6, 101):  # eq. (9) stops the first rotor at 0.43 N
+        u = [M * G, moment]
+        a, plain = (np.array(one.simulated.dynamics(x, u, one.constants)[1]).ravel() for one in (plant, without))
+        assert np.abs(a - plain)[:2].max() < 0.5

@@ -28,6 +28,9 @@ With ideal twist and C_T of Table I: inflow ``lambda = sqrt(2 C_T / pi) / pi = 0
 ``theta_t = lambda + 16 C_T / (pi^3 sigma a) = 0.107`` with solidity sigma = 0.12 and lift slope a = 5.7.
 """
 
+_LARGEST_MU = 0.5
+"""Advance ratio up to which flapping follows its formula; beyond it, where a rotor hardly turns, it stays as it is."""
+
 _EFFECTS = ("rotational", "gravitational")
 PerRotor = float | tuple[float, float]
 
@@ -181,9 +184,9 @@ class _Rotors:
         def forces(q: Symbols, v: Symbols, u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:
             along = v.x * ca.cos(q.theta) + v.z * ca.sin(q.theta)
             back, up, torque = ca.SX(0), ca.SX(0), ca.SX(0)
-            for i, (thrust, n) in enumerate(zip(self.thrusts(u), self.speeds(u), strict=True), start=1):
-                tip_speed = pi * self.diameter * ca.fmax(n, 1.0)  # a rotor that hardly turns has no thrust to tilt
-                mu = along / tip_speed
+            for i, n in enumerate(self.speeds(u), start=1):
+                thrust, tip_speed = self.thrust_factor * n**2, pi * self.diameter * n
+                mu = ca.fmax(ca.fmin(along / ca.fmax(tip_speed, 1e-9), _LARGEST_MU), -_LARGEST_MU)
                 tilt = d[f"flapping_{i}"] * mu / (1 - mu**2 / 2)
                 lost, arm = thrust * (ca.cos(tilt) - 1), self.arm_length * (1 if i == 2 else -1)
                 back += thrust * ca.sin(tilt)
