@@ -35,13 +35,13 @@ def why_not(task: Task, rows: tuple[int, ...], outcome: Outcome, limits: SearchL
     The nearest plan starts where it should, keeps to all limits, and misses the later waypoints as little as it can in
     the sense of least squares. IPOPT finds it.
     """
-    relaxed, program = _relaxed(task, rows)
+    program = _relaxed(task, rows)
     guess = unknowns_of(program, first_path(task, task.dt * np.array(rows)))
     nearest = interior_point("ipopt", program, guess, limits)
     if not nearest.success:
         return (
-            f"there is no plan: {outcome.solver} says {outcome.status} after {outcome.iterations} iterations, and even one "
-            f"that may miss its waypoints was not found ({nearest.status}); check the parameters, or give more time"
+            f"there is no plan: {outcome.solver} says {outcome.status}, and not even one that misses its waypoints was "
+            f"found ({nearest.status}); check the parameters, or give more time"
         )
     missed = _largest_miss(task, program, nearest.unknowns)
     binding = _binding(task, program, nearest.unknowns)
@@ -55,8 +55,8 @@ def why_not(task: Task, rows: tuple[int, ...], outcome: Outcome, limits: SearchL
     return f"the plan cannot be flown: {missed}; give it more time, or {remedy}"
 
 
-def _relaxed(task: Task, rows: tuple[int, ...]) -> tuple[Task, Program]:
-    """The task without its waypoints but the first, and its program, in which missing them costs."""
+def _relaxed(task: Task, rows: tuple[int, ...]) -> Program:
+    """The program without waypoints but the first, in which missing the others costs."""
     nowhere = Waypoint((), np.zeros(0))
     relaxed = replace(
         task,
@@ -70,7 +70,7 @@ def _relaxed(task: Task, rows: tuple[int, ...]) -> tuple[Task, Program]:
         states = list(waypoint.states)
         reference[knot, states], weights[knot, states] = waypoint.values, _MISS_WEIGHT
     numbers = replace(program.numbers, costs=replace(costs, reference=reference, weights=weights))
-    return relaxed, Program(program.stage, program.layout, numbers)
+    return Program(program.stage, program.layout, numbers)
 
 
 def _largest_miss(task: Task, program: Program, unknowns: Floats) -> str | None:
@@ -98,6 +98,6 @@ def _binding(task: Task, program: Program, unknowns: Floats) -> str:
         (states[1:, : len(task.model.state)], task.states, task.model.state),
     ):
         slack = _AT_LIMIT * limits.half_ranges
-        at_limit = ((values <= limits.lower + slack) | (values >= limits.upper - slack)).any(axis=0)
-        names += [name for name, at in zip(known, at_limit, strict=True) if at]
+        at_limit = np.any((values <= limits.lower + slack) | (values >= limits.upper - slack), axis=0)
+        names += [known[j] for j in np.flatnonzero(at_limit)]
     return " and ".join(names)

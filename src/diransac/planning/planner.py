@@ -80,9 +80,9 @@ def plan(
     limits (1 where it has none), plus ``sum_j tracking_j (x_j - reference_j)^2``; where time is free,
     plus `time_weight` for every second: by default a second costs what an input does that is fully used for a second.
 
-    Inputs are held over intervals of 0.1 s or a little less, each a whole number of rows; between rows a Runge-Kutta step
-    is taken, as in a simulation: the rows of the plan are what a simulation gives. Waypoints and state limits hold at
-    the ends of intervals.
+    Inputs are held over intervals of 0.1 s or a little less, each a whole number of rows. From row to row goes one
+    Runge-Kutta step, as in a simulation: the rows of a plan are what a simulation gives. Waypoints and state limits hold
+    at the ends of intervals.
 
     Parameters
     ----------
@@ -219,8 +219,8 @@ def _trim(
 def _path(model: Model, guess: Trajectory) -> Path:
     if guess.state_names != model.state or guess.input_names != tuple(model.inputs):
         raise SettingsError(
-            f'guess= is a trajectory of {", ".join((*guess.state_names, *guess.input_names))}, but model "{model.name}" '
-            f"has {', '.join((*model.state, *model.inputs))}"
+            f"guess= is a trajectory of {', '.join((*guess.state_names, *guess.input_names))}, but model "
+            f'"{model.name}" has {", ".join((*model.state, *model.inputs))}'
         )
     return Path(guess.time - guess.time[0], guess.states, guess.inputs)
 

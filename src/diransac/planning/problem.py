@@ -136,12 +136,14 @@ def _reference(task: Task, time: Floats) -> Floats:
 def first_path(task: Task, durations: Floats) -> Path:
     """Straight from each waypoint to the next, along the reference where there is one, with the inputs of rest."""
     at_waypoints = np.concatenate([[0.0], np.cumsum(durations)])
-    dense = np.linspace(0.0, at_waypoints[-1], 10 * len(at_waypoints) + 100)
-    time = np.union1d(dense, at_waypoints)
+    time = np.union1d(np.linspace(0.0, at_waypoints[-1], 1 + int(np.rint(at_waypoints[-1] / task.dt))), at_waypoints)
     states = np.zeros((len(time), len(task.model.state)))
     for j in range(states.shape[1]):
-        fixed = [(t, w.values[w.states.index(j)]) for t, w in zip(at_waypoints, task.waypoints, strict=True)
-                 if j in w.states]  # fmt: skip
+        fixed = [
+            (t, waypoint.values[waypoint.states.index(j)])
+            for t, waypoint in zip(at_waypoints, task.waypoints, strict=True)
+            if j in waypoint.states
+        ]
         if fixed:
             states[:, j] = np.interp(time, *np.array(fixed).T)
     for name, values in task.reference.at(time).items():
@@ -188,7 +190,7 @@ def trajectory_of(
     rows = np.concatenate([moments[steps > 0.0], states[-1:]])
     held = np.repeat(inputs, (steps > 0.0).sum(axis=1), axis=0)
     return Trajectory(
-        start + task.dt * np.arange(len(rows)),
+        start + task.dt * np.arange(len(rows), dtype=np.float64),
         rows[:, : layout.n_x],
         np.concatenate([held, inputs[-1:]]),
         task.model.state,

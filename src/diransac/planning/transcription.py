@@ -105,7 +105,15 @@ class Layout:
     def pins(self) -> Integers:
         """Knot and state (n_pins, 2) of every value that a waypoint fixes."""
         knots = self.waypoint_knots
-        return np.array([(k, j) for k, names in zip(knots, self.pinned, strict=True) for j in names]).reshape(-1, 2)
+        pins = [(k, j) for k, names in zip(knots, self.pinned, strict=True) for j in names]
+        return np.array(pins, np.int64).reshape(-1, 2)
+
+    @cached_property
+    def pinned_unknowns(self) -> Integers:
+        """Unknown of each pin."""
+        knots, states = self.pins.T
+        unknowns: Integers = self.states[knots, states]
+        return unknowns
 
     @cached_property
     def pin_rows(self) -> Integers:
@@ -152,7 +160,7 @@ class Program:
 
     def __init__(self, stage: Stage, layout: Layout, numbers: Numbers) -> None:
         self.stage, self.layout, self.numbers = stage, layout, numbers
-        self._at: Floats | None = None
+        self._at = np.zeros(0)
         self._interval: Interval | None = None
 
     # ------------------------------------------------------------------ values
@@ -185,7 +193,7 @@ class Program:
         after[layout.ends_segment, layout.n_x :] = unknowns[layout.next_durations][:, None]
         values = np.empty(layout.n_constraints)
         values[layout.defects] = unknowns[layout.states[1:]] - after
-        values[layout.pin_rows] = unknowns[self._pinned_unknowns] - self.numbers.pin_values
+        values[layout.pin_rows] = unknowns[layout.pinned_unknowns] - self.numbers.pin_values
         return values
 
     # ------------------------------------------------------------------ derivatives
@@ -198,7 +206,7 @@ class Program:
         rows = [np.broadcast_to(layout.defects[:, None, :], shape), layout.defects]
         columns = [np.broadcast_to(self._stage_unknowns[:, :, None], shape), layout.states[1:]]
         rows += [layout.pin_rows, layout.defects[layout.ends_segment, layout.n_x :]]
-        columns += [self._pinned_unknowns, layout.next_durations]
+        columns += [layout.pinned_unknowns, layout.next_durations]
         return np.concatenate([a.ravel() for a in rows]), np.concatenate([a.ravel() for a in columns])
 
     def jacobian(self, unknowns: Floats) -> Floats:
@@ -236,11 +244,6 @@ class Program:
     def _stage_unknowns(self) -> Integers:
         """Unknowns (N, n_z) of the state and input of each stage."""
         return np.hstack([self.layout.states[:-1], self.layout.inputs])
-
-    @cached_property
-    def _pinned_unknowns(self) -> Integers:
-        knots, states = self.layout.pins.T
-        return self.layout.states[knots, states]
 
     def _cost(self, unknowns: Floats) -> tuple[Floats, Floats, Floats]:
         """Cost of every knot and its derivatives; after the last there is no interval."""

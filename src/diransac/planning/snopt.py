@@ -1,0 +1,125 @@
+"""SNOPT, the solver of the paper, through the ``drake`` wheel that carries it: ``pip install diransac[snopt]``.
+
+Drake takes constraints one binding at a time and fills every derivative in between with zeros: a segment of the plan is
+a binding, itself a small program of the same stage.
+
+References: Gill, Murray, Saunders 2005, "SNOPT: An SQP algorithm for large-scale constrained optimization".
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from diransac.errors import PlanningError
+from diransac.planning.solvers import Outcome, SearchLimits
+from diransac.planning.transcription import Layout, Program
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Integers = NDArray[np.int64]
+
+__all__ = ["active_set"]
+
+_TOLERANCE = 1e-8
+_SOLVED = (1, 2)
+"""SNOPT's words for a solution: to the tolerance, or feasible and not improved any further."""
+
+
+def active_set(program: Program, guess: Floats, limits: SearchLimits) -> Outcome:
+    """Solve by SNOPT.
+
+    Raises PlanningError: Drake, which carries SNOPT, isn't installed.
+    """
+    try:
+        from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
+    except ImportError as error:
+        raise PlanningError(
+            "SNOPT comes with the drake package, which isn't installed here; pip install 'diransac[snopt]', or choose "
+            'solver="auto"'
+        ) from error
+    drake, options = MathematicalProgram(), SolverOptions()
+    unknowns = drake.NewContinuousVariables(program.layout.n_unknowns)
+    lower, upper = _limits(program)
+    drake.AddBoundingBoxConstraint(lower, upper, unknowns)
+    for part, chosen in _segments(program):
+        last = np.zeros(part.layout.n_constraints)
+        last[-part.layout.n_s + part.layout.n_x :] = np.inf if program.layout.free_time else 0.0
+        drake.AddCost(partial(_value, part.objective, part.gradient), unknowns[chosen])
+        derivatives = partial(_dense, part)
+        bound = drake.AddConstraint(partial(_value, part.constraints, derivatives), -last, last, unknowns[chosen])
+        bound.evaluator().SetGradientSparsityPattern(
+            list(zip(*(e.tolist() for e in part.jacobian_entries), strict=True))
+        )
+    _join_durations(drake, unknowns, program.layout)
+    for name, value in {
+        "Major optimality tolerance": _TOLERANCE,
+        "Major feasibility tolerance": _TOLERANCE,
+        "Major iterations limit": limits.iterations,
+        "Iterations limit": 100 * limits.iterations * len(program.numbers.steps),
+        "Time limit": limits.seconds,
+    }.items():
+        options.SetOption(SnoptSolver.id(), name, value)
+    found = SnoptSolver().Solve(drake, guess, options)
+    details = found.get_solver_details()
+    solution = np.array(found.GetSolution(unknowns), np.float64)
+    success = details.info in _SOLVED and bool(np.isfinite(solution).all())
+    return Outcome(solution, success, f"exit {details.info} ({found.get_solution_result().name})", -1, "snopt")
+
+
+def _limits(program: Program) -> tuple[Floats, Floats]:
+    """Limits of the unknowns, those that a waypoint fixes with no room between."""
+    lower, upper = program.numbers.lower.copy(), program.numbers.upper.copy()
+    fixed = program.layout.pinned_unknowns
+    lower[fixed] = upper[fixed] = program.numbers.pin_values
+    return lower, upper
+
+
+def _segments(program: Program) -> list[tuple[Program, Integers]]:
+    """Each segment as a program without waypoints, and the unknowns that are its own."""
+    layout, numbers = program.layout, program.numbers
+    parts = []
+    for first, after in zip(layout.waypoint_knots[:-1], layout.waypoint_knots[1:], strict=True):
+        alone = Layout(layout.n_x, layout.n_u, (int(after - first),), ((), ()), layout.free_time)
+        knots = slice(first, after + 1)
+        weights = numbers.costs.weights[knots].copy()
+        if after < layout.n_stages:
+            weights[-1] = 0.0  # the next segment counts this knot
+        costs = replace(numbers.costs, reference=numbers.costs.reference[knots], weights=weights)
+        own = replace(numbers, steps=numbers.steps[first:after], pin_values=np.zeros(0), costs=costs)
+        stages = np.hstack([layout.states[first:after], layout.inputs[first:after]]).ravel()
+        parts.append((Program(program.stage, alone, own), np.concatenate([stages, layout.states[after]])))
+    return parts
+
+
+def _join_durations(drake: Any, unknowns: Any, layout: Layout) -> None:
+    """Let the input that chooses the next segment's duration be that duration."""
+    following = layout.states[1:][layout.ends_segment, -1]
+    for chooser, duration in zip(layout.next_durations, following, strict=True):
+        drake.AddLinearEqualityConstraint(unknowns[chooser] == unknowns[duration])
+
+
+def _dense(part: Program, unknowns: Floats) -> Floats:
+    """Jacobian (n_constraints, n_unknowns) with its zeros."""
+    whole = np.zeros((part.layout.n_constraints, part.layout.n_unknowns))
+    whole[part.jacobian_entries] = part.jacobian(unknowns)
+    return whole
+
+
+def _value(value: Callable[[Floats], Any], derivative: Callable[[Floats], Floats], unknowns: Any) -> Any:
+    """A value for Drake, with its derivatives where it asks for them."""
+    if unknowns.dtype != object:
+        return value(unknowns)
+    from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
+
+    at = ExtractValue(unknowns).ravel()
+    if np.ndim(found := value(at)) == 0:
+        return AutoDiffXd(found, derivative(at))
+    return InitializeAutoDiff(found, derivative(at)).ravel()
