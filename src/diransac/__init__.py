@@ -16,6 +16,7 @@ from diransac.errors import (
     PlanningError,
     ResultError,
     SettingsError,
+    StudyError,
 )
 from diransac.model import Model, Parameter
 from diransac.plant import Disturbance, Plant
@@ -29,11 +30,13 @@ if TYPE_CHECKING:
     from diransac.noise import CorruptedLog, Noise, corrupt
     from diransac.nonlinear import NonlinearLeastSquares
     from diransac.planning import plan, sine, square, star
+    from diransac.plots import plot_flight
     from diransac.prepare import despike, differentiate, rename, resample, scale, shift
     from diransac.readers import read_log
     from diransac.report import write_report
     from diransac.result import Result
     from diransac.settings import Settings
+    from diransac.study import Study, run_study
     from diransac.trajectory import Trajectory
     from diransac.validation import Validation, validate
 
@@ -59,6 +62,8 @@ __all__ = [
     "ScikitLearnEstimator",
     "Settings",
     "SettingsError",
+    "Study",
+    "StudyError",
     "TotalLeastSquares",
     "Trajectory",
     "Validation",
@@ -70,9 +75,11 @@ __all__ = [
     "identify",
     "models",
     "plan",
+    "plot_flight",
     "read_log",
     "rename",
     "resample",
+    "run_study",
     "scale",
     "shift",
     "sine",
@@ -94,16 +101,18 @@ _FOUND_IN = {
     "noise": ("CorruptedLog", "Noise", "corrupt"),
     "nonlinear": ("NonlinearLeastSquares",),
     "planning": ("plan", "sine", "square", "star"),
+    "plots": ("plot_flight",),
     "prepare": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
     "readers": ("read_log",),
     "report": ("write_report",),
     "result": ("Result",),
     "settings": ("Settings",),
+    "study": ("Study", "run_study"),
     "trajectory": ("Trajectory",),
     "validation": ("Validation", "validate"),
 }
 _LATER = {name: module for module, names in _FOUND_IN.items() for name in names}
-_SUBMODULES = ("prepare", "simulate")
+_SUBMODULES = ("prepare", "simulate", "study")
 
 
 def __getattr__(name: str) -> Any:
