@@ -9,7 +9,7 @@ import numpy as np
 
 from diransac.planning.problem import Task, first_path, fixed_program, unknowns_of
 from diransac.planning.request import Waypoint
-from diransac.planning.solvers import Outcome, SearchLimits, interior_point
+from diransac.planning.solvers import TIME_LIMIT, Outcome, SearchLimits, interior_point
 from diransac.planning.transcription import Program
 
 if TYPE_CHECKING:
@@ -35,21 +35,23 @@ def why_not(task: Task, rows: tuple[int, ...], outcome: Outcome, limits: SearchL
     The nearest plan starts where it should, keeps to all limits, and misses the later waypoints as little as it can in
     the sense of least squares. IPOPT finds it.
     """
+    if outcome.status == TIME_LIMIT:
+        return f"no plan was found within {limits.seconds:g} s; raise time_limit=, or give a guess="
     program = _relaxed(task, rows)
     guess = unknowns_of(program, first_path(task, task.dt * np.array(rows)))
     nearest = interior_point("ipopt", program, guess, limits)
     if not nearest.success:
         return (
-            f"there is no plan: {outcome.solver} says {outcome.status}, and not even one that misses its waypoints was "
-            f"found ({nearest.status}); check the parameters, or give more time"
+            f"there is no plan: {outcome.words}, and not even one that misses its waypoints was "
+            f"found; check the parameters, or give more time"
         )
     missed = _largest_miss(task, program, nearest.unknowns)
     binding = _binding(task, program, nearest.unknowns)
     if missed is None:
         remedy = f"relax {binding}" if binding else "give guess= or more max_iterations="
         return (
-            f"no plan was found, though one comes near every waypoint: {outcome.solver} says {outcome.status} after "
-            f"{outcome.iterations} iterations; give a little more time, or {remedy}"
+            f"no plan was found, though one comes near every waypoint: {outcome.words}; "
+            f"give a little more time, or {remedy}"
         )
     remedy = f"raise the limits of {binding}" if binding else "ask for something that the inputs can reach"
     return f"the plan cannot be flown: {missed}; give it more time, or {remedy}"

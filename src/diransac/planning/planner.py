@@ -81,8 +81,8 @@ def plan(
     plus `time_weight` for every second: by default a second costs what an input does that is fully used for a second.
 
     Inputs are held over intervals of 0.1 s or a little less, each a whole number of rows. From row to row goes one
-    Runge-Kutta step, as in a simulation: the rows of a plan are what a simulation gives. Waypoints and state limits hold
-    at the ends of intervals.
+    Runge-Kutta step, as in a simulation: the rows of a plan are what a simulation gives. Waypoints and state limits
+    hold at the ends of intervals.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def plan(
         tracking=_tracking(model, way.reference, tracking),
         effort=weights_of("effort", effort, tuple(model.inputs), np.ones(model.n_u)) / limits.half_ranges**2,
         trim=_trim(model, parameters, way.waypoints[0], usable, trim),
-        time_weight=float(time_weight),
+        time_weight=float(time_weight) if way.rows is None else 0.0,
         inputs=usable,
         states=states,
         dt=TIME_STEP,
@@ -253,8 +253,8 @@ class _Search:
         outcome = self._search(program, unknowns_of(program, path or straight, durations), near=path is not None)
         if not outcome.success:
             raise PlanningError(
-                f"no durations were found for which the plan works: {outcome.solver} says {outcome.status} after "
-                f"{outcome.iterations} iterations; give times=, which lets the error say what stands in the way"
+                f"no durations were found for which the plan works: {outcome.words}; "
+                "give times=, which lets the error say what stands in the way"
             )
         found = program.split(outcome.unknowns)[0][program.layout.waypoint_knots[:-1], -1]
         shortest = np.maximum(np.ceil(found / task.dt - 1e-6), 1).astype(int)

@@ -42,7 +42,7 @@ class Task:
     reference, tracking : what is followed, and the weight (n_x,) of each state's squared error, per s
     effort : (n_u,)   cost of an input's squared distance from trim, per s
     trim : (n_u,)   inputs that cost nothing
-    time_weight : cost of a second, where time is free
+    time_weight : cost of a second; 0 where time is given
     inputs, states : their limits
     dt : s   from row to row
     """
@@ -108,7 +108,7 @@ def _program(
     model = task.model
     pinned = tuple(waypoint.states for waypoint in task.waypoints)
     layout = Layout(len(model.state), model.n_u, intervals, pinned, free_time)
-    costs = Costs(reference, weights, task.effort, task.trim, task.time_weight if free_time else 0.0)
+    costs = Costs(reference, weights, task.effort, task.trim, task.time_weight)
     lower, upper = (np.full(layout.n_unknowns, end) for end in (-np.inf, np.inf))
     lower[layout.inputs], upper[layout.inputs] = task.inputs.lower, task.inputs.upper
     knots = layout.states[:, : layout.n_x]

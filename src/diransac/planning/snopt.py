@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 __all__ = ["active_set"]
 
 _TOLERANCE = 1e-8
-_SOLVED = (1, 2)
-"""SNOPT's words for a solution: to the tolerance, or feasible and not improved any further."""
-
 
 def active_set(program: Program, guess: Floats, limits: SearchLimits) -> Outcome:
     """Solve by SNOPT.
@@ -70,8 +67,8 @@ def active_set(program: Program, guess: Floats, limits: SearchLimits) -> Outcome
     found = SnoptSolver().Solve(drake, guess, options)
     details = found.get_solver_details()
     solution = np.array(found.GetSolution(unknowns), np.float64)
-    success = details.info in _SOLVED and bool(np.isfinite(solution).all())
-    return Outcome(solution, success, f"exit {details.info} ({found.get_solution_result().name})", -1, "snopt")
+    success = found.is_success() and bool(np.isfinite(solution).all())
+    return Outcome(solution, success, f"exit {details.info}", None, "snopt")
 
 
 def _limits(program: Program) -> tuple[Floats, Floats]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Integers = NDArray[np.int64]
 
-__all__ = ["Outcome", "SearchLimits", "interior_point"]
+__all__ = ["TIME_LIMIT", "Outcome", "SearchLimits", "interior_point"]
 
 _QUIET: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
 _TOLERANCE = 1e-8
@@ -55,15 +55,21 @@ class Outcome:
     unknowns : (n_unknowns,)   the solution, or where the solver gave up
     success : whether it is a solution
     status : the solver's own words
-    iterations : that it took
+    iterations : that it took; None where it doesn't tell
     solver : its name
     """
 
     unknowns: Floats
     success: bool
     status: str
-    iterations: int
+    iterations: int | None
     solver: str
+
+    @property
+    def words(self) -> str:
+        """How it ended."""
+        count = "" if self.iterations is None else f" after {self.iterations} iterations"
+        return f"{self.solver} says {self.status}{count}"
 
 
 def interior_point(name: str, program: Program, guess: Floats, limits: SearchLimits, *, near: bool = False) -> Outcome:
@@ -261,7 +267,8 @@ class _Evaluation(ca.Callback):
         given = [np.zeros(n) if a is None else np.frombuffer(a) for a, n in zip(arguments, sizes, strict=True)]
         factor, multipliers = (float(given[2][0]), given[3]) if len(given) > 2 else (0.0, np.zeros(0))
         try:
-            for name, buffer in zip(self._results, results, strict=True):
+            # Derivatives stand last and are computed first: values are known then.
+            for name, buffer in reversed(list(zip(self._results, results, strict=True))):
                 if buffer is not None:
                     order = self._outputs.parts[name][1]
                     np.frombuffer(buffer)[:] = self._values(name, given[0], factor, multipliers)[order]

@@ -122,8 +122,8 @@ class Stage:
             adjoints.reshape(rows, self.n_s),
             interval.transitions[:-1].reshape(rows, -1),
         )
-        total: Floats = blocks.reshape(n_steps, n_stages, self.n_z, self.n_z).sum(axis=0)
-        return total
+        triangle: Floats = blocks.reshape(n_steps, n_stages, self.n_z, self.n_z).sum(axis=0)
+        return triangle + triangle.transpose(0, 2, 1) - triangle * np.eye(self.n_z)
 
     def cost(self, states: Floats, inputs: Floats, lengths: Floats, costs: Costs) -> tuple[Floats, Floats, Floats]:
         """Cost (n_knots,), its gradient (n_knots, n_z) and its second derivatives (n_knots, n_z, n_z).
@@ -170,7 +170,7 @@ def _stage(equations: _Equations) -> Stage:
         "step": (arguments, [after]),
         "sensitivities": ([*arguments, Z], [after, jacobian @ whole]),
         "adjoint": ([*arguments, multipliers], [jacobian[:, :n_s].T @ multipliers]),
-        "curvature": ([*arguments, multipliers, Z], [whole.T @ curved @ whole]),
+        "curvature": ([*arguments, multipliers, Z], [ca.triu(whole.T @ (curved @ whole))]),
         "cost": _cost_of(len(model.state), s, u, free_time),
     }
     return Stage(n_s, model.n_u, *(_compiled(name, *parts) for name, parts in functions.items()))

@@ -188,8 +188,8 @@ class Program:
 
     def constraints(self, unknowns: Floats) -> Floats:
         """Defects and distances from the waypoints (n_constraints,), all zero in a solution."""
-        layout = self.layout
-        after = self.advance(unknowns)[-1].copy()
+        layout, known = self.layout, self._known(unknowns)
+        after = (self.advance(unknowns) if known is None else known.states)[-1].copy()
         after[layout.ends_segment, layout.n_x :] = unknowns[layout.next_durations][:, None]
         values = np.empty(layout.n_constraints)
         values[layout.defects] = unknowns[layout.states[1:]] - after
@@ -254,9 +254,13 @@ class Program:
 
     def _linearized(self, unknowns: Floats) -> Interval:
         """Intervals with derivatives, kept for the Hessian that is asked for where the Jacobian was."""
-        if self._interval is None or not np.array_equal(self._at, unknowns):
-            states, inputs = self.split(unknowns)
-            numbers = self.numbers
-            self._interval = self.stage.linearize(states[:-1], inputs, numbers.parameters, numbers.steps)
-            self._at = unknowns.copy()
-        return self._interval
+        interval = self._known(unknowns)
+        if interval is None:
+            (states, inputs), numbers = self.split(unknowns), self.numbers
+            interval = self.stage.linearize(states[:-1], inputs, numbers.parameters, numbers.steps)
+            self._at, self._interval = unknowns.copy(), interval
+        return interval
+
+    def _known(self, unknowns: Floats) -> Interval | None:
+        """Intervals that have been linearized at these very unknowns."""
+        return self._interval if np.array_equal(self._at, unknowns) else None
