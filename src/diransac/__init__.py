@@ -16,7 +16,6 @@ from diransac.errors import (
     PlanningError,
     ResultError,
     SettingsError,
-    StudyError,
 )
 from diransac.model import Model, Parameter
 from diransac.plant import Disturbance, Plant
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from diransac.report import write_report
     from diransac.result import Result
     from diransac.settings import Settings
-    from diransac.study import Study, run_study
     from diransac.trajectory import Trajectory
     from diransac.validation import Validation, validate
 
@@ -62,8 +60,6 @@ __all__ = [
     "ScikitLearnEstimator",
     "Settings",
     "SettingsError",
-    "Study",
-    "StudyError",
     "TotalLeastSquares",
     "Trajectory",
     "Validation",
@@ -79,7 +75,6 @@ __all__ = [
     "read_log",
     "rename",
     "resample",
-    "run_study",
     "scale",
     "shift",
     "sine",
@@ -107,12 +102,11 @@ _FOUND_IN = {
     "report": ("write_report",),
     "result": ("Result",),
     "settings": ("Settings",),
-    "study": ("Study", "run_study"),
     "trajectory": ("Trajectory",),
     "validation": ("Validation", "validate"),
 }
 _LATER = {name: module for module, names in _FOUND_IN.items() for name in names}
-_SUBMODULES = ("prepare", "simulate", "study")
+_SUBMODULES = ("prepare", "simulate")
 
 
 def __getattr__(name: str) -> Any:
