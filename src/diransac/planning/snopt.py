@@ -30,6 +30,7 @@ __all__ = ["active_set"]
 
 _TOLERANCE = 1e-8
 
+
 def active_set(program: Program, guess: Floats, limits: SearchLimits) -> Outcome:
     """Solve by SNOPT.
 

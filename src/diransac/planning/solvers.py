@@ -30,6 +30,7 @@ __all__ = ["TIME_LIMIT", "Outcome", "SearchLimits", "interior_point"]
 
 _QUIET: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
 _TOLERANCE = 1e-8
+TIME_LIMIT = "time limit reached"
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ class _Solver:
             if self._stopped is not None and not isinstance(self._stopped, _Stopped):
                 raise self._stopped
         stats = self._nlpsol.stats()
-        status = "time limit reached" if self._stopped else str(stats["return_status"])
+        status = TIME_LIMIT if self._stopped else str(stats["return_status"])
         unknowns = np.array(found["x"]).ravel()
         success = bool(stats["success"]) and self._stopped is None and bool(np.isfinite(unknowns).all())
         return Outcome(unknowns, success, status, int(stats["iter_count"]), self._name)
