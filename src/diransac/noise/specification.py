@@ -61,7 +61,8 @@ class Noise:
     dead reckoning, whose velocity is off by ``sigma dt sqrt(k)`` after ``k`` samples.  (Integrating the variance over
     one sample, ``sigma^2 dt``, would need a spectral density, which Table III's units are not.)  The paper gives
     nothing for theta_ddot: the same rule run the other way has ``sigma = rate_std / dt``, the angular acceleration
-    that moves the rate by rate_std within one sample.
+    that moves the rate by rate_std within one sample.  That is large (at 100 Hz, a hundred times rate_std), and it is
+    what decides how well an inertia is identified; ``angular_acceleration_std=0`` takes the paper by its word.
 
     ============================  ==================================  =================
     Table III                     here                                its range

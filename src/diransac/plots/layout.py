@@ -18,7 +18,7 @@ WIDTH = 9.0
 """Of every picture, inches."""
 
 # Inches: a row's height; around a panel, for values on its left, its name above and the times below the last one.
-_ROW, _VALUES, _NAME, _TIMES, _GAP, _EDGE = 1.12, 0.46, 0.25, 0.24, 0.06, 0.1
+_ROW, _VALUES, _NAME, _TIMES, _GAP, _EDGE = 1.12, 0.46, 0.25, 0.24, 0.06, 0.17
 # A path beside the states takes this width and rows at most; one above them, for it is so much wider than high, all.
 _PATH_WIDTH, _PATH_ROWS, _WIDE, _PATH_HEIGHT = 3.75, 3, 2.2, 2.3
 _STEPS = (1, 2, 5, 10)
