@@ -16,6 +16,7 @@ from diransac.errors import (
     PlanningError,
     ResultError,
     SettingsError,
+    StudyError,
 )
 from diransac.model import Model, Parameter
 from diransac.plant import Disturbance, Plant
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from diransac.report import write_report
     from diransac.result import Result
     from diransac.settings import Settings
+    from diransac.study import Study, run_study
     from diransac.trajectory import Trajectory
     from diransac.validation import Validation, validate
 
@@ -60,6 +62,8 @@ __all__ = [
     "ScikitLearnEstimator",
     "Settings",
     "SettingsError",
+    "Study",
+    "StudyError",
     "TotalLeastSquares",
     "Trajectory",
     "Validation",
@@ -75,6 +79,7 @@ __all__ = [
     "read_log",
     "rename",
     "resample",
+    "run_study",
     "scale",
     "shift",
     "sine",
@@ -102,11 +107,12 @@ _FOUND_IN = {
     "report": ("write_report",),
     "result": ("Result",),
     "settings": ("Settings",),
+    "study": ("Study", "run_study"),
     "trajectory": ("Trajectory",),
     "validation": ("Validation", "validate"),
 }
 _LATER = {name: module for module, names in _FOUND_IN.items() for name in names}
-_SUBMODULES = ("prepare", "simulate")
+_SUBMODULES = ("prepare", "simulate", "study")
 
 
 def __getattr__(name: str) -> Any:

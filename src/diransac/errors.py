@@ -8,7 +8,8 @@
     ├── SettingsError          a setting, or an argument of a call, has no meaning here
     ├── IdentificationError    the search ended without parameters
     ├── PlanningError          no trajectory, or no controller, does what was asked for
-    └── ResultError            a saved result cannot be read back, or does not fit what it is used with
+    ├── ResultError            a saved result cannot be read back, or does not fit what it is used with
+    └── StudyError             a study's store cannot be used for it, or its workers are lost
 
 A message says what was wrong, what was found, and what to try.
 """
@@ -21,6 +22,7 @@ __all__ = [
     "PlanningError",
     "ResultError",
     "SettingsError",
+    "StudyError",
 ]
 
 
@@ -50,3 +52,7 @@ class PlanningError(DiransacError):
 
 class ResultError(DiransacError):
     """A saved result cannot be read back, or does not fit what it is used with."""
+
+
+class StudyError(DiransacError):
+    """A study's store cannot be used for it, or its workers are lost."""

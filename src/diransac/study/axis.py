@@ -1,0 +1,129 @@
+"""`Axis`: what varies from point to point of a study."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from diransac.errors import SettingsError
+from diransac.study.tables import Reader, flat, is_number
+
+__all__ = ["Axis", "Level", "level_text"]
+
+
+@dataclass(frozen=True)
+class Level:
+    """One point of the axis.
+
+    Parameters
+    ----------
+    text : how it is written, the same for equal values; a trial's randomness depends on it
+    value : a number, or a word
+    changes : dotted path into the study -> value there
+    """
+
+    text: str
+    value: float | str
+    changes: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """What varies, and its levels.
+
+    Parameters
+    ----------
+    name, unit : for people
+    levels : in order
+    path : dotted path of what takes the level as its value; "" where a level stands for a value at each of some paths
+    """
+
+    name: str
+    unit: str
+    levels: tuple[Level, ...]
+    path: str = ""
+
+    @classmethod
+    def from_dict(cls, table: object) -> Axis:
+        """The axis of a study's table: ``path`` and ``levels``, or ``levels`` and ``values.<path>``, a list each.
+
+        Raises SettingsError: a key is missing, unknown or holds something else.
+        """
+        reader = Reader(table, "axis")
+        values = [_checked(reader.path("levels"), value) for value in reader.listed("levels")]
+        if reader.has("values"):
+            path, changes = "", _changes(reader.table("values"), len(values))
+        else:
+            path = reader.text("path")
+            changes = [{path: value} for value in values]
+        levels = tuple(Level(level_text(v), v, change) for v, change in zip(values, changes, strict=True))
+        texts = [level.text for level in levels]
+        if len(set(texts)) < len(texts):
+            raise SettingsError(f"axis.levels has a level twice; found {', '.join(texts)}")
+        found = cls(reader.text("name", path or "level"), reader.text("unit", ""), levels, path)
+        reader.end()
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """The table that `from_dict` takes."""
+        table: dict[str, Any] = {"name": self.name, "unit": self.unit, "levels": [x.value for x in self.levels]}
+        if self.path:
+            return {**table, "path": self.path}
+        paths = self.levels[0].changes
+        return {**table, "values": {path: [level.changes[path] for level in self.levels] for path in paths}}
+
+    def narrowed(self, texts: Sequence[str]) -> Axis:
+        """The same axis with these levels; one that takes its level as a value may get new ones.
+
+        Raises SettingsError: there is no such level.
+        """
+        known = {level.text: level for level in self.levels}
+        chosen = [self._level(_value_of(text), known) for text in texts]
+        if not chosen:
+            raise SettingsError(f"no level is named; there are {', '.join(known)}")
+        return replace(self, levels=tuple({level.text: level for level in chosen}.values()))
+
+    def _level(self, value: float | str, known: Mapping[str, Level]) -> Level:
+        text = level_text(_checked("a level", value))
+        if text in known:
+            return known[text]
+        same_kind = isinstance(value, str) == isinstance(self.levels[0].value, str)
+        if self.path and same_kind:
+            return Level(text, value, {self.path: value})
+        raise SettingsError(f'there is no level "{text}" of {self.name}; there are {", ".join(known)}')
+
+
+def level_text(value: float | str) -> str:
+    """A level as text: ``80`` for 80 and 80.0, ``1e-06`` for 0.000001."""
+    if isinstance(value, str):
+        return value
+    short = f"{value:g}"
+    return short if float(short) == value else repr(float(value))
+
+
+def _value_of(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip()
+
+
+def _checked(where: str, value: object) -> float | str:
+    if is_number(value):
+        return float(value) + 0.0  # type: ignore[arg-type]  # -0.0 is 0
+    if isinstance(value, str) and value.strip() == value and value and "," not in value:
+        return value
+    raise SettingsError(f"{where} has {json.dumps(value, default=str):.60}; give numbers, or words without commas")
+
+
+def _changes(values: Mapping[str, Any], n_levels: int) -> list[dict[str, Any]]:
+    """The changes of each level, from a list of values a path."""
+    columns = dict(flat(values))
+    for path, column in columns.items():
+        if not isinstance(column, list | tuple) or len(column) != n_levels:
+            raise SettingsError(f"axis.values.{path} is {column!r:.60}; give a list of {n_levels} values, one a level")
+    if not columns:
+        raise SettingsError("axis.values is empty; give a list of values, one a level, for a dotted path")
+    return [{path: column[k] for path, column in columns.items()} for k in range(n_levels)]

@@ -1,0 +1,113 @@
+"""Which plant a study flies: its kind, and every argument that makes one."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from diransac.errors import DiransacError, SettingsError
+from diransac.models import TABLE_I, builtin, extended_rotorcraft
+from diransac.plant import Plant
+from diransac.study.tables import Reader, is_number
+
+__all__ = ["PlantChoice"]
+
+ANYWHERE = "any"
+"""As a rotor's phase: drawn anew for each flight."""
+
+
+def _undisturbed(parameters: Mapping[str, float] = TABLE_I) -> Plant:
+    """The planar rotorcraft with nothing that its model leaves out."""
+    return Plant(builtin("planar-rotorcraft"), parameters)
+
+
+_KINDS: dict[str, Callable[..., Plant]] = {
+    "extended-rotorcraft": extended_rotorcraft,
+    "planar-rotorcraft": _undisturbed,
+}
+
+
+@dataclass(frozen=True)
+class PlantChoice:
+    """A plant by its kind and all of its arguments, those that nobody gave included.
+
+    Parameters
+    ----------
+    kind : ``extended-rotorcraft`` (`models.extended_rotorcraft`), or ``planar-rotorcraft``, which has parameters alone
+    arguments : by name, as TOML has them: a list for a pair, the word ``any`` for a rotor phase that is drawn
+    """
+
+    kind: str
+    arguments: Mapping[str, Any]
+
+    @classmethod
+    def from_dict(cls, table: object) -> PlantChoice:
+        """The plant of a study's table.
+
+        Raises SettingsError: an unknown kind or key, or a value that makes no plant.
+        """
+        reader = Reader(table, "plant")
+        kind = reader.text("kind", choices=tuple(_KINDS))
+        arguments = {}
+        for name, parameter in inspect.signature(_KINDS[kind]).parameters.items():
+            default = _as_written(parameter.default)
+            given = reader.has(name)
+            value = table[name] if given else default  # type: ignore[index]  # a reader reads tables alone
+            arguments[name] = _checked(f"plant.{name}", value, default) if given else default
+        reader.end()
+        found = cls(kind, arguments)
+        try:
+            found.plant  # noqa: B018  refuses what makes no plant
+        except DiransacError as error:
+            raise SettingsError(f"plant: {error}") from error
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """The table that `from_dict` takes."""
+        return {"kind": self.kind, **self.arguments}
+
+    @cached_property
+    def plant(self) -> Plant:
+        """The plant itself."""
+        return _KINDS[self.kind](**{name: _as_meant(name, value) for name, value in self.arguments.items()})
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether one flight differs from another by more than its controller."""
+        return any(isinstance(start, tuple) for one in self.plant.disturbances for start in one.start.values())
+
+
+def _as_written(default: Any) -> Any:
+    """A default as TOML would have it."""
+    if isinstance(default, Mapping):
+        return dict(default)
+    return list(default) if isinstance(default, tuple) else default
+
+
+def _as_meant(name: str, value: Any) -> Any:
+    """An argument as the plant's function takes it."""
+    if name == "rotor_phase" and value == ANYWHERE:
+        return None
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _checked(path: str, value: Any, default: Any) -> Any:
+    """The value, if it is of its default's kind.  Raises SettingsError: it isn't."""
+    if isinstance(default, dict):
+        fits, wanted = isinstance(value, Mapping) and all(map(is_number, value.values())), "a table of numbers"
+        value = {name: float(x) for name, x in value.items()} if fits else value
+    elif isinstance(default, list):
+        fits = isinstance(value, list | tuple) and all(isinstance(x, str) for x in value)
+        wanted, value = "a list of words", list(value) if fits else value
+    elif isinstance(default, str):
+        fits, wanted = isinstance(value, str), "a word"
+    else:
+        pair = isinstance(value, list | tuple) and len(value) == 2 and all(map(is_number, value))
+        fits, wanted = is_number(value) or pair or (value == ANYWHERE and path.endswith("rotor_phase")), "a number"
+        value = [float(x) for x in value] if pair else float(value) if is_number(value) else value
+    if not fits:
+        raise SettingsError(f"{path} is {value!r:.60}; give {wanted}")
+    return value

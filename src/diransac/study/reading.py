@@ -1,0 +1,183 @@
+"""What a store holds, for tables, pictures and people."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from diransac.errors import SettingsError
+from diransac.study.store import Store
+from diransac.text_table import aligned
+
+__all__ = ["Cell", "Status", "about", "export", "paths", "read", "status"]
+
+_KINDS: dict[str, Any] = {"TEXT": pl.String, "INTEGER": pl.Int64, "REAL": pl.Float64, "BLOB": pl.Binary}
+
+
+# A row a trial and method -------------------------------------------------------------------------------------------
+def read(store: str | Path) -> pl.DataFrame:
+    """Every row of a store: a level, trial and method each, in the order in which levels and methods were asked for.
+
+    ``level``, ``trial``, ``method``; ``status`` is done or failed, and ``error`` says why; ``seed``;
+    ``parameter_<name>`` in the parameter's unit; ``fit_error``, ``inlier_fraction``, ``iterations``, ``stop_reason`` of
+    the identification;
+    ``<trajectory>_<state>``, the RMS tracking error in the state's unit; ``versions``; ``seconds``, a struct by stage
+    (what is done for several trials together is divided among them); ``host``.  What isn't known is null.
+
+    Raises StudyError: there is no such store.
+    """
+    with Store.existing(store) as kept:
+        columns = [(name, kind) for _, name, kind, *_ in kept.select("PRAGMA table_info(trials)") if name != "paths"]
+        names = ", ".join(f't."{name}"' for name, _ in columns)
+        rows = kept.select(
+            f"SELECT {names} FROM trials t JOIN cells c USING (level, method) "
+            "ORDER BY (SELECT min(rowid) FROM cells WHERE level = t.level), t.trial, c.rowid"
+        )
+    frame = pl.DataFrame(rows, schema={name: _KINDS[kind] for name, kind in columns}, orient="row")
+    stages = list(json.loads(frame["seconds"][0])) if len(frame) else []
+    return frame.with_columns(pl.col("seconds").str.json_decode(pl.Struct(dict.fromkeys(stages, pl.Float64))))
+
+
+def about(store: str | Path) -> dict[str, str]:
+    """The study's ``name`` and ``description``, and the ``axis`` that varies with its ``unit``.
+
+    Raises StudyError: there is no such store.
+    """
+    with Store.existing(store) as kept:
+        return kept.about
+
+
+def paths(store: str | Path, trajectory: str) -> dict[tuple[str, int, str], npt.NDArray[np.float32]]:
+    """The flown path (K, n_q), coordinates in their units, of every level, trial and method that has one.
+
+    Raises StudyError: there is no such store.
+    """
+    with Store.existing(store) as kept:
+        rows = kept.select("SELECT level, trial, method, paths FROM trials WHERE paths NOT NULL ORDER BY rowid")
+    found = {}
+    for level, trial, method, packed in rows:
+        with np.load(io.BytesIO(packed), allow_pickle=False) as flown:
+            if trajectory in flown:
+                found[level, trial, method] = flown[trajectory]
+    return found
+
+
+def export(store: str | Path, path: str | Path, kind: str) -> None:
+    """Write `read`'s table as ``parquet`` or ``csv``, where the seconds by stage are JSON.
+
+    Raises StudyError: there is no such store; SettingsError: another kind.
+    """
+    frame = read(store)
+    if kind == "parquet":
+        frame.write_parquet(path)
+    elif kind == "csv":
+        frame.with_columns(pl.col("seconds").struct.json_encode()).write_csv(path)
+    else:
+        raise SettingsError(f'there is no kind "{kind}"; there are parquet, csv')
+
+
+# How far a study is --------------------------------------------------------------------------------------------------
+class Cell(NamedTuple):
+    """Trials of one level and method: asked for, done, failed; why the first of these failed."""
+
+    asked: int
+    done: int
+    failed: int
+    error: str | None
+
+    @property
+    def missing(self) -> int:
+        """Trials yet to run."""
+        return self.asked - self.done - self.failed
+
+
+@dataclass(frozen=True)
+class Status:
+    """How far a study is.
+
+    Parameters
+    ----------
+    store : the file
+    name : the study's
+    cells : (level, method) -> trials, in the order in which they were asked for
+    """
+
+    store: str
+    name: str
+    cells: Mapping[tuple[str, str], Cell]
+
+    @property
+    def asked(self) -> int:
+        """Rows that were asked for."""
+        return sum(cell.asked for cell in self.cells.values())
+
+    @property
+    def done(self) -> int:
+        """Rows with all figures."""
+        return sum(cell.done for cell in self.cells.values())
+
+    @property
+    def failed(self) -> int:
+        """Rows that say why they lack some."""
+        return sum(cell.failed for cell in self.cells.values())
+
+    @property
+    def missing(self) -> int:
+        """Rows yet to come."""
+        return self.asked - self.done - self.failed
+
+    def to_dict(self) -> dict[str, Any]:
+        """All of it, ready for JSON."""
+        totals = {"rows": self.asked, "done": self.done, "failed": self.failed, "missing": self.missing}
+        cells = [
+            {"level": level, "method": method, **cell._asdict(), "missing": cell.missing}
+            for (level, method), cell in self.cells.items()
+        ]
+        return {"store": self.store, "study": self.name, **totals, "cells": cells}
+
+    def __str__(self) -> str:
+        methods = list(dict.fromkeys(method for _, method in self.cells))
+        levels = dict.fromkeys(level for level, _ in self.cells)
+        rows = [["level", *methods]]
+        rows += [[level, *(_text(self.cells.get((level, method))) for method in methods)] for level in levels]
+        title = f"{self.name} in {self.store}: {self.done} done, {self.failed} failed, {self.missing} missing"
+        lines = [f"{title} of {self.asked} rows (a level, trial and method each)", *aligned(rows)]
+        failures = {(method, cell.error): level for (level, method), cell in self.cells.items() if cell.error}
+        lines += [f"! {method} failed, as at level {level}: {error}" for (method, error), level in _first(failures)]
+        return "\n".join(lines)
+
+
+def status(store: str | Path) -> Status:
+    """How many trials of each level and method are done, failed or missing.
+
+    Raises StudyError: there is no such store.
+    """
+    with Store.existing(store) as kept:
+        name = kept.about["name"]
+        rows = kept.select(
+            "SELECT c.level, c.method, c.trials, coalesce(sum(t.status = 'done'), 0), "
+            "coalesce(sum(t.status = 'failed'), 0), min(t.error) "
+            "FROM cells c LEFT JOIN trials t USING (level, method) GROUP BY c.level, c.method ORDER BY c.rowid"
+        )
+    return Status(str(store), name, {(level, method): Cell(*counts) for level, method, *counts in rows})
+
+
+def _text(cell: Cell | None) -> str:
+    if cell is None:
+        return "-"
+    counts = [f"{cell.done} done"]
+    counts += [f"{n} {word}" for n, word in ((cell.failed, "failed"), (cell.missing, "missing")) if n]
+    return ", ".join(counts)
+
+
+def _first(failures: Mapping[tuple[str, Any], str]) -> list[tuple[tuple[str, Any], str]]:
+    """One failure a method."""
+    return list({method: ((method, error), level) for (method, error), level in failures.items()}.values())

@@ -1,0 +1,295 @@
+"""Trials of one point: fly and spoil the data, identify, plan, steer, fly, judge.
+
+What can be done for many trials at a time is: flights are lanes of one simulation, controllers of one sweep.  Neither
+changes a bit of any of them, and each plan starts from the same guess, so a trial's outcome depends on itself alone.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import platform
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from diransac.controller import Controller, tvlqr, tvlqr_all
+from diransac.errors import DiransacError, PlanningError
+from diransac.flight import fly_all, tracking_error
+from diransac.identification import identify
+from diransac.log import Log
+from diransac.noise import corrupt
+from diransac.plant import Plant
+from diransac.settings import Settings
+from diransac.study.library import load
+from diransac.study.seeds import derived_seed
+from diransac.study.specification import TRAJECTORIES, TRUE, Study
+from diransac.trajectory import Trajectory
+
+__all__ = ["STAGES", "run_trials"]
+
+STAGES = ("record", "identify", "plan", "steer", "fly")
+"""What `seconds` is split by."""
+
+_PACKAGES = ("diransac", "casadi", "llvmlite", "numpy", "scipy")
+
+
+def run_trials(study: str, level: str, trials: Sequence[int], methods: Sequence[str]) -> list[dict[str, Any]]:
+    """A row for each of these trials and methods.
+
+    Parameters
+    ----------
+    study : the JSON of `Study.to_dict`
+    level, trials, methods : which of its trials, and which of its methods by label
+
+    Nothing is raised for a trial that fails: its row says why.  Rows are as the store has them, by column; what isn't
+    known is None.  Everything in them is plain, so that they may come from another process or machine.
+    """
+    point = _point(study, level)
+    cases = [_Case(point, trial, label) for trial in trials for label in methods]
+    point.record(cases)
+    for case in cases:
+        with case.attempt("identify"):
+            case.identify()
+    for shape in point.study.evaluation:
+        _evaluate(point, [case for case in cases if case.found], shape)
+    return [case.row() for case in cases]
+
+
+# A point and its cases -----------------------------------------------------------------------------------------------
+@lru_cache(maxsize=8)
+def _point(study: str, level: str) -> _Point:
+    return _Point(load(json.loads(study)).at(level), level)
+
+
+class _Point:
+    """A study at one level, and what all of its trials share."""
+
+    def __init__(self, study: Study, level: str) -> None:
+        self.study, self.level = study, level
+
+    @property
+    def plant(self) -> Plant:
+        """What flies."""
+        return self.study.plant.plant
+
+    @cached_property
+    def controller(self) -> Controller:
+        """What steers the flight that is recorded.  Raises PlanningError: there is no such flight."""
+        return tvlqr(self.plant, TRAJECTORIES[self.study.data](self.plant))
+
+    def record(self, cases: Sequence[_Case]) -> None:
+        """Fly for data, and spoil each trial's record; where nothing is drawn, one flight serves all trials."""
+        trials = {case.trial: case.seed for case in cases}
+        begin = time.perf_counter()
+        try:
+            seeds = [derived_seed(seed, "data flight") for seed in trials.values()]
+            flights = self._flights(seeds if self.study.plant.is_drawn else seeds[:1])
+            flights = flights if len(flights) == len(trials) else flights * len(trials)
+            logs = {
+                trial: corrupt(log, self.study.noise, derived_seed(seed, "noise"), signals=self.plant.model.signals)
+                for (trial, seed), log in zip(trials.items(), flights, strict=True)
+            }
+        except DiransacError as error:
+            for case in cases:
+                case.fail(error)
+        else:
+            for case in cases:
+                case.log = logs[case.trial]
+        _share(cases, "record", time.perf_counter() - begin)
+
+    def _flights(self, seeds: Sequence[int]) -> list[Log]:
+        n = len(seeds)
+        flights = fly_all([self.plant] * n, [self.controller] * n, seeds=seeds, threads=1)
+        for log in flights:
+            _check_ended(log)
+        return flights
+
+
+@dataclass
+class _Case:
+    """One method in one trial."""
+
+    point: _Point
+    trial: int
+    label: str
+    log: Log | None = None
+    found: Plant | None = None
+    figures: dict[str, Any] = field(default_factory=dict)
+    paths: dict[str, Any] = field(default_factory=dict)
+    errors: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+
+    @cached_property
+    def seed(self) -> int:
+        """Of all that is random in the trial, whatever the method."""
+        return derived_seed(self.point.study.seed, self.point.level, self.trial)
+
+    @contextmanager
+    def attempt(self, stage: str) -> Iterator[None]:
+        """Time what is done; an error is noted, and ends no other case."""
+        begin = time.perf_counter()
+        try:
+            yield
+        except Exception as error:  # noqa: BLE001  a study of days must not end at one trial; its row says what it was
+            self.fail(error)
+        self.seconds[stage] += time.perf_counter() - begin
+
+    def fail(self, error: Exception) -> None:
+        """Note why there is no figure."""
+        known = isinstance(error, DiransacError)
+        self.errors.append(str(error) if known else f"internal error: {type(error).__name__}: {error}")
+
+    def identify(self) -> None:
+        """Find parameters in the log.  Raises DiransacError: nothing is found."""
+        if self.log is None:
+            return
+        plant, method = self.point.plant, self.point.study.methods[self.label]
+        if method.method == TRUE:
+            self.found = Plant(plant.model, plant.parameters)
+        else:
+            settings = Settings.from_dict({**method.settings.to_dict(), "threads": 1})
+            seed = derived_seed(self.seed, "identify")
+            result = identify(plant.model, self.log, method.method, seed=seed, settings=settings)
+            self.found = Plant(plant.model, result.parameters)
+            self.figures |= {
+                "fit_error": result.fit_error,
+                "inlier_fraction": result.inlier_fraction,
+                "iterations": result.iterations,
+                "stop_reason": result.stop_reason,
+            }
+        self.figures |= {f"parameter_{name}": value for name, value in self.found.parameters.items()}
+
+    def judge(self, shape: str, trajectory: Trajectory, log: Log) -> None:
+        """Note the tracking error of a flight.  Raises PlanningError: it diverged."""
+        try:
+            _check_ended(log)
+        except PlanningError as error:
+            raise PlanningError(f"{shape}: {error}") from error
+        self.figures |= {f"{shape}_{name}": error for name, error in tracking_error(trajectory, log).items()}
+        if self.point.study.keep_paths:
+            self.paths[shape] = np.column_stack([log[name] for name in self.point.plant.model.coordinates])
+
+    def row(self) -> dict[str, Any]:
+        """The case as the store has it."""
+        return {
+            "level": self.point.level,
+            "trial": self.trial,
+            "method": self.label,
+            "status": "failed" if self.errors else "done",
+            "error": "; ".join(self.errors) or None,
+            "seed": self.seed,
+            **{name: _plain(value) for name, value in self.figures.items()},
+            "paths": _packed(self.paths) if self.paths else None,
+            "versions": _versions(),
+            "seconds": dict(self.seconds),
+            "host": platform.node(),
+        }
+
+
+# Evaluation ----------------------------------------------------------------------------------------------------------
+def _evaluate(point: _Point, cases: Sequence[_Case], shape: str) -> None:
+    """Plan, steer and fly a trajectory with what each case found."""
+    plans = _plans(cases, shape)
+    planned = [case for case in cases if id(case) in plans]
+    controllers = _controllers(planned, plans)
+    groups = defaultdict(list)
+    for case in planned:
+        if id(case) in controllers:
+            groups[len(controllers[id(case)])].append(case)
+    for group in groups.values():
+        begin = time.perf_counter()
+        seeds = [derived_seed(case.seed, shape) for case in group]
+        steering = [controllers[id(case)] for case in group]
+        logs = fly_all([point.plant] * len(group), steering, seeds=seeds, threads=1)
+        _share(group, "fly", time.perf_counter() - begin)
+        for case, log in zip(group, logs, strict=True):
+            with case.attempt("fly"):
+                case.judge(shape, plans[id(case)], log)
+
+
+def _plans(cases: Sequence[_Case], shape: str) -> dict[int, Trajectory]:
+    """The trajectory of each case that has one; equal parameters have the same, planned once."""
+    planned: dict[tuple[float, ...], Trajectory | DiransacError] = {}
+    plans = {}
+    for case in cases:
+        assert case.found is not None
+        key = tuple(case.found.parameters.values())
+        with case.attempt("plan"):
+            if key not in planned:
+                planned[key] = _tried(TRAJECTORIES[shape], case.found)
+            found = planned[key]
+            if isinstance(found, DiransacError):
+                raise PlanningError(f"{shape}: {found}")
+            plans[id(case)] = found
+    return plans
+
+
+def _tried(make: Callable[[Plant], Trajectory], plant: Plant) -> Trajectory | DiransacError:
+    try:
+        return make(plant)
+    except DiransacError as error:
+        return error
+
+
+def _controllers(cases: Sequence[_Case], plans: dict[int, Trajectory]) -> dict[int, Controller]:
+    """The controller of each case that has one: all in one sweep, or each on its own where one of them has none."""
+    begin = time.perf_counter()
+    plants = [case.found for case in cases if case.found is not None]
+    try:
+        steering = tvlqr_all(plants, [plans[id(case)] for case in cases], threads=1)
+    except DiransacError:
+        return _controllers_alone(cases, plans)
+    _share(cases, "steer", time.perf_counter() - begin)
+    return {id(case): controller for case, controller in zip(cases, steering, strict=True)}
+
+
+def _controllers_alone(cases: Sequence[_Case], plans: dict[int, Trajectory]) -> dict[int, Controller]:
+    found = {}
+    for case in cases:
+        assert case.found is not None
+        with case.attempt("steer"):
+            found[id(case)] = tvlqr(case.found, plans[id(case)])
+    return found
+
+
+# What a row holds ----------------------------------------------------------------------------------------------------
+def _check_ended(log: Log) -> None:
+    """Raises PlanningError: the flight diverged."""
+    diverged = [note for note in log.notes if "diverged" in note]
+    if diverged:
+        raise PlanningError(diverged[0])
+
+
+def _share(cases: Sequence[_Case], stage: str, seconds: float) -> None:
+    """Divide the time of what was done for all."""
+    for case in cases:
+        case.seconds[stage] += seconds / len(cases)
+
+
+def _plain(value: Any) -> float | int | str | None:
+    """A number or text; NaN is not known."""
+    if isinstance(value, str | int):
+        return value
+    return None if np.isnan(value) else float(value)
+
+
+def _packed(paths: dict[str, Any]) -> bytes:
+    """Paths by flight, (K, n_q) in single precision: the bytes of an .npz file."""
+    memory = io.BytesIO()
+    np.savez_compressed(memory, **{name: path.astype(np.float32) for name, path in paths.items()})
+    return memory.getvalue()
+
+
+@lru_cache(maxsize=1)
+def _versions() -> str:
+    """What computed it."""
+    found = [("python", platform.python_version()), *((name, version(name)) for name in _PACKAGES)]
+    return " ".join(f"{name} {number}" for name, number in found)
