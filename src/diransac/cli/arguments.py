@@ -20,7 +20,7 @@ from diransac.errors import DiransacError, ModelError, SettingsError
 from diransac.model import Model
 from diransac.settings import Settings
 
-__all__ = ["load_model", "load_settings", "model_file", "names", "numbers", "pairs"]
+__all__ = ["load_model", "load_settings", "model_file", "names", "numbers", "pairs", "toml_value"]
 
 _MODEL_FILE = re.compile(r"(.+\.py)(?::(\w+))?")
 
@@ -80,7 +80,7 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> Settings:
         keys = [part.strip() for part in key.split(".")]
         if not equals or not all(keys):
             raise typer.BadParameter(f"--set: {text!r} is not key=value")
-        _assign(table, [_known_setting(keys[0]), *keys[1:]], _toml_value(value.strip()))
+        _assign(table, [_known_setting(keys[0]), *keys[1:]], toml_value(value.strip()))
     return Settings.from_dict({key: _none_where_meant(key, value) for key, value in table.items()})
 
 
@@ -110,7 +110,7 @@ def _assign(table: dict[str, Any], keys: Sequence[str], value: object) -> None:
     table[last] = value
 
 
-def _toml_value(text: str) -> object:
+def toml_value(text: str) -> object:
     """A TOML value; a bare word is itself."""
     for candidate in (text, text.lower(), f"[{text}]" if "," in text else text):
         try:

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import load_model, model_file
+from diransac.cli.flights import record, try_out
+from diransac.cli.flying import (
+    FlightPicture,
+    FlightSeed,
+    LogOutput,
+    OptionalLogOutput,
+    Recorder,
+    TrajectoryArgument,
+    TrajectoryOption,
+    TruePlant,
+)
 from diransac.cli.group import Group, grouped
 from diransac.cli.options import (
     Derivation,
@@ -20,10 +30,12 @@ from diransac.cli.options import (
     Output,
     Preparation,
     Report,
+    ResultFile,
     Search,
     known_methods,
 )
 from diransac.cli.outputs import staged
+from diransac.cli.study import study
 from diransac.cli.views import Equations, ModelList, compare_methods
 from diransac.identification import METHODS, identify
 from diransac.inspection import inspect
@@ -40,6 +52,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+app.add_typer(study)
 
 
 @app.callback()
@@ -54,7 +67,8 @@ def _diransac(
         typer.echo(f"diransac {version_of('diransac')}")
         raise typer.Exit
     if context.invoked_subcommand is None:
-        context.fail(f"Give a command: {', '.join(sorted(command.name or '' for command in app.registered_commands))}.")
+        known = (*app.registered_commands, *app.registered_groups)
+        context.fail(f"Give a command: {', '.join(sorted(command.name or '' for command in known))}.")
 
 
 @app.command("identify")
@@ -113,7 +127,7 @@ def _compare(
 @app.command("validate")
 @grouped
 def _validate(
-    model: Annotated[Path, typer.Argument(metavar="MODEL.json", help="What identify saved.")],
+    model: ResultFile,
     file: LogFile,
     derivation: Derivation,
     preparation: Preparation,
@@ -137,6 +151,51 @@ def _inspect(
     """Show what a log holds, what is odd about it, and what is missing for a model."""
     plant = None if model is None else load_model(model)
     screen.show(inspect(preparation.read_uneven(file), plant), as_json)
+
+
+@app.command("simulate")
+@grouped
+def _simulate(
+    shape: TrajectoryArgument,
+    plant: TruePlant,
+    recorder: Recorder,
+    output: LogOutput,
+    model: ModelName = "planar-rotorcraft",
+    plot: FlightPicture = None,
+    seed: FlightSeed = 0,
+    as_json: JsonFlag = False,
+) -> None:
+    """Plan a trajectory, fly it, and write the log that a bad recorder would have kept."""
+    noise = recorder.noise()
+    with staged([output, plot], [model_file(model)]) as (written, picture):
+        known = load_model(model)
+        recording = record(shape, known, plant.of(known), noise, seed)
+        recording.log.write(written)
+        if plot:
+            recording.flight.draw(picture)
+        screen.show(recording, as_json)
+
+
+@app.command("fly")
+@grouped
+def _fly(
+    model: ResultFile,
+    shape: TrajectoryOption,
+    plant: TruePlant,
+    output: OptionalLogOutput = None,
+    plot: FlightPicture = None,
+    seed: FlightSeed = 0,
+    as_json: JsonFlag = False,
+) -> None:
+    """Plan and steer by an identified model, fly the true machine, and say how far it strays."""
+    with staged([output, plot], [model]) as (written, picture):
+        result = Result.load(model)
+        trial = try_out(shape, result, plant.of(result.model), seed)
+        if output:
+            trial.flight.log.write(written)
+        if plot:
+            trial.flight.draw(picture)
+        screen.show(trial, as_json)
 
 
 @app.command("models")

@@ -27,8 +27,10 @@ __all__ = [
     "Output",
     "Preparation",
     "Report",
+    "ResultFile",
     "Search",
     "known_methods",
+    "output_file",
 ]
 
 
@@ -57,7 +59,7 @@ def known_methods(text: str) -> list[str]:
     return wanted
 
 
-def _file(text: str) -> Path:
+def output_file(text: str) -> Path:
     """A file to write.  Raises typer.BadParameter: the name is empty, which `Path` takes for the folder we are in."""
     if not text:
         raise typer.BadParameter("the name is empty; give the name of a file")
@@ -75,14 +77,17 @@ _LOG_HELP = "CSV(.gz), Parquet, NPZ or MAT: time t in seconds and one column a s
 _MODEL = typer.Option("--model", metavar="NAME|FILE.py[:NAME]", help="A built-in model, or one of yours.")
 
 LogFile = Annotated[Path, typer.Argument(metavar="LOG", help=_LOG_HELP)]
+ResultFile = Annotated[Path, typer.Argument(metavar="MODEL.json", help="What identify saved.")]
 ModelName = Annotated[str, _MODEL]
 OptionalModelName = Annotated[str | None, _MODEL]
 MethodName = Annotated[str, typer.Option("--method", callback=known_method, help=f"One of {', '.join(METHODS)}.")]
 Output = Annotated[
-    Path | None, typer.Option("--output", "-o", parser=_file, metavar="FILE.json", help="Where to save the result.")
+    Path | None,
+    typer.Option("--output", "-o", parser=output_file, metavar="FILE.json", help="Where to save the result."),
 ]
 Report = Annotated[
-    Path | None, typer.Option("--report", parser=_file, metavar="FILE.html", help="Where to write a page to look at.")
+    Path | None,
+    typer.Option("--report", parser=output_file, metavar="FILE.html", help="Where to write a page to look at."),
 ]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")]
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-__all__ = ["write_columns"]
+__all__ = ["ENDINGS", "write_columns"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -66,3 +66,5 @@ def _write_npz(columns: Mapping[str, FloatArray], file: Path) -> None:
 
 
 _WRITERS = {".csv": _write_csv, ".csv.gz": _write_csv_gz, ".parquet": _write_parquet, ".npz": _write_npz}
+ENDINGS = tuple(_WRITERS)
+"""Endings of the files that `write_columns` writes."""

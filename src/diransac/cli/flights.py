@@ -1,0 +1,216 @@
+"""What commands that fly do and show: a flight that fills a log, and one that judges an identified model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from diransac.cli.flying import TRAJECTORIES, same_equations
+from diransac.controller import Controller, tvlqr
+from diransac.errors import DiransacError, PlanningError, SettingsError
+from diransac.flight import fly, tracking_error
+from diransac.log import Log
+from diransac.model import Model
+from diransac.noise import CorruptedLog, Noise, corrupt
+from diransac.plant import ModelWithParameters, Plant
+from diransac.result import Result
+from diransac.text_table import aligned
+from diransac.trajectory import Trajectory
+
+__all__ = ["Flight", "Recording", "Trial", "record", "try_out"]
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One closed loop: what was to be flown, what steered, what was flown, RMS errors by state."""
+
+    trajectory: Trajectory
+    controller: Controller
+    log: Log
+    errors: Mapping[str, float]
+
+    @property
+    def at_limit(self) -> dict[str, float]:
+        """Share of the samples in which an input was at one of its limits, by input."""
+        controller = self.controller
+        edges = zip(controller.input_names, controller.u_min, controller.u_max, strict=True)
+        return {name: float(np.mean((self.log[name] <= low) | (self.log[name] >= high))) for name, low, high in edges}
+
+    def draw(self, path: Path) -> None:
+        """Write a picture of it."""
+        from diransac.plots import plot_flight
+
+        plot_flight(self.trajectory, self.log, path)
+
+    def to_dict(self) -> dict[str, Any]:
+        """How well it went."""
+        return {"tracking_error": self.errors, "at_limit": self.at_limit}
+
+
+def flown(shape: str, known: ModelWithParameters, plant: Plant, seed: int) -> Flight:
+    """Plan with what is known, steer by it, fly what there is.
+
+    Raises PlanningError: there is no such plan or no controller, or the flight diverges.
+    Raises SettingsError: the plant has other states or inputs than what is known.
+    """
+    trajectory = TRAJECTORIES[shape](known)
+    controller = tvlqr(known, trajectory)
+    log = fly(plant, trajectory, controller, seed=seed)
+    errors = tracking_error(trajectory, log)
+    if not np.isfinite(list(errors.values())).all():
+        raise PlanningError(f"{shape}: {'; '.join(log.notes)}; these parameters don't fly this plant")
+    return Flight(trajectory, controller, log, errors)
+
+
+# ---------------------------------------------------------------------- a flight that fills a log
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A flight and the log that is left of it."""
+
+    shape: str
+    plant: Plant
+    flight: Flight
+    log: CorruptedLog
+    seed: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """What was flown, how well, and what is wrong with the log."""
+        return {
+            "trajectory": self.shape,
+            "plant": self.plant.simulated.name,
+            "parameters": self.plant.parameters,
+            "seed": self.seed,
+            "rows": len(self.log),
+            "rate": 1.0 / self.log.dt,
+            "units": self.log.units,
+            **self.flight.to_dict(),
+            "spoilt": {name: int(mask.sum()) for name, mask in self.log.planted.items()},
+            "noise": self.log.history[-1]["noise"],
+        }
+
+    def __str__(self) -> str:
+        errors, limits = self.flight.errors, self.flight.at_limit
+        rows = [["signal", "unit", "tracking error", "spoilt values", "at a limit"]]
+        for name in self.log.names:
+            error = f"{errors[name]:.4g}" if name in errors else ""
+            spoilt = str(self.log.planted[name].sum()) if name in self.log.planted else ""
+            rows.append([name, self.log.units[name], error, spoilt, _percent(limits[name]) if name in limits else ""])
+        return "\n".join([f"{self.shape} of {_size(self.plant, self.log)}, seed {self.seed}", *aligned(rows)])
+
+
+def record(shape: str, model: Model, plant: Plant, noise: Noise, seed: int) -> Recording:
+    """Fly by what is true, and spoil the log.
+
+    Raises as `flown` does; SettingsError: the plant is not of that model; LogError: the noise doesn't fit the log.
+    """
+    if not same_equations(model, plant.model):
+        raise SettingsError(
+            f'the plant "{plant.simulated.name}" has the equations of {plant.model.name}, not those of the model '
+            f'"{model.name}"; leave the model or the plant out'
+        )
+    flight = flown(shape, plant, plant, seed)
+    log = corrupt(flight.log, noise, seed, signals=model.signals)
+    return Recording(shape, plant, flight, log, seed)
+
+
+# ---------------------------------------------------------------------- a flight that judges a model
+
+
+@dataclass(frozen=True)
+class Trial:
+    """An identified model, flown on the true plant, beside what the true parameters do there, or why they can't."""
+
+    shape: str
+    result: Result
+    plant: Plant
+    flight: Flight
+    ideal: Flight | DiransacError
+    seed: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Both flights, and what each knew."""
+        ideal = self.ideal.to_dict() if isinstance(self.ideal, Flight) else {"refused": str(self.ideal)}
+        return {
+            "trajectory": self.shape,
+            "model": self.result.model.name,
+            "method": self.result.method,
+            "plant": self.plant.simulated.name,
+            "seed": self.seed,
+            "rows": len(self.flight.log),
+            "rate": 1.0 / self.flight.log.dt,
+            "units": self.flight.log.units,
+            "parameters": self.result.parameters,
+            **self.flight.to_dict(),
+            "true": {"parameters": self.plant.parameters, **ideal},
+        }
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.shape} planned and steered by {self.result.model.name} ({self.result.method}); "
+            f"flight of {_size(self.plant, self.flight.log)}, seed {self.seed}",
+            *aligned(self._parameters()),
+            "",
+            *aligned(self._errors()),
+            "",
+            *aligned(self._limits()),
+        ]
+        if not same_equations(self.result.model, self.plant.model):
+            lines.append(f"! the model has other equations than the plant's {self.plant.model.name}")
+        if isinstance(self.ideal, DiransacError):
+            lines.append(f"! the true parameters don't fly: {self.ideal}")
+        return "\n".join(lines)
+
+    def _parameters(self) -> list[list[str]]:
+        found, true = self.result.parameters, self.plant.parameters
+        units = self.result.units | {name: about.unit for name, about in self.plant.model.parameters.items()}
+        rows = [["parameter", "unit", "identified", "true"]]
+        return rows + [
+            [name, units[name], *(f"{x[name]:.5g}" if name in x else "-" for x in (found, true))] for name in units
+        ]
+
+    def _errors(self) -> list[list[str]]:
+        ideal = self.ideal.errors if isinstance(self.ideal, Flight) else {}
+        rows = [["state", "unit", "tracking error", "with the true parameters"]]
+        for name, error in self.flight.errors.items():
+            other = f"{ideal[name]:.4g}" if name in ideal else "-"
+            rows.append([name, self.flight.log.units[name], f"{error:.4g}", other])
+        return rows
+
+    def _limits(self) -> list[list[str]]:
+        controller = self.flight.controller
+        ideal = self.ideal.at_limit if isinstance(self.ideal, Flight) else {}
+        rows = [["input", "unit", "limits", "at a limit", "with the true parameters"]]
+        edges = zip(controller.u_min, controller.u_max, strict=True)
+        for (name, share), (low, high) in zip(self.flight.at_limit.items(), edges, strict=True):
+            limits = f"{low:g} .. {high:g}" if np.isfinite([low, high]).any() else "none"
+            other = _percent(ideal[name]) if name in ideal else "-"
+            rows.append([name, self.flight.log.units[name], limits, _percent(share), other])
+        return rows
+
+
+def try_out(shape: str, result: Result, plant: Plant, seed: int) -> Trial:
+    """Fly the plant by what an identification found, and by what is true.
+
+    Raises as `flown` does, of the identified model alone.
+    """
+    flight = flown(shape, result, plant, seed)
+    ideal: Flight | DiransacError
+    try:
+        ideal = flown(shape, plant, plant, seed)
+    except DiransacError as error:
+        ideal = error
+    return Trial(shape, result, plant, flight, ideal, seed)
+
+
+def _size(plant: Plant, log: Log) -> str:
+    return f"{plant.simulated.name}: {len(log)} rows at {1.0 / log.dt:.4g} Hz"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.1f} %"
