@@ -52,7 +52,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-app.add_typer(study)
+app.add_typer(study, name="study")
 
 
 @app.callback()
@@ -67,8 +67,8 @@ def _diransac(
         typer.echo(f"diransac {version_of('diransac')}")
         raise typer.Exit
     if context.invoked_subcommand is None:
-        known = (*app.registered_commands, *app.registered_groups)
-        context.fail(f"Give a command: {', '.join(sorted(command.name or '' for command in known))}.")
+        known = [one.name or "" for one in app.registered_commands] + [one.name or "" for one in app.registered_groups]
+        context.fail(f"Give a command: {', '.join(sorted(known))}.")
 
 
 @app.command("identify")
