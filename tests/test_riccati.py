@@ -219,6 +219,12 @@ def test_a_sweep_that_overflows_says_when():
         dr.tvlqr(Plant(pulled, {"m": 1.0}), trajectory)
 
 
+def test_a_sweep_that_loses_its_precision_says_so():
+    """Two inputs that cost next to nothing and one weighted coordinate leave R dt + B'S B singular to rounding."""
+    with pytest.raises(PlanningError, match="did not stay finite and positive"):
+        dr.tvlqr(PLANTS["pendulum"], resting("pendulum", 50), {"q1": 1.0}, 1e-30, 0.0)
+
+
 def test_a_trajectory_through_a_state_without_derivatives_is_refused_with_the_state():
     root = dr.Model(
         "root",
