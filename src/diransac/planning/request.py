@@ -53,15 +53,16 @@ class Limits:
 
     def middle(self, share: float) -> Limits:
         """The middle share of every range that has two ends."""
-        with np.errstate(invalid="ignore"):
-            cut = np.nan_to_num(0.5 * (1.0 - share) * (self.upper - self.lower), posinf=0.0)
-        return Limits(self.lower + cut, self.upper - cut)
+        both = np.isfinite(self.lower) & np.isfinite(self.upper)
+        lower, upper = self.lower.copy(), self.upper.copy()
+        middle, half = 0.5 * (lower[both] + upper[both]), 0.5 * (upper[both] - lower[both])
+        lower[both], upper[both] = middle - share * half, middle + share * half
+        return Limits(lower, upper)
 
     @property
     def half_ranges(self) -> Floats:
         """(n,)   1 where there is no range, or none that has two ends."""
-        with np.errstate(invalid="ignore"):
-            half = 0.5 * (self.upper - self.lower)
+        half = 0.5 * (self.upper - self.lower)
         return np.where(np.isfinite(half) & (half > 0.0), half, 1.0)
 
     def by_name(self, names: Iterable[str]) -> dict[str, tuple[float, float]]:

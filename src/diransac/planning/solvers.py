@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from diransac.planning.transcription import Layout, Program
+from diransac.planning.transcription import Layout, Numbers, Program
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 __all__ = ["TIME_LIMIT", "Outcome", "SearchLimits", "interior_point"]
 
 _QUIET: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
-_TOLERANCE = 1e-8
+_TOLERANCE = 1e-9
+_FATROP_RELAXES = 1e-8
+"""Times a limit, or one: how much wider fatrop takes every limit, which cannot be switched off."""
 TIME_LIMIT = "time limit reached"
 
 
@@ -123,7 +125,8 @@ class _Solver:
         assert self._nlpsol is not None
         numbers = program.numbers
         try:
-            found = self._nlpsol(x0=guess, lbx=numbers.lower, ubx=numbers.upper, lbg=0.0, ubg=0.0)
+            lower, upper = self._limits(numbers)
+            found = self._nlpsol(x0=guess, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
         finally:
             if self._stopped is not None and not isinstance(self._stopped, _Stopped):
                 raise self._stopped
@@ -132,6 +135,16 @@ class _Solver:
         unknowns = np.array(found["x"]).ravel()
         success = bool(stats["success"]) and self._stopped is None and bool(np.isfinite(unknowns).all())
         return Outcome(unknowns, success, status, int(stats["iter_count"]), self._name)
+
+    def _limits(self, numbers: Numbers) -> tuple[Floats, Floats]:
+        """Limits of the unknowns, so that those that the solver really keeps to are the ones that were asked for."""
+        lower, upper = numbers.lower, numbers.upper
+        if self._name != "fatrop":
+            return lower, upper
+        finite = [np.where(np.isfinite(limit), np.abs(limit), 0.0) for limit in (lower, upper)]
+        inward = [_FATROP_RELAXES * np.maximum(1.0, size) for size in finite]
+        roomy = upper - lower > inward[0] + inward[1]
+        return np.where(roomy, lower + inward[0], lower), np.where(roomy, upper - inward[1], upper)
 
     def _build(self, program: Program) -> None:
         outputs = _Outputs(program)
@@ -292,14 +305,17 @@ def _upper(program: Program) -> NDArray[np.bool_]:
 
 
 def _ipopt_options(_layout: Layout, iterations: int, near: bool) -> dict[str, Any]:
-    options = {"print_level": 0, "sb": "yes", "max_iter": iterations, "tol": _TOLERANCE}
-    if near:
-        options |= {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
-    return {"ipopt": options}
+    return {"ipopt": {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, **_interior(iterations, near)}}
 
 
 def _fatrop_options(layout: Layout, iterations: int, near: bool) -> dict[str, Any]:
-    options = {"print_level": 0, "max_iter": iterations, "tol": _TOLERANCE}
+    options = {"print_level": 0, **_interior(iterations, near)}
+    return {"structure_detection": "auto", "equality": [True] * layout.n_constraints, "fatrop": options}
+
+
+def _interior(iterations: int, near: bool) -> dict[str, Any]:
+    """What both solvers call by the same name."""
+    options = {"max_iter": iterations, "tol": _TOLERANCE}
     if near:
         options |= {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
-    return {"structure_detection": "auto", "equality": [True] * layout.n_constraints, "fatrop": options}
+    return options
