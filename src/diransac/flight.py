@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -186,7 +185,8 @@ def _same_instants(a: Floats, b: Floats) -> bool:
 
 def _engine(plants: Sequence[Plant], substeps: int) -> Rollouts:
     """Rollouts of what they all are."""
-    engines = {rollouts(plant.simulated, substeps=substeps) for plant in plants}
+    different = {id(plant): plant for plant in plants}.values()
+    engines = {rollouts(plant.simulated, substeps=substeps) for plant in different}
     if len(engines) > 1:
         raise SettingsError("the plants' equations differ; fly plants of one model and the same disturbances together")
     return engines.pop()
@@ -224,10 +224,7 @@ def _log(plant: Plant, controller: Controller, signals: Floats, inputs: Floats, 
     """A flight as a log."""
     model = plant.model
     columns = dict(zip((*model.signals, *model.inputs), (*signals.T, *inputs.T), strict=True))
-    log = Log.from_arrays(controller.time, columns, model.units, f'flight of "{plant.simulated.name}"')
     step = {"step": "fly", "plant": plant.simulated.name, "substeps": substeps}
     ended = ~np.isfinite(signals).all(axis=1)
-    notes = log.notes
-    if ended.any():
-        notes = (f"the flight diverged at t = {controller.time[int(np.argmax(ended))]:.6g} s",)
-    return replace(log, history=(step,), notes=notes)
+    notes = (f"the flight diverged at t = {controller.time[int(np.argmax(ended))]:.6g} s",) if ended.any() else ()
+    return Log(controller.time, columns, model.units, f'flight of "{plant.simulated.name}"', (step,), notes)
