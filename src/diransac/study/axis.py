@@ -13,6 +13,10 @@ from diransac.study.tables import Reader, flat, is_number
 __all__ = ["Axis", "Level", "level_text"]
 
 
+_EXACT = 2.0**53
+"""Up to here floats hold every whole number."""
+
+
 @dataclass(frozen=True)
 class Level:
     """One point of the axis.
@@ -57,7 +61,7 @@ class Axis:
             path, changes = "", _changes(reader.table("values"), len(values))
         else:
             path = reader.text("path")
-            changes = [{path: value} for value in values]
+            changes = [{path: _as_number(value)} for value in values]
         levels = tuple(Level(level_text(v), v, change) for v, change in zip(values, changes, strict=True))
         texts = [level.text for level in levels]
         if len(set(texts)) < len(texts):
@@ -91,7 +95,7 @@ class Axis:
             return known[text]
         same_kind = isinstance(value, str) == isinstance(self.levels[0].value, str)
         if self.path and same_kind:
-            return Level(text, value, {self.path: value})
+            return Level(text, value, {self.path: _as_number(value)})
         raise SettingsError(f'there is no level "{text}" of {self.name}; there are {", ".join(known)}')
 
 
@@ -101,6 +105,12 @@ def level_text(value: float | str) -> str:
         return value
     short = f"{value:g}"
     return short if float(short) == value else repr(float(value))
+
+
+def _as_number(value: float | str) -> float | str:
+    """A whole number as such: some keys take nothing else."""
+    whole = isinstance(value, float) and value.is_integer() and abs(value) < _EXACT
+    return int(value) if whole else value
 
 
 def _value_of(text: str) -> float | str:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 from typing import Any
 
 from diransac.errors import DiransacError, SettingsError
@@ -69,15 +70,21 @@ class PlantChoice:
         """The table that `from_dict` takes."""
         return {"kind": self.kind, **self.arguments}
 
-    @cached_property
+    @property
     def plant(self) -> Plant:
         """The plant itself."""
-        return _KINDS[self.kind](**{name: _as_meant(name, value) for name, value in self.arguments.items()})
+        return _made(self.kind, json.dumps(self.arguments))
 
     @property
     def is_drawn(self) -> bool:
         """Whether one flight differs from another by more than its controller."""
         return any(isinstance(start, tuple) for one in self.plant.disturbances for start in one.start.values())
+
+
+@lru_cache(maxsize=64)
+def _made(kind: str, arguments: str) -> Plant:
+    """A plant from its arguments as JSON: levels that leave it as it is share it."""
+    return _KINDS[kind](**{name: _as_meant(name, value) for name, value in json.loads(arguments).items()})
 
 
 def _as_written(default: Any) -> Any:

@@ -7,19 +7,21 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import polars as pl
 
 from diransac.errors import SettingsError
 from diransac.study.store import Store
 from diransac.text_table import aligned
 
+if TYPE_CHECKING:
+    import polars as pl
+
 __all__ = ["Cell", "Status", "about", "export", "paths", "read", "status"]
 
-_KINDS: dict[str, Any] = {"TEXT": pl.String, "INTEGER": pl.Int64, "REAL": pl.Float64, "BLOB": pl.Binary}
+_KINDS: dict[str, type] = {"TEXT": str, "INTEGER": int, "REAL": float}
 
 
 # A row a trial and method -------------------------------------------------------------------------------------------
@@ -34,6 +36,8 @@ def read(store: str | Path) -> pl.DataFrame:
 
     Raises StudyError: there is no such store.
     """
+    import polars as pl
+
     with Store.existing(store) as kept:
         columns = [(name, kind) for _, name, kind, *_ in kept.select("PRAGMA table_info(trials)") if name != "paths"]
         names = ", ".join(f't."{name}"' for name, _ in columns)
@@ -75,6 +79,8 @@ def export(store: str | Path, path: str | Path, kind: str) -> None:
 
     Raises StudyError: there is no such store; SettingsError: another kind.
     """
+    import polars as pl
+
     frame = read(store)
     if kind == "parquet":
         frame.write_parquet(path)

@@ -1,0 +1,63 @@
+"""What the tests of studies share: a study that takes a second, and how rows are compared."""
+
+import copy
+import sqlite3
+import sys
+from pathlib import Path
+
+from diransac.study.tables import changed
+
+TINY = {
+    "name": "tiny",
+    "description": "as small as can be",
+    "trials": 2,
+    "seed": 7,
+    "plant": {"kind": "planar-rotorcraft"},
+    "data": {"trajectory": "square"},
+    "noise": {"outlier_probability": 0.1},
+    "methods": {
+        "true": {},
+        "ols": {"preset": "table-iv"},
+        "quick": {"method": "i-diransac", "preset": "table-iv", "settings": {"max_iterations": 20, "sample_size": 30}},
+    },
+    "evaluation": {"trajectories": ["square"]},
+    "axis": {"name": "outlier magnitude", "path": "noise.outlier_magnitude", "levels": [0, 40]},
+}
+MAY_DIFFER = ("seconds", "host")
+
+RUNNER = """
+import sys
+import diransac as dr
+from studies import TINY, tiny
+
+if __name__ == "__main__":
+    def progress(done, asked):
+        print(done, asked, flush=True)
+    store, jobs, trials = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    dr.run_study(tiny(), store=store, jobs=jobs, trials=trials, batch_size=1, progress=progress)
+"""
+"""A script that runs the study in a process of its own and says on stdout, line by line, how many rows there are."""
+
+
+def tiny(**changes: object) -> dict:
+    """The study with other values at dotted paths, written with __ for the dots."""
+    return changed(copy.deepcopy(TINY), {path.replace("__", "."): value for path, value in changes.items()})
+
+
+def rows(store: Path) -> dict[tuple, dict]:
+    """Every row by level, trial and method, without what may differ, read past the package."""
+    connection = sqlite3.connect(store)
+    connection.row_factory = sqlite3.Row
+    found = [dict(row) for row in connection.execute("SELECT * FROM trials")]
+    connection.close()
+    kept = [{name: value for name, value in row.items() if name not in MAY_DIFFER} for row in found]
+    by_key = {(row["level"], row["trial"], row["method"]): row for row in kept}
+    assert len(by_key) == len(found)
+    return by_key
+
+
+def command(store: Path, jobs: int, trials: int = 2) -> dict:
+    """What `subprocess.Popen` needs to run `RUNNER`."""
+    script = store.parent / "runner.py"
+    script.write_text(RUNNER)
+    return {"args": [sys.executable, str(script), str(store), str(jobs), str(trials)]}

@@ -1,0 +1,193 @@
+"""Studies as people write them: what is understood, and what is refused by name."""
+
+import json
+import re
+import tomllib
+
+import pytest
+
+import diransac as dr
+from diransac.study import builtin_names, load, template
+from diransac.study.seeds import derived_seed
+from studies import TINY, tiny
+
+STUDY = load(TINY)
+
+
+# What is understood ---------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("name", builtin_names())
+def test_a_built_in_study_survives_being_written_as_json(name: str):
+    study = load(name)
+    assert load(json.loads(json.dumps(study.to_dict()))) == study
+    assert study.name == name
+
+
+def test_the_figures_of_the_paper_vary_what_they_say():
+    levels = {name: [level.value for level in load(name).axis.levels] for name in ("fig2", "fig3", "fig4", "fig5")}
+    assert levels == {
+        "fig2": [0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100],
+        "fig3": pytest.approx([1.0e-6, 1.2e-6, 1.4e-6, 1.6e-6, 1.8e-6], rel=1e-12),
+        "fig4": pytest.approx([6e-5, 8e-5, 1e-4, 1.2e-4, 1.4e-4], rel=1e-12),
+        "fig5": [80],
+    }
+    assert [load(f"fig{k}").evaluation for k in (2, 3, 4, 5)] == [("square",), ("sine",), ("sine",), ("square", "sine")]
+    assert load("fig2").noise.outlier_probability == 0.1
+    assert load("fig3").at("1.8e-06").plant.arguments["aerodynamic_imbalance"] == 1.8e-6
+    assert load("fig4").at("0.00014").plant.arguments["mass_imbalance"] == 1.4e-4
+    assert all(load(name).data == "star" and load(name).trials == 50 for name in levels)
+    assert load("fig5").keep_paths
+
+
+@pytest.mark.parametrize("name", ["fig2", "fig3", "fig4", "fig5", "gaussian"])
+def test_every_figure_shows_the_true_parameters_and_the_methods_of_the_paper_with_its_settings(name: str):
+    methods = load(name).methods
+    assert {"true", "ols", "diransac", "i-diransac"} <= {one.method for one in methods.values()}
+    assert methods["i-diransac"].settings == dr.Settings.table_iv()
+    assert methods["diransac-without-refit"].settings.refit == "none"
+
+
+def test_the_gaussian_sweep_moves_both_deviations_from_end_to_end_of_table_iii():
+    ends = [load("gaussian").at(level).noise for level in ("0", "1")]
+    assert [(noise.acceleration_std, noise.rate_std) for noise in ends] == [(0.04, 0.003), (2.5, 1.0)]
+
+
+def test_the_template_is_a_study_and_comments_every_table():
+    study = load(tomllib.loads(template()))
+    assert study.methods["all-iterations"].settings.stop_inlier_fraction is None
+    lines = template().splitlines()
+    assert all("#" in line for line in lines if re.match(r"\[(plant|data|noise|evaluation|axis)\]", line))
+
+
+def test_levels_are_the_same_however_they_are_written():
+    study = load(tiny(axis__levels=[0, 0.0000010, 80.0, -0.0000010 + 0.0000010 + 3]))
+    assert [level.text for level in study.axis.levels] == ["0", "1e-06", "80", "3"]
+    assert study.narrowed(levels=["80.00", 3]).axis.levels == study.narrowed(levels=[80, "3"]).axis.levels
+
+
+def test_a_level_that_has_a_path_may_be_new_and_a_combination_may_not():
+    assert STUDY.narrowed(levels=[55]).at("55").noise.outlier_magnitude == 55.0
+    with pytest.raises(dr.SettingsError, match=r'no level "0.3".*there are 0, 0.25, 0.5, 0.75, 1'):
+        load("gaussian").narrowed(levels=["0.3"])
+
+
+def test_an_axis_may_lead_into_a_method():
+    study = load(tiny(axis={"path": "methods.quick.settings.max_iterations", "levels": [5, 50]}))
+    assert [study.at(level).methods["quick"].settings.max_iterations for level in ("5", "50")] == [5, 50]
+    assert study.narrowed(methods=["ols"]).at("5").methods.keys() == {"ols"}
+
+
+def test_settings_are_laid_over_their_preset():
+    quick = STUDY.methods["quick"].settings
+    assert (quick.max_iterations, quick.inlier_thresholds) == (20, dr.Settings.table_iv().inlier_thresholds)
+
+
+def test_a_rotor_phase_may_be_drawn():
+    drawn = load(tiny(plant={"kind": "extended-rotorcraft", "rotor_phase": "any"})).plant
+    assert drawn.is_drawn
+    assert not load("fig4").plant.is_drawn
+    assert drawn.plant.disturbances[0].start["phase_1"] == pytest.approx((0.0, 2 * 3.141592653589793))
+
+
+def test_what_people_call_things_and_how_many_there_are_decide_nothing():
+    other = load(tiny(name="b", description="c", trials=9, axis__name="d", methods__ols__settings={"threads": 1}))
+    assert other.configuration == STUDY.configuration
+    assert load(tiny(seed=8)).configuration != STUDY.configuration
+
+
+# What is refused ------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"plnt.kind": "x"}, 'no key "plnt"; in a study there are .*plant'),
+        ({"trials": 0}, "trials is 0; give a whole number of at least 1"),
+        ({"trials": 2.5}, "trials is 2.5; give a whole number"),
+        ({"seed": "x"}, "seed is 'x'; give a whole number"),
+        ({"plant.kind": "car"}, "plant.kind is 'car'; there are extended-rotorcraft, planar-rotorcraft"),
+        ({"plant.wind": 1}, 'no key "plant.wind"; in plant there are kind, parameters'),
+        ({"plant.parameters": {"mass": 0.2, "inertia": 0.004}}, "plant: .*drag"),
+        ({"plant.parameters.mass": "heavy"}, "plant.parameters is .*heavy.*; give a table of numbers"),
+        ({"data.trajectory": "loop"}, "data.trajectory is 'loop'; there are square, star, sine"),
+        ({"noise.outlier_probability": 2}, "noise.outlier_probability is 2; give a number from 0 to 1"),
+        ({"noise.wind": 2}, 'no key "noise.wind"; in noise there are outlier_probability'),
+        ({"methods": {}}, "methods is empty; there are true, ols"),
+        ({"methods.mine": {}}, "methods.mine.method is 'mine'; there are true, ols"),
+        ({"methods.a": {"method": "ols", "preset": "best"}}, "methods.a.preset is 'best'; there are default, table-iv"),
+        (
+            {"methods.ols.settings": {"sample_sise": 3}},
+            'methods.ols.settings: there is no setting "sample_sise"; there',
+        ),
+        ({"methods.ols.settings": {"sample_size": 0}}, "methods.ols.settings: sample_size is 0"),
+        ({"methods.a,b": {"method": "ols"}}, 'the label "a,b" has other characters'),
+        ({"evaluation.trajectories": ["loop"]}, "evaluation.trajectories has 'loop'; there are square, star, sine"),
+        ({"evaluation.trajectories": []}, r"evaluation.trajectories is \[\]; give a list of one or more"),
+        ({"evaluation.keep_paths": 1}, "evaluation.keep_paths is 1; give true or false"),
+        ({"axis.levels": []}, r"axis.levels is \[\]"),
+        ({"axis.levels": [1, 1.0]}, "axis.levels has a level twice; found 1, 1"),
+        ({"axis.levels": ["a,b"]}, 'axis.levels has "a,b"; give numbers, or words without commas'),
+        ({"axis.levels": [True]}, "axis.levels has true; give numbers"),
+        ({"axis.levels": [float("nan")]}, "axis.levels has NaN; give numbers"),
+        ({"axis.levels": [0, -5]}, "axis: at level -5, noise.outlier_magnitude is -5"),
+        ({"axis.path": "noise.magnitude"}, 'axis: at level 0, there is no key "noise.magnitude"; in noise there are'),
+        ({"axis.path": "trials"}, r'axis: at level 0, "trials" cannot vary; there are plant\.\*'),
+        ({"axis.path": "data.trajectory.x"}, "leads nowhere: trajectory is 'square', not a table"),
+        ({"axis": {"levels": [1, 2], "values": {"noise.rate_std": [1]}}}, "axis.values.noise.rate_std is .*2 values"),
+        ({"axis": {"levels": [1, 2], "values": {}}}, "axis.values is empty"),
+        ({"axis": 3}, "axis is 3; give a table"),
+    ],
+)
+def test_a_study_that_makes_no_sense_is_refused_by_its_key(changes: dict, message: str):
+    with pytest.raises(dr.SettingsError, match=message):
+        load(TINY, changes)
+
+
+def test_a_missing_key_is_named_with_what_was_found():
+    with pytest.raises(dr.SettingsError, match="data is missing; found name, trials: give a table"):
+        load({"name": "a", "trials": 1})
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("fig9", 'study "fig9": there is none of that name; there are fig2, .*or give FILE.toml'),
+        ("none.toml", 'study "none.toml": the file cannot be read: No such file'),
+    ],
+)
+def test_a_study_that_is_not_there_is_refused(source: str, message: str):
+    with pytest.raises(dr.SettingsError, match=message):
+        load(source)
+
+
+def test_a_file_that_is_no_toml_is_refused(tmp_path):
+    (tmp_path / "a.toml").write_text("name = ")
+    with pytest.raises(dr.SettingsError, match=r'a.toml" is not TOML: Invalid value'):
+        load(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize(
+    ("narrower", "message"),
+    [
+        ({"trials": 0}, "trials is 0"),
+        ({"methods": ["tls"]}, 'no method "tls"; there are true, ols, quick'),
+        ({"methods": []}, "no method named"),
+        ({"levels": []}, "no level is named; there are 0, 40"),
+        ({"levels": ["some"]}, 'no level "some" of outlier magnitude; there are 0, 40'),
+    ],
+)
+def test_what_a_study_does_not_have_cannot_be_chosen(narrower: dict, message: str):
+    with pytest.raises(dr.SettingsError, match=message):
+        STUDY.narrowed(**narrower)
+
+
+# Seeds ----------------------------------------------------------------------------------------------------------------
+def test_seeds_differ_by_everything_that_they_are_for_and_fit_a_column():
+    what = [(seed, level, trial) for seed in range(5) for level in ("0", "1", "10") for trial in range(200)]
+    seeds = [derived_seed(*one) for one in what]
+    assert len(set(seeds)) == len(what)
+    assert min(seeds) >= 0
+    assert max(seeds) < 2**63
+    assert 0.45 < sum(seed >> 62 for seed in seeds) / len(seeds) < 0.55
+
+
+def test_a_seed_is_the_same_on_every_machine():
+    # blake2b of the JSON text, 8 bytes, shifted by one: what b2sum -l 64 says of it
+    assert derived_seed(7, "40", 0) == int("e92befec82203588", 16) >> 1
