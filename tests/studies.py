@@ -1,10 +1,13 @@
 """What the tests of studies share: a study that takes a second, and how rows are compared."""
 
 import copy
+import os
 import sqlite3
 import sys
 from pathlib import Path
 
+from diransac.study import load
+from diransac.study.store import Store
 from diransac.study.tables import changed
 
 TINY = {
@@ -61,3 +64,19 @@ def command(store: Path, jobs: int, trials: int = 2) -> dict:
     script = store.parent / "runner.py"
     script.write_text(RUNNER)
     return {"args": [sys.executable, str(script), str(store), str(jobs), str(trials)]}
+
+
+SECONDS = {"record": 0.5, "identify": 0.25, "plan": 0.0, "steer": 0.0, "fly": 0.0}
+
+
+def row(level="0", trial=0, method="ols", **more):
+    """A row as workers send it."""
+    fixed = {"level": level, "trial": trial, "method": method, "status": "done", "error": None, "seed": 3}
+    return {**fixed, "versions": "made up", "seconds": SECONDS, "host": "here", **more}
+
+
+def write_rows(path: Path, first: int) -> None:
+    """Keep made-up rows of 60 trials of two methods, trial by trial."""
+    with Store(path, load(tiny(trials=400))) as kept:
+        for trial in range(first, first + 60):
+            kept.add([row(trial=trial, host=str(os.getpid())), row(trial=trial, method="true")])

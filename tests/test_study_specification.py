@@ -81,6 +81,11 @@ def test_settings_are_laid_over_their_preset():
     assert (quick.max_iterations, quick.inlier_thresholds) == (20, dr.Settings.table_iv().inlier_thresholds)
 
 
+def test_parameters_that_are_not_named_are_those_of_table_i():
+    plant = load(tiny(plant__parameters__mass=0.3)).plant.plant
+    assert plant.parameters == {**dr.models.TABLE_I, "mass": 0.3}
+
+
 def test_a_rotor_phase_may_be_drawn():
     drawn = load(tiny(plant={"kind": "extended-rotorcraft", "rotor_phase": "any"})).plant
     assert drawn.is_drawn
@@ -104,7 +109,7 @@ def test_what_people_call_things_and_how_many_there_are_decide_nothing():
         ({"seed": "x"}, "seed is 'x'; give a whole number"),
         ({"plant.kind": "car"}, "plant.kind is 'car'; there are extended-rotorcraft, planar-rotorcraft"),
         ({"plant.wind": 1}, 'no key "plant.wind"; in plant there are kind, parameters'),
-        ({"plant.parameters": {"mass": 0.2, "inertia": 0.004}}, "plant: .*drag"),
+        ({"plant.parameters.mas": 0.2}, "plant: .*parameters are mass, inertia, drag; found mas"),
         ({"plant.parameters.mass": "heavy"}, "plant.parameters is .*heavy.*; give a table of numbers"),
         ({"data.trajectory": "loop"}, "data.trajectory is 'loop'; there are square, star, sine"),
         ({"noise.outlier_probability": 2}, "noise.outlier_probability is 2; give a number from 0 to 1"),

@@ -38,7 +38,8 @@ class PlantChoice:
     Parameters
     ----------
     kind : ``extended-rotorcraft`` (`models.extended_rotorcraft`), or ``planar-rotorcraft``, which has parameters alone
-    arguments : by name, as TOML has them: a list for a pair, the word ``any`` for a rotor phase that is drawn
+    arguments : by name, as TOML has them: a list for a pair, the word ``any`` for a rotor phase that is drawn;
+        parameters of the model that nobody named are those of Table I
     """
 
     kind: str
@@ -105,7 +106,7 @@ def _checked(path: str, value: Any, default: Any) -> Any:
     """The value, if it is of its default's kind.  Raises SettingsError: it isn't."""
     if isinstance(default, dict):
         fits, wanted = isinstance(value, Mapping) and all(map(is_number, value.values())), "a table of numbers"
-        value = {name: float(x) for name, x in value.items()} if fits else value
+        value = {**default, **{name: float(x) for name, x in value.items()}} if fits else value
     elif isinstance(default, list):
         fits = isinstance(value, list | tuple) and all(isinstance(x, str) for x in value)
         wanted, value = "a list of words", list(value) if fits else value
