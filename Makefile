@@ -6,7 +6,7 @@ ENVIRONMENT := .venv/.installed
 
 .PHONY: demo test lint bench docs coverage lock clean
 
-demo: $(ENVIRONMENT)  ## identify a model from a simulated log; writes out/demo/report.html
+demo: $(ENVIRONMENT)  ## fly, identify, fly what was identified; writes out/demo/report.html and flight.png
 	$(BIN)/python examples/demo.py
 
 test: lint docs  ## everything that must hold
