@@ -28,19 +28,6 @@ TINY = {
 }
 MAY_DIFFER = ("seconds", "host")
 
-RUNNER = """
-import sys
-import diransac as dr
-from studies import TINY, tiny
-
-if __name__ == "__main__":
-    def progress(done, asked):
-        print(done, asked, flush=True)
-    store, jobs, trials = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-    dr.run_study(tiny(), store=store, jobs=jobs, trials=trials, batch_size=1, progress=progress)
-"""
-"""A script that runs the study in a process of its own and says on stdout, line by line, how many rows there are."""
-
 
 def tiny(**changes: object) -> dict:
     """The study with other values at dotted paths, written with __ for the dots."""
@@ -59,11 +46,19 @@ def rows(store: Path) -> dict[tuple, dict]:
     return by_key
 
 
-def command(store: Path, jobs: int, trials: int = 2) -> dict:
-    """What `subprocess.Popen` needs to run `RUNNER`."""
+def command(store: Path, jobs: int) -> dict:
+    """What `subprocess.Popen` needs for a process that runs the study, and says, line by line, how many rows it has."""
     script = store.parent / "runner.py"
-    script.write_text(RUNNER)
-    return {"args": [sys.executable, str(script), str(store), str(jobs), str(trials)]}
+    script.write_text(f"""
+import diransac as dr
+
+def progress(done, asked):
+    print(done, asked, flush=True)
+
+if __name__ == "__main__":
+    dr.run_study({TINY!r}, store={str(store)!r}, jobs={jobs}, batch_size=1, progress=progress)
+""")
+    return {"args": [sys.executable, str(script)]}
 
 
 SECONDS = {"record": 0.5, "identify": 0.25, "plan": 0.0, "steer": 0.0, "fly": 0.0}
