@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 __all__ = ["why_not"]
 
+_ITERATIONS = 500
+
 _MISS_WEIGHT = 1e4
 """What missing a waypoint by one unit costs, against full use of an input for a second."""
 
@@ -39,7 +41,7 @@ def why_not(task: Task, rows: tuple[int, ...], outcome: Outcome, limits: SearchL
         return f"no plan was found within {limits.seconds:g} s; raise time_limit=, or give a guess="
     program = _relaxed(task, rows)
     guess = unknowns_of(program, first_path(task, task.dt * np.array(rows)))
-    nearest = interior_point("ipopt", program, guess, limits)
+    nearest = interior_point("ipopt", program, guess, SearchLimits(_ITERATIONS, limits.seconds))
     if not nearest.success:
         return (
             f"there is no plan: {outcome.words}, and not even one that misses its waypoints was "

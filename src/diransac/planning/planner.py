@@ -72,7 +72,7 @@ def plan(
     guess: Trajectory | None = None,
     solver: str = "auto",
     max_iterations: int = 500,
-    time_limit: float = 60.0,
+    time_limit: float = 30.0,
 ) -> Trajectory:
     """The cheapest trajectory through waypoints or along a reference, by direct transcription.
 
@@ -101,7 +101,8 @@ def plan(
     guess : a trajectory of the same model to start the search from
     solver : ``ipopt``, ``fatrop``, ``snopt`` (with ``pip install diransac[snopt]``), or ``auto``: fatrop, and
         IPOPT where that fails
-    max_iterations, time_limit : of a search, which may take s
+    max_iterations : of a solver
+    time_limit : s, for all solvers that are tried; to find out why there is no plan may take as long again
 
     Returns
     -------
@@ -117,6 +118,7 @@ def plan(
     model, limits = plant.model, limits_of("input", input_limits, tuple(plant.model.inputs))
     way = _way(model, waypoints, times, reference, duration, rest)
     _check_weights(tracking, way, input_share)
+    _check_search(time_weight, max_iterations, time_limit)
     parameters = model.parameter_vector(plant.parameters)
     usable = limits.middle(input_share)
     states = limits_of("state", state_limits, model.state)
@@ -187,6 +189,15 @@ def _check_weights(tracking: Mapping[str, float] | None, way: _Way, input_share:
         raise SettingsError(f'tracking: "{stray[0]}" has no reference; give one, or leave its weight out')
     if not 0.0 < input_share <= 1.0:
         raise SettingsError(f"input_share is {input_share}; it must be above 0 and at most 1")
+
+
+def _check_search(time_weight: float, max_iterations: int, time_limit: float) -> None:
+    if not (np.isfinite(time_weight) and time_weight >= 0.0):
+        raise SettingsError(f"time_weight is {time_weight}; it must be a finite number of at least 0")
+    if not max_iterations >= 1 or not time_limit >= 0.0:
+        raise SettingsError(
+            f"max_iterations is {max_iterations} and time_limit {time_limit} s; give at least 1 iteration and 0 s"
+        )
 
 
 def _check_within(model: Model, waypoints: Sequence[Waypoint], limits: Limits) -> None:

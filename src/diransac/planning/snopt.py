@@ -62,7 +62,7 @@ def active_set(program: Program, guess: Floats, limits: SearchLimits) -> Outcome
         "Major feasibility tolerance": _TOLERANCE,
         "Major iterations limit": limits.iterations,
         "Iterations limit": 100 * limits.iterations * len(program.numbers.steps),
-        "Time limit": limits.seconds,
+        "Time limit": limits.left,
     }.items():
         options.SetOption(SnoptSolver.id(), name, value)
     found = SnoptSolver().Solve(drake, guess, options)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -32,21 +32,34 @@ _QUIET: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eva
 _TOLERANCE = 1e-9
 _FATROP_RELAXES = 1e-8
 """Times a limit, or one: how much wider fatrop takes every limit, which cannot be switched off."""
+_FATROP_LARGEST = 1e10
+"""Values beyond which fatrop may search for a regularisation for ever, without asking for another value."""
+
 TIME_LIMIT = "time limit reached"
 
 
 @dataclass(frozen=True)
 class SearchLimits:
-    """How long a solver may try.
+    """How long solvers may try, one after the other.
 
     Parameters
     ----------
-    iterations : at most
-    seconds : at most
+    iterations : of one solver, at most
+    seconds : of all of them, at most
+    deadline : when these are over, by the monotonic clock; that many seconds from now by default
     """
 
     iterations: int
     seconds: float
+    deadline: float = field(default=0.0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "deadline", self.deadline or time.monotonic() + self.seconds)
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left."""
+        return max(0.0, self.deadline - time.monotonic())
 
 
 @dataclass(frozen=True)
@@ -85,7 +98,7 @@ def interior_point(name: str, program: Program, guess: Floats, limits: SearchLim
 
     Raises KeyboardInterrupt: the user stopped it.
     """
-    return _solver(name, program.layout, limits.iterations, near).solve(program, guess, limits.seconds)
+    return _solver(name, program.layout, limits.iterations, near).solve(program, guess, limits.deadline)
 
 
 @lru_cache(maxsize=64)
@@ -94,7 +107,7 @@ def _solver(name: str, layout: Layout, iterations: int, near: bool) -> _Solver:
 
 
 class _Stopped(Exception):
-    """The solver's time is over."""
+    """The solver is to give up; it says why."""
 
 
 class _Solver:
@@ -110,10 +123,10 @@ class _Solver:
         self._deadline = 0.0
         self._stopped: BaseException | None = None
 
-    def solve(self, program: Program, guess: Floats, seconds: float) -> Outcome:
+    def solve(self, program: Program, guess: Floats, deadline: float) -> Outcome:
         """Solve one program of this layout."""
         with self._lock:
-            self._program, self._stopped, self._deadline = program, None, time.monotonic() + seconds
+            self._program, self._stopped, self._deadline = program, None, deadline
             try:
                 return self._run(program, guess)
             finally:
@@ -127,14 +140,16 @@ class _Solver:
         try:
             lower, upper = self._limits(numbers)
             found = self._nlpsol(x0=guess, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
-        finally:
-            if self._stopped is not None and not isinstance(self._stopped, _Stopped):
-                raise self._stopped
-        stats = self._nlpsol.stats()
-        status = TIME_LIMIT if self._stopped else str(stats["return_status"])
-        unknowns = np.array(found["x"]).ravel()
-        success = bool(stats["success"]) and self._stopped is None and bool(np.isfinite(unknowns).all())
-        return Outcome(unknowns, success, status, int(stats["iter_count"]), self._name)
+        except RuntimeError:
+            if self._stopped is None:
+                raise
+        if isinstance(self._stopped, _Stopped):
+            return Outcome(guess, False, str(self._stopped), None, self._name)
+        if self._stopped is not None:
+            raise self._stopped
+        stats, unknowns = self._nlpsol.stats(), np.array(found["x"]).ravel()
+        success = bool(stats["success"]) and bool(np.isfinite(unknowns).all())
+        return Outcome(unknowns, success, str(stats["return_status"]), int(stats["iter_count"]), self._name)
 
     def _limits(self, numbers: Numbers) -> tuple[Floats, Floats]:
         """Limits of the unknowns, so that those that the solver really keeps to are the ones that were asked for."""
@@ -163,14 +178,18 @@ class _Solver:
         Raises whatever stopped the solver: from then on no function has a value, which ends the solver's search.
         """
         if self._stopped is None and time.monotonic() > self._deadline:
-            self._stopped = _Stopped()
-        if self._stopped is not None or self._program is None:
-            raise _Stopped
+            self._stopped = _Stopped(TIME_LIMIT)
+        if self._stopped is not None:
+            raise self._stopped
+        assert self._program is not None
         try:
-            return _Outputs.values(self._program, name, x, objective_factor, multipliers)
+            values = _Outputs.values(self._program, name, x, objective_factor, multipliers)
+            if self._name == "fatrop" and not np.abs(values).max(initial=0.0) < _FATROP_LARGEST:
+                raise _Stopped("a number is too large")
         except BaseException as error:
             self._stopped = error
             raise
+        return values
 
 
 class _Outputs:
@@ -252,6 +271,7 @@ class _Evaluation(ca.Callback):
         if weighted:
             sizes |= {"lam_f": 1, "lam_g": outputs.n_constraints}
         self._sizes = sizes
+        self._unread = name == "nlp_grad"
         self.construct(name, {})
 
     def get_n_in(self) -> int:
@@ -277,6 +297,11 @@ class _Evaluation(ca.Callback):
 
     def eval_buffer(self, arguments: Any, results: Any) -> int:
         """Fill the buffers; 1 where there is no value, which CasADi tells the solver."""
+        if self._unread:  # the multipliers that CasADi adds to a solution, even to one that was stopped
+            for buffer in results:
+                if buffer is not None:
+                    np.frombuffer(buffer)[:] = 0.0
+            return 0
         sizes = self._sizes.values()
         given = [np.zeros(n) if a is None else np.frombuffer(a) for a, n in zip(arguments, sizes, strict=True)]
         factor, multipliers = (float(given[2][0]), given[3]) if len(given) > 2 else (0.0, np.zeros(0))
