@@ -5,8 +5,8 @@ values of every signal is an outlier of up to 80. From that log every method ide
 the imbalance. Each model then plans a square and a sine and steers the same machine along them: how far it strays is
 what the model is worth. Run it with ``make demo``; it writes ``report.html`` and ``flight.png`` into ``out/demo``.
 
-The imbalance acts as the paper prints it, eq. (20). With ``convention="physical"`` it shakes the machine a hundred
-times harder: try it, and see what is left of each method.
+The imbalance acts as the paper prints it, eq. (20). With ``convention="physical"`` its torque is divided by the inertia
+and shakes the machine 250 times harder: try it, and see what is left of each method.
 """
 
 from __future__ import annotations

@@ -309,6 +309,7 @@ def test_an_option_without_its_company_is_refused_in_the_command_line_s_words(fo
         ([*SIMULATE, "--model", "servo-axis"], "true parameters"),
         ([*SIMULATE, "--parameter", "weight=3"], "weight"),
         ([*SIMULATE, "--parameter", "mass=nan"], "mass"),
+        ([*SIMULATE, "--parameter", "mass=-0.2"], "mass = -0.2, which is outside its bounds"),
         ([*SIMULATE, "--parameter", "mass=0.7"], "thrust"),
         ([*SIMULATE, "--model", "slider.py", "--plant", "extended-rotorcraft"], "slider"),
         ([*SIMULATE, "--outliers", "0.1", "--magnitude", "inf"], "outlier_magnitude"),

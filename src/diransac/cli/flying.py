@@ -166,7 +166,7 @@ class TruePlant:
     def of(self, model: Model) -> Plant:
         """The machine: a disturbed one if it is asked for, else the model with its true parameters.
 
-        Raises ModelError: a parameter is unknown, or missing where Table I has none.
+        Raises ModelError: a parameter is unknown, outside its bounds, or missing where Table I has none.
         Raises typer.BadParameter: disturbances without a plant that has them.
         """
         given = numbers("--parameter", self.assignments or ())
@@ -196,7 +196,7 @@ def same_equations(a: Model, b: Model) -> bool:
 def _true_parameters(model: Model, given: Mapping[str, float]) -> dict[str, float]:
     """The values that are given, over those of Table I where the model is the paper's.
 
-    Raises ModelError: a name is unknown, or a value is missing.
+    Raises ModelError: a name is unknown, a value is missing or outside its bounds.
     """
     known = TABLE_I if same_equations(model, planar_rotorcraft()) else {}
     unknown = [name for name in given if name not in model.parameters]
@@ -207,6 +207,9 @@ def _true_parameters(model: Model, given: Mapping[str, float]) -> dict[str, floa
     if missing:
         wanted = " ".join(f"--parameter {name}=VALUE" for name in missing)
         raise ModelError(f'the true parameters of "{model.name}" are not known; give {wanted}')
+    for name, bounds in model.parameters.items():
+        if not bounds.admits(values[name]):
+            raise ModelError(f'"{model.name}" cannot have {name} = {values[name]:g}, which is outside its bounds')
     return values
 
 
