@@ -26,6 +26,7 @@ from diransac.planning.request import (
     Signal,
     Waypoint,
     limits_of,
+    named_values,
     rows_of,
     waypoints_of,
     weights_of,
@@ -96,7 +97,7 @@ def plan(
     effort : input -> weight, per s; 1 by default
     tracking : state -> weight of its squared distance from the reference, one over its unit squared and s; 1 by default
     time_weight : per s, where time is free
-    trim : input -> value that costs nothing; by default what holds the plant at rest at the start
+    trim : input -> value that costs nothing, 0 where not named; by default what holds the plant at rest at the start
     rest : what the first and the last waypoint don't name is zero there; otherwise free
     guess : a trajectory of the same model to start the search from
     solver : ``ipopt``, ``fatrop``, ``snopt`` (with ``pip install diransac[snopt]``), or ``auto``: fatrop, and
@@ -129,7 +130,7 @@ def plan(
         waypoints=way.waypoints,
         reference=way.reference,
         tracking=_tracking(model, way.reference, tracking),
-        effort=weights_of("effort", effort, tuple(model.inputs), np.ones(model.n_u)) / limits.half_ranges**2,
+        effort=weights_of("effort", "input", effort, tuple(model.inputs), np.ones(model.n_u)) / limits.half_ranges**2,
         trim=_trim(model, parameters, way.waypoints[0], usable, trim),
         time_weight=float(time_weight) if way.rows is None else 0.0,
         inputs=usable,
@@ -212,14 +213,15 @@ def _check_within(model: Model, waypoints: Sequence[Waypoint], limits: Limits) -
 
 def _tracking(model: Model, reference: Reference, weights: Mapping[str, float] | None) -> Floats:
     default = np.array([1.0 if name in reference.signals else 0.0 for name in model.state])
-    return weights_of("tracking", weights, model.state, default)
+    return weights_of("tracking", "state", weights, model.state, default)
 
 
 def _trim(
     model: Model, parameters: Floats, start: Waypoint, limits: Limits, given: Mapping[str, float] | None
 ) -> Floats:
     if given is not None:
-        return limits_of("trim", {n: (v, v) for n, v in given.items()}, tuple(model.inputs)).lower
+        values = named_values("trim", "input", given, tuple(model.inputs))
+        return np.array([values.get(name, 0.0) for name in model.inputs])
     coordinates = np.zeros(model.n_q)
     for j, value in zip(start.states, start.values, strict=True):
         if j < model.n_q:

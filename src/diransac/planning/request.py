@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-__all__ = ["Limits", "Reference", "Waypoint", "limits_of", "rows_of", "waypoints_of", "weights_of"]
+__all__ = ["Limits", "Reference", "Waypoint", "limits_of", "named_values", "rows_of", "waypoints_of", "weights_of"]
 
 _UNIT_LENGTH = 1e-3
 """How far a quaternion's length may be from one where a user writes it."""
@@ -118,7 +118,7 @@ def waypoints_of(model: Model, waypoints: Sequence[Mapping[str, float]], rest: b
     found = []
     for k, waypoint in enumerate(waypoints):
         at_end = k in (0, len(waypoints) - 1)
-        values = _named_values(f"waypoint {k}", "state", waypoint, model.state)
+        values = named_values(f"waypoint {k}", "state", waypoint, model.state)
         _check_quaternions(model, k, values, rest and at_end)
         if rest and at_end:
             values = dict.fromkeys(model.state, 0.0) | values
@@ -165,13 +165,15 @@ def limits_of(what: str, limits: Mapping[str, tuple[float, float]] | None, names
     return Limits(lower, upper)
 
 
-def weights_of(what: str, weights: Mapping[str, float] | None, names: Sequence[str], default: Floats) -> Floats:
+def weights_of(
+    what: str, kind: str, weights: Mapping[str, float] | None, names: Sequence[str], default: Floats
+) -> Floats:
     """Weights (n,) by name.
 
     Raises SettingsError: an unknown name, or a weight that is negative or not finite.
     """
     values = default.copy()
-    for name, weight in _named_values(what, "name", weights or {}, names).items():
+    for name, weight in named_values(what, kind, weights or {}, names).items():
         if weight < 0.0:
             raise SettingsError(f'{what} of "{name}" is {weight:g}; a weight is at least 0')
         values[names.index(name)] = weight
@@ -198,8 +200,11 @@ def rows_of(times: Sequence[float], n_waypoints: int, dt: float) -> tuple[int, .
     return tuple(int(n) for n in steps)
 
 
-def _named_values(what: str, kind: str, values: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
-    """The same as finite floats, names checked."""
+def named_values(what: str, kind: str, values: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
+    """The same as finite floats.
+
+    Raises SettingsError: an unknown name, or a value that is no finite number.
+    """
     found = {}
     for name, value in values.items():
         _check_known(what, kind, name, names)
