@@ -8,7 +8,6 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import load_model, model_file
-from diransac.cli.flights import record, try_out
 from diransac.cli.flying import (
     FlightPicture,
     FlightSeed,
@@ -166,6 +165,8 @@ def _simulate(
     as_json: JsonFlag = False,
 ) -> None:
     """Plan a trajectory, fly it, and write the log that a bad recorder would have kept."""
+    from diransac.cli.flights import record
+
     noise = recorder.noise()
     with staged([output, plot], [model_file(model)]) as (written, picture):
         known = load_model(model)
@@ -188,6 +189,8 @@ def _fly(
     as_json: JsonFlag = False,
 ) -> None:
     """Plan and steer by an identified model, fly the true machine, and say how far it strays."""
+    from diransac.cli.flights import try_out
+
     with staged([output, plot], [model]) as (written, picture):
         result = Result.load(model)
         trial = try_out(shape, result, plant.of(result.model), seed)

@@ -9,19 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from diransac.cli.flying import TRAJECTORIES, same_equations
+from diransac.cli.flying import SHAPES, same_equations
 from diransac.controller import Controller, tvlqr
 from diransac.errors import DiransacError, PlanningError, SettingsError
 from diransac.flight import fly, tracking_error
 from diransac.log import Log
 from diransac.model import Model
 from diransac.noise import CorruptedLog, Noise, corrupt
+from diransac.planning import sine, square, star
 from diransac.plant import ModelWithParameters, Plant
 from diransac.result import Result
 from diransac.text_table import aligned
 from diransac.trajectory import Trajectory
 
 __all__ = ["Flight", "Recording", "Trial", "record", "try_out"]
+
+_PLANNERS = dict(zip(SHAPES, (star, square, sine), strict=True))
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ def flown(shape: str, known: ModelWithParameters, plant: Plant, seed: int) -> Fl
     Raises PlanningError: there is no such plan or no controller, or the flight diverges.
     Raises SettingsError: the plant has other states or inputs than what is known.
     """
-    trajectory = TRAJECTORIES[shape](known)
+    trajectory = _PLANNERS[shape](known)
     controller = tvlqr(known, trajectory)
     log = fly(plant, trajectory, controller, seed=seed)
     errors = tracking_error(trajectory, log)

@@ -17,11 +17,10 @@ from diransac.log.writing import ENDINGS
 from diransac.model import Model
 from diransac.models import TABLE_I, extended_rotorcraft, planar_rotorcraft
 from diransac.noise import Noise
-from diransac.planning import sine, square, star
 from diransac.plant import Plant
 
 __all__ = [
-    "TRAJECTORIES",
+    "SHAPES",
     "FlightPicture",
     "FlightSeed",
     "LogOutput",
@@ -32,7 +31,7 @@ __all__ = [
     "TruePlant",
 ]
 
-TRAJECTORIES = {"star": star, "square": square, "sine": sine}
+SHAPES = ("star", "square", "sine")
 EXTENDED = "extended-rotorcraft"
 
 
@@ -83,14 +82,14 @@ def _picture_file(text: str) -> Path:
     return path
 
 
-_SHAPES = "|".join(TRAJECTORIES)
+_SHAPE = "|".join(SHAPES)
 _LOG_NAMES: dict[str, Any] = {"parser": _log_file, "metavar": "FILE.csv"}
 
 TrajectoryArgument = Annotated[
-    str, typer.Argument(metavar=_SHAPES, callback=_one_of(*TRAJECTORIES), help="What is flown: section V of the paper.")
+    str, typer.Argument(metavar=_SHAPE, callback=_one_of(*SHAPES), help="What is flown: section V of the paper.")
 ]
 TrajectoryOption = Annotated[
-    str, typer.Option("--trajectory", metavar=_SHAPES, callback=_one_of(*TRAJECTORIES), help="What is flown.")
+    str, typer.Option("--trajectory", metavar=_SHAPE, callback=_one_of(*SHAPES), help="What is flown.")
 ]
 LogOutput = Annotated[
     Path, typer.Option("--output", "-o", help=f"Where to write the log: {', '.join(ENDINGS)}.", **_LOG_NAMES)
