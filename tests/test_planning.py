@@ -96,9 +96,11 @@ def test_solvers_agree(flight):
     np.testing.assert_allclose(found.states, other.states, atol=1e-4)
 
 
-def test_snopt_agrees():
+@pytest.mark.parametrize("times", [[0.0, 0.83, 2.16], None], ids=["given times", "free times"])
+def test_snopt_agrees(times):
     pytest.importorskip("pydrake", reason="SNOPT NOT CHECKED: pip install 'diransac[snopt]'")
-    found, other = across(ROTORCRAFT, "snopt"), across(ROTORCRAFT, "ipopt")
+    found, other = (across(ROTORCRAFT, solver, times=times) for solver in ("snopt", "ipopt"))
+    assert found.solver == "snopt"
     assert found.cost == pytest.approx(other.cost, rel=1e-5)
     np.testing.assert_allclose(found.states, other.states, atol=1e-3)
 

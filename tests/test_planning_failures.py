@@ -172,8 +172,10 @@ def test_nothing_is_printed(solver, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop", "snopt"])
 def test_an_interrupt_stops_the_search(solver, monkeypatch, capfd):
+    if solver == "snopt":
+        pytest.importorskip("pydrake", reason="SNOPT NOT CHECKED: pip install 'diransac[snopt]'")
     plain, calls = Program.constraints, []
 
     def interrupted(self, *arguments):

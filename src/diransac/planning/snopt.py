@@ -1,7 +1,7 @@
 """SNOPT, the solver of the paper, through the ``drake`` wheel that carries it: ``pip install diransac[snopt]``.
 
-Drake takes constraints one binding at a time and fills every derivative in between with zeros: a segment of the plan is
-a binding, itself a small program of the same stage.
+Drake takes constraints one binding at a time, each with all derivatives of all its values: a segment of the plan is a
+binding, itself a small program of the same stage.
 
 References: Gill, Murray, Saunders 2005, "SNOPT: An SQP algorithm for large-scale constrained optimization".
 """
@@ -47,15 +47,15 @@ def active_set(program: Program, guess: Floats, limits: SearchLimits) -> Outcome
     unknowns = drake.NewContinuousVariables(program.layout.n_unknowns)
     lower, upper = _limits(program)
     drake.AddBoundingBoxConstraint(lower, upper, unknowns)
+    stopped: list[BaseException] = []
     for part, chosen in _segments(program):
         last = np.zeros(part.layout.n_constraints)
         last[-part.layout.n_s + part.layout.n_x :] = np.inf if program.layout.free_time else 0.0
-        drake.AddCost(partial(_value, part.objective, part.gradient), unknowns[chosen])
-        derivatives = partial(_dense, part)
-        bound = drake.AddConstraint(partial(_value, part.constraints, derivatives), -last, last, unknowns[chosen])
-        bound.evaluator().SetGradientSparsityPattern(
-            list(zip(*(e.tolist() for e in part.jacobian_entries), strict=True))
-        )
+        drake.AddCost(partial(_value, stopped, part.objective, part.gradient), unknowns[chosen])
+        constraints = partial(_value, stopped, part.constraints, partial(_dense, part))
+        bound = drake.AddConstraint(constraints, -last, last, unknowns[chosen])
+        entries = zip(*(indices.tolist() for indices in part.jacobian_entries), strict=True)
+        bound.evaluator().SetGradientSparsityPattern(list(entries))
     _join_durations(drake, unknowns, program.layout)
     for name, value in {
         "Major optimality tolerance": _TOLERANCE,
@@ -65,7 +65,10 @@ def active_set(program: Program, guess: Floats, limits: SearchLimits) -> Outcome
         "Time limit": limits.left,
     }.items():
         options.SetOption(SnoptSolver.id(), name, value)
-    found = SnoptSolver().Solve(drake, guess, options)
+    try:
+        found = SnoptSolver().Solve(drake, guess, options)
+    except RuntimeError as error:  # what Drake makes of anything that is raised in a binding, interrupts too
+        raise (stopped or [error])[0] from None
     details = found.get_solver_details()
     solution = np.array(found.GetSolution(unknowns), np.float64)
     success = found.is_success() and bool(np.isfinite(solution).all())
@@ -111,13 +114,19 @@ def _dense(part: Program, unknowns: Floats) -> Floats:
     return whole
 
 
-def _value(value: Callable[[Floats], Any], derivative: Callable[[Floats], Floats], unknowns: Any) -> Any:
-    """A value for Drake, with its derivatives where it asks for them."""
-    if unknowns.dtype != object:
-        return value(unknowns)
+def _value(
+    stopped: list[BaseException], value: Callable[[Floats], Any], derivative: Callable[[Floats], Floats], unknowns: Any
+) -> Any:
+    """A value for Drake, with its derivatives where it asks for them; what is raised is kept in `stopped`."""
     from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 
-    at = ExtractValue(unknowns).ravel()
-    if np.ndim(found := value(at)) == 0:
-        return AutoDiffXd(found, derivative(at))
-    return InitializeAutoDiff(found, derivative(at)).ravel()
+    try:
+        if unknowns.dtype != object:
+            return value(unknowns)
+        at = ExtractValue(unknowns).ravel()
+        if np.ndim(found := value(at)) == 0:
+            return AutoDiffXd(found, derivative(at))
+        return InitializeAutoDiff(found, derivative(at)).ravel()
+    except BaseException as error:
+        stopped.append(error)
+        raise

@@ -1,8 +1,8 @@
 """One stage of a plan: the state an interval later, what the interval costs, and the derivatives of both, compiled.
 
 An interval is a few Runge-Kutta steps with the input held, the very steps of a simulation. One step and its derivatives
-are expressions; the kernel makes machine code of them that takes every stage of a plan at once, and NumPy chains the
-steps. So an exact second derivative through ten steps takes a model no longer to compile than one step's.
+are expressions; the kernel makes machine code of them that takes every stage of a plan at once, step after step. So an
+exact second derivative through ten steps takes a model no longer to compile than one step's.
 
 Names, of a stage: ``s`` its state, ``u`` its input, ``z = [s; u]``; ``Z = ds/dz`` from the start of the interval on.
 """
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from diransac.kernel.row_map import Map, compile_map
+from diransac.kernel import Map, Scan, compile_map, compile_scan
 from diransac.simulate.steps import INTEGRATORS
 
 if TYPE_CHECKING:
@@ -73,9 +73,9 @@ class Stage:
 
     n_s: int
     n_u: int
-    _step: Map
-    _sensitivities: Map
-    _adjoint: Map
+    _step: Scan
+    _sensitivities: Scan
+    _adjoint: Scan
     _curvature: Map
     _cost: Map
 
@@ -86,21 +86,17 @@ class Stage:
 
     def advance(self, states: Floats, inputs: Floats, parameters: Floats, steps: Floats) -> Floats:
         """States (M + 1, N, n_s) before each step and after the last; steps (N, M) in s, or shares of the duration."""
-        moments = [states]
-        for step in steps.T:
-            moments.append(self._step(moments[-1], inputs, parameters, _column(step))[0])
-        return np.array(moments)
+        after = self._step(states, steps[:, :, None], _constants(inputs, parameters))
+        return np.concatenate([states[None], after.swapaxes(0, 1)])
 
     def linearize(self, states: Floats, inputs: Floats, parameters: Floats, steps: Floats) -> Interval:
         """The same with derivatives."""
-        identity = np.eye(self.n_z, self.n_s)
-        moments, transitions = [states], [np.broadcast_to(identity, (len(states), *identity.shape))]
-        for step in steps.T:
-            flat = transitions[-1].reshape(len(states), -1)
-            after, moved = self._sensitivities(moments[-1], inputs, parameters, _column(step), flat)
-            moments.append(after)
-            transitions.append(moved.reshape(-1, self.n_z, self.n_s))
-        return Interval(np.array(moments), np.array(transitions))
+        identity = np.broadcast_to(np.eye(self.n_z, self.n_s).ravel(), (len(states), self.n_z * self.n_s))
+        start = np.hstack([states, identity])
+        after = self._sensitivities(start, steps[:, :, None], _constants(inputs, parameters))
+        moments = np.concatenate([start[None], after.swapaxes(0, 1)])
+        transitions = moments[..., self.n_s :].reshape(*moments.shape[:2], self.n_z, self.n_s)
+        return Interval(np.ascontiguousarray(moments[..., : self.n_s]), transitions)
 
     def curvature(
         self, interval: Interval, inputs: Floats, parameters: Floats, steps: Floats, multipliers: Floats
@@ -109,10 +105,10 @@ class Stage:
         n_steps, n_stages = steps.shape[1], len(steps)
         adjoints = np.empty((n_steps, n_stages, self.n_s))
         adjoints[-1] = multipliers
-        for j in range(n_steps - 1, 0, -1):
-            adjoints[j - 1] = self._adjoint(interval.states[j], inputs, parameters, _column(steps[:, j]), adjoints[j])[
-                0
-            ]
+        if n_steps > 1:
+            backward = np.concatenate([steps[:, :0:-1, None], interval.states[-2:0:-1].swapaxes(0, 1)], axis=-1)
+            before = self._adjoint(multipliers, backward, _constants(inputs, parameters))
+            adjoints[-2::-1] = before.swapaxes(0, 1)
         rows = n_steps * n_stages
         (blocks,) = self._curvature(
             interval.states[:-1].reshape(rows, self.n_s),
@@ -166,14 +162,23 @@ def _stage(equations: _Equations) -> Stage:
     Z = ca.SX.sym("Z", n_s, z.numel())
     whole = ca.vertcat(Z, ca.horzcat(ca.SX(model.n_u, n_s), ca.SX.eye(model.n_u)))
     curved = ca.hessian(ca.dot(multipliers, after), z)[0]
-    functions = {
-        "step": (arguments, [after]),
-        "sensitivities": ([*arguments, Z], [after, jacobian @ whole]),
-        "adjoint": ([*arguments, multipliers], [jacobian[:, :n_s].T @ multipliers]),
+    constants = ca.vertcat(u, p)
+    moved = ca.vertcat(after, ca.vec(ca.densify(jacobian @ whole)))
+    before = jacobian[:, :n_s].T @ multipliers
+    scans = {
+        "step": ([s, c, constants], after),
+        "sensitivities": ([ca.vertcat(s, ca.vec(Z)), c, constants], moved),
+        "adjoint": ([multipliers, ca.vertcat(c, s), constants], before),
+    }
+    maps = {
         "curvature": ([*arguments, multipliers, Z], [ca.triu(whole.T @ (curved @ whole))]),
         "cost": _cost_of(len(model.state), s, u, free_time),
     }
-    return Stage(n_s, model.n_u, *(_compiled(name, *parts) for name, parts in functions.items()))
+    step, sensitivities, adjoint = (
+        compile_scan(_function(name, parts, [result, result])) for name, (parts, result) in scans.items()
+    )
+    curvature, cost = (compile_map(_function(name, *parts)) for name, parts in maps.items())
+    return Stage(n_s, model.n_u, step, sensitivities, adjoint, curvature, cost)
 
 
 def _stepped(model: Model, s: ca.SX, u: ca.SX, p: ca.SX, c: ca.SX, free_time: bool) -> ca.SX:
@@ -203,9 +208,13 @@ def _cost_of(n_x: int, s: ca.SX, u: ca.SX, free_time: bool) -> tuple[list[ca.SX]
     return [s, u, length, reference, weights, effort, trim, time], [cost, gradient, curved]
 
 
-def _compiled(name: str, arguments: Sequence[ca.SX], results: Sequence[ca.SX]) -> Map:
-    dense = [ca.densify(result) for result in results]
-    return compile_map(ca.Function(name, list(arguments), ca.cse(dense)))
+def _function(name: str, arguments: Sequence[ca.SX], results: Sequence[ca.SX]) -> ca.Function:
+    return ca.Function(name, list(arguments), ca.cse([ca.densify(result) for result in results]))
+
+
+def _constants(inputs: Floats, parameters: Floats) -> Floats:
+    """What a stage keeps for all its steps: its input, and the parameters (N, n_u + n_p)."""
+    return np.hstack([inputs, np.broadcast_to(parameters, (len(inputs), len(parameters)))])
 
 
 def _column(values: Floats) -> Floats:
