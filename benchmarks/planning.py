@@ -23,6 +23,7 @@ from diransac.simulate import rollouts
 
 FLIGHTS: dict[str, Callable[..., dr.Trajectory]] = {"square": dr.square, "star": dr.star, "sine": dr.sine}
 REPETITIONS = 15
+LONG = 300.0
 PLANT = dr.Plant(dr.models.planar_rotorcraft(), dr.models.TABLE_I)
 NEIGHBOUR = dr.Plant(PLANT.model, {name: 1.02 * value for name, value in PLANT.parameters.items()})
 
@@ -47,13 +48,14 @@ def compare(name: str, snopt: bool) -> None:
     """Print a row for each solver: agreement with IPOPT, and times."""
     flight = FLIGHTS[name]
     names = ("ipopt", "fatrop")
-    first = {solver: seconds(lambda s=solver: flight(PLANT, solver=s)) for solver in (*names, *["snopt"] * snopt)}
+    every = (*names, *["snopt"] * snopt)
+    first = {solver: seconds(lambda s=solver: flight(PLANT, solver=s, time_limit=LONG)) for solver in every}
     guess = flight(NEIGHBOUR)
     again = medians({s: lambda s=s: flight(PLANT, solver=s) for s in names}, REPETITIONS)
     near = medians({s: lambda s=s: flight(PLANT, solver=s, guess=guess) for s in names}, REPETITIONS)
     if snopt:
         again["snopt"] = first["snopt"][0]
-        near["snopt"] = seconds(lambda: flight(PLANT, solver="snopt", guess=guess))[0]
+        near["snopt"] = seconds(lambda: flight(PLANT, solver="snopt", guess=guess, time_limit=LONG))[0]
     best = first["ipopt"][1]
     for solver, (_, found) in first.items():
         print(

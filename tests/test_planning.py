@@ -220,12 +220,18 @@ def test_plans_do_not_depend_on_what_was_planned_before():
     np.testing.assert_array_equal(across(ROTORCRAFT).states, first.states)
 
 
-def test_threads_plan_alike():
-    plants = [rotorcraft(mass=m) for m in (0.24, 0.25, 0.26, 0.27)]
-    alone = [across(plant).states for plant in plants]
+@pytest.mark.parametrize("solver", ["fatrop", "ipopt"])
+def test_threads_plan_alike(solver):
+    """Two shapes of problem, so that two solver objects run at a time."""
+    tasks = [(rotorcraft(mass=m), [0.0, 0.8, end]) for m in (0.24, 0.25, 0.26) for end in (2.0, 2.6)]
+
+    def planned(task):
+        return across(task[0], solver, times=task[1]).states
+
+    alone = [planned(task) for task in tasks]
     with ThreadPoolExecutor(4) as pool:
-        for states, expected in zip(pool.map(across, plants), alone, strict=True):
-            np.testing.assert_array_equal(states.states, expected)
+        for states, expected in zip(pool.map(planned, tasks), alone, strict=True):
+            np.testing.assert_array_equal(states, expected)
 
 
 def test_a_plan_starts_when_its_first_waypoint_says():

@@ -43,36 +43,45 @@ def active_set(program: Program, guess: Floats, limits: SearchLimits) -> Outcome
             "SNOPT comes with the drake package, which isn't installed here; pip install 'diransac[snopt]', or choose "
             'solver="auto"'
         ) from error
-    drake, options = MathematicalProgram(), SolverOptions()
-    unknowns = drake.NewContinuousVariables(program.layout.n_unknowns)
-    lower, upper = _limits(program)
-    drake.AddBoundingBoxConstraint(lower, upper, unknowns)
     stopped: list[BaseException] = []
-    for part, chosen in _segments(program):
-        last = np.zeros(part.layout.n_constraints)
-        last[-part.layout.n_s + part.layout.n_x :] = np.inf if program.layout.free_time else 0.0
-        drake.AddCost(partial(_value, stopped, part.objective, part.gradient), unknowns[chosen])
-        constraints = partial(_value, stopped, part.constraints, partial(_dense, part))
-        bound = drake.AddConstraint(constraints, -last, last, unknowns[chosen])
-        entries = zip(*(indices.tolist() for indices in part.jacobian_entries), strict=True)
-        bound.evaluator().SetGradientSparsityPattern(list(entries))
-    _join_durations(drake, unknowns, program.layout)
-    for name, value in {
-        "Major optimality tolerance": _TOLERANCE,
-        "Major feasibility tolerance": _TOLERANCE,
-        "Major iterations limit": limits.iterations,
-        "Iterations limit": 100 * limits.iterations * len(program.numbers.steps),
-        "Time limit": limits.left,
-    }.items():
+    drake, options = MathematicalProgram(), SolverOptions()
+    unknowns = _bind(drake, program, stopped)
+    for name, value in _options(program, limits).items():
         options.SetOption(SnoptSolver.id(), name, value)
     try:
         found = SnoptSolver().Solve(drake, guess, options)
     except RuntimeError as error:  # what Drake makes of anything that is raised in a binding, interrupts too
         raise (stopped or [error])[0] from None
-    details = found.get_solver_details()
     solution = np.array(found.GetSolution(unknowns), np.float64)
     success = found.is_success() and bool(np.isfinite(solution).all())
-    return Outcome(solution, success, f"exit {details.info}", None, "snopt")
+    return Outcome(solution, success, f"exit {found.get_solver_details().info}", None, "snopt")
+
+
+def _options(program: Program, limits: SearchLimits) -> dict[str, float | int]:
+    """SNOPT's own names; minor iterations are many where it starts far from the active set."""
+    return {
+        "Major optimality tolerance": _TOLERANCE,
+        "Major feasibility tolerance": _TOLERANCE,
+        "Major iterations limit": limits.iterations,
+        "Iterations limit": 100 * limits.iterations * program.layout.n_stages,
+        "Time limit": limits.left,
+    }
+
+
+def _bind(drake: Any, program: Program, stopped: list[BaseException]) -> Any:
+    """The program's unknowns as variables of Drake's, its segments and limits as bindings."""
+    unknowns = drake.NewContinuousVariables(program.layout.n_unknowns)
+    drake.AddBoundingBoxConstraint(*_limits(program), unknowns)
+    for part, chosen in _segments(program):
+        drake.AddCost(partial(_value, stopped, part.objective, part.gradient), unknowns[chosen])
+        slack = np.zeros(part.layout.n_constraints)
+        slack[part.layout.n_constraints - part.layout.free_time :] = np.inf  # the next segment has its own duration
+        constraints = partial(_value, stopped, part.constraints, partial(_dense, part))
+        bound = drake.AddConstraint(constraints, -slack, slack, unknowns[chosen])
+        entries = zip(*(indices.tolist() for indices in part.jacobian_entries), strict=True)
+        bound.evaluator().SetGradientSparsityPattern(list(entries))
+    _join_durations(drake, unknowns, program.layout)
+    return unknowns
 
 
 def _limits(program: Program) -> tuple[Floats, Floats]:

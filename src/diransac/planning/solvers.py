@@ -130,7 +130,7 @@ class _Solver:
             try:
                 return self._run(program, guess)
             finally:
-                self._program = None
+                self._program = self._stopped = None
 
     def _run(self, program: Program, guess: Floats) -> Outcome:
         if self._nlpsol is None:
@@ -162,18 +162,18 @@ class _Solver:
         return np.where(roomy, lower + inward[0], lower), np.where(roomy, upper - inward[1], upper)
 
     def _build(self, program: Program) -> None:
-        outputs = _Outputs(program)
+        structure = _Structure(program)
         signatures = _SIGNATURES[self._name]
         self._functions = {
-            name: _Evaluation(name, results, outputs, self._values) for name, results in signatures.items()
+            name: _Evaluation(name, results, structure, self._values) for name, results in signatures.items()
         }
-        nlp = _Evaluation("nlp", ("f", "g"), outputs, self._values)
+        nlp = _Evaluation("nlp", ("f", "g"), structure, self._values)
         self._functions["nlp"] = nlp
         cache = {name: function for name, function in self._functions.items() if name != "nlp"}
         self._nlpsol = ca.nlpsol("plan", self._name, nlp, {**_QUIET, **self._options, "cache": cache})
 
     def _values(self, name: str, x: Floats, objective_factor: float, multipliers: Floats) -> Floats:
-        """One of `_Outputs` at a point.
+        """One of `_COMPUTE` at a point.
 
         Raises whatever stopped the solver: from then on no function has a value, which ends the solver's search.
         """
@@ -183,7 +183,7 @@ class _Solver:
             raise self._stopped
         assert self._program is not None
         try:
-            values = _Outputs.values(self._program, name, x, objective_factor, multipliers)
+            values = np.asarray(_COMPUTE[name](self._program, x, objective_factor, multipliers))
             if self._name == "fatrop" and not np.abs(values).max(initial=0.0) < _FATROP_LARGEST:
                 raise _Stopped("a number is too large")
         except BaseException as error:
@@ -192,14 +192,14 @@ class _Solver:
         return values
 
 
-class _Outputs:
+class _Structure:
     """Sparsity of everything that a solver asks for, and how its entries are ordered."""
 
     def __init__(self, program: Program) -> None:
         n, m = program.layout.n_unknowns, program.layout.n_constraints
         self.n_unknowns, self.n_constraints = n, m
-        triangle = _upper(program)
         jacobian, hessian = program.jacobian_entries, program.hessian_entries
+        triangle = hessian[0] <= hessian[1]
         sorted_jacobian = _sorted(jacobian, (m, n))
         sorted_hessian = _sorted(hessian, (n, n))
         sorted_triangle = _sorted((hessian[0][triangle], hessian[1][triangle]), (n, n))
@@ -214,12 +214,6 @@ class _Outputs:
             "hess_gamma_x_x": sorted_hessian,
             "triu_hess_gamma_x_x": (sorted_triangle[0], np.flatnonzero(triangle)[sorted_triangle[1]]),
         }
-
-    @staticmethod
-    def values(program: Program, name: str, x: Floats, objective_factor: float, multipliers: Floats) -> Floats:
-        """Entries of one part, in the program's order."""
-        compute = _COMPUTE[name]
-        return np.asarray(compute(program, x, objective_factor, multipliers))
 
 
 def _lagrangian_gradient(program: Program, x: Floats, objective_factor: float, multipliers: Floats) -> Floats:
@@ -238,6 +232,7 @@ _COMPUTE: Mapping[str, Callable[[Program, Floats, float, Floats], Any]] = {
     "hess_gamma_x_x": Program.hessian,
     "triu_hess_gamma_x_x": Program.hessian,
 }
+"""What a solver may ask for, by CasADi's names: (program, unknowns, objective's factor, multipliers) -> its entries."""
 
 _SIGNATURES: dict[str, dict[str, tuple[str, ...]]] = {
     "ipopt": {
@@ -261,16 +256,19 @@ _SIGNATURES: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 class _Evaluation(ca.Callback):
-    """One function of the nonlinear program for CasADi: (x, p, lam_f, lam_g) or (x, p) -> some of `_Outputs`."""
+    """One function of the nonlinear program for CasADi: (x, p, lam_f, lam_g) or (x, p) -> some of `_COMPUTE`."""
 
-    def __init__(self, name: str, results: tuple[str, ...], outputs: _Outputs, values: Callable[..., Floats]) -> None:
+    def __init__(
+        self, name: str, results: tuple[str, ...], structure: _Structure, values: Callable[..., Floats]
+    ) -> None:
         ca.Callback.__init__(self)
-        self._results, self._outputs, self._values = results, outputs, values
+        self._results, self._structure, self._values = results, structure, values
         weighted = name in ("nlp_hess_l", "nlp_grad")
-        sizes = {"x": outputs.n_unknowns, "p": 0}
+        sizes = {"x": structure.n_unknowns, "p": 0}
         if weighted:
-            sizes |= {"lam_f": 1, "lam_g": outputs.n_constraints}
+            sizes |= {"lam_f": 1, "lam_g": structure.n_constraints}
         self._sizes = sizes
+        # CasADi adds multipliers to every solution, even to one that was stopped, and warns if it can't.
         self._unread = name == "nlp_grad"
         self.construct(name, {})
 
@@ -290,27 +288,25 @@ class _Evaluation(ca.Callback):
         return ca.Sparsity.dense(list(self._sizes.values())[i], 1)
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        return self._outputs.parts[self._results[i]][0]
+        return self._structure.parts[self._results[i]][0]
 
     def has_eval_buffer(self) -> bool:
         return True
 
     def eval_buffer(self, arguments: Any, results: Any) -> int:
         """Fill the buffers; 1 where there is no value, which CasADi tells the solver."""
-        if self._unread:  # the multipliers that CasADi adds to a solution, even to one that was stopped
-            for buffer in results:
-                if buffer is not None:
-                    np.frombuffer(buffer)[:] = 0.0
+        wanted = [(name, np.frombuffer(b)) for name, b in zip(self._results, results, strict=True) if b is not None]
+        if self._unread:
+            for _, buffer in wanted:
+                buffer[:] = 0.0
             return 0
         sizes = self._sizes.values()
         given = [np.zeros(n) if a is None else np.frombuffer(a) for a, n in zip(arguments, sizes, strict=True)]
         factor, multipliers = (float(given[2][0]), given[3]) if len(given) > 2 else (0.0, np.zeros(0))
         try:
             # Derivatives stand last and are computed first: values are known then.
-            for name, buffer in reversed(list(zip(self._results, results, strict=True))):
-                if buffer is not None:
-                    order = self._outputs.parts[name][1]
-                    np.frombuffer(buffer)[:] = self._values(name, given[0], factor, multipliers)[order]
+            for name, buffer in reversed(wanted):
+                buffer[:] = self._values(name, given[0], factor, multipliers)[self._structure.parts[name][1]]
         except BaseException:  # noqa: BLE001 - CasADi would print it; it is raised where the solver was called
             return 1
         return 0
@@ -322,11 +318,6 @@ def _sorted(entries: tuple[Integers, Integers], shape: tuple[int, int]) -> tuple
     order = np.lexsort((rows, columns))
     starts = np.searchsorted(columns[order], np.arange(shape[1] + 1))
     return ca.Sparsity(*shape, starts.tolist(), rows[order].tolist()), order
-
-
-def _upper(program: Program) -> NDArray[np.bool_]:
-    rows, columns = program.hessian_entries
-    return np.asarray(rows <= columns)
 
 
 def _ipopt_options(_layout: Layout, iterations: int, near: bool) -> dict[str, Any]:
