@@ -52,7 +52,7 @@ def corner_times() -> Array:
     return STEP * np.concatenate([[0.0], np.cumsum(np.rint(lengths / MEAN_SPEED / STEP))])
 
 
-def plan(plant: dr.Plant, guess: dr.Trajectory | None = None, solver: str = "auto") -> dr.Trajectory:
+def plan(plant: dr.Plant, guess: dr.Trajectory | None = None, solver: str = "ipopt") -> dr.Trajectory:
     """The square."""
     times = corner_times()
     route = {name: partial(np.interp, xp=times, fp=[place[j] for place in PLANES]) for j, name in enumerate(("x", "z"))}

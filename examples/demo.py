@@ -57,7 +57,7 @@ def judge(shape: str, known: dict[str, dr.Plant | dr.Result]) -> tuple[dr.Trajec
     plans, flights = {}, {}
     for name, plant in known.items():
         try:
-            plan = SHAPES[shape](plant, solver="ipopt")
+            plan = SHAPES[shape](plant)
             flight = dr.fly(MACHINE, plan, dr.tvlqr(plant, plan))
         except dr.PlanningError as reason:
             print(f"{name:14}   no plan: {str(reason).split(': ', 1)[-1].split(';')[0]}")

@@ -23,7 +23,7 @@ def rotorcraft(**changes):
     return dr.Plant(ROTORCRAFT.model, {**ROTORCRAFT.parameters, **changes})
 
 
-def across(plant, solver="auto", **options):
+def across(plant, solver="ipopt", **options):
     """From rest to rest, 2 m to the right and 1 m up, past a point on the way; segments of uneven length."""
     way = [{}, {"x": 0.7, "z": 1.0}, {"x": 2.0, "z": 1.0}]
     chosen = {"times": [0.0, 0.83, 2.16], "input_limits": LIMITS} | options

@@ -334,8 +334,8 @@ def test_what_cannot_be_done_ends_with_1_and_leaves_no_file(
 
 
 def test_a_plan_that_fails_writes_nothing_over_what_is_there(folder: Path, clean_log: dr.Log):
-    light = {**clean_log.signals, "thrust": 0.1 * clean_log["thrust"]}
-    identified(dr.Log.from_arrays(clean_log.time, light))
+    heavy = {**clean_log.signals, "thrust": 3.0 * clean_log["thrust"]}
+    identified(dr.Log.from_arrays(clean_log.time, heavy))
     Path("flown.csv").write_text("mine")
     before = contents(folder)
     done = run(*FLY, "-o", "flown.csv", "--plot", "flight.png")

@@ -44,10 +44,10 @@ def test_a_state_limit_that_binds_is_named():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"mass": 0.75}, "cannot rest at .* thrust would have to be 7.357, but may be 0.5 to 4.5"),
+        ({"mass": 0.75}, "cannot rest at .* thrust would have to be 7.357, but may be 0 to 5"),
         ({"mass": -0.249}, "thrust would have to be -2.443"),
         ({"inertia": 0.4}, "waypoint 1 .* is missed by"),
-        ({"mass": 1e-12}, "thrust would have to be"),
+        ({"mass": 1e-12}, "there is no plan: .* check the parameters"),
     ],
 )
 def test_parameters_that_are_wildly_off_fail_in_a_sentence(changes, words):
@@ -76,8 +76,10 @@ def test_no_input_holds_a_falling_body():
 def test_trim_may_be_given_where_there_is_none():
     thrown = dr.Model("thrown", {"x": "m", "y": "m"}, {"push": "N"}, {"g": dr.Parameter()},
                       lambda q, v, a, u, p: [a.x - u.push, a.y + p.g])  # fmt: skip
-    start, end = {"y": 0.0, "y_dot": 9.81}, {"x": 1.0, "y": 0.0, "y_dot": -9.81}
-    found = dr.plan(dr.Plant(thrown, {"g": 9.81}), waypoints=[start, end], times=[0.0, 2.0], trim={"push": 0.0})
+    start, end = {"x": 0.0, "x_dot": 0.0, "y": 0.0, "y_dot": 9.81}, {"x": 1.0}
+    found = dr.plan(
+        dr.Plant(thrown, {"g": 9.81}), waypoints=[start, end], times=[0.0, 2.0], trim={"push": 0.0}, rest=False
+    )
     assert found["y"].max() == pytest.approx(9.81 / 2, rel=1e-6)
 
 
@@ -120,7 +122,7 @@ SENSELESS = {
     "limits upside down": ({"waypoints": TWO, "input_limits": {"force": (1, 0)}}, "must be .lowest, highest."),
     "waypoint out of limits": ({"waypoints": TWO, "state_limits": {"y": (0, 0.5)}}, "move the waypoint or the limits"),
     "no share": ({"waypoints": TWO, "input_share": 0.0}, "above 0 and at most 1"),
-    "unknown solver": ({"waypoints": TWO, "solver": "best"}, "choose one of auto, ipopt, fatrop, snopt"),
+    "unknown solver": ({"waypoints": TWO, "solver": "best"}, "choose one of ipopt, fatrop, snopt"),
     "negative time weight": ({"waypoints": TWO, "time_weight": -1.0}, "time_weight"),
     "unknown trim": ({"waypoints": TWO, "trim": {"push": 1.0}}, 'there is no input "push"'),
     "no iterations": ({"waypoints": TWO, "max_iterations": 0}, "max_iterations"),
@@ -162,7 +164,7 @@ def test_flights_need_x_and_z(flight):
 # ---------------------------------------------------------------------- silence, and being stopped
 
 
-@pytest.mark.parametrize("solver", ["auto", "ipopt", "fatrop"])
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
 def test_nothing_is_printed(solver, capfd):
     across(ROTORCRAFT, solver, times=None)
     with pytest.raises(PlanningError):

@@ -9,8 +9,8 @@ Fixed choices, made once, before any figure was looked at, because the paper doe
   which of them is found depends on the solver and its first guess;
 - the sine is two periods of `WAVELENGTH` along x, from the origin, in `SINE_DURATION`, and an error of 0.1 m costs as
   much as full use of an input (`POSITION_WEIGHT`);
-- a rotorcraft's inputs keep to `ROTORCRAFT_LIMITS`, of which a plan uses the middle share `PLANNED_SHARE`, so that
-  feedback keeps some authority.
+- a rotorcraft's inputs keep to `ROTORCRAFT_LIMITS`; a plan uses the share `PLANNED_SHARE` of the way from hovering to
+  each of them, so that feedback keeps some authority whatever mass was identified.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def square(plant: ModelWithParameters, *, input_limits: Limits | None = None, **
     input_limits : name -> (lowest, highest); 0 to 5 N of thrust and -1 to 1 N of moment for a model with these inputs
     options : of `plan`, such as solver or guess
 
-    Segments take their length at a mean speed of 1.6 m/s; the plan uses the middle 80 % of the inputs' ranges. It is
-    weakly drawn to the straight way, 1 m off which costs as much as full use of an input: without that there are
+    Segments take their length at a mean speed of 1.6 m/s; the plan uses 80 % of the way from hovering to the limits. It
+    is weakly drawn to the straight way, 1 m off which costs as much as full use of an input: without that there are
     several minima of about the same cost, some with an overshoot of 3 m.
 
     Raises SettingsError: a model without coordinates x and z.
@@ -103,7 +103,7 @@ def sine(plant: ModelWithParameters, *, input_limits: Limits | None = None, **op
     """As near as can be to z = 2 sin(2 pi x / 4 m) along two periods of x, from rest to rest in 12 s.
 
     Parameters and errors are those of `square`. The reference moves along x evenly; an error of 0.1 m in x or z costs
-    as much as full use of an input; the plan uses the middle 80 % of the inputs' ranges.
+    as much as full use of an input; the plan uses 80 % of the way from hovering to the limits.
 
     References: Dimmig et al. 2023, section V-A.
     """

@@ -49,7 +49,7 @@ __all__ = ["SOLVERS", "TIME_STEP", "plan"]
 TIME_STEP = 0.01
 """s, from row to row of a plan: flights are simulated and controlled at 100 Hz."""
 
-SOLVERS = ("auto", "ipopt", "fatrop", "snopt")
+SOLVERS = ("ipopt", "fatrop", "snopt")
 
 _MORE_ROWS = (0, 1, 2, 4, 8)
 """Rows that a free duration is lengthened by, one after the other, until the rounded plan can be flown on the grid."""
@@ -71,7 +71,7 @@ def plan(
     trim: Mapping[str, float] | None = None,
     rest: bool = True,
     guess: Trajectory | None = None,
-    solver: str = "auto",
+    solver: str = "ipopt",
     max_iterations: int = 500,
     time_limit: float = 30.0,
 ) -> Trajectory:
@@ -93,17 +93,17 @@ def plan(
     reference : state -> function of time (s from the start, an array), or samples evenly spread over the duration
     duration : s, of a plan along a reference without waypoints: it starts and ends on the reference
     input_limits, state_limits : name -> (lowest, highest), each input's or state's unit
-    input_share : middle share of the inputs' ranges that the plan uses; feedback keeps the rest
+    input_share : share of the way from trim to each of an input's limits that the plan uses; feedback keeps the rest
     effort : input -> weight, per s; 1 by default
     tracking : state -> weight of its squared distance from the reference, one over its unit squared and s; 1 by default
     time_weight : per s, where time is free
     trim : input -> value that costs nothing, 0 where not named; by default what holds the plant at rest at the start
     rest : what the first and the last waypoint don't name is zero there; otherwise free
     guess : a trajectory of the same model to start the search from
-    solver : ``ipopt``, ``fatrop``, ``snopt`` (with ``pip install diransac[snopt]``), or ``auto``: fatrop, and
-        IPOPT where that fails
+    solver : ``ipopt``; ``fatrop``, which takes two thirds of the time, but now and then searches for ever, beyond the
+        reach of time_limit and Ctrl-C, where parameters are far off; or ``snopt``, with ``pip install diransac[snopt]``
     max_iterations : of a solver
-    time_limit : s, for all solvers that are tried; to find out why there is no plan may take as long again
+    time_limit : s; to find out why there is no plan may take as long again
 
     Returns
     -------
@@ -121,7 +121,7 @@ def plan(
     _check_weights(tracking, way, input_share)
     _check_search(time_weight, max_iterations, time_limit)
     parameters = model.parameter_vector(plant.parameters)
-    usable = limits.middle(input_share)
+    at_rest = _trim(model, parameters, way.waypoints[0], limits, trim)
     states = limits_of("state", state_limits, model.state)
     _check_within(model, way.waypoints, states)
     task = Task(
@@ -131,9 +131,9 @@ def plan(
         reference=way.reference,
         tracking=_tracking(model, way.reference, tracking),
         effort=weights_of("effort", "input", effort, tuple(model.inputs), np.ones(model.n_u)) / limits.half_ranges**2,
-        trim=_trim(model, parameters, way.waypoints[0], usable, trim),
+        trim=at_rest,
         time_weight=float(time_weight) if way.rows is None else 0.0,
-        inputs=usable,
+        inputs=limits.around(at_rest, input_share),
         states=states,
         dt=TIME_STEP,
     )
@@ -289,17 +289,12 @@ class _Search:
         return self._search(program, unknowns_of(program, straight), near=False)
 
     def _search(self, program: Program, unknowns: Floats, *, near: bool) -> Outcome:
-        """Solve by the solver that was chosen, or by IPOPT where the fastest fails."""
+        """Solve by the solver that was chosen."""
         if self.solver == "snopt":
             from diransac.planning.snopt import active_set
 
             return active_set(program, unknowns, self.search_limits)
-        names = ("fatrop", "ipopt") if self.solver == "auto" else (self.solver,)
-        for name in names:
-            outcome = interior_point(name, program, unknowns, self.search_limits, near=near)
-            if outcome.success:
-                break
-        return outcome
+        return interior_point(self.solver, program, unknowns, self.search_limits, near=near)
 
     def _trajectory(self, program: Program, outcome: Outcome) -> Trajectory:
         kept = np.clip(outcome.unknowns, program.numbers.lower, program.numbers.upper)

@@ -51,13 +51,10 @@ class Limits:
     lower: Floats
     upper: Floats
 
-    def middle(self, share: float) -> Limits:
-        """The middle share of every range that has two ends."""
-        both = np.isfinite(self.lower) & np.isfinite(self.upper)
-        lower, upper = self.lower.copy(), self.upper.copy()
-        middle, half = 0.5 * (lower[both] + upper[both]), 0.5 * (upper[both] - lower[both])
-        lower[both], upper[both] = middle - share * half, middle + share * half
-        return Limits(lower, upper)
+    def around(self, trim: Floats, share: float) -> Limits:
+        """Limits that leave this share of the way from trim (n,) to each limit; a trim beyond a limit is left alone."""
+        lower, upper = (trim + share * (limit - trim) for limit in (self.lower, self.upper))
+        return Limits(np.maximum(self.lower, lower), np.minimum(self.upper, upper))
 
     @property
     def half_ranges(self) -> Floats:

@@ -41,7 +41,7 @@ def active_set(program: Program, guess: Floats, limits: SearchLimits) -> Outcome
     except ImportError as error:
         raise PlanningError(
             "SNOPT comes with the drake package, which isn't installed here; pip install 'diransac[snopt]', or choose "
-            'solver="auto"'
+            'solver="ipopt"'
         ) from error
     stopped: list[BaseException] = []
     drake, options = MathematicalProgram(), SolverOptions()

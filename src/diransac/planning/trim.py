@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from diransac.errors import PlanningError
 
@@ -61,6 +60,8 @@ def _least_acceleration(
     model: Model, parameters: Floats, x: Floats, lower: Floats, upper: Floats
 ) -> tuple[Floats, Floats]:
     """Inputs with the smallest accelerations, and these."""
+    from scipy.optimize import lsq_linear  # takes longer to import than all of planning
+
     u = np.clip(np.zeros(model.n_u), lower, upper)
     roomy = upper > lower
     for _ in range(_ITERATIONS):
