@@ -34,7 +34,7 @@ def store(tmp_path: Path) -> Path:
 def test_a_row_that_is_there_stays_as_it_is(store: Path):
     with Store(store, STUDY) as kept:
         assert kept.add([row(square_x=9.0), row(trial=1)]) == 1
-        assert len(kept.finished()) == 4
+        assert len(kept.finished("0", [0, 1])) == 3
     assert rows(store)["0", 0, "ols"]["square_x"] == 0.25
 
 
@@ -64,7 +64,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 def test_a_store_whose_maker_was_killed_at_once_is_new(tmp_path: Path):
     (tmp_path / "a.db").touch()
     with Store(tmp_path / "a.db", STUDY) as kept:
-        assert kept.finished() == set()
+        assert kept.finished("0", [0, 1]) == set()
 
 
 def test_processes_that_write_at_once_lose_nothing_and_repeat_nothing(tmp_path: Path):

@@ -7,7 +7,7 @@ import os
 import platform
 import random
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +24,8 @@ from diransac.study.workers import Workers, workers_of
 __all__ = ["BATCH_SIZE", "Progress", "run_study"]
 
 Progress = Callable[[int, int], None]
+_Row = tuple[str, int, str]
+"""Level, trial and method."""
 
 BATCH_SIZE = 8
 """Trials a task: as many flights as fill a vector, few enough that little is lost with a process that is killed."""
@@ -92,7 +94,7 @@ class _Batch:
     attempts: int = 0
 
     @property
-    def rows(self) -> Iterator[tuple[str, int, str]]:
+    def rows(self) -> Iterator[_Row]:
         """Level, trial and method of each."""
         return ((self.level, trial, method) for trial in self.trials for method in self.methods)
 
@@ -102,18 +104,21 @@ class _Work:
 
     def __init__(self, study: Study, store: Store, batch_size: int, progress: Progress) -> None:
         self._text, self._store, self._progress = json.dumps(study.to_dict()), store, progress
-        self._asked = [
-            (level.text, k, label)
+        asked = [
+            (level.text, trial, label)
             for level in study.axis.levels
-            for k in range(study.trials)
+            for trial in range(study.trials)
             for label in study.methods
         ]
-        batches = _batches(self._missing(), batch_size)
+        finished = set[_Row]().union(*(store.finished(x.text, range(study.trials)) for x in study.axis.levels))
+        missing = [row for row in asked if row not in finished]
+        batches = _batches(missing, batch_size)
         # Another process on the same store takes another order: they seldom run the same batch.
         random.Random(f"{platform.node()} {os.getpid()}").shuffle(batches)
         self.waiting = deque(batches)
         self._running: dict[Future[Any], _Batch] = {}
-        self._show()
+        self._n_asked, self._missing = len(asked), set(missing)
+        self._note(())
 
     def run(self, workers: Workers) -> None:
         """Run all.  Raises StudyError: a batch is lost again and again."""
@@ -125,7 +130,9 @@ class _Work:
 
     def _hand_out(self, workers: Workers, batch: _Batch) -> None:
         """Give workers a batch, but for what another process has kept meanwhile."""
-        finished = self._store.finished(batch.level)
+        finished = self._store.finished(batch.level, batch.trials)
+        if not finished.isdisjoint(self._missing):
+            self._note(finished)
         for left in _batches([row for row in batch.rows if row not in finished], len(batch.trials)):
             future = workers.submit(run_trials, self._text, left.level, left.trials, left.methods)
             self._running[future] = replace(left, attempts=batch.attempts)
@@ -135,25 +142,23 @@ class _Work:
         error = future.exception()
         if error is None:
             self._store.add(future.result())
-            self._show()
+            self._note(batch.rows)
             return
         if batch.attempts + 1 == _ATTEMPTS:
             which = ", ".join(map(str, batch.trials))
             raise StudyError(
-                f"trials {which} at level {batch.level} were lost {_ATTEMPTS} times, at last "
-                f"by {type(error).__name__}: {error}; all that is done is kept: look at the workers, then run it again"
+                f"trials {which} at level {batch.level} were lost {_ATTEMPTS} times, at last by "
+                f"{type(error).__name__}: {error}; all that is done is kept: look at the workers, then run it again"
             ) from error
         self.waiting.append(replace(batch, attempts=batch.attempts + 1))
 
-    def _missing(self) -> list[tuple[str, int, str]]:
-        finished = self._store.finished()
-        return [row for row in self._asked if row not in finished]
-
-    def _show(self) -> None:
-        self._progress(len(self._asked) - len(self._missing()), len(self._asked))
+    def _note(self, finished: Iterable[_Row]) -> None:
+        """Say how many rows there are, with these."""
+        self._missing.difference_update(finished)
+        self._progress(self._n_asked - len(self._missing), self._n_asked)
 
 
-def _batches(rows: Sequence[tuple[str, int, str]], size: int) -> list[_Batch]:
+def _batches(rows: Sequence[_Row], size: int) -> list[_Batch]:
     """Rows in batches of a level and so many trials, those together that lack the same methods."""
     methods_of: dict[tuple[str, int], list[str]] = defaultdict(list)
     for level, trial, method in rows:

@@ -84,10 +84,10 @@ class Store:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         self._connection.close()
 
-    def finished(self, level: str | None = None) -> set[tuple[str, int, str]]:
-        """Level, trial and method of every row, or of those at one level."""
-        where, values = ("", ()) if level is None else (" WHERE level = ?", (level,))
-        return set(self.select(f"SELECT level, trial, method FROM trials{where}", values))
+    def finished(self, level: str, trials: Sequence[int]) -> set[tuple[str, int, str]]:
+        """Level, trial and method of the rows there are of these trials."""
+        query = "SELECT level, trial, method FROM trials WHERE level = ? AND trial BETWEEN ? AND ?"
+        return set(self.select(query, (level, min(trials), max(trials))))
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> int:
         """Keep rows, in one transaction; those that another process kept meanwhile stay.  How many were new."""

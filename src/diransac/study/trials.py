@@ -11,7 +11,7 @@ import json
 import platform
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -37,6 +37,9 @@ __all__ = ["STAGES", "run_trials"]
 
 STAGES = ("record", "identify", "plan", "steer", "fly")
 """What `seconds` is split by."""
+
+_PATIENCE = 600.0
+"""s that a plan may take: so many that a solver's limit of iterations ends it first, as fast or slow as a machine is."""
 
 _PACKAGES = ("diransac", "casadi", "llvmlite", "numpy", "scipy")
 
@@ -83,7 +86,7 @@ class _Point:
     @cached_property
     def controller(self) -> Controller:
         """What steers the flight that is recorded.  Raises PlanningError: there is no such flight."""
-        return tvlqr(self.plant, TRAJECTORIES[self.study.data](self.plant))
+        return tvlqr(self.plant, TRAJECTORIES[self.study.data](self.plant, time_limit=_PATIENCE))
 
     def record(self, cases: Sequence[_Case]) -> None:
         """Fly for data, and spoil each trial's record; where nothing is drawn, one flight serves all trials."""
@@ -216,25 +219,29 @@ def _evaluate(point: _Point, cases: Sequence[_Case], shape: str) -> None:
 
 
 def _plans(cases: Sequence[_Case], shape: str) -> dict[int, Trajectory]:
-    """The trajectory of each case that has one; equal parameters have the same, planned once."""
-    planned: dict[tuple[float, ...], Trajectory | DiransacError] = {}
+    """The trajectory of each case that has one."""
     plans = {}
     for case in cases:
         assert case.found is not None
-        key = tuple(case.found.parameters.values())
         with case.attempt("plan"):
-            if key not in planned:
-                planned[key] = _tried(TRAJECTORIES[shape], case.found)
-            found = planned[key]
-            if isinstance(found, DiransacError):
-                raise PlanningError(f"{shape}: {found}")
-            plans[id(case)] = found
+            plan = _planned(case.point, shape, tuple(case.found.parameters.values()))
+            if isinstance(plan, DiransacError):
+                raise PlanningError(f"{shape}: {plan}")
+            plans[id(case)] = plan
     return plans
 
 
-def _tried(make: Callable[[Plant], Trajectory], plant: Plant) -> Trajectory | DiransacError:
+@lru_cache(maxsize=64)
+def _planned(point: _Point, shape: str, parameters: tuple[float, ...]) -> Trajectory | DiransacError:
+    """The plan for these parameters, from the planner's own first guess, or why there is none.
+
+    Without other noise than imbalance, least squares finds the same parameters in each trial; the true ones are the
+    same everywhere.
+    """
+    model = point.plant.model
+    plant = Plant(model, dict(zip(model.parameters, parameters, strict=True)))
     try:
-        return make(plant)
+        return TRAJECTORIES[shape](plant, time_limit=_PATIENCE)
     except DiransacError as error:
         return error
 

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, Protocol
 
 from diransac.errors import SettingsError
@@ -100,7 +101,6 @@ class Processes:
 
     def __init__(self, jobs: int, tasks: int) -> None:
         self.tasks, self._jobs = tasks, jobs
-        self._others = set(multiprocessing.active_children())
         self._pool = self._new_pool()
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
@@ -115,13 +115,26 @@ class Processes:
 
     def stop(self) -> None:
         """End the processes, whatever they do."""
-        for process in set(multiprocessing.active_children()) - self._others:
+        for process in self._begun.processes:
             process.terminate()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _new_pool(self) -> ProcessPoolExecutor:
-        context = multiprocessing.get_context("spawn")  # threads and solvers don't survive a fork
-        return ProcessPoolExecutor(self._jobs, context, initializer=_begin)
+        self._begun = _Begun()
+        return ProcessPoolExecutor(self._jobs, self._begun, initializer=_begin)
+
+
+class _Begun(SpawnContext):
+    """How a pool begins processes, and which it has begun; spawned, for threads and solvers don't survive a fork."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.processes: list[SpawnProcess] = []
+
+    def Process(self, *arguments: Any, **more: Any) -> SpawnProcess:  # type: ignore[override]  # noqa: N802
+        """A process, noted."""
+        self.processes.append(SpawnProcess(*arguments, **more))
+        return self.processes[-1]
 
 
 def _begin() -> None:
