@@ -39,7 +39,7 @@ STAGES = ("record", "identify", "plan", "steer", "fly")
 """What `seconds` is split by."""
 
 _PATIENCE = 600.0
-"""s that a plan may take: so many that a solver's limit of iterations ends it first, as fast or slow as a machine is."""
+"""s that a plan may take: so many that a solver's limit of iterations ends it first, however slow a machine is."""
 
 _PACKAGES = ("diransac", "casadi", "llvmlite", "numpy", "scipy")
 

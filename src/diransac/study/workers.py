@@ -131,7 +131,7 @@ class _Begun(SpawnContext):
         super().__init__()
         self.processes: list[SpawnProcess] = []
 
-    def Process(self, *arguments: Any, **more: Any) -> SpawnProcess:  # type: ignore[override]  # noqa: N802
+    def Process(self, *arguments: Any, **more: Any) -> SpawnProcess:  # type: ignore[override]
         """A process, noted."""
         self.processes.append(SpawnProcess(*arguments, **more))
         return self.processes[-1]
