@@ -277,7 +277,7 @@ def test_two_processes_share_a_store_and_give_the_rows_of_one(whole: dict, tmp_p
 
 
 class KillsItsWorkers(ThreadPoolExecutor):
-    """An executor whose first tasks are lost with their worker."""
+    """An executor whose first tasks are lost with their worker: cancelled, or with an error."""
 
     def __init__(self, lost: int) -> None:
         super().__init__(1)
@@ -289,7 +289,11 @@ class KillsItsWorkers(ThreadPoolExecutor):
             return super().submit(function, *arguments)
         self.lost -= 1
         future: Future = Future()
-        future.set_exception(ConnectionError("the worker is gone"))
+        if self.lost % 2:
+            future.cancel()
+            future.set_running_or_notify_cancel()
+        else:
+            future.set_exception(ConnectionError("the worker is gone"))
         return future
 
 
@@ -360,7 +364,7 @@ def test_a_cluster_whose_worker_is_killed_gives_the_same_rows(whole: dict, tmp_p
     victims = []
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
     with distributed.LocalCluster(**options) as cluster, connected(cluster.scheduler_address) as (executor, tasks):
-        with distributed.Client(cluster) as client:
+        with distributed.Client(cluster, set_as_default=False) as client:
             workers = list(client.run(os.getpid).values())
 
         def kill_one(done: int, asked: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -89,6 +90,8 @@ def _everywhere(wanted: Study, store: Path, jobs: int | None, cluster: str | Non
     if cluster is None:
         return run_study(wanted, store=store, jobs=jobs, progress=progress)
     with connected(cluster) as (executor, tasks):
+        for talker in ("distributed", "concurrent.futures"):  # an error says in a line what they say in many
+            logging.getLogger(talker).setLevel(logging.CRITICAL)
         return run_study(wanted, store=store, executor=executor, tasks=tasks, progress=progress)
 
 

@@ -21,10 +21,10 @@ def connected(address: str) -> Iterator[tuple[Executor, int]]:
     ----------
     address : such as ``tcp://host:8786``
 
-    Raises SettingsError: Dask is not installed.  StudyError: nobody listens there.
+    Raises SettingsError: Dask is not installed.  StudyError: nobody listens there, or no more.
     """
     try:
-        from distributed import Client
+        from distributed.client import Client, ClosedClientError
     except ModuleNotFoundError as error:
         raise SettingsError("a cluster needs Dask, which is not installed; pip install 'diransac[cluster]'") from error
     try:
@@ -32,4 +32,9 @@ def connected(address: str) -> Iterator[tuple[Executor, int]]:
     except (OSError, ValueError) as error:
         raise StudyError(f"no scheduler at {address}: {error}; start one with dask scheduler") from error
     with client:
-        yield client.get_executor(), 2 * max(32, sum(client.nthreads().values()))
+        try:
+            yield client.get_executor(), 2 * max(32, sum(client.nthreads().values()))
+        except ClosedClientError as error:
+            raise StudyError(
+                f"the scheduler at {address} is gone; all that is done is kept: start another, then run it again"
+            ) from error

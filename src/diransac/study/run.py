@@ -8,7 +8,7 @@ import platform
 import random
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -139,7 +139,7 @@ class _Work:
 
     def _keep(self, batch: _Batch, future: Future[Any]) -> None:
         """Keep what a batch gave; one whose worker was lost waits again."""
-        error = future.exception()
+        error = CancelledError("the workers gave it up") if future.cancelled() else future.exception()
         if error is None:
             self._store.add(future.result())
             self._note(batch.rows)
