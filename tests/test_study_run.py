@@ -243,6 +243,7 @@ def test_an_infeasible_data_flight_fails_every_trial_of_its_level(tmp_path: Path
 def test_arguments_without_meaning_are_refused(options: dict, message: str, tmp_path: Path):
     with pytest.raises(dr.SettingsError, match=message):
         run(tmp_path, **options)
+    assert not list(tmp_path.iterdir())
 
 
 # What is killed -------------------------------------------------------------------------------------------------------

@@ -27,8 +27,8 @@ Progress = Callable[[int, int], None]
 _Row = tuple[str, int, str]
 """Level, trial and method."""
 
-BATCH_SIZE = 8
-"""Trials a task: as many flights as fill a vector, few enough that little is lost with a process that is killed."""
+BATCH_SIZE = 4
+"""Trials a task: with a few methods each, their flights fill vectors, and little is lost with a killed process."""
 
 _ATTEMPTS = 3
 
@@ -73,14 +73,12 @@ def run_study(
     study = load(spec).narrowed(trials, levels, methods)
     if batch_size < 1:
         raise SettingsError(f"batch_size is {batch_size}; give at least 1")
+    workers = workers_of(executor, jobs, tasks)
     with Store(store, study) as kept:
-        work = _Work(study, kept, batch_size, progress or (lambda _done, _asked: None))
-        if work.waiting:
-            workers = workers_of(executor, jobs, tasks)
-            try:
-                work.run(workers)
-            finally:
-                workers.stop()
+        try:
+            _Work(study, kept, batch_size, progress or (lambda _done, _asked: None)).run(workers)
+        finally:
+            workers.stop()
     return status(store)
 
 
@@ -115,16 +113,16 @@ class _Work:
         batches = _batches(missing, batch_size)
         # Another process on the same store takes another order: they seldom run the same batch.
         random.Random(f"{platform.node()} {os.getpid()}").shuffle(batches)
-        self.waiting = deque(batches)
+        self._waiting = deque(batches)
         self._running: dict[Future[Any], _Batch] = {}
         self._n_asked, self._missing = len(asked), set(missing)
         self._note(())
 
     def run(self, workers: Workers) -> None:
         """Run all.  Raises StudyError: a batch is lost again and again."""
-        while self.waiting or self._running:
-            while self.waiting and len(self._running) < workers.tasks:
-                self._hand_out(workers, self.waiting.popleft())
+        while self._waiting or self._running:
+            while self._waiting and len(self._running) < workers.tasks:
+                self._hand_out(workers, self._waiting.popleft())
             for future in wait(self._running, return_when=FIRST_COMPLETED).done:
                 self._keep(self._running.pop(future), future)
 
@@ -150,7 +148,7 @@ class _Work:
                 f"trials {which} at level {batch.level} were lost {_ATTEMPTS} times, at last by "
                 f"{type(error).__name__}: {error}; all that is done is kept: look at the workers, then run it again"
             ) from error
-        self.waiting.append(replace(batch, attempts=batch.attempts + 1))
+        self._waiting.append(replace(batch, attempts=batch.attempts + 1))
 
     def _note(self, finished: Iterable[_Row]) -> None:
         """Say how many rows there are, with these."""
