@@ -149,7 +149,7 @@ def _findings(
     seen = windows.known.any(axis=0)
     inlying = fit.noise.inlying(fit.residuals, windows.known)[:N]
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
-    units = parameter_units(windows, motion, result.parameters).min(axis=0)
+    units = parameter_units(windows, motion, result.parameters)
     return Findings(
         parameters=result.parameters,
         covariance=result.covariance,

@@ -1,6 +1,6 @@
 """The quadratic model of all windows together: measurements, continuity, and what is believed beforehand.
 
-Unknowns are what all windows share (parameters, deviations, delay), and at the start of each window w the state x_w and
+Unknowns are what all windows share (parameters, pushes, delay), and at the start of each window w the state x_w and
 a latent acceleration d_w that acts over the window.  With ``F`` the rollout of a window, twice the cost is
 
     sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / slack^2 + sum |d_w|^2 / tau^2 + |s|^2 / prior^2
@@ -33,13 +33,13 @@ class Fit:
 
     Parameters
     ----------
-    shared : (n_s,)   parameters, deviations between equations, input delay in rows
+    shared : (n_s,)   parameters, pushes, input delay in rows
     x, d : (W, n_x), (W, n_v)   states at the windows' starts, latent accelerations
     residuals : (N, n_signals)   simulated less measured
     noise : of each signal
     tau : (n_v,)   size of the latent accelerations
     slack : (n_x,)   size of the jumps from window to window
-    prior : (n_s,)   size of the deviations and of the delay; infinite for the parameters
+    prior : (n_s,)   size of the pushes and of the delay; infinite for the parameters
     """
 
     shared: FloatArray

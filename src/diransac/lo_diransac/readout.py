@@ -38,6 +38,7 @@ __all__ = ["Readout", "deviation_units", "read_out"]
 FloatArray = npt.NDArray[np.float64]
 
 _NEWTON_STEPS = 5
+_TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -78,20 +79,27 @@ def read_out(windows: Windows, fit: Fit) -> Readout:
 
 
 def deviation_units(windows: Windows, motion: Motion, p: FloatArray) -> FloatArray:
-    """What each deviation would have to be to make all of its equation's inertial force; infinite for parameters."""
-    of_pairs = parameter_units(windows, motion, p)
-    pairs = [of_pairs[i, j] for i, j in windows.freed.pairs]
-    return np.concatenate([np.full(windows.model.n_p, np.inf), pairs, [1.0]])
+    """What each push would have to be to make all of its equation's inertial force; infinite for parameters."""
+    force = inertial_forces(windows, motion, p)
+    level = np.append(1.0, np.sqrt(np.square(windows.inputs).mean(axis=0)) + _TINY)
+    return np.concatenate([np.full(windows.model.n_p, np.inf), (force[:, None] / level).ravel(), [1.0]])
 
 
 def parameter_units(windows: Windows, motion: Motion, p: FloatArray) -> FloatArray:
-    """The change of each parameter that would make all of each equation's inertial force, (n_v, n_p)."""
+    """The change of each parameter ``(n_p,)`` that would make all of some equation's inertial force."""
     model, N = windows.model, len(motion.signals)
     q, v, a = np.split(motion.signals, [model.n_q, model.n_q + model.n_v], axis=1)
-    _, W, M = _residual_map(model)(q, v, a, windows.inputs[:N], p)
-    force = np.einsum("nji,nj->ni", M.reshape(N, model.n_v, model.n_v), a)
-    sizes = np.sqrt(np.square(W.reshape(N, model.n_p, model.n_v)).mean(axis=0)).T
-    return np.asarray(np.sqrt(np.square(force).mean(axis=0))[:, None] / np.maximum(sizes, 1e-300))
+    W = _residual_map(model)(q, v, a, windows.inputs[:N], p)[1]
+    sizes = np.sqrt(np.square(W.reshape(N, model.n_p, model.n_v)).mean(axis=0))
+    return np.asarray((inertial_forces(windows, motion, p) / np.maximum(sizes, _TINY)).min(axis=1))
+
+
+def inertial_forces(windows: Windows, motion: Motion, p: FloatArray) -> FloatArray:
+    """RMS of ``M a`` of each equation, (n_v,)."""
+    model, N = windows.model, len(motion.signals)
+    q, v, a = np.split(motion.signals, [model.n_q, model.n_q + model.n_v], axis=1)
+    M = _residual_map(model)(q, v, a, windows.inputs[:N], p)[2].reshape(N, model.n_v, model.n_v)
+    return np.asarray(np.sqrt(np.square(np.einsum("nji,nj->ni", M, a)).mean(axis=0)))
 
 
 def _motion(windows: Windows, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -130,6 +138,6 @@ def _matrices(columns: FloatArray, n_p: int) -> FloatArray:
 
 def _instrumented(A: FloatArray, Z: FloatArray) -> FloatArray:
     """``(Z'A)^-1 Z'``, columns scaled to one."""
-    scale = np.linalg.norm(Z, axis=0) + 1e-300
+    scale = np.linalg.norm(Z, axis=0) + _TINY
     scaled = Z / scale
     return np.asarray(np.linalg.lstsq(scaled.T @ (A / scale), scaled.T, rcond=None)[0] / scale[:, None])

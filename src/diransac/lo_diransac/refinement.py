@@ -6,7 +6,7 @@ Gauss and Newton's steps on `normal_equations`, each followed by an update of ev
 - tau, the size of the latent accelerations, by the evidence: with tau large, windows stand alone; with tau = 0, the
   whole log is one rollout.  A model of a real machine is right to a hundredth of its accelerations at best, which
   counts like one window's evidence: where noise hides the deviations, their absence is not believed;
-- the size of the deviations between equations, and of the delay, likewise.
+- the size of the pushes, and of the delay, likewise.
 
 All come down slowly from large values, and so does the slack in the continuity: far from the truth the problem is many
 easy ones, near it a single one that uses every bit of information (graduated non-convexity).  On the way down tau
@@ -52,14 +52,14 @@ class Belief:
     Parameters
     ----------
     tau : (n_v,)   latent accelerations, a hundredth of the accelerations' spread
-    unit : (n_s,)   a deviation that makes all of an equation's inertial force; a row of delay; infinite for parameters
-    deviation : of those units, once the fit has settled; ``guarded`` until then
+    unit : (n_s,)   a push that makes all of an equation's inertial force; a row of delay; infinite for parameters
+    push : of those units, once the fit has settled; ``guarded`` until then
     delay : rows
     """
 
     tau: FloatArray
     unit: FloatArray
-    deviation: float = 0.1
+    push: float = 0.1
     guarded: float = 0.01
     delay: float = 0.03
 
@@ -106,7 +106,7 @@ def refine(windows: Windows, fit: Fit, belief: Belief) -> Refinement:
         steps += 1
         moved, solved, damping = _step(windows, fit, damping)
         updated = _update(windows, moved, solved, belief, robust=robust)
-        settled = _unchanged(fit, updated, windows.model.n_p)
+        settled = _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[: windows.model.n_p]))
         fit = updated
         if settled and not robust:
             return Refinement(fit, steps, settled=True)
@@ -168,9 +168,9 @@ def _evidence(belief: FloatArray, now: FloatArray, squares: FloatArray, determin
 
 
 def _deviations(fit: Fit, belief: Belief, variance: FloatArray, n_p: int) -> FloatArray:
-    """Sizes of the deviations between equations, which have one in common, and of the delay."""
+    """Sizes of the pushes, which have one in common, and of the delay."""
     prior = fit.prior.copy()
-    for members, size in ((slice(n_p, len(prior) - 1), belief.deviation), (slice(len(prior) - 1, None), belief.delay)):
+    for members, size in ((slice(n_p, len(prior) - 1), belief.push), (slice(len(prior) - 1, None), belief.delay)):
         unit, now = belief.unit[members], fit.prior[members]
         if len(unit):
             squares = np.square(fit.shared[members] / unit).sum()
@@ -187,13 +187,14 @@ def _continuity(windows: Windows, tau: FloatArray) -> FloatArray:
     return np.concatenate([coordinate, velocity])
 
 
-def _unchanged(old: Fit, new: Fit, n_p: int) -> bool:
-    """Whether parameters and scales have settled."""
-    moved = np.abs(new.shared - old.shared)[:n_p] / (np.abs(old.shared[:n_p]) + 1e-12)
+def _unchanged(old: Fit, new: Fit, errors: FloatArray) -> bool:
+    """Whether parameters move by less than a hundredth of their standard errors, and scales by a few hundredths."""
+    n_p = len(errors)
+    moved = np.abs(new.shared - old.shared)[:n_p] / (errors + 1e-9 * np.abs(old.shared[:n_p]) + 1e-300)
     changes = (
         (np.abs(np.log(new.noise.sigma / old.noise.sigma)), 0.01),
         (np.abs(np.log(new.tau / old.tau)), 0.05),
         (np.abs(np.log(new.slack / old.slack)), 0.05),
         (np.abs(np.log(new.prior[n_p:] / old.prior[n_p:])), 0.1),
     )
-    return bool((moved < 2e-5).all() and all((change < limit).all() for change, limit in changes))
+    return bool((moved < 0.01).all() and all((change < limit).all() for change, limit in changes))
