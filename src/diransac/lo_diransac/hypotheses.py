@@ -53,6 +53,8 @@ def find_hypotheses(
         finalists = _nonlinear(motion, seed, observations)
     else:
         finalists = _concentrated(windows, motion, seed)
+    if not len(finalists):
+        return finalists, np.zeros(0)
     scores = robust_scores(windows, motion, finalists, np.arange(len(windows)))
     order = np.argsort(scores, kind="stable")[: np.isfinite(scores).sum()]
     return finalists[order], scores[order]
@@ -63,6 +65,8 @@ def _concentrated(windows: Windows, motion: Motion, seed: int) -> FloatArray:
     weak = weak_form(windows, motion)
     few = np.unique(np.linspace(0, len(windows) - 1, min(_FIRST_WINDOWS, len(windows))).astype(int))
     samples = _admitted(windows, weak.solve(_samples(weak, seed)))
+    if not len(samples):
+        return samples
     ranked = samples[np.argsort(robust_scores(windows, motion, samples, few), kind="stable")]
     found = [ranked[:_FINALISTS]]
     for _ in range(_CONCENTRATIONS):

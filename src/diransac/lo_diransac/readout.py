@@ -3,7 +3,7 @@
 Where the model is right, the parameters of the fit are the parameters.  Where it is not, they share the explanation of
 the log with the deviations, in proportions that depend on the noise.  What is wanted is what least squares would give
 on noise-free data: the parameters for which the equations hold best, all deviations left over.  ``W p = b`` is solved
-again, on the fitted motion, a window's mean at a time, with instruments from which the latent accelerations are
+again, on the fitted motion, with instruments from which the latent accelerations are
 left out: accelerations that noise has shaken would pull inertias towards zero.
 
 The covariance has two parts: the fit's, carried through that solution; and that of the latent forces that the
@@ -37,7 +37,6 @@ __all__ = ["Readout", "deviation_units", "read_out"]
 
 FloatArray = npt.NDArray[np.float64]
 
-_NEWTON_STEPS = 5
 _TINY = 1e-300
 
 
@@ -51,31 +50,53 @@ class Readout:
 
 
 def read_out(windows: Windows, fit: Fit) -> Readout:
-    """The parameters for which the equations hold best on the fitted motion."""
+    """The parameters for which the equations hold best on the fitted motion.
+
+    In the fit they hold exactly, with the pushes and the latent accelerations besides: ``r(p) = push + M d``.  What the
+    parameters could make of either is given back to them: of the pushes row by row; of the latent accelerations, which
+    are constant over a window, by the windows' means.
+    """
     model, n_p, n_s, n_x = windows.model, windows.model.n_p, len(fit.shared), fit.x.shape[1]
-    q, v, a, u = _motion(windows, fit)
-    quiet = a - np.repeat(fit.d, windows.length, axis=0)
-    evaluate, p = _residual_map(model), fit.shared[:n_p].copy()
-    for _ in range(_NEWTON_STEPS if model.nonlinear_parameters else 1):
-        r, W, _ = (_means(windows, x) for x in evaluate(q, v, a, u, p))
-        Z = _means(windows, evaluate(q, v, quiet, u, p)[1])
-        gain = _instrumented(_matrices(W, n_p), _matrices(Z, n_p))
-        p = p - gain @ r.ravel()
-    freely = np.hstack([np.broadcast_to(fit.shared, (len(a), n_s)), np.repeat(fit.d, windows.length, axis=0)])
-    slopes = _means(windows, _residual_map(windows.freed.model)(q, v, a, windows.moving_inputs, freely)[1])
-    # d p = -gain dr, and dr = -(dr_freed / d(shared, d)): a deviation makes the force that the model lacks.
-    effect = np.einsum("pwi,wji->wpj", gain.reshape(n_p, len(windows), -1), slopes.reshape(len(windows), -1, model.n_v))
-    of_s, of_z = effect[:, :, :n_s].sum(axis=0).T, np.zeros((len(windows), n_x + model.n_v, n_p))
-    of_s[-1] = 0.0  # the delayed inputs stand on both sides
-    of_z[:, n_x:] = effect[:, :, n_s:].swapaxes(1, 2)
+    by_rows, by_means, push, M = _gains(windows, fit)
+    latent = np.einsum("wij,wj->wi", M, fit.d)
+    p = fit.shared[:n_p] - np.einsum("pni,ni->p", by_rows, push) - np.einsum("pwi,wi->p", by_means, latent)
+    of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(windows), n_x + model.n_v, n_p))
+    level = np.hstack([np.ones((len(push), 1)), windows.inputs])
+    of_s[:n_p] = np.eye(n_p)
+    of_s[n_p:-1] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
+    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means, M)
     at = linearize(windows, fit, weights_of(windows, fit))
     z, s = at.system.functional(of_z, of_s)
     covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s
-    latent = (_means(windows, evaluate(q, v, a, u, p)[0]) - _means(windows, evaluate(q, v, quiet, u, p)[0])).ravel()
-    left = latent - _matrices(W, n_p) @ (gain @ latent)
-    sampled = _batch_sums((gain * left).reshape(n_p, len(windows), -1).sum(axis=2).T)
+    sampled = _sampled(windows, fit, by_means, latent)
     delay = at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
-    return Readout(p, covariance + sampled.T @ sampled, float(np.sqrt(delay)))
+    return Readout(p, covariance + sampled, float(np.sqrt(delay)))
+
+
+def _gains(windows: Windows, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """What rows (n_p, N, n_v) and windows' means (n_p, W, n_v) do to parameters; pushes (N, n_v); mean M (W, n_v, n_v).
+
+    The instruments are the regressors of the motion without its latent accelerations.
+    """
+    model = windows.model
+    evaluate, (q, v, a, u) = _residual_map(model), _motion(windows, fit)
+    quiet, p = a - np.repeat(fit.d, windows.length, axis=0), fit.shared[: model.n_p]
+    push, Z, M = evaluate(q, v, quiet, u, p)
+    W = evaluate(q, v, a, u, p)[1]
+    logged = windows.is_logged[:, None]
+    W, Z = _matrices(W * logged, model.n_p), _matrices(Z * logged, model.n_p)
+    by_means = _instrumented(_means(windows, W), _means(windows, Z))
+    return _instrumented(W, Z), by_means, push * logged, _means(windows, _matrices(M, model.n_v))
+
+
+def _sampled(windows: Windows, fit: Fit, by_means: FloatArray, latent: FloatArray) -> FloatArray:
+    """Covariance of the parameters over logs that hold other latent forces than this one's, which it estimates."""
+    q, v, a, u = _motion(windows, fit)
+    W = _residual_map(windows.model)(q, v, a, u, fit.shared[: windows.model.n_p])[1] * windows.is_logged[:, None]
+    means = _means(windows, _matrices(W, windows.model.n_p))
+    left = latent - means @ np.einsum("pwi,wi->p", by_means, latent)
+    sums = _batch_sums(np.einsum("pwi,wi->wp", by_means, left))
+    return np.asarray(sums.T @ sums)
 
 
 def deviation_units(windows: Windows, motion: Motion, p: FloatArray) -> FloatArray:
@@ -126,18 +147,19 @@ def _batch_sums(values: FloatArray) -> FloatArray:
 
 
 def _means(windows: Windows, rows: FloatArray) -> FloatArray:
-    """Mean of each window, (W, n)."""
-    return np.asarray(rows.reshape(len(windows), windows.length, -1).mean(axis=1))
+    """Mean of each window, (W, ...)."""
+    return np.asarray(rows.reshape(len(windows), windows.length, *rows.shape[1:]).mean(axis=1))
 
 
-def _matrices(columns: FloatArray, n_p: int) -> FloatArray:
-    """Rows of all equations (W r, n_p) from matrices that were stored column by column."""
-    W = columns.reshape(len(columns), n_p, -1).swapaxes(1, 2)
-    return np.ascontiguousarray(W).reshape(-1, n_p)
+def _matrices(columns: FloatArray, n_columns: int) -> FloatArray:
+    """Matrices (N, r, n_columns) that were stored column by column."""
+    return columns.reshape(len(columns), n_columns, -1).swapaxes(1, 2)
 
 
 def _instrumented(A: FloatArray, Z: FloatArray) -> FloatArray:
-    """``(Z'A)^-1 Z'``, columns scaled to one."""
-    scale = np.linalg.norm(Z, axis=0) + _TINY
-    scaled = Z / scale
-    return np.asarray(np.linalg.lstsq(scaled.T @ (A / scale), scaled.T, rcond=None)[0] / scale[:, None])
+    """``(Z'A)^-1 Z'`` of stacked matrices (N, r, n_p), as (n_p, N, r); columns scaled to one."""
+    rows, instruments = A.reshape(-1, A.shape[2]), Z.reshape(-1, A.shape[2])
+    scale = np.linalg.norm(instruments, axis=0) + _TINY
+    instruments = instruments / scale
+    solved = np.linalg.lstsq(instruments.T @ (rows / scale), instruments.T, rcond=None)[0] / scale[:, None]
+    return np.asarray(solved).reshape(-1, *A.shape[:2])

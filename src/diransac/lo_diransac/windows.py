@@ -37,6 +37,7 @@ class Windows:
     inputs : (N, n_u)
     dt : s
     length : rows of a window
+    n_logged : rows of the log; all that are given, by default
     """
 
     model: Model
@@ -45,8 +46,10 @@ class Windows:
     inputs: FloatArray
     dt: float
     length: int
+    n_logged: int = 0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "n_logged", self.n_logged or len(self.measured))
         missing = -len(self.measured) % self.length
         if missing:
             object.__setattr__(self, "known", np.pad(self.known, ((0, missing), (0, 0))))
@@ -65,6 +68,11 @@ class Windows:
     def every(self) -> BoolArray:
         """All rows count; what isn't known in them has no weight."""
         return np.ones(len(self.measured), bool)
+
+    @cached_property
+    def is_logged(self) -> BoolArray:
+        """Which rows ``(N,)`` are the log's."""
+        return np.arange(len(self.measured)) < self.n_logged
 
     @property
     def duration(self) -> float:
