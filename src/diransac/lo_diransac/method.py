@@ -1,0 +1,168 @@
+"""lo-diransac: random minimal samples, consensus by simulation, local optimisation.
+
+1. `gate`: what is not to be used at all.
+2. `smoothing`: the motion without a model.
+3. `hypotheses`: parameters from random samples of the equations in weak form, judged by simulation.
+4. `refinement`: the most probable motion and parameters, noise and deviations from the model, from the best of them.
+5. `readout`: parameters that hold for the whole motion, and their covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac.errors import IdentificationError, LogError
+from diransac.lo_diransac.gate import mended_inputs, stuck_rows
+from diransac.lo_diransac.hypotheses import find_hypotheses
+from diransac.lo_diransac.readout import deviation_units, parameter_units, read_out
+from diransac.lo_diransac.refinement import believe, refine, start
+from diransac.lo_diransac.smoothing import choose_half_width, smooth
+from diransac.lo_diransac.windows import Windows
+
+if TYPE_CHECKING:
+    from diransac.lo_diransac.readout import Readout
+    from diransac.lo_diransac.refinement import Belief, Refinement
+    from diransac.lo_diransac.smoothing import Motion
+    from diransac.observations import Observations
+
+__all__ = ["Findings", "find"]
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+_FEWEST_WINDOWS = 4
+# Half a row of delay or more is taken up by shifting the inputs, as often as needed.
+_WHOLE_ROW, _MAX_SHIFTS = 0.5, 3
+_OUTLIER = 0.5
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What lo-diransac found in a log.
+
+    Parameters
+    ----------
+    parameters, covariance : (n_p,), (n_p, n_p)
+    undetermined : (n_p,)   parameters whose 95 % interval spans more than all of an equation's inertial force
+    noise_scale, outlier_fraction : (n_s,)   of each signal of the model; NaN where it is not measured
+    outliers : (N, n_s)   samples that are more likely outliers than not
+    latent_starts, latent_accelerations : (W,), (W, n_v)   first row of each window, and what acts there unexplained
+    input_delay, input_delay_error : s
+    hypotheses, steps : how many were judged on the whole log, Gauss-Newton steps
+    settled : whether local optimisation ended before its limit
+    notes : what was found and done, a sentence each
+    """
+
+    parameters: FloatArray
+    covariance: FloatArray
+    undetermined: BoolArray
+    noise_scale: FloatArray
+    outlier_fraction: FloatArray
+    outliers: BoolArray
+    latent_starts: npt.NDArray[np.int64]
+    latent_accelerations: FloatArray
+    input_delay: float
+    input_delay_error: float
+    hypotheses: int
+    steps: int
+    settled: bool
+    notes: tuple[str, ...]
+
+
+def find(observations: Observations, seed: int) -> Findings:
+    """Parameters of the model from the log, without starting values or thresholds.
+
+    Raises LogError: the log is too short; IdentificationError: no sample of it gives parameters within their bounds.
+    """
+    windows, motion, notes = _prepare(observations)
+    hypotheses, _ = find_hypotheses(windows, motion, seed, observations)
+    if not len(hypotheses):
+        raise IdentificationError(
+            f"{observations.log.source}: no sample of the log gives parameters within their bounds; check the model, "
+            "the signs and units of inputs, and the bounds"
+        )
+    belief = believe(windows, motion, deviation_units(windows, motion, hypotheses[0]))
+    windows, refined, delay = _refined(windows, motion, hypotheses[0], belief)
+    result = read_out(windows, refined.fit)
+    if not refined.settled:
+        notes = (*notes, "local optimisation had not settled when it reached its limit of steps")
+    return _findings(observations, windows, motion, refined, result, delay, len(hypotheses), notes)
+
+
+def _prepare(observations: Observations) -> tuple[Windows, Motion, tuple[str, ...]]:
+    """The log in windows of the motion's own time scale, and the motion."""
+    model, dt = observations.model, observations.log.dt
+    measured = np.full((len(observations), len(model.signals)), np.nan)
+    measured[:, [model.signals.index(n) for n in observations.signals]] = observations.measured
+    stuck = stuck_rows(observations.measured)
+    known = np.isfinite(measured) & ~stuck[:, None]
+    measured = np.where(known, measured, 0.0)
+    inputs, n_leaps = mended_inputs(observations.inputs)
+    notes = []
+    if stuck.any():
+        notes.append(f"{stuck.sum()} rows repeat the row before in every signal, and were taken as missing")
+    if n_leaps:
+        notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median stands in for them")
+    half = choose_half_width(model, measured, known, dt)
+    if len(observations) < _FEWEST_WINDOWS * half:
+        raise LogError(
+            f"{observations.log.source}: {len(observations)} rows are too few; lo-diransac needs at least "
+            f"{_FEWEST_WINDOWS * half}. Give a longer log"
+        )
+    motion = smooth(model, measured, known, dt, half)
+    return Windows(model, measured, known, inputs, dt, half), motion, tuple(notes)
+
+
+def _refined(windows: Windows, motion: Motion, p: FloatArray, belief: Belief) -> tuple[Windows, Refinement, int]:
+    """Local optimisation, again with the inputs shifted by whole rows while it finds them late."""
+    refined, shift = refine(windows, start(windows, motion, p, belief), belief), 0
+    steps = refined.steps
+    for _ in range(_MAX_SHIFTS):
+        delay = refined.fit.shared[-1]
+        if not _WHOLE_ROW <= abs(delay) < windows.length:
+            break
+        shift += round(delay)
+        windows = windows.delayed(round(delay))
+        shared = refined.fit.shared.copy()
+        shared[-1] = 0.0
+        prior = np.append(refined.fit.prior[:-1], belief.delay)
+        refined = refine(windows, windows.judged(replace(refined.fit, shared=shared, prior=prior)), belief)
+        steps += refined.steps
+    return windows, replace(refined, steps=steps), shift
+
+
+def _findings(
+    observations: Observations,
+    windows: Windows,
+    motion: Motion,
+    refined: Refinement,
+    result: Readout,
+    shift: int,
+    n_hypotheses: int,
+    notes: tuple[str, ...],
+) -> Findings:
+    fit, N, dt = refined.fit, len(observations), windows.dt
+    seen = windows.known.any(axis=0)
+    inlying = fit.noise.inlying(fit.residuals, windows.known)[:N]
+    spans = np.sqrt(np.diag(result.covariance)) * 1.96
+    units = parameter_units(windows, motion, result.parameters)
+    return Findings(
+        parameters=result.parameters,
+        covariance=result.covariance,
+        undetermined=~(spans < units),
+        noise_scale=np.where(seen, fit.noise.sigma, np.nan),
+        outlier_fraction=np.where(seen, fit.noise.pi, np.nan),
+        outliers=windows.known[:N] & (inlying < _OUTLIER),
+        latent_starts=windows.starts,
+        latent_accelerations=fit.d,
+        input_delay=float((shift + fit.shared[-1]) * dt),
+        input_delay_error=result.delay_error * dt,
+        hypotheses=n_hypotheses,
+        steps=refined.steps,
+        settled=refined.settled,
+        notes=notes,
+    )

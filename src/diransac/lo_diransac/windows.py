@@ -1,0 +1,119 @@
+"""A log cut into windows of equal length, each a rollout of its own: the lanes of multiple shooting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac.lo_diransac.freed import Freed, freed
+from diransac.simulate import rollouts
+
+if TYPE_CHECKING:
+    from diransac.lo_diransac.normal_equations import Fit
+    from diransac.model import Model
+    from diransac.simulate import Rollouts
+
+__all__ = ["Windows"]
+
+_DIVERGED = 1e6
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Windows:
+    """One log as windows of ``length`` rows; the last is filled up with rows in which nothing is known.
+
+    Parameters
+    ----------
+    model : what is identified
+    measured, known : (N, n_s)   every signal of the model, in its order
+    inputs : (N, n_u)
+    dt : s
+    length : rows of a window
+    n_logged : rows of the log; all that are given, by default
+    """
+
+    model: Model
+    measured: FloatArray
+    known: BoolArray
+    inputs: FloatArray
+    dt: float
+    length: int
+    n_logged: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "n_logged", self.n_logged or len(self.measured))
+        missing = -len(self.measured) % self.length
+        if missing:
+            object.__setattr__(self, "known", np.pad(self.known, ((0, missing), (0, 0))))
+            for name in ("measured", "inputs"):
+                object.__setattr__(self, name, np.pad(getattr(self, name), ((0, missing), (0, 0)), mode="edge"))
+
+    def __len__(self) -> int:
+        return len(self.measured) // self.length
+
+    @cached_property
+    def starts(self) -> IntArray:
+        """First row of each window."""
+        return np.arange(len(self), dtype=np.int64) * self.length
+
+    @cached_property
+    def every(self) -> BoolArray:
+        """All rows count; what isn't known in them has no weight."""
+        return np.ones(len(self.measured), bool)
+
+    @cached_property
+    def is_logged(self) -> BoolArray:
+        """Which rows ``(N,)`` are the log's."""
+        return np.arange(len(self.measured)) < self.n_logged
+
+    @property
+    def duration(self) -> float:
+        """Of a window, s."""
+        return self.length * self.dt
+
+    @cached_property
+    def freed(self) -> Freed:
+        """The model with what it may lack."""
+        return freed(self.model)
+
+    @cached_property
+    def rollouts(self) -> Rollouts:
+        """Of the freed model."""
+        return rollouts(self.freed.model)
+
+    @cached_property
+    def moving_inputs(self) -> FloatArray:
+        """Inputs, and how they change with a row of delay, (N, 2 n_u)."""
+        later = np.gradient(self.inputs, axis=0) if len(self.inputs) > 1 else np.zeros_like(self.inputs)
+        return np.hstack([self.inputs, -later])
+
+    def delayed(self, rows: int) -> Windows:
+        """The same log with its inputs acting some rows later."""
+        at = np.clip(np.arange(len(self.inputs)) - rows, 0, len(self.inputs) - 1)
+        return replace(self, inputs=self.inputs[at])
+
+    def lanes(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Parameters of every lane, initial states and inputs, as `Rollouts` takes them."""
+        return np.hstack([np.broadcast_to(shared, (len(x), len(shared))), d]), x, self.moving_inputs
+
+    def judged(self, fit: Fit) -> Fit:
+        """The fit with the residuals that it has here."""
+        return replace(fit, residuals=self.residuals(fit.shared, fit.x, fit.d))
+
+    def residuals(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
+        """Simulated less measured, (N, n_s); huge from a divergence on."""
+        return np.nan_to_num(self._errors(shared, x, d), nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
+
+    def _errors(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
+        series = self.rollouts.errors(
+            *self.lanes(shared, x, d), self.measured, self.every, self.dt, start_rows=self.starts, n_rows=self.length
+        )
+        return series.reshape(self.measured.shape)

@@ -1,0 +1,314 @@
+"""The parts of lo-diransac, each against an oracle of its own: dense algebra, plain loops, finite differences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import diransac as dr
+from diransac.lo_diransac.arrowhead import Arrowhead
+from diransac.lo_diransac.freed import freed
+from diransac.lo_diransac.gate import mended_inputs, stuck_rows
+from diransac.lo_diransac.hypotheses import robust_scores, weak_form
+from diransac.lo_diransac.mixture import Mixture, lower_scale
+from diransac.lo_diransac.normal_equations import Fit, cost, linearize
+from diransac.lo_diransac.smoothing import choose_half_width, smooth
+from diransac.lo_diransac.windows import Windows
+from simulated import MACHINES, flight, rollout
+
+ROTORCRAFT = dr.models.planar_rotorcraft()
+TRUTH = np.array(list(MACHINES["planar-rotorcraft"].truth.values()))
+
+
+def windows_of(n_rows=200, length=25, dt=0.01):
+    signals, inputs = flight(MACHINES["planar-rotorcraft"], n_rows, dt)
+    return Windows(ROTORCRAFT, signals, np.ones(signals.shape, bool), inputs, dt, length), signals
+
+
+# ---------------------------------------------------------------------- arrowhead
+
+
+def dense_arrowhead(n_windows, k, m, seed):
+    """A random one as a full matrix, its unknowns in units that differ by decades, and its blocks."""
+    rng = np.random.default_rng(seed)
+    n = n_windows * k + m
+    A = np.zeros((n, n))
+    for w in range(n_windows):
+        own = np.r_[w * k : min(w + 2, n_windows) * k, n_windows * k : n]
+        J = rng.normal(size=(5 * len(own), len(own))) * np.exp(2.0 * rng.normal(size=len(own)))
+        A[np.ix_(own, own)] += J.T @ J
+    z = [slice(w * k, (w + 1) * k) for w in range(n_windows)]
+    p = slice(n_windows * k, n)
+    below = np.array([A[z[w + 1], z[w]] for w in range(n_windows - 1)]).reshape(-1, k, k)
+    blocks = Arrowhead(np.array([A[s, s] for s in z]), below, np.array([A[s, p] for s in z]), A[p, p])
+    return A, blocks, z, p
+
+
+@pytest.mark.parametrize("n_windows", [1, 2, 3, 4, 5, 8, 13, 50])
+def test_arrowhead_gives_what_dense_algebra_gives(n_windows):
+    k, m = 4, 3
+    A, blocks, z, p = dense_arrowhead(n_windows, k, m, seed=n_windows)
+    right = np.random.default_rng(0).normal(size=len(A))
+    solution, inverse = np.linalg.solve(A, right), np.linalg.inv(A)
+    found = blocks.solve(right[: n_windows * k].reshape(-1, k), right[p])
+    assert np.allclose(np.append(found.step_z, found.step_p), solution, rtol=1e-7, atol=1e-9 * np.abs(solution).max())
+    assert np.allclose(found.var_p, inverse[p, p], rtol=1e-6)
+    for w, s in enumerate(z):
+        assert np.allclose(found.var_z[w], inverse[s, s], rtol=1e-6, atol=1e-9 * np.abs(inverse[s, s]).max())
+
+
+def test_arrowhead_functionals_are_columns_of_the_inverse():
+    A, blocks, _, p = dense_arrowhead(7, 4, 3, seed=1)
+    wanted = np.random.default_rng(2).normal(size=(len(A), 2))
+    expected = np.linalg.solve(A, wanted)
+    z, s = blocks.functional(wanted[: p.start].reshape(7, 4, 2), wanted[p])
+    assert np.allclose(np.vstack([z.reshape(-1, 2), s]), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+
+
+# ---------------------------------------------------------------------- noise
+
+
+def test_mixture_weighs_a_sample_by_bayes_rule():
+    noise = Mixture(np.array([0.5]), np.array([0.2]), np.array([10.0]), np.array([1e-6]))
+    residuals = np.array([[0.0], [1.0], [4.0]])
+    near = 0.8 * np.exp(-2.0 * residuals**2) / (0.5 * np.sqrt(2 * np.pi))
+    expected = near / (near + 0.2 / 20.0)
+    assert np.allclose(noise.inlying(residuals, np.ones((3, 1), bool)), expected)
+    assert not noise.inlying(residuals, np.zeros((3, 1), bool)).any()
+
+
+def test_mixture_finds_a_planted_scale_and_fraction():
+    rng = np.random.default_rng(3)
+    hit = rng.random((4000, 1)) < 0.4
+    residuals = np.where(hit, rng.uniform(-20.0, 20.0, hit.shape), 0.1 * rng.normal(size=hit.shape))
+    known = np.ones(hit.shape, bool)
+    noise = Mixture(np.array([2.0]), np.array([0.1]), np.array([40.0]), np.array([1e-6]))
+    for _ in range(40):
+        noise = noise.updated(residuals, known, noise.inlying(residuals, known))
+    assert noise.sigma[0] == pytest.approx(0.1, rel=0.05)
+    assert noise.pi[0] == pytest.approx(hit.mean(), abs=0.01)
+
+
+def test_lower_scale_is_the_standard_deviation_of_normal_noise_and_survives_a_minority_of_it():
+    rng = np.random.default_rng(4)
+    residuals = rng.normal(size=(20000, 2)) * [1.0, 3.0]
+    known = np.ones(residuals.shape, bool)
+    assert lower_scale(residuals, known) == pytest.approx([1.0, 3.0], rel=0.03)
+    residuals[rng.random(residuals.shape) < 0.6] = 1e9
+    assert (lower_scale(residuals, known) < [4.0, 12.0]).all()
+    assert np.isnan(lower_scale(residuals, np.zeros(residuals.shape, bool))).all()
+
+
+# ---------------------------------------------------------------------- motion
+
+
+def quartic(t):
+    """Three coordinates that are polynomials of degree 4, and their derivatives."""
+    c = np.array([[1.0, -0.5, 0.3, 0.2, -0.02], [0.0, 1.0, -0.4, 0.1, 0.01], [0.2, 0.0, 0.5, -0.1, 0.005]])
+    values = [[np.polyval(np.polyder(row[::-1], order), t) for row in c] for order in range(3)]
+    return np.array(values).reshape(9, -1).T
+
+
+def test_smoothing_leaves_a_quartic_as_it_is_though_four_samples_in_ten_are_wrong():
+    t = 0.01 * np.arange(400)
+    truth = quartic(t)
+    rng = np.random.default_rng(5)
+    measured = truth + (rng.random(truth.shape) < 0.4) * rng.uniform(-50.0, 50.0, truth.shape)
+    motion = smooth(ROTORCRAFT, measured, np.ones(truth.shape, bool), 0.01, 25)
+    assert np.median(np.abs(motion.signals - truth), axis=0) == pytest.approx(np.zeros(9), abs=1e-4)
+
+
+def test_smoothing_finds_velocities_and_accelerations_from_coordinates_alone():
+    t = 0.01 * np.arange(400)
+    truth, known = quartic(t), np.zeros((400, 9), bool)
+    known[:, :3] = True
+    motion = smooth(ROTORCRAFT, np.where(known, truth, 0.0), known, 0.01, 25)
+    assert np.abs(motion.signals - truth).max() < 1e-4
+
+
+def test_half_width_is_wider_where_the_motion_is_slower():
+    t = 0.01 * np.arange(4000)
+    noise = 0.02 * np.random.default_rng(6).normal(size=(4000, 9))
+    known = np.zeros((4000, 9), bool)
+    known[:, :3] = True
+    widths = [
+        choose_half_width(ROTORCRAFT, np.repeat(np.sin(w * t)[:, None], 9, axis=1) + noise, known, 0.01)
+        for w in (10.0, 0.5)
+    ]
+    assert widths[0] == 25
+    assert widths[1] > 25
+
+
+# ---------------------------------------------------------------------- the freed model
+
+
+def test_freed_model_is_the_model_where_nothing_deviates():
+    model, rng = freed(ROTORCRAFT).model, np.random.default_rng(7)
+    x, u = rng.normal(size=6), rng.normal(size=2)
+    free = np.concatenate([TRUTH, np.zeros(model.n_p - 3)])
+    assert np.allclose(
+        model.dynamics(x, [*u, 9, 9], free)[1].full(), ROTORCRAFT.dynamics(x, u, TRUTH)[1].full(), rtol=1e-14
+    )
+
+
+def test_freed_model_adds_latent_accelerations_and_forces_that_go_with_the_inputs():
+    parts = freed(ROTORCRAFT)
+    rng = np.random.default_rng(8)
+    x, u, d, push = rng.normal(size=6), rng.normal(size=2), rng.normal(size=3), rng.normal(size=(3, 3))
+    found = parts.model.dynamics(x, [*u, 0, 0], [*TRUTH, *push.ravel(), 0.0, *d])[1].full().ravel()
+    own = ROTORCRAFT.dynamics(x, u, TRUTH)[1].full().ravel()
+    mass, inertia, _ = TRUTH
+    expected = own + d + push @ np.append(1.0, u) / [mass, mass, inertia]
+    assert np.allclose(found, expected, rtol=1e-12)
+
+
+def test_freed_model_delays_its_inputs_to_first_order():
+    parts = freed(ROTORCRAFT)
+    x, u, later = np.zeros(6), np.array([2.0, 0.1]), np.array([-0.3, 0.02])
+    free = np.concatenate([TRUTH, np.zeros(parts.n_pushes), [0.5], np.zeros(3)])
+    found = parts.model.dynamics(x, [*u, *later], free)[1].full()
+    assert np.allclose(found, ROTORCRAFT.dynamics(x, u + 0.5 * later, TRUTH)[1].full(), rtol=1e-13)
+
+
+def test_windows_from_true_states_reproduce_the_log():
+    windows, signals = windows_of()
+    shared = np.append(TRUTH, np.zeros(windows.freed.n_shared - 3))
+    x, d = signals[windows.starts, :6], np.zeros((len(windows), 3))
+    assert np.abs(windows.residuals(shared, x, d)).max() < 1e-11
+
+
+def test_a_last_window_that_is_not_full_has_rows_in_which_nothing_is_known():
+    windows, _ = windows_of(n_rows=210)
+    assert len(windows) == 9
+    assert not windows.known[210:].any()
+
+
+def test_delay_moves_the_inputs_by_rows():
+    windows, _ = windows_of()
+    assert np.array_equal(windows.delayed(2).inputs[2:], windows.inputs[:-2])
+    assert np.array_equal(windows.delayed(-3).inputs[:-3], windows.inputs[3:])
+
+
+# ---------------------------------------------------------------------- normal equations
+
+
+def perturbed_fit(windows, signals, seed=9):
+    rng = np.random.default_rng(seed)
+    x = signals[windows.starts, :6] + 0.01 * rng.normal(size=(len(windows), 6))
+    d = 0.05 * rng.normal(size=(len(windows), 3))
+    n = windows.freed.n_shared
+    shared = np.append(TRUTH, np.zeros(n - 3)) * 1.05 + np.r_[0, 0, 0, 1e-3 * rng.normal(size=n - 3)]
+    noise = Mixture(np.full(9, 0.1), np.full(9, 0.1), np.full(9, 10.0), np.full(9, 1e-6))
+    prior = np.r_[np.full(3, np.inf), np.full(n - 3, 0.01)]
+    sizes = (np.full(3, 0.1), np.full(6, 0.02), prior)
+    return windows.judged(Fit(shared, x, d, np.zeros_like(signals), noise, *sizes))
+
+
+def moved(windows, fit, dz, ds):
+    return windows.judged(replace(fit, shared=fit.shared + ds, x=fit.x + dz[:, :6], d=fit.d + dz[:, 6:]))
+
+
+def test_right_hand_side_is_minus_half_the_slope_of_the_cost():
+    windows, signals = windows_of(n_rows=100)
+    fit = perturbed_fit(windows, signals)
+    weights = np.random.default_rng(10).uniform(0.0, 5.0, signals.shape)
+    at = linearize(windows, fit, weights)
+    rng = np.random.default_rng(11)
+    for _ in range(6):
+        dz, ds = rng.normal(size=at.right_z.shape), rng.normal(size=at.right_s.shape) * 1e-2
+        h = 1e-5
+        ahead, behind = (cost(windows, moved(windows, fit, s * h * dz, s * h * ds), weights) for s in (1, -1))
+        assert (ahead - behind) / (4 * h) == pytest.approx(-(at.right_z * dz).sum() - at.right_s @ ds, rel=1e-5)
+
+
+def test_a_gauss_newton_step_solves_a_linear_problem_at_once():
+    """A mass under a force is linear in its state and in 1 / m: the second step has nothing left to do."""
+    model = dr.Model(
+        "push",
+        {"x": "m"},
+        {"force": "N"},
+        {"gain": dr.Parameter("1/kg")},
+        lambda q, v, a, u, p: [a.x - p.gain * u.force],
+    )
+    rng = np.random.default_rng(12)
+    n, dt = 100, 0.01
+    measured, inputs = rng.normal(size=(n, 3)), rng.normal(size=(n, 1))
+    windows = Windows(model, measured, np.ones((n, 3), bool), inputs, dt, 20)
+    noise = Mixture(np.ones(3), np.full(3, 0.1), np.full(3, 10.0), np.full(3, 1e-6))
+    shared = np.zeros(windows.freed.n_shared)
+    sizes = (np.array([0.3]), np.array([0.1, 0.1]), np.r_[np.inf, 0.1, 0.1, 1e-9])
+    fit = windows.judged(Fit(shared, np.zeros((5, 2)), np.zeros((5, 1)), measured, noise, *sizes))
+    weights = rng.uniform(0.5, 2.0, (n, 3))
+    first = linearize(windows, fit, weights)
+    step = first.system.solve(first.right_z, first.right_s)
+    there = windows.judged(replace(fit, shared=shared + step.step_p, x=step.step_z[:, :2], d=step.step_z[:, 2:]))
+    again = linearize(windows, there, weights)
+    assert np.abs(again.right_z).max() < 1e-6 * np.abs(first.right_z).max()
+    assert np.abs(again.right_s[:1]).max() < 1e-6 * np.abs(first.right_s).max()
+
+
+# ---------------------------------------------------------------------- hypotheses
+
+
+def test_weak_form_of_a_clean_log_is_near_the_parameters():
+    """Within what smoothing does to a motion as lively as this one."""
+    windows, signals = windows_of(n_rows=600)
+    motion = smooth(ROTORCRAFT, signals, windows.known, 0.01, 25)
+    weak = weak_form(windows, motion)
+    everything = np.ones((1, *weak.b.shape), bool)
+    assert weak.solve(everything)[0] == pytest.approx(TRUTH, rel=0.1)
+
+
+def test_rows_that_a_hypothesis_explains_are_the_unspoilt_ones():
+    windows, signals = windows_of(n_rows=600)
+    weak = weak_form(windows, smooth(ROTORCRAFT, signals, windows.known, 0.01, 25))
+    spoilt = np.zeros(weak.b.shape, bool)
+    spoilt[::2] = True
+    weak.b[spoilt] += 5.0
+    assert not (weak.explained(TRUTH[None])[0] & spoilt).any()
+
+
+def test_consensus_ranks_the_truth_first_though_half_of_the_samples_are_wrong():
+    windows, signals = windows_of(n_rows=1000)
+    rng = np.random.default_rng(13)
+    hit = rng.random(signals.shape) < 0.5
+    measured = signals + hit * rng.uniform(-50.0, 50.0, signals.shape)
+    windows = Windows(ROTORCRAFT, measured, windows.known, windows.inputs, 0.01, 25)
+    motion = smooth(ROTORCRAFT, measured, windows.known, 0.01, 25)
+    others = TRUTH * np.exp(rng.normal(scale=0.2, size=(50, 3)))
+    scores = robust_scores(windows, motion, np.vstack([others, TRUTH]), np.arange(len(windows)))
+    assert np.argmin(scores) == 50
+
+
+def test_consensus_is_the_sum_of_log_scales_of_a_plain_simulation():
+    windows, signals = windows_of(n_rows=100)
+    motion = smooth(ROTORCRAFT, signals, windows.known, 0.01, 25)
+    p = TRUTH * [1.1, 0.9, 1.3]
+    machine = MACHINES["planar-rotorcraft"]
+    starts = motion.signals[windows.starts, :6]
+    simulated = [
+        rollout(machine, p, x, windows.inputs[a : a + 25], 0.01) for x, a in zip(starts, windows.starts, strict=True)
+    ]
+    size = np.sort(np.abs(np.vstack(simulated) - signals), axis=0)[35] / 0.4538
+    assert robust_scores(windows, motion, p[None], np.arange(4))[0] == pytest.approx(np.log(size).sum(), rel=1e-9)
+
+
+# ---------------------------------------------------------------------- gate
+
+
+def test_rows_that_repeat_exactly_are_stuck_and_others_are_not():
+    measured = np.random.default_rng(14).normal(size=(20, 3))
+    measured[5:8] = measured[4]
+    measured[12, 0] = measured[11, 0]
+    assert np.flatnonzero(stuck_rows(measured)).tolist() == [5, 6, 7]
+
+
+def test_momentary_leaps_of_an_input_are_mended_and_steps_are_not():
+    t = np.arange(300)
+    clean = np.column_stack([np.sin(0.05 * t), np.where(t // 40 % 2, 1.0, -1.0)])
+    spoilt = clean.copy()
+    spoilt[[50, 123], 0] = [500.0, -80.0]
+    mended, n = mended_inputs(spoilt)
+    assert n == 2
+    assert np.abs(mended - clean).max() < 0.1
+    assert np.array_equal(mended[:, 1], clean[:, 1])
