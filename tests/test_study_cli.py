@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import polars as pl
@@ -9,6 +10,7 @@ import pytest
 
 from command_line import contents, run
 from diransac.study import builtin_names, load, template
+from diransac.study.workers import Given
 from studies import rows
 
 TINY = """
@@ -33,8 +35,9 @@ QUICK = ["--store", "a.db", "--jobs", 1, "--trials", 1]
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Working directory with a study in it."""
+    """Working directory with a study in it; trials run in a thread of this process."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("diransac.study.run.workers_of", lambda *_: Given(ThreadPoolExecutor(1), 1))
     (tmp_path / "tiny.toml").write_text(TINY)
     return tmp_path
 

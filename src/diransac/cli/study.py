@@ -80,8 +80,13 @@ def _run(
         raise typer.BadParameter("--jobs counts processes of this machine, --cluster runs on others; give one of them")
     wanted = load(source, _changes(assignments or ()))
     wanted = wanted.narrowed(trials, _listed("--levels", levels), _listed("--methods", methods))
-    with _bar(wanted.name) as progress, _kept(store, progress) as report:
-        found = _everywhere(wanted, store, jobs, cluster, report)
+    with _kept(store) as note, _bar(wanted.name) as show:
+
+        def progress(done: int, asked: int) -> None:
+            note(done, asked)
+            show(done, asked)
+
+        found = _everywhere(wanted, store, jobs, cluster, progress)
     screen.show(found, as_json)
 
 
@@ -156,13 +161,12 @@ class _Studies:
 
 # What is shown meanwhile ---------------------------------------------------------------------------------------------
 @contextmanager
-def _kept(store: Path, progress: Progress) -> Iterator[Progress]:
-    """Progress that is passed on; after Ctrl-C it says what there is and how to go on."""
+def _kept(store: Path) -> Iterator[Progress]:
+    """What notes how far a study is, and says it after Ctrl-C, with how to go on."""
     counts = [0, 0]
 
     def update(done: int, asked: int) -> None:
         counts[:] = done, asked
-        progress(done, asked)
 
     try:
         yield update

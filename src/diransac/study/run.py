@@ -59,7 +59,7 @@ def run_study(
     executor : what runs the trials, any executor of `concurrent.futures` or one that is like it (Dask's
         ``client.get_executor()``); None: processes of this machine, for which a script needs ``if __name__ ==
         "__main__":``
-    jobs : how many of these processes; 1 runs everything in this one; None: as many as there are cores
+    jobs : how many of these processes; None: as many as there are cores
     trials, levels, methods : so many trials, at these levels, of these methods; None: those of the study
     batch_size : trials of a level that are run together
     tasks : how many batches are handed out at a time; None: two a process, 64 to an executor

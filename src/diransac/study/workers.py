@@ -1,4 +1,7 @@
-"""Where trials run: in processes of this machine, in this process, or wherever an executor takes them."""
+"""Where trials run: in processes of this machine, or wherever an executor takes them.
+
+Never where Ctrl-C arrives: solvers swallow it, and say that there is no plan.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from typing import Any, Protocol
 from diransac.errors import SettingsError
 from diransac.simulate import default_threads
 
-__all__ = ["Given", "Here", "Processes", "Workers", "workers_of"]
+__all__ = ["Given", "Processes", "Workers", "workers_of"]
 
 _AHEAD = 2
 """Tasks a worker that are handed out: one to do, one to go on with."""
@@ -43,7 +46,7 @@ def workers_of(executor: Executor | None, jobs: int | None, tasks: int | None) -
     Parameters
     ----------
     executor : any executor; None: processes of this machine
-    jobs : how many processes; 1 runs everything in this one; None: as many as there are cores
+    jobs : how many processes; None: as many as there are cores
     tasks : how many tasks to hand out at a time; None: enough to keep the workers busy
 
     Raises SettingsError: both an executor and jobs, or numbers below one.
@@ -58,22 +61,7 @@ def workers_of(executor: Executor | None, jobs: int | None, tasks: int | None) -
             )
         return Given(executor, tasks or _AHEAD_OF_OTHERS)
     jobs = default_threads() if jobs is None else jobs
-    return Here() if jobs == 1 else Processes(jobs, tasks or _AHEAD * jobs)
-
-
-class Here:
-    """In this process, one task at a time."""
-
-    tasks = 1
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Run it at once."""
-        future: Future[Any] = Future()
-        future.set_result(function(*arguments))
-        return future
-
-    def stop(self) -> None:
-        """Nothing runs."""
+    return Processes(jobs, tasks or _AHEAD * jobs)
 
 
 class Given:
