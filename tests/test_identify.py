@@ -176,7 +176,7 @@ def test_systems_that_do_not_say_which_cores_are_ours_serve_too(monkeypatch):
     """MacOS and Windows know no affinity."""
     monkeypatch.delattr("os.sched_getaffinity", raising=False)
     log = as_log(PLANE, *spoilt(), 0.02)
-    assert dr.identify(MODEL, log, settings=QUICK).iterations == 40
+    assert dr.identify(MODEL, log, "i-diransac", settings=QUICK).iterations == 40
 
 
 @pytest.mark.parametrize("seed", [-1, 2**80, np.int64(3)])
@@ -189,7 +189,7 @@ def test_pickled_model_gives_the_same_result():
 
     log = as_log(PLANE, *spoilt(), 0.02)
     twin = pickle.loads(pickle.dumps(MODEL))
-    ours, theirs = (dr.identify(model, log, settings=TABLE_IV) for model in (MODEL, twin))
+    ours, theirs = (dr.identify(model, log, "i-diransac", settings=TABLE_IV) for model in (MODEL, twin))
     assert ours == theirs
 
 
@@ -226,8 +226,8 @@ def test_robust_start_saves_what_an_outlier_in_the_first_row_spoils():
     signals[0, 1] += 4.0
     log = as_log(machine, signals, inputs, 0.01)
     settings = dr.Settings(sample_size=20, max_iterations=200, stop_inlier_fraction=None)
-    robust = dr.identify(model, log, settings=replace(settings, initial_state="robust"))
-    faithful = dr.identify(model, log, settings=settings)
+    robust = dr.identify(model, log, "i-diransac", settings=replace(settings, initial_state="robust"))
+    faithful = dr.identify(model, log, "i-diransac", settings=settings)
     assert robust.inlier_fraction > 0.85 > 0.75 > faithful.inlier_fraction
     assert robust.fit_error < faithful.fit_error
 
@@ -255,7 +255,7 @@ def test_least_squares_returns_what_violates_a_bound_and_says_so():
 def test_progress_is_told_up_to_the_end():
     calls = []
     log = as_log(PLANE, *spoilt(), 0.02)
-    result = dr.identify(MODEL, log, settings=TABLE_IV, progress=lambda *now: calls.append(now))
+    result = dr.identify(MODEL, log, "i-diransac", settings=TABLE_IV, progress=lambda *now: calls.append(now))
     assert [k for k, _, _ in calls] == sorted({k for k, _, _ in calls})
     assert calls[-1][:2] == (60, 60) == (result.iterations, 60)
     assert calls[-1][2] == Score(result.fit_error, result.inlier_fraction)
@@ -300,12 +300,12 @@ def test_search_without_an_initial_state_says_which_and_what_to_try():
     columns = {n: log[n] for n in log.names if n != "theta_dot"}
     partial = dr.Log.from_arrays(log.time, columns, source='log "imu.csv"')
     with pytest.raises(LogError, match=r'"imu.csv".*"theta_dot".*initial_state') as caught:
-        dr.identify(MODEL, partial, settings=QUICK)
+        dr.identify(MODEL, partial, "i-diransac", settings=QUICK)
     assert len(str(caught.value).splitlines()) == 1
     weights = {n: x for n, x in TABLE_IV.error_weights.items() if n != "theta_dot"}
     thresholds = {n: x for n, x in TABLE_IV.inlier_thresholds.items() if n != "theta_dot"}
     given = replace(TABLE_IV, error_weights=weights, inlier_thresholds=thresholds, initial_state={"theta_dot": 0.1})
-    result = dr.identify(MODEL, partial, settings=given)
+    result = dr.identify(MODEL, partial, "i-diransac", settings=given)
     assert result.parameters == pytest.approx(PLANE.truth, rel=1e-8)
     assert result.fit_error < 1e-9
 
@@ -313,14 +313,14 @@ def test_search_without_an_initial_state_says_which_and_what_to_try():
 def test_fewer_rows_than_a_sample_are_refused():
     log = as_log(PLANE, *spoilt(n_rows=50), 0.02)
     with pytest.raises(LogError, match="50 usable rows are fewer than sample_size = 75"):
-        dr.identify(MODEL, log)
+        dr.identify(MODEL, log, "i-diransac")
     assert dr.identify(MODEL, log, "ols").fitted_rows == 50
 
 
 def test_log_in_which_nothing_moves_is_refused():
     columns = dict.fromkeys((*PLANE.signals, *PLANE.inputs), np.zeros(200))
     with pytest.raises(IdentificationError, match="does not determine"):
-        dr.identify(MODEL, dr.Log.from_arrays(np.arange(200) * 0.01, columns))
+        dr.identify(MODEL, dr.Log.from_arrays(np.arange(200) * 0.01, columns), "i-diransac")
 
 
 def test_estimate_that_is_not_finite_is_refused():
@@ -345,7 +345,7 @@ def test_nothing_accepted_says_how_many_failed_at_which_step():
     signals, inputs = flight(PLANE, 300, 0.02)
     log = as_log(PLANE, signals, -inputs, 0.02)
     with pytest.raises(IdentificationError, match=r"in 40 samples \(40 out of bounds\); check units and signs"):
-        dr.identify(MODEL, log, settings=QUICK)
+        dr.identify(MODEL, log, "i-diransac", settings=QUICK)
 
 
 # ---------------------------------------------------------------------- arguments without meaning
@@ -361,8 +361,9 @@ def test_nothing_accepted_says_how_many_failed_at_which_step():
         ({"seed": True}, SettingsError, "seed is True"),
         ({"settings": {"sample_size": 30}}, SettingsError, "settings"),
         ({"method": "ols", "estimator": dr.TotalLeastSquares()}, SettingsError, '"ols" is an estimator itself'),
-        ({"estimator": "huber"}, SettingsError, "estimator is 'huber'"),
+        ({"method": "i-diransac", "estimator": "huber"}, SettingsError, "estimator is 'huber'"),
         ({"bandwidth": 5.0}, SettingsError, "without differentiate"),
+        ({"bandwidth": 5.0, "differentiate": True}, SettingsError, "lo-diransac does not"),
         ({"settings": replace(QUICK, error_weights={"y": 1.0})}, SettingsError, 'no signal "y"'),
         ({"settings": replace(QUICK, error_weights={"x_dot": 0.0})}, SettingsError, "every error weight is zero"),
         ({"settings": replace(QUICK, min_inlier_signals=7)}, SettingsError, "min_inlier_signals = 7, but 6"),
@@ -387,4 +388,4 @@ def test_linear_estimator_in_a_search_refuses_a_nonlinear_model():
     machine = MACHINES["underwater-vehicle"]
     log = as_log(machine, *flight(machine, 200, 0.05), 0.05)
     with pytest.raises(ModelError, match="not affine in k"):
-        dr.identify(model, log, estimator=dr.OrdinaryLeastSquares(), settings=QUICK)
+        dr.identify(model, log, "i-diransac", estimator=dr.OrdinaryLeastSquares(), settings=QUICK)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from diransac import prepare
 from diransac.consensus import Diransac, InlierBiasedDiransac, Score, Variant
+from diransac.diagnosis import Diagnosis
 from diransac.errors import DiransacError, IdentificationError, LogError, SettingsError
 from diransac.estimators import (
     BoundEstimator,
@@ -32,7 +33,9 @@ from diransac.settings import Settings
 from diransac.uncertainty import N_BLOCKS, jackknife_covariance
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
+
+    from diransac.lo_diransac import Findings
 
 __all__ = ["METHODS", "identify"]
 
@@ -48,13 +51,16 @@ _VARIANTS: dict[str, Callable[[Settings], Variant]] = {
     "diransac": lambda _: Diransac(),
     "i-diransac": lambda settings: InlierBiasedDiransac(settings.acceptance_weights),
 }
-METHODS = (*_ESTIMATORS, *_VARIANTS)
+_LOCALLY_OPTIMISED = "lo-diransac"
+_GAUSSIAN = 10_000
+"""Degrees of freedom of an interval whose covariance is not itself an estimate from few numbers."""
+METHODS = (*_ESTIMATORS, *_VARIANTS, _LOCALLY_OPTIMISED)
 
 
 def identify(
     model: Model,
     log: Log,
-    method: str = "i-diransac",
+    method: str = _LOCALLY_OPTIMISED,
     *,
     seed: int = 0,
     settings: Settings | None = None,
@@ -67,14 +73,16 @@ def identify(
 
     Parameters
     ----------
-    method : "ols", "tls", "nls" (least squares of the whole log: ordinary, total, nonlinear), "diransac", "i-diransac"
+    method : "lo-diransac", which asks for nothing and says most; "ols", "tls", "nls" (least squares of the whole log:
+        ordinary, total, nonlinear); "diransac", "i-diransac", the paper's
     seed : sample k of a RANSAC method depends on (seed, k) alone
-    settings : `Settings`; those of a search are ignored by the least-squares methods, those of the simulation serve
-        the fit error and the inliers of every method
+    settings : `Settings`; those of a search serve the paper's methods alone, those of the simulation serve the fit
+        error and the inliers of every method
     estimator : inside a RANSAC method, `OrdinaryLeastSquares()` (default; `NonlinearLeastSquares()` where the model is
         not affine in its parameters), another of ours, or any scikit-learn linear regressor
     differentiate : derive the velocities and accelerations that the log lacks, and filter both sides of the
-        equations alike; the identification is then repeated at half and twice the bandwidth, for ``result.sensitivity``
+        equations alike; the identification is then repeated at half and twice the bandwidth, for
+        ``result.sensitivity``.  lo-diransac leaves unmeasured what the log lacks, and has no such filter
     bandwidth : of that filter, Hz; None: chosen from the log
     progress : called with (samples drawn, max_iterations, score of the stored hypothesis)
 
@@ -86,9 +94,13 @@ def identify(
     settings = Settings() if settings is None else settings
     _check_arguments(model, log, method, estimator, seed, settings)
     task = _Task(model, log, method, seed, settings, _estimator(model, method, estimator))
+    if bandwidth is not None and (not differentiate or method == _LOCALLY_OPTIMISED):
+        raise SettingsError(
+            "bandwidth is given without differentiate=True, which alone uses it (and lo-diransac does not)"
+        )
+    if method == _LOCALLY_OPTIMISED:
+        return task.optimise(derivable=differentiate)
     if not differentiate:
-        if bandwidth is not None:
-            raise SettingsError("bandwidth is given without differentiate=True, which alone uses it")
         return task.run(log, progress)
     derived = prepare.differentiate(log, model, bandwidth)
     result = task.run(derived, progress)
@@ -142,33 +154,98 @@ class _Task:
         outcome = self._estimate(bound, simulation, progress)
         best = outcome.best
         assert best is not None
-        score, inliers = best.score, np.zeros(len(observations), dtype=bool)
-        if simulation is not None:
-            score, inliers = simulation.scores(best.parameters[None])[0], simulation.inlier_mask(best.parameters)
         rows = np.sort(best.rows)
         return Result(
-            model=self.model,
-            parameters=dict(zip(self.model.parameters, best.parameters.tolist(), strict=True)),
+            **self._judged(log, observations, simulation, best.parameters),
             covariance=jackknife_covariance(bound, rows),
             degrees_of_freedom=max(1, min(N_BLOCKS, len(rows)) - 1),
             fitted_rows=len(rows),
-            inliers=self._on_given_log(observations, inliers),
-            inlier_fraction=score.inlier_fraction,
-            fit_error=score.error,
-            method=self.method,
             estimator=name_of(self.estimator),
-            seed=int(self.seed),
-            settings=self.settings,
             iterations=outcome.iterations,
             evaluated=outcome.evaluated,
             stop_reason=outcome.stop_reason,
             skipped=dict(outcome.skipped),
-            violations=self._violations(best.parameters),
-            log=LogSummary(
-                self.given.source, self.given.fingerprint, float(self.given.time[0]), self.given.dt, len(self.given)
-            ),
-            preparation=tuple(log.history),
             notes=(*observations.notes, *scoring.notes),
+        )
+
+    def optimise(self, *, derivable: bool) -> Result:
+        """Identify by lo-diransac; velocities and accelerations may be missing where they are derivable."""
+        from diransac.lo_diransac import find
+
+        judged = judged_signals(self.model, self.given, self.settings)
+        observations = observe(self.model, self.given, judged, pointwise=not derivable)
+        findings = find(observations, int(self.seed))
+        scoring = choose_scoring(observations, self.settings)
+        settings = dataclasses.replace(self.settings, initial_state=self._start(observations, findings))
+        simulation = Simulation(_delayed(observations, findings), scoring, settings, self._variant())
+        covariance = findings.covariance.copy()
+        covariance[findings.undetermined] = covariance[:, findings.undetermined] = np.inf
+        return Result(
+            **self._judged(self.given, observations, simulation, findings.parameters),
+            covariance=covariance,
+            degrees_of_freedom=_GAUSSIAN,
+            fitted_rows=int(np.isfinite(observations.measured).any(axis=1).sum()),
+            estimator="multiple shooting",
+            iterations=findings.samples,
+            evaluated=findings.hypotheses,
+            stop_reason="settled" if findings.settled else "limit of steps",
+            skipped={},
+            notes=(*observations.notes, *findings.notes, *scoring.notes),
+            diagnosis=self._diagnosis(observations, findings),
+        )
+
+    def _judged(
+        self, log: Log, observations: Observations, simulation: Simulation | None, parameters: FloatArray
+    ) -> dict[str, Any]:
+        """What a result says of how it was made, and of the parameters that it returns."""
+        score, inliers = Score(np.nan, np.nan), np.zeros(len(observations), dtype=bool)
+        if simulation is not None:
+            score, inliers = simulation.scores(parameters[None])[0], simulation.inlier_mask(parameters)
+        given = self.given
+        return {
+            "model": self.model,
+            "parameters": dict(zip(self.model.parameters, parameters.tolist(), strict=True)),
+            "inliers": self._on_given_log(observations, inliers),
+            "inlier_fraction": score.inlier_fraction,
+            "fit_error": score.error,
+            "method": self.method,
+            "seed": int(self.seed),
+            "settings": self.settings,
+            "violations": self._violations(parameters),
+            "log": LogSummary(given.source, given.fingerprint, float(given.time[0]), given.dt, len(given)),
+            "preparation": tuple(log.history),
+        }
+
+    def _start(self, observations: Observations, findings: Findings) -> str | Mapping[str, float]:
+        """Where a simulation starts: as the settings say, but for first samples that are missing or outliers."""
+        if self.settings.initial_state != "first":
+            return self.settings.initial_state
+        start = dict(zip(self.model.state, findings.initial_state.tolist(), strict=True))
+        for k, name in enumerate(self.model.state):
+            if name in observations.signals and not findings.outliers[0, k]:
+                first = float(observations.column(name)[0])
+                start[name] = first if np.isfinite(first) else start[name]
+        return start
+
+    def _diagnosis(self, observations: Observations, findings: Findings) -> Diagnosis:
+        """What lo-diransac found beside the parameters, by name and over the rows of the log that the user gave."""
+        model, dt = self.model, observations.log.dt
+        columns = {name: model.signals.index(name) for name in observations.signals}
+        begin = observations.log.time[observations.offset]
+        forces = (
+            () if findings.latent_forces is None else zip(model.accelerations, findings.latent_forces.T, strict=True)
+        )
+        return Diagnosis(
+            noise_scale={name: float(findings.noise_scale[k]) for name, k in columns.items()},
+            outlier_fraction={name: float(findings.outlier_fraction[k]) for name, k in columns.items()},
+            outliers={name: self._on_given_log(observations, findings.outliers[:, k]) for name, k in columns.items()},
+            latent_time=begin + dt * findings.latent_middles,
+            latent_accelerations=dict(zip(model.accelerations, findings.latent_accelerations.T.copy(), strict=True)),
+            latent_forces={name: force.copy() for name, force in forces},
+            input_delay=findings.input_delay,
+            input_delay_error=findings.input_delay_error,
+            is_late=findings.is_late,
+            undetermined=tuple(np.array(list(model.parameters))[findings.undetermined].tolist()),
         )
 
     def _variant(self) -> Variant:
@@ -235,3 +312,12 @@ class _Task:
         except DiransacError:
             return dict.fromkeys(result.parameters, np.nan)
         return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}
+
+
+def _delayed(observations: Observations, findings: Findings) -> Observations:
+    """The same log with its inputs acting later, if they do, for what judges a simulation."""
+    if not findings.is_late:
+        return observations
+    time = observations.log.dt * np.arange(len(observations))
+    columns = [np.interp(time - findings.input_delay, time, column) for column in observations.inputs.T]
+    return dataclasses.replace(observations, inputs=np.column_stack(columns))

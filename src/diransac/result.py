@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.atomic import write_text
+from diransac.diagnosis import Diagnosis
 from diransac.errors import DiransacError, ResultError, SettingsError
 from diransac.model import Model
 from diransac.settings import Settings
@@ -24,7 +25,7 @@ __all__ = ["LogSummary", "Result"]
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
 
-_FORMAT = 1
+_FORMAT = 2
 _FEW_INLIERS = 0.5
 _PLAIN = {
     "method": str,
@@ -57,7 +58,8 @@ class Result:
     ----------
     model : the model, equations included
     parameters : name -> estimate, in the parameter's unit
-    covariance : (n_p, n_p)   by a jackknife over stretches of time; infinite where the log cannot tell
+    covariance : (n_p, n_p)   lo-diransac's own, else by a jackknife over stretches of time; infinite where the log
+        cannot tell
     degrees_of_freedom : of that covariance, for intervals
     inliers : (N,)   over the rows of the log that was given
     fitted_rows : observations that the parameters were fitted to: a sample, or a set of inliers
@@ -70,6 +72,7 @@ class Result:
     violations : names of the parameters outside their bounds (never with a RANSAC method)
     log : which log it was; preparation : what was done to it, in order; notes : what was found on the way
     sensitivity : name -> relative change at half and at twice the differentiating filter's bandwidth
+    diagnosis : lo-diransac's: noise, faults, and what the model leaves out
 
     Two results are equal if all of this is.
     """
@@ -95,6 +98,7 @@ class Result:
     preparation: tuple[Mapping[str, Any], ...] = ()
     notes: tuple[str, ...] = ()
     sensitivity: Mapping[str, tuple[float, float]] | None = None
+    diagnosis: Diagnosis | None = None
 
     def __post_init__(self) -> None:
         for name in ("covariance", "inliers"):
@@ -151,6 +155,7 @@ class Result:
             "violations": list(self.violations),
             "notes": list(self.notes),
             "sensitivity": _encode_pairs(self.sensitivity),
+            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
             "preparation": [dict(step) for step in self.preparation],
             "log": vars(self.log).copy(),
             "settings": self.settings.to_dict(),
@@ -179,7 +184,7 @@ class Result:
         if len(packed) != (log.n_rows + 7) // 8:
             raise ValueError(f"inliers of {log.n_rows} rows")
         values = model.parameter_vector(data["parameters"])
-        pairs = data["sensitivity"]
+        pairs, diagnosis = data["sensitivity"], data["diagnosis"]
         return cls(
             model=model,
             parameters=dict(zip(model.parameters, values.tolist(), strict=True)),
@@ -195,6 +200,7 @@ class Result:
             notes=tuple(data["notes"]),
             preparation=tuple(data["preparation"]),
             sensitivity=None if pairs is None else {n: (_decode(a), _decode(b)) for n, (a, b) in pairs.items()},
+            diagnosis=None if diagnosis is None else Diagnosis.from_dict(diagnosis, log.n_rows),
             log=log,
             **{key: _of_kind(kind, data[key], key) for key, kind in _PLAIN.items()},
         )
@@ -234,7 +240,7 @@ class Result:
         return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
 
     def __str__(self) -> str:
-        return "\n".join([self._headline(), *self._table(), self._summary(), *self._warnings()])
+        return "\n".join([self._headline(), *self._table(), self._summary(), *self._diagnosed(), *self._warnings()])
 
     def _headline(self) -> str:
         seconds = self.log.dt * (self.log.n_rows - 1)
@@ -244,12 +250,18 @@ class Result:
     def _table(self) -> list[str]:
         rows = [("parameter", "estimate", "95 % interval", "unit")]
         for name, (low, high) in self.intervals().items():
-            interval = f"{low:.5g} .. {high:.5g}" if np.isfinite(high - low) else "unknown"
-            rows.append((name, f"{self.parameters[name]:.6g}", interval, self.units[name]))
+            digits = _digits(low, high)
+            interval = f"{low:.{digits}g} .. {high:.{digits}g}" if np.isfinite(high - low) else "unknown"
+            estimate = "?" if self._is_undetermined(name) else f"{self.parameters[name]:.6g}"
+            rows.append((name, estimate, interval, self.units[name]))
         return aligned(rows)
 
+    def _is_undetermined(self, name: str) -> bool:
+        return self.diagnosis is not None and name in self.diagnosis.undetermined
+
     def _summary(self) -> str:
-        parts = [f"fit error {self.fit_error:.4g}", f"inliers {100.0 * self.inlier_fraction:.1f} %"]
+        whole = "" if self.diagnosis is None else "in one simulation of the whole log: "
+        parts = [f"{whole}fit error {self.fit_error:.4g}", f"inliers {100.0 * self.inlier_fraction:.1f} %"]
         parts.append(f"fitted to {self.fitted_rows} rows")
         if self.iterations:
             skipped = ", ".join(f"{n} {reason}" for reason, n in self.skipped.items())
@@ -257,8 +269,23 @@ class Result:
             parts.append(f"{self.evaluated} hypotheses" + (f" ({skipped})" if skipped else ""))
         return "; ".join(parts)
 
+    def _diagnosed(self) -> list[str]:
+        """What is wrong with the log and with the model, where it is known."""
+        if self.diagnosis is None:
+            return []
+        return ["", *aligned(self.diagnosis.lines(self.model.units)), ""]
+
     def _warnings(self) -> list[str]:
         lines = [f"! {n} = {self.parameters[n]:.6g} is outside its bounds" for n in self.violations]
+        lines += self._warnings_of_search() if self.diagnosis is None else self._warnings_of_diagnosis(self.diagnosis)
+        for name, (half, double) in (self.sensitivity or {}).items():
+            lines.append(
+                f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice"
+            )
+        return lines + [f"  {note}" for note in self.notes]
+
+    def _warnings_of_search(self) -> list[str]:
+        lines = []
         if self.inlier_fraction < _FEW_INLIERS:
             lines.append("! the simulation agrees with less than half of the log: do not rely on these parameters")
         wanted = self.settings.stop_inlier_fraction
@@ -266,11 +293,19 @@ class Result:
             lines.append(f"! the search ended short of the {100 * wanted:.3g} % inliers that it was to reach")
         if not np.isfinite(self.covariance).all():
             lines.append(f"! intervals are unknown: {self.fitted_rows} fitted rows are too few to tell")
-        for name, (half, double) in (self.sensitivity or {}).items():
-            lines.append(
-                f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice"
-            )
-        return lines + [f"  {note}" for note in self.notes]
+        return lines
+
+    def _warnings_of_diagnosis(self, found: Diagnosis) -> list[str]:
+        lines = [f"! the log cannot tell {name}: record a motion that depends on it" for name in found.undetermined]
+        if found.is_late:
+            lines.append(f"! inputs act {1e3 * found.input_delay:.3g} ms later than the log says")
+        return lines
+
+
+def _digits(low: float, high: float) -> int:
+    """Significant digits that tell the ends of an interval apart."""
+    size, width = max(abs(low), abs(high)), high - low
+    return 5 if not 0.0 < width < size else min(12, max(5, 2 + int(np.ceil(np.log10(size / width)))))
 
 
 def _encode(x: float) -> float | str:

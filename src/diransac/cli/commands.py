@@ -78,7 +78,7 @@ def _identify(
     search: Search,
     derivation: Derivation,
     preparation: Preparation,
-    method: MethodName = "i-diransac",
+    method: MethodName = METHODS[-1],
     output: Output = None,
     report: Report = None,
     as_json: JsonFlag = False,

@@ -26,9 +26,10 @@ from diransac.simulate import rollouts
 if TYPE_CHECKING:
     from diransac.lo_diransac.smoothing import Motion
     from diransac.lo_diransac.windows import Windows
+    from diransac.model import Model
     from diransac.observations import Observations
 
-__all__ = ["WeakForm", "find_hypotheses", "robust_scores", "weak_form"]
+__all__ = ["WeakForm", "find_hypotheses", "n_samples", "robust_scores", "weak_form"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -40,6 +41,11 @@ _OVERLAP = 5
 _KEPT = 0.4
 _CONCENTRATIONS = 3
 _FIRST_WINDOWS, _FINALISTS = 12, 12
+
+
+def n_samples(model: Model) -> int:
+    """Samples that are drawn for a model."""
+    return _NONLINEAR_SAMPLES if model.nonlinear_parameters else _COUNT
 
 
 def find_hypotheses(
@@ -112,7 +118,7 @@ class WeakForm:
 
 def _samples(weak: WeakForm, seed: int) -> BoolArray:
     """All rows, and random sets of n_p to 4 n_p rows of each equation."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([int(seed < 0), abs(seed)])
     n, r, n_p = weak.W.shape
     sizes = np.r_[n, np.minimum(rng.integers(n_p, 4 * n_p + 1, _COUNT), n)]
     ranks = rng.random((len(sizes), n, r)).argsort(axis=1).argsort(axis=1)

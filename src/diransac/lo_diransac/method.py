@@ -15,15 +15,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from diransac.errors import IdentificationError, LogError
+from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.lo_diransac.gate import mended_inputs, stuck_rows
-from diransac.lo_diransac.hypotheses import find_hypotheses
+from diransac.lo_diransac.hypotheses import find_hypotheses, n_samples
 from diransac.lo_diransac.readout import deviation_units, parameter_units, read_out
 from diransac.lo_diransac.refinement import believe, refine, start
 from diransac.lo_diransac.smoothing import choose_half_width, smooth
 from diransac.lo_diransac.windows import Windows
 
 if TYPE_CHECKING:
+    from diransac.lo_diransac.normal_equations import Fit
     from diransac.lo_diransac.readout import Readout
     from diransac.lo_diransac.refinement import Belief, Refinement
     from diransac.lo_diransac.smoothing import Motion
@@ -38,6 +39,8 @@ _FEWEST_WINDOWS = 4
 # Half a row of delay or more is taken up by shifting the inputs, as often as needed.
 _WHOLE_ROW, _MAX_SHIFTS = 0.5, 3
 _OUTLIER = 0.5
+# A delay that is worth a word: so many standard errors, and so many rows.
+_SURE, _SMALL_DELAY = 3.0, 0.25
 
 
 @dataclass(frozen=True)
@@ -47,26 +50,32 @@ class Findings:
     Parameters
     ----------
     parameters, covariance : (n_p,), (n_p, n_p)
+    initial_state : (n_x,)   at the first row
     undetermined : (n_p,)   parameters whose 95 % interval spans more than all of an equation's inertial force
     noise_scale, outlier_fraction : (n_s,)   of each signal of the model; NaN where it is not measured
     outliers : (N, n_s)   samples that are more likely outliers than not
-    latent_starts, latent_accelerations : (W,), (W, n_v)   first row of each window, and what acts there unexplained
-    input_delay, input_delay_error : s
-    hypotheses, steps : how many were judged on the whole log, Gauss-Newton steps
+    latent_middles, latent_accelerations : (W,), (W, n_v)   middle row of each window, and what acts there unexplained
+    latent_forces : (W, n_v)   the same as generalised forces; None where the equations are no balance of forces
+    input_delay, input_delay_error : s; is_late : whether that is more than errors of estimation
+    samples, hypotheses, steps : samples drawn, hypotheses judged on the whole log, Gauss-Newton steps
     settled : whether local optimisation ended before its limit
     notes : what was found and done, a sentence each
     """
 
     parameters: FloatArray
     covariance: FloatArray
+    initial_state: FloatArray
     undetermined: BoolArray
     noise_scale: FloatArray
     outlier_fraction: FloatArray
     outliers: BoolArray
-    latent_starts: npt.NDArray[np.int64]
+    latent_middles: FloatArray
     latent_accelerations: FloatArray
+    latent_forces: FloatArray | None
     input_delay: float
     input_delay_error: float
+    is_late: bool
+    samples: int
     hypotheses: int
     steps: int
     settled: bool
@@ -146,6 +155,7 @@ def _findings(
     notes: tuple[str, ...],
 ) -> Findings:
     fit, N, dt = refined.fit, len(observations), windows.dt
+    delay = float(shift + fit.shared[-1])
     seen = windows.known.any(axis=0)
     inlying = fit.noise.inlying(fit.residuals, windows.known)[:N]
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
@@ -153,16 +163,35 @@ def _findings(
     return Findings(
         parameters=result.parameters,
         covariance=result.covariance,
+        initial_state=fit.x[0],
         undetermined=~(spans < units),
         noise_scale=np.where(seen, fit.noise.sigma, np.nan),
         outlier_fraction=np.where(seen, fit.noise.pi, np.nan),
         outliers=windows.known[:N] & (inlying < _OUTLIER),
-        latent_starts=windows.starts,
+        latent_middles=np.asarray(windows.starts + 0.5 * (windows.length - 1), np.float64),
         latent_accelerations=fit.d,
-        input_delay=float((shift + fit.shared[-1]) * dt),
+        latent_forces=_latent_forces(windows, fit, result.parameters),
+        input_delay=float(delay * dt),
         input_delay_error=result.delay_error * dt,
+        is_late=abs(delay) > max(_SURE * result.delay_error, _SMALL_DELAY),
+        samples=n_samples(windows.model),
         hypotheses=n_hypotheses,
         steps=refined.steps,
         settled=refined.settled,
         notes=notes,
     )
+
+
+def _latent_forces(windows: Windows, fit: Fit, parameters: FloatArray) -> FloatArray | None:
+    """Generalised forces (W, n_v) that make the latent accelerations, at the windows' starts."""
+    model = windows.model
+    try:
+        response = model.force_response
+    except ModelError:
+        return None
+    n_v, forces = model.n_v, []
+    for x, u, d in zip(fit.x, windows.inputs[windows.starts], fit.d, strict=True):
+        q, v = x[: model.n_q], x[model.n_q :]
+        accelerations = [np.array(response(q, v, u, parameters, f)).ravel() for f in np.eye(n_v)]
+        forces.append(np.linalg.lstsq(np.column_stack(accelerations), d, rcond=None)[0])
+    return np.array(forces)

@@ -1,0 +1,118 @@
+"""`Diagnosis`: what lo-diransac found beside the parameters - noise, faults, and what the model leaves out."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["Diagnosis"]
+
+BoolArray = npt.NDArray[np.bool_]
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What is wrong with a log, and what the model doesn't explain of it.
+
+    Parameters
+    ----------
+    noise_scale : signal -> standard deviation of its Gaussian noise, its unit; of the measured signals
+    outlier_fraction : signal -> share of its samples that are outliers
+    outliers : signal -> (N,) samples that are more likely outliers than not: sensor faults, over the log's rows
+    latent_time : (W,)   s, middle of each window in which the latent accelerations are constant
+    latent_accelerations : acceleration -> (W,), its unit: what acts on the machine and is not in the model
+    latent_forces : the same as generalised forces, N where a coordinate is in m, N m where it is in rad; empty where
+        the model's equations are no balance of forces
+    input_delay, input_delay_error : s by which the inputs act later than the log says; its standard error
+    is_late : whether that is more than errors of estimation
+    undetermined : parameters that the log cannot tell
+    """
+
+    noise_scale: Mapping[str, float]
+    outlier_fraction: Mapping[str, float]
+    outliers: Mapping[str, BoolArray]
+    latent_time: FloatArray
+    latent_accelerations: Mapping[str, FloatArray]
+    latent_forces: Mapping[str, FloatArray]
+    input_delay: float
+    input_delay_error: float
+    is_late: bool
+    undetermined: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        for name in ("noise_scale", "outlier_fraction", "outliers", "latent_accelerations", "latent_forces"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        series = (self.latent_time, *self.outliers.values(), *self.latent_accelerations.values())
+        for array in (*series, *self.latent_forces.values()):
+            array.setflags(write=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, ready for JSON; `from_dict` reads it back."""
+        return {
+            "noise_scale": dict(self.noise_scale),
+            "outlier_fraction": dict(self.outlier_fraction),
+            "outliers": {
+                n: base64.b64encode(np.packbits(mask).tobytes()).decode() for n, mask in self.outliers.items()
+            },
+            "latent_time": self.latent_time.tolist(),
+            "latent_accelerations": {n: x.tolist() for n, x in self.latent_accelerations.items()},
+            "latent_forces": {n: x.tolist() for n, x in self.latent_forces.items()},
+            "input_delay": self.input_delay,
+            "input_delay_error": self.input_delay_error,
+            "is_late": self.is_late,
+            "undetermined": list(self.undetermined),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], n_rows: int) -> Diagnosis:
+        """The diagnosis that `to_dict` wrote, of a log with so many rows.
+
+        Raises KeyError, TypeError or ValueError: the data are damaged.
+        """
+        return cls(
+            noise_scale={name: float(x) for name, x in data["noise_scale"].items()},
+            outlier_fraction={name: float(x) for name, x in data["outlier_fraction"].items()},
+            outliers={name: _unpacked(text, n_rows) for name, text in data["outliers"].items()},
+            latent_time=np.array(data["latent_time"], np.float64),
+            latent_accelerations=_series(data["latent_accelerations"]),
+            latent_forces=_series(data["latent_forces"]),
+            input_delay=float(data["input_delay"]),
+            input_delay_error=float(data["input_delay_error"]),
+            is_late=bool(data["is_late"]),
+            undetermined=tuple(map(str, data["undetermined"])),
+        )
+
+    def lines(self, units: Mapping[str, str]) -> list[list[str]]:
+        """Rows of a table: signal, noise, outliers, and what the model leaves out of it.
+
+        Parameters
+        ----------
+        units : unit of each signal
+        """
+        rows = [["signal", "noise", "outliers", "unexplained", "unit"]]
+        for name, scale in self.noise_scale.items():
+            latent = self.latent_accelerations.get(name)
+            unexplained = "" if latent is None else f"{np.sqrt(np.mean(np.square(latent))):.2g}"
+            share = f"{100.0 * self.outlier_fraction[name]:.1f} %"
+            rows.append([name, f"{scale:.2g}", share, unexplained, units[name]])
+        return rows
+
+
+def _series(columns: Mapping[str, Any]) -> dict[str, FloatArray]:
+    """Arrays (W,) by name."""
+    return {name: np.array(values, np.float64) for name, values in columns.items()}
+
+
+def _unpacked(text: str, n_rows: int) -> BoolArray:
+    """A mask ``(n_rows,)`` that was packed into text.  Raises ValueError: it is of another length."""
+    packed = np.frombuffer(base64.b64decode(text, validate=True), dtype=np.uint8)
+    if len(packed) != (n_rows + 7) // 8:
+        raise ValueError(f"a mask of {n_rows} rows")
+    return np.unpackbits(packed, count=n_rows).astype(bool)
