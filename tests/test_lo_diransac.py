@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.errors import LogError
+from diransac.errors import IdentificationError, LogError
 from diransac.lo_diransac import find
 from diransac.observations import observe
 from simulated import MACHINES, as_log, flight, with_outliers
@@ -113,7 +113,7 @@ def test_a_gust_is_an_acceleration_that_the_model_does_not_explain_not_a_sensor_
     gust[1000:1100] = 0.5
     pushed, _ = flight_with(machine, gust)
     findings = found("underwater-vehicle", pushed, inputs)
-    inside = (findings.latent_starts >= 1000) & (findings.latent_starts < 1100)
+    inside = (findings.latent_middles >= 1000) & (findings.latent_middles < 1100)
     assert findings.latent_accelerations[inside] == pytest.approx(0.5, abs=0.1)
     assert np.abs(findings.latent_accelerations[~inside]).max() < 0.1
     assert findings.outliers.mean() < 0.02
@@ -146,12 +146,27 @@ def test_one_wild_input_does_not_matter():
     assert any("inputs leap" in note for note in findings.notes)
 
 
+def climb(moment):
+    """Up and down on the spot: a log that shows mass, but little or nothing of inertia and drag."""
+    t, (mass, inertia, _) = DT * np.arange(1500), truth("planar-rotorcraft")
+    a = np.where(np.sin(1.3 * t) > 0.0, 1.0, -1.0)
+    signals = np.zeros((1500, 9))
+    signals[:, 7] = a
+    signals[1:, 4] = DT * np.cumsum(a)[:-1]
+    signals[1:, 1] = np.cumsum(DT * signals[:-1, 4] + 0.5 * DT**2 * a[:-1])
+    noise = np.random.default_rng(7).normal(size=signals.shape)
+    return signals + 0.02 * noise, np.column_stack([mass * (a + 9.81), moment * np.sin(9.0 * t)])
+
+
 def test_parameters_that_the_motion_does_not_show_are_named():
-    """At rest against gravity, with a moment that is always zero, nothing shows inertia."""
-    signals, inputs = np.zeros((500, 9)), np.tile([0.249 * 9.81, 0.0], (500, 1))
-    noisy = signals + 0.01 * np.random.default_rng(7).normal(size=signals.shape)
-    findings = found("planar-rotorcraft", noisy, inputs)
-    assert findings.undetermined[1]
+    findings = found("planar-rotorcraft", *climb(moment=1e-6))
+    assert findings.undetermined.tolist() == [False, True, True]
+    assert findings.parameters[0] == pytest.approx(truth("planar-rotorcraft")[0], rel=1e-3)
+
+
+def test_a_log_that_cannot_give_a_parameter_at_all_is_refused():
+    with pytest.raises(IdentificationError, match="within their bounds"):
+        found("planar-rotorcraft", *climb(moment=0.0))
 
 
 def test_same_seed_same_answer():

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.lo_diransac.gate import mended_inputs, stuck_rows
 from diransac.lo_diransac.hypotheses import find_hypotheses, n_samples
+from diransac.lo_diransac.mixture import BREAKDOWN
 from diransac.lo_diransac.readout import deviation_units, parameter_units, read_out
 from diransac.lo_diransac.refinement import believe, refine, start
 from diransac.lo_diransac.smoothing import choose_half_width, smooth
@@ -38,6 +39,8 @@ BoolArray = npt.NDArray[np.bool_]
 _FEWEST_WINDOWS = 4
 # Half a row of delay or more is taken up by shifting the inputs, as often as needed.
 _WHOLE_ROW, _MAX_SHIFTS = 0.5, 3
+# Local optimisations at most, and the difference in their losses, nats, that shows nothing.
+_MAX_STARTS, _AS_LIKELY = 5, 5.0
 _OUTLIER = 0.5
 # A delay that is worth a word: so many standard errors, and so many rows.
 _SURE, _SMALL_DELAY = 3.0, 0.25
@@ -95,7 +98,7 @@ def find(observations: Observations, seed: int) -> Findings:
             "the signs and units of inputs, and the bounds"
         )
     belief = believe(windows, motion, deviation_units(windows, motion, hypotheses[0]))
-    windows, refined, delay = _refined(windows, motion, hypotheses[0], belief)
+    windows, refined, delay = _shifted(windows, _best(windows, motion, hypotheses, belief), belief)
     result = read_out(windows, refined.fit)
     if not refined.settled:
         notes = (*notes, "local optimisation had not settled when it reached its limit of steps")
@@ -126,18 +129,38 @@ def _prepare(observations: Observations) -> tuple[Windows, Motion, tuple[str, ..
     return Windows(model, measured, known, inputs, dt, half), motion, tuple(notes)
 
 
-def _refined(windows: Windows, motion: Motion, p: FloatArray, belief: Belief) -> tuple[Windows, Refinement, int]:
-    """Local optimisation, again with the inputs shifted by whole rows while it finds them late."""
-    refined, shift = refine(windows, start(windows, motion, p, belief), belief), 0
-    steps = refined.steps
+def _best(windows: Windows, motion: Motion, hypotheses: FloatArray, belief: Belief) -> Refinement:
+    """Local optimisation from the best hypothesis; where it leaves a doubt, from the next ones; the likeliest of these.
+
+    Doubtful is what takes most of a window for outliers: sensors may have failed there, or the fit.  Doubt ends with a
+    second fit that is as likely.
+    """
+    found: list[Refinement] = []
+    for p in hypotheses[:_MAX_STARTS]:
+        found.append(refine(windows, start(windows, motion, p, belief), belief))
+        again = any(abs(found[-1].loss - x.loss) < _AS_LIKELY for x in found[:-1])
+        if again or not _is_doubtful(windows, found[-1]):
+            break
+    return replace(min(found, key=lambda x: x.loss), steps=sum(x.steps for x in found))
+
+
+def _is_doubtful(windows: Windows, refined: Refinement) -> bool:
+    """Whether some window has too few inlying samples for a robust scale to stand on."""
+    fit = refined.fit
+    inlying = (fit.noise.inlying(fit.residuals, windows.known) > _OUTLIER).reshape(len(windows), -1).sum(axis=1)
+    return bool((inlying < BREAKDOWN * windows.known.reshape(len(windows), -1).sum(axis=1)).any())
+
+
+def _shifted(windows: Windows, refined: Refinement, belief: Belief) -> tuple[Windows, Refinement, int]:
+    """Local optimisation again with the inputs shifted by whole rows, while it finds them late."""
+    shift, steps = 0, refined.steps
     for _ in range(_MAX_SHIFTS):
         delay = refined.fit.shared[-1]
         if not _WHOLE_ROW <= abs(delay) < windows.length:
             break
         shift += round(delay)
         windows = windows.delayed(round(delay))
-        shared = refined.fit.shared.copy()
-        shared[-1] = 0.0
+        shared = np.append(refined.fit.shared[:-1], delay - round(delay))
         prior = np.append(refined.fit.prior[:-1], belief.delay)
         refined = refine(windows, windows.judged(replace(refined.fit, shared=shared, prior=prior)), belief)
         steps += refined.steps

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Mixture", "lower_scale"]
+__all__ = ["BREAKDOWN", "Mixture", "lower_scale"]
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 # A scale that holds while fewer than 65 % of the residuals are outliers: the 35 % quantile of |r|, and what it is of a
 # standard normal variable.
-_QUANTILE, _OF_NORMAL = 0.35, 0.4538
+BREAKDOWN, _OF_NORMAL = 0.35, 0.4538
 _FEWEST = 5
 _SHRINK = 0.4
 _FRACTION = (0.002, 0.95)
@@ -60,7 +60,7 @@ def lower_scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
     """Robust scale of each column ``(..., n_s)`` of residuals ``(..., N, n_s)``; NaN where there are too few."""
     size = np.where(known, np.abs(residuals), np.inf)
     count = known.sum(axis=-2)
-    place = np.maximum((_QUANTILE * count).astype(int), 0)
+    place = np.maximum((BREAKDOWN * count).astype(int), 0)
     ordered = np.partition(size, np.unique(place), axis=-2)
     found = np.take_along_axis(ordered, place[..., None, :], axis=-2)[..., 0, :]
     return np.where(count >= _FEWEST, found / _OF_NORMAL, np.nan)

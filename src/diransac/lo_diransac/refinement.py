@@ -71,10 +71,12 @@ class Refinement:
     Parameters
     ----------
     fit : the most probable motion and parameters
+    loss : minus the log of the likelihood of all samples
     steps : Gauss-Newton steps; settled : whether they ended before the limit
     """
 
     fit: Fit
+    loss: float
     steps: int
     settled: bool
 
@@ -101,17 +103,17 @@ def start(windows: Windows, motion: Motion, p: FloatArray, belief: Belief) -> Fi
 
 def refine(windows: Windows, fit: Fit, belief: Belief) -> Refinement:
     """Steps and updates until nothing changes, first with a robust tau, then with the evidence's."""
-    damping, robust, steps = 0.0, True, 0
-    for _ in range(_MAX_STEPS):
+    damping, robust, settled, steps = 0.0, True, False, 0
+    while steps < _MAX_STEPS and (robust or not settled):
         steps += 1
+        robust = robust and not settled
         moved, solved, damping = _step(windows, fit, damping)
         updated = _update(windows, moved, solved, belief, robust=robust)
-        settled = _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[: windows.model.n_p]))
+        errors = np.sqrt(np.diag(solved.var_p)[: windows.model.n_p])
+        settled = _unchanged(fit, updated, errors)
         fit = updated
-        if settled and not robust:
-            return Refinement(fit, steps, settled=True)
-        robust = robust and not settled
-    return Refinement(fit, steps, settled=False)
+    loss = float(fit.noise.negative_log_likelihood(fit.residuals, windows.known).sum())
+    return Refinement(fit, loss, steps, settled and not robust)
 
 
 def weights_of(windows: Windows, fit: Fit) -> FloatArray:

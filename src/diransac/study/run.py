@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
 import random
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -112,7 +110,7 @@ class _Work:
         missing = [row for row in asked if row not in finished]
         batches = _batches(missing, batch_size)
         # Another process on the same store takes another order: they seldom run the same batch.
-        random.Random(f"{platform.node()} {os.getpid()}").shuffle(batches)
+        random.SystemRandom().shuffle(batches)
         self._waiting = deque(batches)
         self._running: dict[Future[Any], _Batch] = {}
         self._n_asked, self._missing = len(asked), set(missing)
