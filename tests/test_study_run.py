@@ -234,6 +234,25 @@ def test_an_infeasible_data_flight_fails_every_trial_of_its_level(tmp_path: Path
     assert all("cannot rest" in row["error"] for key, row in found.items() if key[0] == "3")
 
 
+def test_a_data_flight_that_diverges_fails_its_own_trial_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    fly_all, flown = dr.fly_all, []
+
+    def one_runs_away(plants: list, controllers: list, **more: object) -> list:
+        logs = fly_all(plants, controllers, **more)
+        flown.append(len(logs))
+        if len(flown) == 1:
+            lost = logs[1]
+            logs[1] = dr.Log(lost.time, {n: lost[n] for n in lost.names}, notes=("the flight diverged at t = 1 s",))
+        return logs
+
+    monkeypatch.setattr(trials, "fly_all", one_runs_away)
+    plant = {"kind": "extended-rotorcraft", "rotor_phase": "any"}
+    found = run(tmp_path, tiny(plant=plant), levels=[40], methods=["ols"], batch_size=2)
+    assert flown == [2, 1]
+    assert found["40", 0, "ols"]["status"] == "done"
+    assert found["40", 1, "ols"]["error"] == "the flight diverged at t = 1 s"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

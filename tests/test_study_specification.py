@@ -41,7 +41,7 @@ def test_the_figures_of_the_paper_vary_what_they_say():
 @pytest.mark.parametrize("name", ["fig2", "fig3", "fig4", "fig5", "gaussian"])
 def test_every_figure_shows_the_true_parameters_and_the_methods_of_the_paper_with_its_settings(name: str):
     methods = load(name).methods
-    assert {"true", "ols", "diransac", "i-diransac"} <= {one.method for one in methods.values()}
+    assert {"true", "ols", "diransac", "i-diransac", "lo-diransac"} <= {one.method for one in methods.values()}
     assert methods["i-diransac"].settings == dr.Settings.table_iv()
     assert methods["diransac-without-refit"].settings.refit == "none"
 

@@ -90,30 +90,37 @@ class _Point:
 
     def record(self, cases: Sequence[_Case]) -> None:
         """Fly for data, and spoil each trial's record; where nothing is drawn, one flight serves all trials."""
-        trials = {case.trial: case.seed for case in cases}
+        seeds = {case.trial: case.seed for case in cases}
         begin = time.perf_counter()
         try:
-            seeds = [derived_seed(seed, "data flight") for seed in trials.values()]
-            flights = self._flights(seeds if self.study.plant.is_drawn else seeds[:1])
-            flights = flights if len(flights) == len(trials) else flights * len(trials)
-            logs = {
-                trial: corrupt(log, self.study.noise, derived_seed(seed, "noise"), signals=self.plant.model.signals)
-                for (trial, seed), log in zip(trials.items(), flights, strict=True)
-            }
+            flights = self._flights(list(seeds.values()))
+        except DiransacError as error:
+            for case in cases:
+                case.fail(error)
+        else:
+            for (trial, seed), flight in zip(seeds.items(), flights, strict=True):
+                self._spoil(flight, seed, [case for case in cases if case.trial == trial])
+        _share(cases, "record", time.perf_counter() - begin)
+
+    def _flights(self, seeds: Sequence[int]) -> list[Log]:
+        """The flight that is recorded, of each trial."""
+        drawn = [derived_seed(seed, "data flight") for seed in (seeds if self.study.plant.is_drawn else seeds[:1])]
+        n = len(drawn)
+        flights = fly_all([self.plant] * n, [self.controller] * n, seeds=drawn, threads=1)
+        return flights if n == len(seeds) else flights * len(seeds)
+
+    def _spoil(self, flight: Log, seed: int, cases: Sequence[_Case]) -> None:
+        """Give the cases of one trial its record."""
+        noise = derived_seed(seed, "noise")
+        try:
+            _check_ended(flight)
+            log = corrupt(flight, self.study.noise, noise, signals=self.plant.model.signals)
         except DiransacError as error:
             for case in cases:
                 case.fail(error)
         else:
             for case in cases:
-                case.log = logs[case.trial]
-        _share(cases, "record", time.perf_counter() - begin)
-
-    def _flights(self, seeds: Sequence[int]) -> list[Log]:
-        n = len(seeds)
-        flights = fly_all([self.plant] * n, [self.controller] * n, seeds=seeds, threads=1)
-        for log in flights:
-            _check_ended(log)
-        return flights
+                case.log = log
 
 
 @dataclass
