@@ -97,11 +97,12 @@ class Diagnosis:
         units : unit of each signal
         """
         rows = [["signal", "noise", "outliers", "unexplained", "unit"]]
-        for name, scale in self.noise_scale.items():
-            latent = self.latent_accelerations.get(name)
+        for name in dict.fromkeys((*self.noise_scale, *self.latent_accelerations)):
+            measured, latent = name in self.noise_scale, self.latent_accelerations.get(name)
+            noise = f"{self.noise_scale[name]:.2g}" if measured else ""
+            share = f"{100.0 * self.outlier_fraction[name]:.1f} %" if measured else ""
             unexplained = "" if latent is None else f"{np.sqrt(np.mean(np.square(latent))):.2g}"
-            share = f"{100.0 * self.outlier_fraction[name]:.1f} %"
-            rows.append([name, f"{scale:.2g}", share, unexplained, units[name]])
+            rows.append([name, noise, share, unexplained, units[name]])
         return rows
 
 

@@ -212,9 +212,6 @@ def _latent_forces(windows: Windows, fit: Fit, parameters: FloatArray) -> FloatA
         response = model.force_response
     except ModelError:
         return None
-    n_v, forces = model.n_v, []
-    for x, u, d in zip(fit.x, windows.inputs[windows.starts], fit.d, strict=True):
-        q, v = x[: model.n_q], x[model.n_q :]
-        accelerations = [np.array(response(q, v, u, parameters, f)).ravel() for f in np.eye(n_v)]
-        forces.append(np.linalg.lstsq(np.column_stack(accelerations), d, rcond=None)[0])
-    return np.array(forces)
+    motion = (fit.x[:, : model.n_q].T, fit.x[:, model.n_q :].T, windows.inputs[windows.starts].T, parameters)
+    columns = [np.array(response(*motion, np.repeat(f[:, None], len(fit.d), axis=1))).T for f in np.eye(model.n_v)]
+    return np.asarray(np.linalg.solve(np.stack(columns, axis=-1), fit.d[:, :, None])[:, :, 0])
