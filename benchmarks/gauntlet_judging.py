@@ -1,0 +1,168 @@
+"""How the gauntlet judges: one log, every method, and what came of it.  Nothing happens when this file is run."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from gauntlet_methods import METHODS, Estimate
+from gauntlet_scenarios import SCENARIOS
+from gauntlet_vehicles import VEHICLES, effective_parameters, recorded
+
+import diransac as dr
+from diransac.simulate import rollouts
+
+ErrorsByName = Mapping[str, float]
+_ROUNDING, _VISIBLE = 1e-6, 1e-5
+Mission = Callable[..., dr.Trajectory]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One log."""
+
+    vehicle: str
+    flight: str
+    scenario: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class Record:
+    """What one method made of one log.
+
+    Parameters
+    ----------
+    trial, method : which
+    errors : by parameter, relative to the best parameters that the model can reach; empty where there is no estimate
+    errors_of_truth : relative to the plant's own parameters
+    covered : by parameter, whether its 95 % interval holds the best one; empty without finite intervals
+    tracking, tracking_of_truth : RMS distance from the mission, m, flown by what was identified and by the truth;
+        infinite where there is no plan or the flight diverges, NaN where none is flown
+    mismatch : whether the plant has more to it than the model
+    bound : by parameter, Cramer-Rao's relative standard deviation; empty where more is wrong than Gaussian noise
+    seconds : that it took
+    refusal : why there is no estimate
+    """
+
+    trial: Trial
+    method: str
+    errors: ErrorsByName
+    errors_of_truth: ErrorsByName
+    covered: Mapping[str, bool]
+    tracking: float
+    tracking_of_truth: float
+    mismatch: bool
+    bound: ErrorsByName
+    seconds: float
+    refusal: str = ""
+
+    @property
+    def mean_effect(self) -> bool:
+        """Whether what the model does not know has a mean, so that the best parameters are not the plant's own."""
+        return any(abs(x - self.errors_of_truth[name]) > _VISIBLE for name, x in self.errors.items())
+
+    @property
+    def worst(self) -> float:
+        """Error of the worst parameter; infinite without an estimate."""
+        return max(self.errors.values(), default=np.inf)
+
+    @property
+    def worst_of_truth(self) -> float:
+        """The same against the plant's own parameters."""
+        return max(self.errors_of_truth.values(), default=np.inf)
+
+
+def run(trial: Trial, methods: Sequence[str], *, fly: bool = True) -> list[Record]:
+    """Record a log, spoil it, and let every method at it."""
+    vehicle = VEHICLES[trial.vehicle]
+    scenario = next(one for one in SCENARIOS[trial.vehicle] if one.name == trial.scenario)
+    plant = vehicle.plant(**scenario.world)
+    clean = recorded(trial.vehicle, trial.flight, plant, trial.seed)
+    log = dr.corrupt(clean, scenario.noise, trial.seed, signals=plant.model.signals)
+    best = effective_parameters(plant, clean)
+    bound = cramer_rao(plant, clean, scenario.noise) if scenario.gaussian else {}
+    records = []
+    for method in methods:
+        estimate, seconds, refusal = _estimated(method, plant.model, log)
+        found = estimate.parameters if estimate else {}
+        flown = (np.nan, np.nan)
+        if fly and vehicle.mission:
+            true = _tracking_of_truth(trial.vehicle, tuple(scenario.world.items()), trial.seed)
+            flown = (tracking(vehicle.mission, plant, found, trial.seed), true)
+        records.append(
+            Record(
+                trial, method, relative(found, best), relative(found, plant.parameters), _covered(estimate, best),
+                *flown, bool(scenario.world), bound, seconds, refusal,
+            )
+        )  # fmt: skip
+    return records
+
+
+def _estimated(method: str, model: dr.Model, log: dr.Log) -> tuple[Estimate | None, float, str]:
+    start = time.perf_counter()
+    try:
+        estimate, refusal = METHODS[method](model, log), ""
+    except (dr.DiransacError, ValueError, np.linalg.LinAlgError) as error:
+        estimate, refusal = None, str(error)
+    return estimate, time.perf_counter() - start, refusal
+
+
+def relative(found: ErrorsByName, reference: ErrorsByName) -> dict[str, float]:
+    """``|found / reference - 1|`` by name."""
+    return {name: abs(x / reference[name] - 1.0) for name, x in found.items()}
+
+
+def _covered(estimate: Estimate | None, best: ErrorsByName) -> dict[str, bool]:
+    """Whether each interval holds the best parameter, to a millionth: where nothing is wrong, intervals are points."""
+    intervals = (estimate.intervals or {}) if estimate else {}
+    slack = {n: _ROUNDING * abs(x) for n, x in best.items()}
+    return {
+        n: low - slack[n] <= best[n] <= high + slack[n]
+        for n, (low, high) in intervals.items()
+        if np.isfinite(high - low)
+    }
+
+
+def tracking(mission: Mission, plant: dr.Plant, parameters: ErrorsByName, seed: int) -> float:
+    """RMS distance (m) from the mission that a model with these parameters plans, steers and flies on the plant."""
+    if not parameters:
+        return np.inf
+    try:
+        known = dr.Plant(plant.model, parameters)
+        trajectory = mission(known, time_limit=5.0)
+        log = dr.fly(plant, trajectory, dr.tvlqr(known, trajectory), seed=seed)
+    except dr.DiransacError:
+        return np.inf
+    errors = dr.tracking_error(trajectory, log)
+    return float(np.hypot(errors["x"], errors["z"]))
+
+
+@cache
+def _tracking_of_truth(vehicle: str, world: tuple[tuple[str, Any], ...], seed: int) -> float:
+    plant, mission = VEHICLES[vehicle].plant(**dict(world)), VEHICLES[vehicle].mission
+    return tracking(mission, plant, plant.parameters, seed) if mission else np.nan
+
+
+def cramer_rao(plant: dr.Plant, clean: dr.Log, noise: dr.Noise) -> dict[str, float]:
+    """Relative standard deviation of each parameter that no unbiased estimate beats, from the whole log.
+
+    Unknown are the parameters and the initial state; each signal's noise is as `dr.corrupt` makes it, measured.
+    """
+    model = plant.model
+    noisy = dr.corrupt(clean, noise, seed=0, signals=model.signals)
+    sigma = np.array([np.std(noisy[name] - clean[name]) for name in model.signals])
+    spread = np.array([np.std(clean[name]) for name in model.signals])
+    weights = 1.0 / np.maximum(sigma, 1e-6 * spread) ** 2
+    measured = np.column_stack([clean[name] for name in model.signals])
+    inputs = np.column_stack([clean[name] for name in model.inputs])
+    p = np.array(list(plant.parameters.values()))
+    sums = rollouts(model, substeps=4).gauss_newton(
+        p[None], measured[0, : len(model.state)], inputs, measured, np.ones(len(clean), bool), clean.dt, weights
+    )
+    N = sums.normal_matrix[0]
+    scale = 1.0 / np.sqrt(np.diag(N))
+    covariance = np.linalg.pinv(N * np.outer(scale, scale)) * np.outer(scale, scale)
+    return dict(zip(model.parameters, (np.sqrt(np.diag(covariance))[: model.n_p] / np.abs(p)).tolist(), strict=True))
