@@ -345,6 +345,17 @@ def test_processes_give_the_same_rows_though_one_of_them_is_killed(whole: dict, 
     assert victims
 
 
+def test_a_script_that_begins_itself_again_in_each_worker_is_told_what_it_lacks(tmp_path: Path):
+    words = command(tmp_path / "a.db", jobs=1)["args"]
+    script = Path(words[1])
+    script.write_text(script.read_text().replace('if __name__ == "__main__":', "if True:"))
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("diransac.errors.StudyError: ")
+    assert last.endswith('run again (in a script, under if __name__ == "__main__":)')
+
+
 def test_ctrl_c_ends_a_run_at_once_and_says_how_to_go_on(tmp_path: Path):
     (tmp_path / "tiny.toml").write_text(TOML)
     words = ["-m", "diransac", "study", "run", "tiny.toml", "--store", "a.db", "--trials", "2000", "--jobs", "2"]

@@ -30,6 +30,8 @@ class Diagnosis:
     latent_accelerations : acceleration -> (W,), its unit: what acts on the machine and is not in the model
     latent_forces : the same as generalised forces, N where a coordinate is in m, N m where it is in rad; empty where
         the model's equations are no balance of forces
+    motion_time : (W,)   s, first row of each window
+    motion : state -> (W,)   the most probable motion at those times, measured or not
     input_delay, input_delay_error : s by which the inputs act later than the log says; its standard error
     is_late : whether that is more than errors of estimation
     undetermined : parameters that the log cannot tell
@@ -41,16 +43,20 @@ class Diagnosis:
     latent_time: FloatArray
     latent_accelerations: Mapping[str, FloatArray]
     latent_forces: Mapping[str, FloatArray]
+    motion_time: FloatArray
+    motion: Mapping[str, FloatArray]
     input_delay: float
     input_delay_error: float
     is_late: bool
     undetermined: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        for name in ("noise_scale", "outlier_fraction", "outliers", "latent_accelerations", "latent_forces"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
-        series = (self.latent_time, *self.outliers.values(), *self.latent_accelerations.values())
-        for array in (*series, *self.latent_forces.values()):
+        series = [self.latent_time, self.motion_time]
+        for name in ("noise_scale", "outlier_fraction", "outliers", "latent_accelerations", "latent_forces", "motion"):
+            values = dict(getattr(self, name))
+            series += [x for x in values.values() if isinstance(x, np.ndarray)]
+            object.__setattr__(self, name, MappingProxyType(values))
+        for array in series:
             array.setflags(write=False)
 
     def to_dict(self) -> dict[str, Any]:
@@ -64,6 +70,8 @@ class Diagnosis:
             "latent_time": self.latent_time.tolist(),
             "latent_accelerations": {n: x.tolist() for n, x in self.latent_accelerations.items()},
             "latent_forces": {n: x.tolist() for n, x in self.latent_forces.items()},
+            "motion_time": self.motion_time.tolist(),
+            "motion": {n: x.tolist() for n, x in self.motion.items()},
             "input_delay": self.input_delay,
             "input_delay_error": self.input_delay_error,
             "is_late": self.is_late,
@@ -83,6 +91,8 @@ class Diagnosis:
             latent_time=np.array(data["latent_time"], np.float64),
             latent_accelerations=_series(data["latent_accelerations"]),
             latent_forces=_series(data["latent_forces"]),
+            motion_time=np.array(data["motion_time"], np.float64),
+            motion=_series(data["motion"]),
             input_delay=float(data["input_delay"]),
             input_delay_error=float(data["input_delay_error"]),
             is_late=bool(data["is_late"]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,12 +13,15 @@ from diransac.errors import LogError, SettingsError
 from diransac.simulate import Scores, default_threads, rollouts
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from diransac.diagnosis import Diagnosis
     from diransac.log import Log
     from diransac.model import Model
     from diransac.observations import Observations
     from diransac.settings import Settings
 
-__all__ = ["Scoring", "Simulation", "choose_scoring", "judged_signals"]
+__all__ = ["Scoring", "Simulation", "as_diagnosed", "choose_scoring", "judged_signals"]
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -89,6 +92,29 @@ def choose_scoring(observations: Observations, settings: Settings) -> Scoring:
     notes = [f"{n} is constant and judges nothing" for n in constant]
     notes.append(f"a row is an inlier if {needed} of its {n_signals} judging signals are near: {judging}")
     return Scoring(w, eps, needed, tuple(notes))
+
+
+def as_diagnosed(observations: Observations, settings: Settings, diagnosis: Diagnosis) -> tuple[Observations, Settings]:
+    """The log with its inputs acting as late as they do, and settings that start where the machine was.
+
+    That is the first sample, as by default, but for samples that are missing or outliers.
+    """
+    if diagnosis.is_late:
+        time = observations.log.dt * np.arange(len(observations))
+        columns = [np.interp(time - diagnosis.input_delay, time, column) for column in observations.inputs.T]
+        observations = replace(observations, inputs=np.column_stack(columns))
+    return observations, replace(settings, initial_state=_start(observations, settings, diagnosis))
+
+
+def _start(observations: Observations, settings: Settings, diagnosis: Diagnosis) -> str | Mapping[str, float]:
+    if settings.initial_state != "first":
+        return settings.initial_state
+    start = {name: float(motion[0]) for name, motion in diagnosis.motion.items()}
+    for name in start:
+        if name in diagnosis.outliers and not diagnosis.outliers[name][observations.offset]:
+            first = float(observations.column(name)[0])
+            start[name] = first if np.isfinite(first) else start[name]
+    return start
 
 
 class Simulation:

@@ -21,7 +21,7 @@ from diransac.estimators import (
     as_estimator,
     name_of,
 )
-from diransac.evaluation import Scoring, Simulation, choose_scoring, judged_signals
+from diransac.evaluation import Scoring, Simulation, as_diagnosed, choose_scoring, judged_signals
 from diransac.log import Log
 from diransac.model import Model
 from diransac.nonlinear import NonlinearLeastSquares
@@ -33,7 +33,7 @@ from diransac.settings import Settings
 from diransac.uncertainty import N_BLOCKS, jackknife_covariance
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from diransac.lo_diransac import Findings
 
@@ -176,8 +176,9 @@ class _Task:
         observations = observe(self.model, self.given, judged, pointwise=not derivable)
         findings = find(observations, int(self.seed))
         scoring = choose_scoring(observations, self.settings)
-        settings = dataclasses.replace(self.settings, initial_state=self._start(observations, findings))
-        simulation = Simulation(_delayed(observations, findings), scoring, settings, self._variant())
+        diagnosis = self._diagnosis(observations, findings)
+        acting, settings = as_diagnosed(observations, self.settings, diagnosis)
+        simulation = Simulation(acting, scoring, settings, self._variant())
         covariance = findings.covariance.copy()
         covariance[findings.undetermined] = covariance[:, findings.undetermined] = np.inf
         return Result(
@@ -191,7 +192,7 @@ class _Task:
             stop_reason="settled" if findings.settled else "limit of steps",
             skipped={},
             notes=(*observations.notes, *findings.notes, *scoring.notes),
-            diagnosis=self._diagnosis(observations, findings),
+            diagnosis=diagnosis,
         )
 
     def _judged(
@@ -216,17 +217,6 @@ class _Task:
             "preparation": tuple(log.history),
         }
 
-    def _start(self, observations: Observations, findings: Findings) -> str | Mapping[str, float]:
-        """Where a simulation starts: as the settings say, but for first samples that are missing or outliers."""
-        if self.settings.initial_state != "first":
-            return self.settings.initial_state
-        start = dict(zip(self.model.state, findings.initial_state.tolist(), strict=True))
-        for k, name in enumerate(self.model.state):
-            if name in observations.signals and not findings.outliers[0, k]:
-                first = float(observations.column(name)[0])
-                start[name] = first if np.isfinite(first) else start[name]
-        return start
-
     def _diagnosis(self, observations: Observations, findings: Findings) -> Diagnosis:
         """What lo-diransac found beside the parameters, by name and over the rows of the log that the user gave."""
         model, dt = self.model, observations.log.dt
@@ -242,6 +232,8 @@ class _Task:
             latent_time=begin + dt * findings.latent_middles,
             latent_accelerations=dict(zip(model.accelerations, findings.latent_accelerations.T.copy(), strict=True)),
             latent_forces={name: force.copy() for name, force in forces},
+            motion_time=begin + dt * (findings.latent_middles - findings.latent_middles[0]),
+            motion=dict(zip(model.state, findings.states.T.copy(), strict=True)),
             input_delay=findings.input_delay,
             input_delay_error=findings.input_delay_error,
             is_late=findings.is_late,
@@ -312,12 +304,3 @@ class _Task:
         except DiransacError:
             return dict.fromkeys(result.parameters, np.nan)
         return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}
-
-
-def _delayed(observations: Observations, findings: Findings) -> Observations:
-    """The same log with its inputs acting later, if they do, for what judges a simulation."""
-    if not findings.is_late:
-        return observations
-    time = observations.log.dt * np.arange(len(observations))
-    columns = [np.interp(time - findings.input_delay, time, column) for column in observations.inputs.T]
-    return dataclasses.replace(observations, inputs=np.column_stack(columns))

@@ -76,7 +76,8 @@ def _concentrated(windows: Windows, motion: Motion, seed: int) -> FloatArray:
     ranked = samples[np.argsort(robust_scores(windows, motion, samples, few), kind="stable")]
     found = [ranked[:_FINALISTS]]
     for _ in range(_CONCENTRATIONS):
-        found.append(_admitted(windows, weak.solve(weak.explained(found[-1]))))
+        if len(found[-1]):
+            found.append(_admitted(windows, weak.solve(weak.explained(found[-1]))))
     return np.concatenate(found)
 
 

@@ -42,6 +42,8 @@ _WHOLE_ROW, _MAX_SHIFTS = 0.5, 3
 # Local optimisations at most, and the difference in their losses, nats, that shows nothing.
 _MAX_STARTS, _AS_LIKELY = 5, 5.0
 _OUTLIER = 0.5
+# A share of a signal's spread that is no noise any more.
+_ALL_OF_IT = 0.8
 # A delay that is worth a word: so many standard errors, and so many rows.
 _SURE, _SMALL_DELAY = 3.0, 0.25
 
@@ -53,7 +55,7 @@ class Findings:
     Parameters
     ----------
     parameters, covariance : (n_p,), (n_p, n_p)
-    initial_state : (n_x,)   at the first row
+    states : (W, n_x)   of the most probable motion, at the first row of each window
     undetermined : (n_p,)   parameters whose 95 % interval spans more than all of an equation's inertial force
     noise_scale, outlier_fraction : (n_s,)   of each signal of the model; NaN where it is not measured
     outliers : (N, n_s)   samples that are more likely outliers than not
@@ -67,7 +69,7 @@ class Findings:
 
     parameters: FloatArray
     covariance: FloatArray
-    initial_state: FloatArray
+    states: FloatArray
     undetermined: BoolArray
     noise_scale: FloatArray
     outlier_fraction: FloatArray
@@ -100,9 +102,25 @@ def find(observations: Observations, seed: int) -> Findings:
     belief = believe(windows, motion, deviation_units(windows, motion, hypotheses[0]))
     windows, refined, delay = _shifted(windows, _best(windows, motion, hypotheses, belief), belief)
     result = read_out(windows, refined.fit)
+    if not _admits(windows, result.parameters):
+        # The fit keeps to the bounds, least squares on its motion need not.
+        result = replace(result, parameters=refined.fit.shared[: windows.model.n_p])
+        notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
+    if _explains_nothing(windows, motion, refined):
+        notes = (*notes, "the model explains hardly anything of this log: do not rely on these parameters")
     if not refined.settled:
         notes = (*notes, "local optimisation had not settled when it reached its limit of steps")
     return _findings(observations, windows, motion, refined, result, delay, len(hypotheses), notes)
+
+
+def _admits(windows: Windows, parameters: FloatArray) -> bool:
+    return all(bounds.admits(x) for bounds, x in zip(windows.model.parameters.values(), parameters, strict=True))
+
+
+def _explains_nothing(windows: Windows, motion: Motion, refined: Refinement) -> bool:
+    """Whether the noise of every signal is as large as the signal."""
+    seen = windows.known.any(axis=0)
+    return bool((refined.fit.noise.sigma > _ALL_OF_IT * motion.spread)[seen].all())
 
 
 def _prepare(observations: Observations) -> tuple[Windows, Motion, tuple[str, ...]]:
@@ -186,7 +204,7 @@ def _findings(
     return Findings(
         parameters=result.parameters,
         covariance=result.covariance,
-        initial_state=fit.x[0],
+        states=fit.x.copy(),
         undetermined=~(spans < units),
         noise_scale=np.where(seen, fit.noise.sigma, np.nan),
         outlier_fraction=np.where(seen, fit.noise.pi, np.nan),

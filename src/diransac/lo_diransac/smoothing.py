@@ -32,6 +32,7 @@ _DEGREE, _STEPS = 4, 12
 _MEDIAN = 31
 _SHRINK = 0.3
 _FLOOR = 1e-4
+_AT_REST = 0.1
 _NARROWEST = 25
 _TRIALS = 24
 # Residuals that a scale is taken from; more would only cost time.
@@ -123,8 +124,10 @@ def _neighbourhoods(knots: npt.NDArray[np.int64], half: int, n_rows: int) -> tup
 
 
 def _spread(values: FloatArray) -> FloatArray:
-    """Standard deviation of each column by the MAD."""
-    return np.asarray(1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0))
+    """Standard deviation of each column by the MAD; where half the samples rest at one value, by the central 80 %."""
+    low, median, high = np.quantile(values, [0.1, 0.5, 0.9], axis=0)
+    mad, wide = 1.4826 * np.median(np.abs(values - median), axis=0), (high - low) / 2.563
+    return np.asarray(np.where(mad > _AT_REST * wide, mad, wide))
 
 
 def _running_median(measured: FloatArray, known: BoolArray) -> FloatArray:

@@ -6,7 +6,7 @@ import json
 import random
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -142,9 +142,10 @@ class _Work:
             return
         if batch.attempts + 1 == _ATTEMPTS:
             which = ", ".join(map(str, batch.trials))
+            guard = "" if not isinstance(error, BrokenExecutor) else ' (in a script, under if __name__ == "__main__":)'
             raise StudyError(
                 f"trials {which} at level {batch.level} were lost {_ATTEMPTS} times, at last by "
-                f"{type(error).__name__}: {error}; all that is done is kept: look at the workers, then run it again"
+                f"{type(error).__name__}: {error}; all that is done is kept: look at the workers, then run again{guard}"
             ) from error
         self._waiting.append(replace(batch, attempts=batch.attempts + 1))
 

@@ -104,7 +104,8 @@ class Processes:
     def stop(self) -> None:
         """End the processes, whatever they do."""
         for process in self._begun.processes:
-            process.terminate()
+            if process.pid is not None:  # it did begin
+                process.terminate()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _new_pool(self) -> ProcessPoolExecutor:
