@@ -2,6 +2,8 @@
 
 import signal
 import sys
+import signal
+import threading
 import time
 
 import numpy as np
@@ -202,3 +204,14 @@ def test_an_error_in_the_midst_of_a_search_is_not_swallowed(monkeypatch):
     monkeypatch.setattr(Program, "gradient", broken)
     with pytest.raises(ZeroDivisionError, match="planted"):
         across(ROTORCRAFT)
+
+
+def test_ctrl_c_at_any_moment_stops_the_search():
+    """CasADi swallows half of the interrupts that it is left to find by itself."""
+    far_off = rotorcraft(inertia=1e-5)
+    for moment in (0.1, 0.17, 0.23, 0.31):
+        interrupt = threading.Timer(moment, signal.raise_signal, [signal.SIGINT])
+        with pytest.raises(KeyboardInterrupt):
+            interrupt.start()
+            dr.sine(far_off, max_iterations=3000)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

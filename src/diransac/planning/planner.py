@@ -72,7 +72,7 @@ def plan(
     rest: bool = True,
     guess: Trajectory | None = None,
     solver: str = "ipopt",
-    max_iterations: int = 500,
+    max_iterations: int = 200,
     time_limit: float = 30.0,
 ) -> Trajectory:
     """The cheapest trajectory through waypoints or along a reference, by direct transcription.

@@ -8,8 +8,11 @@ References: Waechter and Biegler 2006 (IPOPT); Vanroye et al. 2023, "FATROP" (st
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from threading import Lock
@@ -106,6 +109,20 @@ def _solver(name: str, layout: Layout, iterations: int, near: bool) -> _Solver:
     return _Solver(name, layout, iterations, near)
 
 
+@contextmanager
+def _interrupts_noted() -> Iterator[list[int]]:
+    """Note Ctrl-C instead of raising it: CasADi keeps to itself what is raised between two evaluations."""
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():  # interrupts come to the main thread alone
+        yield noted
+        return
+    before = signal.signal(signal.SIGINT, lambda number, _frame: noted.append(number))
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+
+
 class _Stopped(Exception):
     """The solver is to give up; it says why."""
 
@@ -122,6 +139,7 @@ class _Solver:
         self._functions: dict[str, _Evaluation] = {}
         self._deadline = 0.0
         self._stopped: BaseException | None = None
+        self._interrupts: list[int] = []
 
     def solve(self, program: Program, guess: Floats, deadline: float) -> Outcome:
         """Solve one program of this layout."""
@@ -137,12 +155,15 @@ class _Solver:
             self._build(program)
         assert self._nlpsol is not None
         numbers = program.numbers
-        try:
-            lower, upper = self._limits(numbers)
-            found = self._nlpsol(x0=guess, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
-        except RuntimeError:
-            if self._stopped is None:
-                raise
+        with _interrupts_noted() as self._interrupts:
+            try:
+                lower, upper = self._limits(numbers)
+                found = self._nlpsol(x0=guess, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+            except RuntimeError:
+                if self._stopped is None:
+                    raise
+        if self._interrupts:
+            raise KeyboardInterrupt
         if isinstance(self._stopped, _Stopped):
             return Outcome(guess, False, str(self._stopped), None, self._name)
         if self._stopped is not None:
@@ -177,6 +198,8 @@ class _Solver:
 
         Raises whatever stopped the solver: from then on no function has a value, which ends the solver's search.
         """
+        if self._stopped is None and self._interrupts:
+            self._stopped = KeyboardInterrupt()
         if self._stopped is None and time.monotonic() > self._deadline:
             self._stopped = _Stopped(TIME_LIMIT)
         if self._stopped is not None:
