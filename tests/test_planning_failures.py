@@ -2,7 +2,6 @@
 
 import signal
 import sys
-import signal
 import threading
 import time
 
@@ -210,8 +209,7 @@ def test_ctrl_c_at_any_moment_stops_the_search():
     """CasADi swallows half of the interrupts that it is left to find by itself."""
     far_off = rotorcraft(inertia=1e-5)
     for moment in (0.1, 0.17, 0.23, 0.31):
-        interrupt = threading.Timer(moment, signal.raise_signal, [signal.SIGINT])
+        threading.Timer(moment, signal.raise_signal, [signal.SIGINT]).start()
         with pytest.raises(KeyboardInterrupt):
-            interrupt.start()
             dr.sine(far_off, max_iterations=3000)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
