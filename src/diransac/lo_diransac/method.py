@@ -19,7 +19,7 @@ from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.lo_diransac.gate import mended_inputs, stuck_rows
 from diransac.lo_diransac.hypotheses import find_hypotheses, n_samples
 from diransac.lo_diransac.mixture import BREAKDOWN
-from diransac.lo_diransac.readout import deviation_units, parameter_units, read_out
+from diransac.lo_diransac.readout import deviation_units, parameter_units, read_out, unexplained
 from diransac.lo_diransac.refinement import believe, refine, start
 from diransac.lo_diransac.smoothing import choose_half_width, smooth
 from diransac.lo_diransac.windows import Windows
@@ -104,7 +104,8 @@ def find(observations: Observations, seed: int) -> Findings:
     result = read_out(windows, refined.fit)
     if not _admits(windows, result.parameters):
         # The fit keeps to the bounds, least squares on its motion need not.
-        result = replace(result, parameters=refined.fit.shared[: windows.model.n_p])
+        kept = refined.fit.shared[: windows.model.n_p]
+        result = replace(result, parameters=kept, unexplained=unexplained(windows, refined.fit, kept))
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
     if _explains_nothing(windows, motion, refined):
         notes = (*notes, "the model explains hardly anything of this log: do not rely on these parameters")
@@ -210,8 +211,8 @@ def _findings(
         outlier_fraction=np.where(seen, fit.noise.pi, np.nan),
         outliers=windows.known[:N] & (inlying < _OUTLIER),
         latent_middles=np.asarray(windows.starts + 0.5 * (windows.length - 1), np.float64),
-        latent_accelerations=fit.d,
-        latent_forces=_latent_forces(windows, fit, result.parameters),
+        latent_accelerations=result.unexplained,
+        latent_forces=_latent_forces(windows, fit, result),
         input_delay=float(delay * dt),
         input_delay_error=result.delay_error * dt,
         is_late=abs(delay) > max(_SURE * result.delay_error, _SMALL_DELAY),
@@ -223,13 +224,13 @@ def _findings(
     )
 
 
-def _latent_forces(windows: Windows, fit: Fit, parameters: FloatArray) -> FloatArray | None:
+def _latent_forces(windows: Windows, fit: Fit, result: Readout) -> FloatArray | None:
     """Generalised forces (W, n_v) that make the latent accelerations, at the windows' starts."""
     model = windows.model
     try:
         response = model.force_response
     except ModelError:
         return None
-    motion = (fit.x[:, : model.n_q].T, fit.x[:, model.n_q :].T, windows.inputs[windows.starts].T, parameters)
-    columns = [np.array(response(*motion, np.repeat(f[:, None], len(fit.d), axis=1))).T for f in np.eye(model.n_v)]
-    return np.asarray(np.linalg.solve(np.stack(columns, axis=-1), fit.d[:, :, None])[:, :, 0])
+    motion = (fit.x[:, : model.n_q].T, fit.x[:, model.n_q :].T, windows.inputs[windows.starts].T, result.parameters)
+    columns = [np.array(response(*motion, np.repeat(f[:, None], len(fit.x), axis=1))).T for f in np.eye(model.n_v)]
+    return np.asarray(np.linalg.solve(np.stack(columns, axis=-1), result.unexplained[:, :, None])[:, :, 0])

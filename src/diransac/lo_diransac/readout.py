@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from diransac.lo_diransac.windows import Windows
     from diransac.model import Model
 
-__all__ = ["Readout", "deviation_units", "read_out"]
+__all__ = ["Readout", "deviation_units", "read_out", "unexplained"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -42,10 +42,18 @@ _TINY = 1e-300
 
 @dataclass(frozen=True)
 class Readout:
-    """Parameters ``(n_p,)``, their covariance ``(n_p, n_p)``, and the standard error of the delay, rows."""
+    """What holds for the whole motion.
+
+    Parameters
+    ----------
+    parameters, covariance : (n_p,), (n_p, n_p)
+    unexplained : (W, n_v)   mean of each window's accelerations that the model with these parameters does not make
+    delay_error : standard error of the delay, rows
+    """
 
     parameters: FloatArray
     covariance: FloatArray
+    unexplained: FloatArray
     delay_error: float
 
 
@@ -70,7 +78,7 @@ def read_out(windows: Windows, fit: Fit) -> Readout:
     covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s
     sampled = _sampled(windows, fit, by_means, latent)
     delay = at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
-    return Readout(p, covariance + sampled, float(np.sqrt(delay)))
+    return Readout(p, covariance + sampled, unexplained(windows, fit, p), float(np.sqrt(delay)))
 
 
 def _gains(windows: Windows, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -97,6 +105,14 @@ def _sampled(windows: Windows, fit: Fit, by_means: FloatArray, latent: FloatArra
     left = latent - means @ np.einsum("pwi,wi->p", by_means, latent)
     sums = _batch_sums(np.einsum("pwi,wi->wp", by_means, left))
     return np.asarray(sums.T @ sums)
+
+
+def unexplained(windows: Windows, fit: Fit, parameters: FloatArray) -> FloatArray:
+    """Mean accelerations (W, n_v) of the fitted motion that the model does not make: ``M^-1 r`` of the residuals."""
+    residuals, _, M = _residual_map(windows.model)(*_motion(windows, fit), parameters)
+    left = np.linalg.solve(_matrices(M, windows.model.n_v), residuals[:, :, None])[:, :, 0]
+    logged = windows.is_logged[:, None].astype(float)
+    return _means(windows, left * logged) / _means(windows, logged)
 
 
 def deviation_units(windows: Windows, motion: Motion, p: FloatArray) -> FloatArray:
