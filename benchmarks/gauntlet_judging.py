@@ -107,6 +107,9 @@ def _estimated(method: str, model: dr.Model, log: dr.Log) -> tuple[Estimate | No
         estimate, refusal = METHODS[method](model, log), ""
     except (dr.DiransacError, ValueError, np.linalg.LinAlgError) as error:
         estimate, refusal = None, str(error)
+    except Exception as error:
+        error.add_note(f"method {method}, {log.source}, {', '.join(log.notes)}")
+        raise
     return estimate, time.perf_counter() - start, refusal
 
 
@@ -155,7 +158,7 @@ def cramer_rao(plant: dr.Plant, clean: dr.Log, noise: dr.Noise) -> dict[str, flo
     noisy = dr.corrupt(clean, noise, seed=0, signals=model.signals)
     sigma = np.array([np.std(noisy[name] - clean[name]) for name in model.signals])
     spread = np.array([np.std(clean[name]) for name in model.signals])
-    weights = 1.0 / np.maximum(sigma, 1e-6 * spread) ** 2
+    weights = 1.0 / np.maximum(sigma, 1e-9 * spread) ** 2
     measured = np.column_stack([clean[name] for name in model.signals])
     inputs = np.column_stack([clean[name] for name in model.inputs])
     p = np.array(list(plant.parameters.values()))

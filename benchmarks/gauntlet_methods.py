@@ -7,6 +7,7 @@ a `dr.DiransacError`: the table then has a dash.  Nothing happens when this file
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import casadi as ca
@@ -141,6 +142,13 @@ def _bounds(model: dr.Model) -> tuple[Array, Array]:
     return np.concatenate([low, -free]), np.concatenate([high, free])
 
 
+def mujoco_sysid(model: dr.Model, log: dr.Log) -> Estimate:
+    """MuJoCo's own identification, of the vehicles that MuJoCo has; from Hampel + least squares."""
+    from gauntlet_mujoco import fitted
+
+    return Estimate(fitted(model, log, dict(hampel_least_squares(model, log).parameters)))
+
+
 METHODS: dict[str, Method] = {
     **{name: partial(identified, name, None) for name in dr.METHODS},
     "diransac (Table IV)": partial(identified, "diransac", dr.Settings.table_iv()),
@@ -151,4 +159,5 @@ METHODS: dict[str, Method] = {
     "SciPy soft-L1": partial(equation_error, "soft_l1"),
     "SciPy Cauchy": partial(equation_error, "cauchy"),
     "SciPy output error": output_error,
+    **({"mujoco.sysid": mujoco_sysid} if find_spec("mujoco") else {}),
 }
