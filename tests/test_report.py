@@ -123,7 +123,7 @@ def test_page_names_model_method_log_and_every_parameter_with_its_interval(resul
 
 def test_page_holds_what_repeats_the_identification(model, log, tmp_path):
     settings = dr.Settings(max_iterations=7, stop_inlier_fraction=None)
-    text = Page(written(dr.identify(model, log, seed=5, settings=settings), log, tmp_path)).text
+    text = Page(written(dr.identify(model, log, "i-diransac", seed=5, settings=settings), log, tmp_path)).text
     assert "dr.identify(model, log, method='i-diransac', seed=5, settings=dr.Settings(max_iterations=7" in text
     assert log.fingerprint in text
     assert "llvmlite" in text
@@ -351,8 +351,8 @@ def test_markup_gives_back_exactly_the_text_and_attribute_that_went_in(text, val
 def test_a_long_signal_keeps_every_stretchs_extremes_and_draws_samples_alone(kind):
     rng = np.random.default_rng(0)
     values = rng.normal(size=25_000)
-    rows, scale = np.arange(25_000), figures.Scale(-5.0, 5.0)
-    drawn = vertices(figures.path_data(figures.Trace("noise", "m0", kind, rows, values), scale, 25_000))
+    rows, scale, timeline = np.arange(25_000), figures.Scale(-5.0, 5.0), figures.Timeline(25_000, 0.0, 0.01)
+    drawn = vertices(figures.path_data(figures.Trace("noise", "m0", kind, rows, values), scale, timeline))
     assert len(drawn) <= 2_200
     np.testing.assert_array_equal(drawn[:, 1], scale.height(values)[drawn[:, 0]])
     assert {int(values.argmin()), int(values.argmax())} <= set(drawn[:, 0].tolist())
@@ -365,7 +365,7 @@ def test_a_long_signal_keeps_every_stretchs_extremes_and_draws_samples_alone(kin
 def test_a_short_signal_is_drawn_whole_and_a_line_breaks_where_samples_are_missing():
     values = np.array([0.0, 1.0, np.nan, 3.0, 4.0])
     trace = figures.Trace("x", "m0", "line", np.arange(5), values)
-    path = figures.path_data(trace, figures.Scale(0.0, 4.0), 5)
+    path = figures.path_data(trace, figures.Scale(0.0, 4.0), figures.Timeline(5, 0.0, 0.1))
     assert path == "M0 1000h0l1-250m2-500h0l1-250"
 
 

@@ -12,13 +12,17 @@ from diransac.atomic import write_text
 from diransac.errors import ResultError
 from diransac.log import Log
 from diransac.report import sections
+from diransac.report.diagnosed import diagnoses
 from diransac.report.figures import Timeline
 from diransac.report.markup import Html, tag
 from diransac.report.over_time import inliers_over_time, signals_over_time
-from diransac.report.runs import Run, labelled, simulate_on
+from diransac.report.runs import Run, diagnosis_of, labelled, simulate_on
 from diransac.result import Result
 
 __all__ = ["write_report"]
+
+# Detail of the figures: a page of many results has less of each, so that it stays light.
+_CELLS, _FEWEST_CELLS = 500, 120
 
 
 def write_report(results: Result | Sequence[Result] | Mapping[str, Result], log: Log, path: str | Path) -> None:
@@ -34,7 +38,9 @@ def write_report(results: Result | Sequence[Result] | Mapping[str, Result], log:
     browser will run.  The same results and log give the same page.
     Raises ResultError: there is no result, the log cannot be simulated by its model, or the page cannot be written.
     """
-    runs = [simulate_on(label, result, log) for label, result in labelled(results).items()]
+    named = labelled(results)
+    diagnosis = diagnosis_of(named, log)
+    runs = [simulate_on(label, result, log, diagnosis) for label, result in named.items()]
     try:
         write_text(path, _page(runs, log))
     except OSError as error:
@@ -42,7 +48,7 @@ def write_report(results: Result | Sequence[Result] | Mapping[str, Result], log:
 
 
 def _page(runs: Sequence[Run], log: Log) -> str:
-    timeline = Timeline(len(log), float(log.time[0]), log.dt)
+    timeline = Timeline(len(log), float(log.time[0]), log.dt, max(_FEWEST_CELLS, _CELLS // len(runs)))
     title = f"{runs[0].result.model.name}: {', '.join(run.label for run in runs)}"
     body = [
         sections.heading(runs, log),
@@ -50,6 +56,7 @@ def _page(runs: Sequence[Run], log: Log) -> str:
             "main",
             sections.short(runs),
             sections.parameters(runs),
+            *diagnoses(runs, timeline),
             signals_over_time(runs, timeline),
             inliers_over_time(runs, timeline),
             sections.scores(runs),

@@ -34,18 +34,25 @@ IntArray = npt.NDArray[np.int64]
 
 _HEIGHT = 1000
 _FARTHEST = 10**6
-_CELLS = 700
 _STRIP_CELLS = 3000
 _MARGIN = 0.06
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """The log's rows in time: how many, the first one's time and the sampling time, s."""
+    """The log's rows in time.
+
+    Parameters
+    ----------
+    n_rows : how many
+    start, dt : time of the first, and from one to the next, s
+    cells : stretches of which a figure keeps the extremes
+    """
 
     n_rows: int
     start: float
     dt: float
+    cells: int = 700
 
 
 @dataclass(frozen=True)
@@ -123,20 +130,20 @@ def extremes(values: FloatArray, cells: IntArray) -> IntArray:
     return np.unique(np.concatenate([order[np.append(0, ends[:-1] + 1)], order[ends]]))
 
 
-def _kept(trace: Trace, n_rows: int) -> IntArray:
+def _kept(trace: Trace, timeline: Timeline) -> IntArray:
     """Indices of the samples that are drawn: all if few, else each cell's extremes, of dots some more."""
     finite = np.flatnonzero(np.isfinite(trace.values))
-    if len(finite) <= 2 * _CELLS:
+    if len(finite) <= 2 * timeline.cells:
         return finite
-    kept = finite[extremes(trace.values[finite], trace.rows[finite] * _CELLS // n_rows)]
+    kept = finite[extremes(trace.values[finite], trace.rows[finite] * timeline.cells // timeline.n_rows)]
     if trace.kind == "line":
         return kept
-    return np.union1d(kept, finite[:: -(-len(finite) // _CELLS)])
+    return np.union1d(kept, finite[:: -(-len(finite) // timeline.cells)])
 
 
-def path_data(trace: Trace, scale: Scale, n_rows: int) -> str:
+def path_data(trace: Trace, scale: Scale, timeline: Timeline) -> str:
     """The ``d`` of a path: a relative line or move from each sample to the next, ``h0`` making a dot after a move."""
-    kept = _kept(trace, n_rows)
+    kept = _kept(trace, timeline)
     if not len(kept):
         return ""
     gaps = np.cumsum(~np.isfinite(trace.values))[kept]
@@ -180,7 +187,7 @@ def time_plot(
     lines = [tag("path", class_="grid", d="".join(f"M0 {y}h{width}" for y in heights))]
     if levels:
         lines.append(tag("path", class_="level", d="".join(f"M0 {y}h{width}" for y in scale.height(levels))))
-    drawn = [(trace, path_data(trace, scale, timeline.n_rows)) for trace in traces]
+    drawn = [(trace, path_data(trace, scale, timeline)) for trace in traces]
     lines += [tag("path", class_=f"trace {t.kind} {t.look}", data_name=t.name, d=d) for t, d in drawn if d]
     reach = None if full is None else " ".join(str(y) for y in scale.height([full[1], full[0]]))
     svg = _svg(lines, timeline, label, data_low=scale.low, data_high=scale.high, data_full=reach)

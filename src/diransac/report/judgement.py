@@ -21,7 +21,7 @@ Level = Literal["note", "good", "care", "bad"]
 _ORDER: tuple[Level, ...] = ("note", "good", "care", "bad")
 
 _NEAR, _FAR = 0.05, 0.25
-_MANY, _HALF = 0.7, 0.5
+_MANY, _HALF, _FEW = 0.7, 0.5, 0.01
 _UNCERTAIN = 0.5
 _STEADY, _UNSTEADY = 0.05, 0.2
 _N_WINDOWS = 40
@@ -41,6 +41,7 @@ def findings(run: Run) -> list[Finding]:
         *_bounds(run),
         *_simulation(run),
         *_inliers(run),
+        *_diagnosis(run),
         *_certainty(run),
         *_bandwidth(run),
         *_search(run),
@@ -103,15 +104,24 @@ def _simulation(run: Run) -> Iterator[Finding]:
     name = max(errors, key=lambda n: errors[n])
     seconds = number((len(run.observations) - 1) * run.observations.log.dt)
     others = "the other signals that judge are nearer" if len(errors) > 1 else "it is the signal that judges"
-    text = (
-        f"Simulated through all {seconds} s from its first state alone, {name} is typically off by "
-        f"{share(errors[name], 'its range')}; {others}."
-    )
+    how, beyond = f"Simulated through all {seconds} s from its first state alone", ""
+    if np.isfinite(run.period):
+        how, beyond = f"Simulated for {number(run.period)} s at a time from where the machine was", " beyond its noise"
+    text = f"{how}, {name} is typically off by {share(errors[name], 'its range')}{beyond}; {others}."
+    if np.isfinite(run.period) and not errors[name]:
+        text = f"{how}, no signal is typically off by more than its noise."
     yield Finding(_graded(errors[name], _NEAR, _FAR), text)
 
 
 def _inliers(run: Run) -> Iterator[Finding]:
     fraction, n_rows = run.inlier_fraction, run.observations.n_rows
+    if run.result.diagnosis is not None:
+        yield Finding(
+            "note",
+            f"{percent(fraction)} of {plural(n_rows, 'row')} agree with one simulation of the whole log, which drifts "
+            "where anything acts that the model lacks, and counts outliers.",
+        )
+        return
     level: Level = "good" if fraction >= _MANY else "care" if fraction >= _HALF else "bad"
     yield Finding(level, f"{percent(fraction)} of {plural(n_rows, 'row')} agree with the simulation.")
     edges, fractions = windows(run)
@@ -137,12 +147,35 @@ def windows(run: Run) -> tuple[IntArray, FloatArray]:
     return edges, np.where(counting > 0.0, inliers / np.maximum(counting, 1.0), np.nan)
 
 
+def _diagnosis(run: Run) -> Iterator[Finding]:
+    """What was found wrong with the log and the model."""
+    found = run.result.diagnosis
+    if found is None:
+        return
+    name = max(found.outlier_fraction, key=lambda n: found.outlier_fraction[n])
+    most = found.outlier_fraction[name]
+    if most > _FEW:
+        text = f"Up to {percent(most)} of a signal's samples are outliers ({name}): the parameters do not rest on them."
+        yield Finding("note" if most <= _HALF else "care", text)
+    if run.unexplained:
+        name = max(run.unexplained, key=lambda n: run.unexplained[n])
+        left = run.unexplained[name]
+        text = f"The model leaves out what is worth {percent(left)} of {name}, and less of other accelerations."
+        yield Finding("good" if left <= _NEAR else "care", text)
+    if found.is_late:
+        late = f"Inputs act {number(1e3 * found.input_delay, 3)} ms later than the log says"
+        yield Finding("care", f"{late}: the parameters allow for that, simulations of the model need it, too.")
+    if found.undetermined:
+        names = ", ".join(found.undetermined)
+        yield Finding("care", f"The log cannot tell {names}: record a motion that depends on it.")
+
+
 def _certainty(run: Run) -> Iterator[Finding]:
     """What the intervals say."""
     result, widths = run.result, {}
     intervals = result.intervals()
     vague = [name for name, (low, high) in intervals.items() if not np.isfinite(high - low)]
-    if vague:
+    if vague and result.diagnosis is None:
         rows = plural(result.fitted_rows, "row")
         yield Finding("care", f"How certain {', '.join(vague)} is cannot be told: the fit rests on {rows}.")
     for name, (low, high) in intervals.items():
@@ -180,7 +213,7 @@ def _bandwidth(run: Run) -> Iterator[Finding]:
 
 def _search(run: Run) -> Iterator[Finding]:
     result, asked = run.result, run.result.settings.stop_inlier_fraction
-    if result.iterations and asked is not None and result.inlier_fraction < asked:
+    if result.iterations and result.diagnosis is None and asked is not None and result.inlier_fraction < asked:
         samples = plural(result.iterations, "sample")
         yield Finding(
             "note", f"The search ended after {samples}, short of the {percent(asked)} inliers it was to reach."

@@ -20,6 +20,11 @@ _BEYOND_MEASURED = 0.4
 _BEYOND_REFERENCE = 2.0
 _VISIBLE = 0.01
 _MOST = 0.5
+_NOISE = 3.0
+_HOW_TO_ZOOM = (
+    "Drag across a figure to zoom into all of them, drag a box to zoom into one, double-click to see everything again; "
+    "keys ←, →, +, −, 0."
+)
 
 
 def signals_over_time(runs: Sequence[Run], timeline: Timeline) -> Html:
@@ -30,27 +35,43 @@ def signals_over_time(runs: Sequence[Run], timeline: Timeline) -> Html:
     return tag(
         "section",
         tag("h2", "Measured against simulated"),
-        tag(
-            "p",
-            "Each simulation starts at the first row and sees the inputs alone. Drag across a figure to zoom into all "
-            "of them, drag a box to zoom into one, double-click to see everything again; keys ←, →, +, −, 0.",
-            class_="how",
-        ),
+        tag("p", f"{_how_simulated(runs)} {_HOW_TO_ZOOM}", class_="how"),
         _legend(runs, marking),
         tag("div", *figures, class_="figures"),
         id="signals",
     )
 
 
+def _how_simulated(runs: Sequence[Run]) -> str:
+    """Where the simulations that are drawn begin."""
+    periods = [run.period for run in runs if np.isfinite(run.period)]
+    if not periods:
+        return "Each simulation starts at the first row and sees the inputs alone."
+    text = (
+        f"Each simulation sees the inputs alone, and begins anew every {number(periods[0])} s where the machine most "
+        "probably was: forces that the model lacks would otherwise add up over the log."
+    )
+    if len(runs) > 1:
+        return text
+    return f"{text} The faint line is one simulation of the whole log, which decides on the rows that agree."
+
+
 def _legend(runs: Sequence[Run], marking: Run) -> Html:
+    of = f" with {marking.label}" if len(runs) > 1 else ""
+    marks = [_key("outlier", f"in a row that does not agree{of} (outlier)")]
+    if marking.diagnosis is not None:
+        whole = f" of {marking.label}" if len(runs) > 1 else ""
+        marks = [
+            _key("fault", "outlier: a sensor's fault"),
+            _key("outlier", f"in a row that does not agree with the whole log's simulation{whole}"),
+        ]
     keys = [
         _key("measured", "measured"),
-        _key(
-            "outlier",
-            "in a row that does not agree" + (f" with {marking.label}" if len(runs) > 1 else "") + " (outlier)",
-        ),
+        *marks,
         *(_key(f"m{i}", f"simulated, {run.label}") for i, run in enumerate(runs)),
     ]
+    if _shows_both(runs):
+        keys.append(_key("long", "through the whole log"))
     reset = tag("button", "Show all of the log", type="button", id="reset", hidden=True)
     return tag("div", *keys, reset, class_="legend")
 
@@ -69,6 +90,9 @@ def _signal(name: str, runs: Sequence[Run], marking: Run, timeline: Timeline) ->
     scale = _signal_scale(name, shown, [run for _, run in having])
     beyond = _beyond(measured, scale)
     traces = _signal_traces(name, having, shown)
+    if _shows_both(runs):
+        whole = _column(shown.throughout, shown, name)
+        traces.append(Trace("through the whole log", "m0 long", "line", shown.rows, whole))
     about = f"{name} in {unit}, measured and simulated over {number(timeline.dt * (timeline.n_rows - 1))} s"
     facts = [_typical_error(name, run, unit, label=f"{run.label} " * (len(runs) > 1)) for _, run in having]
     caption = [
@@ -97,24 +121,28 @@ def _typical_error(name: str, run: Run, unit: str, label: str) -> str:
 
 
 def _signal_traces(name: str, having: Sequence[tuple[int, Run]], shown: Run) -> list[Trace]:
-    measured, outlying = shown.observations.column(name), shown.observations.valid & ~shown.inliers
+    measured, faulty = shown.observations.column(name), shown.faults[name]
+    outlying = shown.observations.valid & ~shown.inliers & ~faulty
+    rejected = "measured (row does not agree)" if shown.diagnosis is not None else "measured (outlier)"
     return [
-        _dots("measured", "measured", shown, measured, ~outlying),
-        _dots("measured (outlier)", "outlier", shown, measured, outlying),
-        *(Trace(run.label, f"m{i}", "line", run.rows, _simulated(run, name)) for i, run in having),
+        _dots("measured", "measured", shown, measured, ~outlying & ~faulty),
+        _dots(rejected, "outlier", shown, measured, outlying),
+        _dots("measured (outlier)", "fault", shown, measured, faulty),
+        *(Trace(run.label, f"m{i}", "line", run.rows, _column(run.simulated, run, name)) for i, run in having),
     ]
+
+
+def _shows_both(runs: Sequence[Run]) -> bool:
+    """Whether the simulation of the whole log is drawn besides: of several results that would be too many lines."""
+    return len(runs) == 1 and np.isfinite(runs[0].period)
 
 
 def _dots(name: str, look: str, run: Run, values: FloatArray, chosen: npt.NDArray[np.bool_]) -> Trace:
     return Trace(name, look, "dots", run.rows[chosen], values[chosen])
 
 
-def _simulated(run: Run, name: str) -> FloatArray:
-    return run.simulated[:, run.observations.signals.index(name)]
-
-
-def _errors(run: Run, name: str) -> FloatArray:
-    return run.errors[:, run.observations.signals.index(name)]
+def _column(values: FloatArray, run: Run, name: str) -> FloatArray:
+    return values[:, run.observations.signals.index(name)]
 
 
 def _signal_scale(name: str, shown: Run, runs: Sequence[Run]) -> Scale:
@@ -122,7 +150,7 @@ def _signal_scale(name: str, shown: Run, runs: Sequence[Run]) -> Scale:
     low, high = shown.ranges[name]
     reach = _BEYOND_MEASURED * (high - low)
     for run in runs:
-        simulated = _simulated(run, name)
+        simulated = _column(run.simulated, run, name)
         near = np.clip(simulated[np.isfinite(simulated)], low - reach, high + reach)
         if reach > 0.0 and len(near):
             low, high = min(low, float(near.min())), max(high, float(near.max()))
@@ -137,21 +165,37 @@ def _beyond(measured: FloatArray, scale: Scale) -> tuple[float, float, int] | No
 
 
 def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timeline: Timeline) -> Html:
-    """Simulated less measured, with the inlier threshold."""
+    """Simulated less measured, with the inlier threshold, or with the noise where it is known."""
     traces, ranges = [], []
     for i, run in having:
-        errors, outlying = _errors(run, name), run.observations.valid & ~run.inliers & (run is shown)
-        traces.append(_dots(f"{run.label} (outlier)", "outlier", run, errors, outlying))
-        traces.append(_dots(run.label, f"m{i}", run, errors, ~outlying))
-        ranges.append(bulk(errors[~outlying] if np.mean(outlying) < _MOST else errors))
-    threshold = float(shown.thresholds[shown.observations.signals.index(name)])
-    levels = (-threshold, threshold) if threshold > 0.0 else ()
+        errors = _column(run.errors, run, name)
+        look, apart = _set_apart(name, run, is_shown=run is shown)
+        if run is shown:
+            traces.append(_dots(f"{run.label} (outlier)", look, run, errors, apart))
+        traces.append(_dots(run.label, f"m{i}", run, errors, ~apart))
+        ranges.append(bulk(errors[~apart] if np.mean(apart) < _MOST else errors))
+    level, meaning = _level(name, shown)
+    levels = (-level, level) if level > 0.0 else ()
     low, high = shown.ranges[name]
     scale = _residual_scale(ranges, [run is shown for _, run in having], _VISIBLE * (high - low))
-    note = f"; the dashed lines are the inlier threshold, {number(threshold)}" if levels else ""
+    note = f"; the dashed lines are {meaning}, {number(level, 3)}" if levels else ""
     label = f"Residuals of {name}, simulated less measured{note}"
     heading = tag("p", f"simulated − measured{note}", class_="residual-title")
     return tag("div", heading, time_plot(traces, scale, timeline, label, look="residual", levels=levels))
+
+
+def _set_apart(name: str, run: Run, *, is_shown: bool) -> tuple[str, npt.NDArray[np.bool_]]:
+    """How residuals (N,) that are marked look, and which are: faults if they are known, else rows that don't agree."""
+    if run.diagnosis is not None:
+        return "fault", run.faults[name]
+    return "outlier", run.observations.valid & ~run.inliers & is_shown
+
+
+def _level(name: str, run: Run) -> tuple[float, str]:
+    """What residuals are to be measured by, 0 if nothing is, and what it is."""
+    if run.diagnosis is not None:
+        return _NOISE * run.diagnosis.noise_scale.get(name, 0.0), "three times the noise"
+    return float(run.thresholds[run.observations.signals.index(name)]), "the inlier threshold"
 
 
 def _residual_scale(ranges: Sequence[tuple[float, float]], is_shown: Sequence[bool], visible: float) -> Scale:

@@ -11,21 +11,24 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac import prepare
+from diransac.diagnosis import Diagnosis
 from diransac.errors import LogError, ResultError, SettingsError
-from diransac.evaluation import choose_scoring, judged_signals
+from diransac.evaluation import as_diagnosed, choose_scoring, judged_signals
 from diransac.log import Log
 from diransac.observations import Observations, observe
 from diransac.result import Result
 from diransac.settings import Settings
-from diransac.simulate import inlier_mask, rollouts
+from diransac.simulate import Rollouts, inlier_mask, rollouts
 from diransac.validation import Validation, validate
 
-__all__ = ["Run", "bulk", "labelled", "simulate_on"]
+__all__ = ["Run", "bulk", "diagnosis_of", "labelled", "simulate_on"]
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 _MET = 0.5
+_N_RESTARTS = 12
+_MEDIAN = 0.6745  # of the absolute value of Gaussian noise, in standard deviations
 
 
 @dataclass(frozen=True)
@@ -38,8 +41,12 @@ class Run:
     held_out : whether the log is another one than the result was made from
     observations : the model over the log, ``N`` rows
     first : row of the log that is row 0 here
+    diagnosis : what is known of this log, by whichever result of the page found it; None if none did
+    period : s after which the shown simulation begins anew, where the machine most probably was; infinite: never
     simulated : (N, n_s)   the observations' signals, NaN from a divergence on
     errors : (N, n_s)   simulated less measured, NaN where either is missing
+    throughout : (N, n_s)   simulated through the whole log from its first row, which decides on inliers
+    accelerations : acceleration -> (N,)   simulated, measured or not
     thresholds : (n_s,)   an error is near below it; 0 where the signal judges nothing
     inliers : (N,)   rows that agree with the simulation
     validation : open-loop scores at several horizons, or why there are none
@@ -50,8 +57,12 @@ class Run:
     held_out: bool
     observations: Observations
     first: int
+    diagnosis: Diagnosis | None
+    period: float
     simulated: FloatArray
     errors: FloatArray
+    throughout: FloatArray
+    accelerations: Mapping[str, FloatArray]
     thresholds: FloatArray
     inliers: BoolArray
     validation: Validation | str
@@ -66,6 +77,11 @@ class Run:
         """Of the rows that count."""
         return float(self.inliers.sum() / self.observations.n_rows)
 
+    def tells(self, name: str) -> bool:
+        """Whether the result has a parameter, and its log could tell it."""
+        diagnosis = self.result.diagnosis
+        return name in self.result.parameters and (diagnosis is None or name not in diagnosis.undetermined)
+
     @property
     def divergence(self) -> float | None:
         """Log time at which the simulation becomes infinite, s; None if it stays finite."""
@@ -73,11 +89,23 @@ class Run:
         return float(self.observations.log.time[self.observations.offset + np.argmax(lost)]) if lost.any() else None
 
     @cached_property
+    def faults(self) -> dict[str, BoolArray]:
+        """Samples (N,) of each signal that are known to be outliers."""
+        known = {} if self.diagnosis is None else self.diagnosis.outliers
+        none = np.zeros(len(self.observations), dtype=bool)
+        return {n: known[n][self.rows] if n in known else none for n in self.observations.signals}
+
+    @cached_property
+    def sound_errors(self) -> dict[str, FloatArray]:
+        """Absolute errors of each signal, but for faults, in rows that count; infinite after a divergence."""
+        error = np.where(np.isnan(self.simulated), np.inf, np.abs(self.errors))
+        columns = zip(self.faults.items(), error.T, strict=True)
+        return {n: x[self.observations.valid & ~faults & ~np.isnan(x)] for (n, faults), x in columns}
+
+    @cached_property
     def typical_errors(self) -> dict[str, float]:
-        """Median absolute error of each signal over the rows that count, in its unit; infinite after a divergence."""
-        error = np.where(np.isnan(self.simulated), np.inf, np.abs(self.errors))[self.observations.valid]
-        columns = zip(self.observations.signals, error.T, strict=True)
-        return {n: float(np.median(x[~np.isnan(x)])) if (~np.isnan(x)).any() else np.nan for n, x in columns}
+        """Median of those of each signal, in its unit; NaN of none."""
+        return {n: float(np.median(x)) if len(x) else np.nan for n, x in self.sound_errors.items()}
 
     @cached_property
     def ranges(self) -> dict[str, tuple[float, float]]:
@@ -93,10 +121,21 @@ class Run:
 
     @property
     def relative_errors(self) -> dict[str, float]:
-        """Typical errors of the signals that judge, each over the signal's range."""
+        """Typical errors of the signals that judge, less what noise makes if it is known, over the signal's range."""
         widths = {n: high - low for n, (low, high) in self.ranges.items()}
         judging = [n for n, x in zip(self.observations.signals, self.thresholds, strict=True) if x > 0.0]
-        return {n: self.typical_errors[n] / widths[n] for n in judging if widths[n] > 0.0}
+        noise = {} if self.diagnosis is None else self.diagnosis.noise_scale
+        excess = {n: max(0.0, self.typical_errors[n] - _MEDIAN * noise.get(n, 0.0)) for n in judging}
+        return {n: excess[n] / widths[n] for n in judging if widths[n] > 0.0}
+
+    @property
+    def unexplained(self) -> dict[str, float]:
+        """RMS of what the model does not explain of each acceleration, over the RMS of what it does; {} if unknown."""
+        if self.result.diagnosis is None or self.held_out:
+            return {}
+        latent = {n: _rms(x) for n, x in self.result.diagnosis.latent_accelerations.items()}
+        explained = {n: _rms(x[np.isfinite(x)]) for n, x in self.accelerations.items()}
+        return {n: x / explained[n] for n, x in latent.items() if explained[n] > 0.0}
 
 
 def bulk(values: FloatArray) -> tuple[float, float]:
@@ -108,6 +147,10 @@ def bulk(values: FloatArray) -> tuple[float, float]:
     width = high - low
     kept = finite[(finite >= low - width) & (finite <= high + width)]
     return float(kept.min()), float(kept.max())
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
 
 
 def labelled(results: Result | Sequence[Result] | Mapping[str, Result]) -> dict[str, Result]:
@@ -131,13 +174,24 @@ def labelled(results: Result | Sequence[Result] | Mapping[str, Result]) -> dict[
     return named
 
 
-def simulate_on(label: str, result: Result, log: Log) -> Run:
+def diagnosis_of(results: Mapping[str, Result], log: Log) -> Diagnosis | None:
+    """The first diagnosis of this log among the results; it is the log's and the machine's, not a method's."""
+    own = (result.diagnosis for result in results.values() if result.log.fingerprint == log.fingerprint)
+    return next((diagnosis for diagnosis in own if diagnosis is not None), None)
+
+
+def simulate_on(label: str, result: Result, log: Log, diagnosis: Diagnosis | None = None) -> Run:
     """The result simulated over the log, which is prepared as its own was.
+
+    Parameters
+    ----------
+    diagnosis : of this log; with it, simulations begin anew every now and then where the machine most probably was, so
+        that what acts on it unknown to the model does not add up
 
     Raises ResultError: the log cannot be simulated by this model; it says why.
     """
     try:
-        return _simulate(label, result, _prepared(result, log), log)
+        return _simulate(label, result, _prepared(result, log), log, diagnosis)
     except (LogError, SettingsError) as error:
         raise ResultError(f'no report: model "{result.model.name}" cannot be simulated on this log: {error}') from error
 
@@ -154,33 +208,68 @@ def _last_step(history: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
     return history[-1] if history else {}
 
 
-def _simulate(label: str, result: Result, log: Log, given: Log) -> Run:
+def _simulate(label: str, result: Result, log: Log, given: Log, diagnosis: Diagnosis | None) -> Run:
     settings, model = result.settings, result.model
+    held_out = given.fingerprint != result.log.fingerprint
     observations = _observations(result, log)
     scoring = choose_scoring(observations, settings)
+    if result.diagnosis is not None and not held_out:
+        observations, settings = as_diagnosed(observations, settings, result.diagnosis)
     engine = rollouts(model, observations.signals, integrator=settings.integrator, substeps=settings.substeps)
-    start = observations.initial_state(settings.initial_state)
-    parameters = model.parameter_vector(result.parameters)[None]
-    everything = engine.trajectories(parameters, start, observations.inputs, log.dt)[0]
-    measured, missing = np.nan_to_num(observations.measured), ~np.isfinite(observations.measured)
-    all_rows = np.ones(len(observations), dtype=bool)
-    errors = engine.errors(parameters, start, observations.inputs, measured, all_rows, log.dt)[0]
+    start = observations.initial_state(settings.initial_state)[None]
     first = round(float(log.time[observations.offset] - given.time[0]) / given.dt)
-    held_out = given.fingerprint != result.log.fingerprint
-    apart = np.where(missing, np.inf, errors)
+    throughout, errors = _simulated(engine, result, observations, start, len(observations))
+    apart = np.where(np.isnan(errors), np.inf, errors)
     near = inlier_mask(apart, observations.valid, scoring.thresholds, scoring.min_inlier_signals)
+    simulated, period = throughout, np.inf
+    if diagnosis is not None and set(model.state) <= set(diagnosis.motion):
+        states, n_rows = _restarts(diagnosis, observations)
+        simulated, errors = _simulated(engine, result, observations, states, n_rows)
+        period = n_rows * log.dt
+    columns = [model.signals.index(name) for name in observations.signals]
     return Run(
         label=label,
         result=result,
         held_out=held_out,
         observations=observations,
         first=first,
-        simulated=everything[:, [model.signals.index(n) for n in observations.signals]],
-        errors=np.where(missing, np.nan, errors),
+        diagnosis=diagnosis,
+        period=period,
+        simulated=simulated[:, columns],
+        errors=errors,
+        throughout=throughout[:, columns],
+        accelerations=dict(zip(model.accelerations, simulated[:, len(model.state) :].T, strict=True)),
         thresholds=scoring.thresholds,
         inliers=near if held_out else result.inliers[first : first + len(observations)],
-        validation=_validation(result, log, settings),
+        validation=_validation(result, log, result.settings),
     )
+
+
+def _restarts(diagnosis: Diagnosis, observations: Observations) -> tuple[FloatArray, int]:
+    """States (K, n_x) from which simulations begin anew, and the rows between them."""
+    time, names = diagnosis.motion_time, observations.model.state
+    every = max(1, round(len(time) / _N_RESTARTS))
+    dt, start = observations.log.dt, observations.log.time[observations.offset]
+    n_rows = max(1, every * round(float(time[1] - time[0]) / dt)) if len(time) > 1 else len(observations)
+    at = start + dt * np.arange(0, len(observations), n_rows)
+    return np.column_stack([np.interp(at, time, diagnosis.motion[n]) for n in names]), n_rows
+
+
+def _simulated(
+    engine: Rollouts, result: Result, observations: Observations, states: FloatArray, n_rows: int
+) -> tuple[FloatArray, FloatArray]:
+    """All signals simulated (N, n), and that less measured (N, n_s), begun in each state for so many rows."""
+    model, n = result.model, len(observations)
+    more = ((0, len(states) * n_rows - n), (0, 0))
+    inputs, measured = (np.pad(x, more, mode="edge") for x in (observations.inputs, observations.measured))
+    parameters = np.tile(model.parameter_vector(result.parameters), (len(states), 1))
+    rows, dt, every = n_rows * np.arange(len(states)), observations.log.dt, np.ones(len(inputs), dtype=bool)
+    everything = engine.trajectories(parameters, states, inputs, dt, start_rows=rows, n_rows=n_rows)
+    errors = engine.errors(
+        parameters, states, inputs, np.nan_to_num(measured), every, dt, start_rows=rows, n_rows=n_rows
+    )
+    missing = ~np.isfinite(observations.measured)
+    return everything.reshape(len(inputs), -1)[:n], np.where(missing, np.nan, errors.reshape(len(inputs), -1)[:n])
 
 
 def _observations(result: Result, log: Log) -> Observations:

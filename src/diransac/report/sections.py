@@ -41,7 +41,9 @@ def heading(runs: Sequence[Run], log: Log) -> Html:
         lead = f"Held-out validation. {lead}; shown here on a log that it was not made from, {log.source}"
     descriptions = dict.fromkeys(run.result.model.description for run in runs if run.result.model.description)
     about = [tag("p", text, class_="about") for text in descriptions]
-    links = (("short", "In short"), ("parameters", "Parameters"), ("signals", "Simulation"), ("inliers", "Inliers"))
+    diagnosed = any(run.result.diagnosis is not None for run in runs)
+    found = (("short", "In short"), ("parameters", "Parameters"), *((("diagnosis", "Diagnosis"),) if diagnosed else ()))
+    links = (*found, ("signals", "Simulation"), ("inliers", "Inliers"))
     more = (("scores", "Scores"), ("equations", "Equations"), ("making", "How it was made"))
     menu = tag("nav", *(tag("a", text, href=f"#{key}") for key, text in links + more), aria_label="Sections")
     return tag("header", tag("h1", models), *about, tag("p", f"{lead} ({size})."), menu)
@@ -71,7 +73,9 @@ def _differences(runs: Sequence[Run]) -> Html:
     """In which parameter the results differ most."""
     spread = {}
     for name in runs[0].result.parameters:
-        values = {run.label: run.result.parameters[name] for run in runs if name in run.result.parameters}
+        values = {run.label: run.result.parameters[name] for run in runs if run.tells(name)}
+        if not values:
+            continue
         low, high = min(values, key=lambda k: values[k]), max(values, key=lambda k: values[k])
         middle = abs(float(np.median(list(values.values()))))
         if middle > 0.0:
@@ -82,7 +86,7 @@ def _differences(runs: Sequence[Run]) -> Html:
     difference, low, high = spread[name]
     if difference < 1e-3:
         return tag("p", "The results agree to 0.1 % in every parameter.")
-    by_label = {run.label: number(run.result.parameters[name]) for run in runs if name in run.result.parameters}
+    by_label = {run.label: number(run.result.parameters[name]) for run in runs if run.tells(name)}
     unit = runs[0].result.units[name]
     return tag("p", f"They differ most in {name}: {by_label[low]} {unit} ({low}) to {by_label[high]} {unit} ({high}).")
 
@@ -110,9 +114,8 @@ def _parameter(name: str, having: Sequence[tuple[int, Run]]) -> Html:
     first = tag("th", name, " ", tag("span", about, class_="unit"), scope="rowgroup", rowspan=len(having) + 1)
     scale = _parameter_scale(name, [run for _, run in having])
     rows = [_estimate(name, run, i, scale) for i, run in having]
-    marks = [
-        tag("span", text, class_="tick x", style=f"left:{_at(x, scale)}") for x, text in ticks(scale.low, scale.high, 4)
-    ]
+    shown = ticks(scale.low, scale.high, 4) if any(run.tells(name) for _, run in having) else []
+    marks = [tag("span", text, class_="tick x", style=f"left:{_at(x, scale)}") for x, text in shown]
     axis = tag(
         "tr", tag("td", colspan=4), tag("td", tag("div", *marks, class_="times"), aria_hidden="true"), class_="scale"
     )
@@ -121,6 +124,9 @@ def _parameter(name: str, having: Sequence[tuple[int, Run]]) -> Html:
 
 def _parameter_scale(name: str, runs: Sequence[Run]) -> Scale:
     """All estimates, and the intervals as far as they do not dwarf the narrowest."""
+    runs = [run for run in runs if run.tells(name)]
+    if not runs:
+        return Scale(-1.0, 1.0)
     intervals = np.array([run.result.intervals()[name] for run in runs])
     estimates = np.array([run.result.parameters[name] for run in runs])
     widths = intervals[:, 1] - intervals[:, 0]
@@ -136,6 +142,9 @@ def _parameter_scale(name: str, runs: Sequence[Run]) -> Scale:
 
 def _estimate(name: str, run: Run, i: int, scale: Scale) -> list[Html]:
     result = run.result
+    if not run.tells(name):
+        told = tag("td", "the log cannot tell", colspan=4)
+        return [tag("td", tag("span", class_=f"swatch m{i}"), run.label), told]
     value, (low, high) = result.parameters[name], result.intervals()[name]
     known = np.isfinite(high - low)
     interval = f"{number(low, 5)} … {number(high, 5)}" if known else "unknown"
@@ -196,10 +205,36 @@ def scores(runs: Sequence[Run]) -> Html:
     return tag(
         "section",
         tag("h2", "Open-loop scores"),
+        *_short_term(runs),
         tag("p", about, class_="how"),
         *(_scores(run) for run in runs),
         id="scores",
     )
+
+
+def _short_term(runs: Sequence[Run]) -> list[Html]:
+    """How well each predicts from where the machine was, where that is known."""
+    having = [run for run in runs if np.isfinite(run.period)]
+    if not having:
+        return []
+    names = dict.fromkeys(name for run in having for name in run.observations.signals)
+    noise = having[0].diagnosis.noise_scale if having[0].diagnosis is not None else {}
+    units = having[0].result.model.units
+    rows = [
+        (name, units[name], number(noise.get(name, np.nan), 3), *(_sound_rms(run, name) for run in having))
+        for name in names
+    ]
+    period = number(having[0].period)
+    caption = (
+        f"RMS error but for outliers, simulated for {period} s at a time from where the machine most probably was."
+    )
+    return [table(("Signal", "Unit", "Noise", *(run.label for run in having)), rows, caption)]
+
+
+def _sound_rms(run: Run, name: str) -> str:
+    errors = run.sound_errors.get(name, np.empty(0))
+    with np.errstate(over="ignore"):
+        return number(float(np.sqrt(np.mean(np.square(errors)))) if len(errors) else np.nan, 3)
 
 
 def _scores(run: Run) -> Html:
@@ -352,9 +387,11 @@ def _call(run: Run) -> str:
     chosen = [(n, getattr(result.settings, n)) for n in names if getattr(result.settings, n) != getattr(default, n)]
     if chosen:
         arguments.append(f"settings=dr.Settings({', '.join(f'{name}={value!r}' for name, value in chosen)})")
-    if result.iterations and result.estimator not in _DEFAULT_ESTIMATORS:
+    if result.iterations and result.diagnosis is None and result.estimator not in _DEFAULT_ESTIMATORS:
         arguments.append(f"estimator={result.estimator}(...)")
-    if result.preparation and result.preparation[-1].get("step") == "differentiate":
+    if result.diagnosis is not None and not set(result.model.required_signals) <= set(result.diagnosis.noise_scale):
+        arguments.append("differentiate=True")
+    elif result.preparation and result.preparation[-1].get("step") == "differentiate":
         arguments.append(f"differentiate=True, bandwidth={result.preparation[-1]['bandwidth']!r}")
     return f"result = dr.identify(model, log, {', '.join(arguments)})"
 
