@@ -4,7 +4,7 @@ Gauss and Newton's steps on `normal_equations`, each followed by an update of ev
 
 - the noise of each signal, by EM (`mixture`);
 - tau, the size of the latent accelerations, by the evidence: with tau large, windows stand alone; with tau = 0, the
-  whole log is one rollout.  A model of a real machine is right to a hundredth of its accelerations at best, which
+  whole log is one rollout.  A model of a real machine is right to a thousandth of its accelerations at best, which
   counts like one window's evidence: where noise hides the deviations, their absence is not believed;
 - the size of the pushes, and of the delay, likewise.
 
@@ -41,6 +41,8 @@ _TAU_START, _SHRINK = 0.3, 0.4
 # Continuity is exact for practical purposes: jumps are as small a part of what latent accelerations do in a window.
 _SLACK = 0.03
 _SIGMA_FLOOR = 1e-4
+# Of the accelerations' spread: what a model may miss without any evidence for it.
+_BELIEF = 1e-3
 _MAX_STEPS, _MAX_TRIALS = 60, 8
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
 
@@ -51,7 +53,7 @@ class Belief:
 
     Parameters
     ----------
-    tau : (n_v,)   latent accelerations, a hundredth of the accelerations' spread
+    tau : (n_v,)   latent accelerations, a thousandth of the accelerations' spread
     unit : (n_s,)   a push that makes all of an equation's inertial force; a row of delay; infinite for parameters
     push : of those units, once the fit has settled; ``guarded`` until then
     delay : rows
@@ -83,7 +85,7 @@ class Refinement:
 
 def believe(windows: Windows, motion: Motion, unit: FloatArray) -> Belief:
     """Beliefs in the units of this log."""
-    return Belief(0.01 * motion.spread[-windows.model.n_v :], unit)
+    return Belief(_BELIEF * motion.spread[-windows.model.n_v :], unit)
 
 
 def start(windows: Windows, motion: Motion, p: FloatArray, belief: Belief) -> Fit:
