@@ -41,8 +41,9 @@ _TAU_START, _SHRINK = 0.3, 0.4
 # Continuity is exact for practical purposes: jumps are as small a part of what latent accelerations do in a window.
 _SLACK = 0.03
 _SIGMA_FLOOR = 1e-4
-# Of the accelerations' spread: what a model may miss without any evidence for it.
-_BELIEF = 1e-3
+# Of the accelerations' spread: what a model may miss without any evidence for it; so many times that on the way down,
+# lest noise explain what the model does not.
+_BELIEF, _GUARDED = 1e-3, 10.0
 _MAX_STEPS, _MAX_TRIALS = 60, 8
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
 
@@ -156,10 +157,10 @@ def _update(windows: Windows, fit: Fit, solved: Factored, belief: Belief, *, rob
     inlying = fit.noise.inlying(fit.residuals, windows.known)
     noise = fit.noise.updated(fit.residuals, windows.known, inlying)
     variance = np.einsum("wii->wi", solved.var_z)[:, n_x:]
-    squares = np.square(fit.d).sum(axis=0)
+    squares, believed = np.square(fit.d).sum(axis=0), belief.tau
     if robust:
-        squares = len(fit.d) * np.square(1.4826 * np.median(np.abs(fit.d), axis=0))
-    tau = _evidence(belief.tau, fit.tau, squares, (1.0 - variance / np.square(fit.tau)).clip(0.0).sum(axis=0))
+        squares, believed = len(fit.d) * np.square(1.4826 * np.median(np.abs(fit.d), axis=0)), _GUARDED * belief.tau
+    tau = _evidence(believed, fit.tau, squares, (1.0 - variance / np.square(fit.tau)).clip(0.0).sum(axis=0))
     slack = np.maximum(_continuity(windows, tau), _SHRINK * fit.slack)
     prior = fit.prior if robust else _deviations(fit, belief, np.diag(solved.var_p), n_p)
     return replace(fit, noise=noise, tau=tau, slack=slack, prior=prior)
