@@ -215,7 +215,7 @@ LEFT_OUT = {
     "further starts": further_starts,
     "outliers in the noise": outlier_component,
     "latent accelerations": latent_accelerations,
-    "belief in a hundredth": weak_belief,
+    "belief in a thousandth": weak_belief,
     "pushes": pushes,
     "delay": delay,
     "robust tau at first": robust_tau,

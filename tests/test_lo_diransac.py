@@ -109,9 +109,8 @@ def test_noise_and_outliers_are_told_apart():
 
 def test_a_gust_is_an_acceleration_that_the_model_does_not_explain_not_a_sensor_fault():
     machine, gust = MACHINES["underwater-vehicle"], np.zeros(2500)
-    signals, inputs = flown("underwater-vehicle", 2500)
     gust[1000:1100] = 0.5
-    pushed, _ = flight_with(machine, gust)
+    pushed, inputs = flight_with(machine, gust)
     findings = found("underwater-vehicle", pushed, inputs)
     inside = (findings.latent_middles >= 1000) & (findings.latent_middles < 1100)
     assert findings.latent_accelerations[inside] == pytest.approx(0.5, abs=0.1)
@@ -148,7 +147,7 @@ def test_one_wild_input_does_not_matter():
 
 def climb(moment):
     """Up and down on the spot: a log that shows mass, but little or nothing of inertia and drag."""
-    t, (mass, inertia, _) = DT * np.arange(1500), truth("planar-rotorcraft")
+    t, mass = DT * np.arange(1500), truth("planar-rotorcraft")[0]
     a = np.where(np.sin(1.3 * t) > 0.0, 1.0, -1.0)
     signals = np.zeros((1500, 9))
     signals[:, 7] = a

@@ -4,7 +4,7 @@ Gauss and Newton's steps on `normal_equations`, each followed by an update of ev
 
 - the noise of each signal, by EM (`mixture`);
 - tau, the size of the latent accelerations, by the evidence: with tau large, windows stand alone; with tau = 0, the
-  whole log is one rollout.  A model of a real machine is right to a hundredth of its accelerations at best, which
+  whole log is one rollout.  A model of a real machine is right to a thousandth of its accelerations at best, which
   counts like one window's evidence: where noise hides the deviations, their absence is not believed;
 - the size of the pushes, and of the delay, likewise.
 
@@ -41,6 +41,9 @@ _TAU_START, _SHRINK = 0.3, 0.4
 # Continuity is exact for practical purposes: jumps are as small a part of what latent accelerations do in a window.
 _SLACK = 0.03
 _SIGMA_FLOOR = 1e-4
+# Of the accelerations' spread: what a model may miss without any evidence for it; so many times that on the way down,
+# lest noise explain what the model does not.
+_BELIEF, _GUARDED = 1e-3, 10.0
 _MAX_STEPS, _MAX_TRIALS = 60, 8
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
 
@@ -51,7 +54,7 @@ class Belief:
 
     Parameters
     ----------
-    tau : (n_v,)   latent accelerations, a hundredth of the accelerations' spread
+    tau : (n_v,)   latent accelerations, a thousandth of the accelerations' spread
     unit : (n_s,)   a push that makes all of an equation's inertial force; a row of delay; infinite for parameters
     push : of those units, once the fit has settled; ``guarded`` until then
     delay : rows
@@ -83,7 +86,7 @@ class Refinement:
 
 def believe(windows: Windows, motion: Motion, unit: FloatArray) -> Belief:
     """Beliefs in the units of this log."""
-    return Belief(0.01 * motion.spread[-windows.model.n_v :], unit)
+    return Belief(_BELIEF * motion.spread[-windows.model.n_v :], unit)
 
 
 def start(windows: Windows, motion: Motion, p: FloatArray, belief: Belief) -> Fit:
@@ -154,10 +157,10 @@ def _update(windows: Windows, fit: Fit, solved: Factored, belief: Belief, *, rob
     inlying = fit.noise.inlying(fit.residuals, windows.known)
     noise = fit.noise.updated(fit.residuals, windows.known, inlying)
     variance = np.einsum("wii->wi", solved.var_z)[:, n_x:]
-    squares = np.square(fit.d).sum(axis=0)
+    squares, believed = np.square(fit.d).sum(axis=0), belief.tau
     if robust:
-        squares = len(fit.d) * np.square(1.4826 * np.median(np.abs(fit.d), axis=0))
-    tau = _evidence(belief.tau, fit.tau, squares, (1.0 - variance / np.square(fit.tau)).clip(0.0).sum(axis=0))
+        squares, believed = len(fit.d) * np.square(1.4826 * np.median(np.abs(fit.d), axis=0)), _GUARDED * belief.tau
+    tau = _evidence(believed, fit.tau, squares, (1.0 - variance / np.square(fit.tau)).clip(0.0).sum(axis=0))
     slack = np.maximum(_continuity(windows, tau), _SHRINK * fit.slack)
     prior = fit.prior if robust else _deviations(fit, belief, np.diag(solved.var_p), n_p)
     return replace(fit, noise=noise, tau=tau, slack=slack, prior=prior)
