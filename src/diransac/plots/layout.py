@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["WIDTH", "inches", "laid_out", "name_panel"]
+__all__ = ["WIDTH", "inches", "laid_out", "name_panel", "panel"]
 
 WIDTH = 9.0
 """Of every picture, inches."""
@@ -46,18 +46,18 @@ def laid_out(
     path = None
     if box is not None:
         rows = min(n_rows, _PATH_ROWS)
-        path = _panel(figure, 0.0, header, *((WIDTH, _PATH_HEIGHT) if wide else (_PATH_WIDTH, rows * _ROW)))
+        path = panel(figure, 0.0, header, *((WIDTH, _PATH_HEIGHT) if wide else (_PATH_WIDTH, rows * _ROW)))
     left = _PATH_WIDTH if box is not None and not wide else 0.0
     width = (WIDTH - left) / 2.0
     panels = {}
     for column, names in enumerate(columns):
         for row, name in enumerate(names):
             place = (left + column * width, top + row * _ROW, width, _ROW)
-            panels[name] = _panel(figure, *place, last=row == len(names) - 1)
+            panels[name] = panel(figure, *place, last=row == len(names) - 1)
     for i, name in enumerate(inputs):
         alone = i == len(inputs) - 1 and i % 2 == 0
         place = (i % 2 * WIDTH / 2.0, below + i // 2 * _ROW, WIDTH if alone else WIDTH / 2.0, _ROW)
-        panels[name] = _panel(figure, *place, last=i >= len(inputs) - 2)
+        panels[name] = panel(figure, *place, last=i >= len(inputs) - 2)
     return figure, panels, path
 
 
@@ -70,7 +70,7 @@ def _columns(states: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
     return [name for name in states if name not in velocities], velocities
 
 
-def _panel(figure: Figure, left: float, top: float, width: float, height: float, *, last: bool = True) -> Axes:
+def panel(figure: Figure, left: float, top: float, width: float, height: float, *, last: bool = True) -> Axes:
     """A calm panel in a rectangle, inches from the figure's top left; only the last of a column names its times."""
     from matplotlib.ticker import MaxNLocator
 
