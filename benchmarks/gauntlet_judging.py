@@ -81,7 +81,7 @@ def run(trial: Trial, methods: Sequence[str], *, fly: bool = True) -> list[Recor
     scenario = next(one for one in SCENARIOS[trial.vehicle] if one.name == trial.scenario)
     plant = vehicle.plant(**scenario.world)
     clean = recorded(trial.vehicle, trial.flight, plant, trial.seed)
-    log = dr.corrupt(clean, scenario.noise, trial.seed, signals=plant.model.signals)
+    log = scenario.recorded(plant, clean, trial.seed)
     best = effective_parameters(plant, clean)
     bound = cramer_rao(plant, clean, scenario.noise) if scenario.gaussian else {}
     records = []

@@ -32,6 +32,9 @@ class Estimate:
 
 Method = Callable[[dr.Model, dr.Log], Estimate]
 
+FAR = 1e6
+"""Standard deviations: what a diverged simulation is off by, and nothing is off by more."""
+
 
 # ---------------------------------------------------------------------- this package's
 
@@ -103,7 +106,7 @@ def equation_error(loss: str, model: dr.Model, log: dr.Log) -> Estimate:
     return Estimate(dict(zip(model.parameters, found.x.tolist(), strict=True)))
 
 
-def output_error(model: dr.Model, log: dr.Log, max_evaluations: int = 60) -> Estimate:
+def output_error(model: dr.Model, log: dr.Log, max_evaluations: int = 40) -> Estimate:
     """Robust single shooting: simulate the whole log, soft-L1 loss in units of each signal's noise.
 
     Unknown are the parameters and the initial state; the start is Hampel + least squares, within bounds, and the first
@@ -115,22 +118,22 @@ def output_error(model: dr.Model, log: dr.Log, max_evaluations: int = 60) -> Est
     first = np.clip(list(hampel_least_squares(model, log).parameters.values()), low[: model.n_p], high[: model.n_p])
     measured, valid = np.nan_to_num(seen.measured), np.isfinite(seen.measured)
     noise = 1.4826 * np.nanmedian(np.abs(np.diff(seen.measured, n=2, axis=0)), axis=0) / np.sqrt(6.0) + 1e-9
-    engine = rollouts(model, seen.signals)
+    engine, log_arrays = rollouts(model, seen.signals), (seen.inputs, measured, np.ones(len(seen), bool), log.dt)
 
-    def linearized(z: Array) -> tuple[Array, Array]:
-        args = (z[None, : model.n_p], z[model.n_p :], seen.inputs, measured, np.ones(len(seen), bool), log.dt)
-        found = engine.linearized_errors(*args, unknowns=names)
-        usable = valid & np.isfinite(found.errors[0]) & (np.abs(found.errors[0]) < 1e6)
-        far = np.where(valid, 1e3, 0.0)  # where the simulation diverged
-        errors = np.where(usable, found.errors[0] / noise, far)
-        J = np.where(usable[..., None], np.nan_to_num(found.jacobian[0]) / noise[:, None], 0.0)
-        return errors.ravel(), J.reshape(errors.size, -1)
+    def errors(z: Array) -> Array:
+        e = engine.errors(z[None, : model.n_p], z[model.n_p :], *log_arrays)[0] / noise
+        return np.where(valid, np.clip(np.nan_to_num(e, nan=FAR), -FAR, FAR), 0.0).ravel()
+
+    def jacobian(z: Array) -> Array:
+        found = engine.linearized_errors(z[None, : model.n_p], z[model.n_p :], *log_arrays, unknowns=names)
+        near = valid & (np.abs(found.errors[0] / noise) < FAR)
+        J = found.jacobian[0] / noise[:, None]
+        return np.where(near[..., None] & (np.abs(J) < 1e100), J, 0.0).reshape(-1, len(names))
 
     start = np.concatenate([first, seen.initial_state("robust")])
     found = least_squares(
-        lambda z: linearized(z)[0], start, lambda z: linearized(z)[1],
-        bounds=(low, high), loss="soft_l1", x_scale="jac", max_nfev=max_evaluations,
-    )  # fmt: skip
+        errors, start, jacobian, bounds=(low, high), loss="soft_l1", x_scale="jac", max_nfev=max_evaluations
+    )
     return Estimate(dict(zip(model.parameters, found.x[: model.n_p].tolist(), strict=True)))
 
 

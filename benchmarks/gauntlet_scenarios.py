@@ -3,13 +3,13 @@
 A new scenario is one more row.  Nothing happens when this file is run.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from gauntlet_vehicles import VEHICLES
 
-from diransac import Noise
+from diransac import Log, Noise, Plant, corrupt
 
 MIDDLE = {"acceleration_std": 1.27, "rate_std": 0.5}
 """Gaussian noise of Table III, m/s^2 and rad/s: the middle of its range."""
@@ -23,21 +23,29 @@ class Scenario:
     Parameters
     ----------
     name : as the table shows it
-    noise : what is wrong with the recording
+    noise : what is wrong with the recording, or a function that spoils it: ``(log, seed) -> log``
     world : options of the vehicle's plant: what its model does not know
     """
 
     name: str
-    noise: Noise = Noise()  # noqa: RUF009  frozen
+    noise: Noise | Callable[[Log, int], Log] = Noise()  # noqa: RUF009  frozen
     world: Mapping[str, Any] = field(default_factory=dict)
+
+    def recorded(self, plant: Plant, log: Log, seed: int) -> Log:
+        """What a recorder with these faults makes of a log."""
+        return corrupt(log, self.noise, seed, signals=plant.model.signals) if self._is_noise else self.noise(log, seed)
 
     @property
     def gaussian(self) -> bool:
         """Whether Gaussian noise is all that is wrong, so that the Cramer-Rao bound holds."""
-        return {"acceleration_std", "rate_std"} <= set(self.noise.changed) <= _GAUSSIAN and not self.world
+        return self._is_noise and set(MIDDLE) <= set(self.noise.changed) <= _GAUSSIAN and not self.world
+
+    @property
+    def _is_noise(self) -> bool:
+        return isinstance(self.noise, Noise)
 
 
-_GAUSSIAN = {"acceleration_std", "rate_std", "angular_acceleration_std"}
+_GAUSSIAN = {*MIDDLE, "angular_acceleration_std"}
 
 
 def _outliers(probability: float, magnitude: float, **more: Any) -> Noise:
@@ -45,7 +53,7 @@ def _outliers(probability: float, magnitude: float, **more: Any) -> Noise:
 
 
 def recordings(lever: str) -> list[Scenario]:
-    """What any recording suffers from; 20 % of the samples are frozen, missing or in bursts (0.025 x 10 samples)."""
+    """What any recording suffers from; bursts, frozen and missing runs of 10 samples cover 20 % of the log."""
     return [
         Scenario("clean"),
         Scenario("outliers .1 x 80", _outliers(0.1, 80.0)),
