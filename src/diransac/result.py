@@ -18,7 +18,7 @@ from diransac.errors import DiransacError, ResultError, SettingsError
 from diransac.model import Model
 from diransac.settings import Settings
 from diransac.student_t import student_t_quantile
-from diransac.text_table import aligned
+from diransac.text_table import aligned, telling_digits
 
 __all__ = ["LogSummary", "Result"]
 
@@ -250,7 +250,7 @@ class Result:
     def _table(self) -> list[str]:
         rows = [("parameter", "estimate", "95 % interval", "unit")]
         for name, (low, high) in self.intervals().items():
-            digits = _digits(low, high)
+            digits = telling_digits(low, high)
             interval = f"{low:.{digits}g} .. {high:.{digits}g}" if np.isfinite(high - low) else "unknown"
             estimate = "?" if self._is_undetermined(name) else f"{self.parameters[name]:.6g}"
             rows.append((name, estimate, interval, self.units[name]))
@@ -300,12 +300,6 @@ class Result:
         if found.is_late:
             lines.append(f"! inputs act {1e3 * found.input_delay:.3g} ms later than the log says")
         return lines
-
-
-def _digits(low: float, high: float) -> int:
-    """Significant digits that tell the ends of an interval apart."""
-    size, width = max(abs(low), abs(high)), high - low
-    return 5 if not 0.0 < width < size else min(12, max(5, 2 + int(np.ceil(np.log10(size / width)))))
 
 
 def _encode(x: float) -> float | str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,14 +42,33 @@ class Comparison:
         rows += [self._row(name, result) for name, result in self.results.items()]
         lines = [f"{self.model.name} from {self.log.source}", *aligned(rows)]
         lines += [f"{name}: {reason}" for name, reason in self.refusals.items()]
+        return "\n".join([*lines, *self._remarks()])
+
+    def _remarks(self) -> Iterator[str]:
+        """What figures mean that do not compare, and what a diagnosis warns of."""
         if "diransac" in self.results:
-            lines.append("diransac's fit error is a mean square, the others' a root mean square, eq. (2)")
-        return "\n".join(lines)
+            yield "diransac's fit error is a mean square, the others' a root mean square, eq. (2)"
+        diagnosed = {name: result for name, result in self.results.items() if result.diagnosis is not None}
+        preparations = {json.dumps([dict(step) for step in x.preparation]) for x in self.results.values()}
+        if diagnosed and len(preparations) > 1:
+            yield f"{', '.join(diagnosed)} is judged by what was measured, the others by what was derived, too"
+        elif diagnosed and len(self.results) > 1:
+            yield "fit error and inliers are those of one simulation of the whole log, outliers and drift included"
+        for name, result in diagnosed.items():
+            found = result.diagnosis
+            assert found is not None
+            if found.undetermined:
+                yield f"{name}: the log cannot tell {', '.join(found.undetermined)}"
+            if found.is_late:
+                yield f"{name}: inputs act {1e3 * found.input_delay:.3g} ms later than the log says; others miss that"
 
     def _row(self, name: str, result: Result) -> list[str]:
         errors = result.standard_errors
         outside = {n: "!" if n in result.violations else "" for n in result.parameters}
-        estimates = [f"{x:.5g} ± {errors[n]:.2g}{outside[n]}" for n, x in result.parameters.items()]
+        untold = () if result.diagnosis is None else result.diagnosis.undetermined
+        estimates = [
+            "?" if n in untold else f"{x:.5g} ± {errors[n]:.2g}{outside[n]}" for n, x in result.parameters.items()
+        ]
         inliers = f"{100.0 * result.inlier_fraction:.1f} %"
         return [
             name,

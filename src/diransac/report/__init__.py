@@ -22,7 +22,7 @@ from diransac.result import Result
 __all__ = ["write_report"]
 
 # Detail of the figures: a page of many results has less of each, so that it stays light.
-_CELLS, _FEWEST_CELLS = 500, 120
+_CELLS, _FEWEST_CELLS = 500, 110
 
 
 def write_report(results: Result | Sequence[Result] | Mapping[str, Result], log: Log, path: str | Path) -> None:

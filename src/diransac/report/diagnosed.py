@@ -52,12 +52,13 @@ def _table(run: Run, found: Diagnosis, several: bool) -> Html:
         latent = found.latent_accelerations.get(name)
         unexplained = "" if latent is None else number(_rms(latent), 2)
         rows.append((name, units[name], noise, share, unexplained))
-    caption = (
+    about = (
         "Noise: standard deviation of what is Gaussian. Outliers: samples that are not. Unexplained: RMS of the "
-        "acceleration that the model does not make."
+        "accelerations that the model does not make."
     )
-    by = f"{run.label}. " if several else ""
-    return table(("Signal", "Unit", "Noise", "Outliers", "Unexplained"), rows, by + caption)
+    header = ("Signal", "Unit", "Noise", "Outliers", "Unexplained")
+    caption = f"By {run.label}" if several else "Signal by signal"
+    return join([tag("p", about, class_="how"), table(header, rows, caption)])
 
 
 def _unexplained(run: Run, found: Diagnosis, i: int, timeline: Timeline) -> Html:

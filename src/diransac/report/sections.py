@@ -16,6 +16,7 @@ from diransac.report.judgement import bounds_text, findings, verdict, worst
 from diransac.report.markup import Html, join, number, percent, plural, table, tag
 from diransac.report.runs import Run
 from diransac.settings import Settings
+from diransac.text_table import telling_digits
 from diransac.validation import Scores, Validation
 
 __all__ = ["equations", "heading", "making", "parameters", "scores", "short"]
@@ -147,7 +148,8 @@ def _estimate(name: str, run: Run, i: int, scale: Scale) -> list[Html]:
         return [tag("td", tag("span", class_=f"swatch m{i}"), run.label), told]
     value, (low, high) = result.parameters[name], result.intervals()[name]
     known = np.isfinite(high - low)
-    interval = f"{number(low, 5)} … {number(high, 5)}" if known else "unknown"
+    digits = telling_digits(low, high)
+    interval = f"{number(low, digits)} … {number(high, digits)}" if known else "unknown"
     width = "includes 0" if low <= 0.0 <= high else percent(0.5 * (high - low) / abs(value))
     outside = tag("strong", " outside its bounds") if name in result.violations else ""
     return [
