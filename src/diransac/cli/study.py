@@ -134,6 +134,45 @@ def _export(
         export(store, written, kind)
 
 
+@study.command("plot")
+def _plot(
+    store: StoreArgument,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="Where to draw it: .png, .svg or .pdf.")
+    ],
+    flown: Annotated[
+        bool | None,
+        typer.Option("--paths/--errors", help="Flown paths at one level, or errors over the axis.", show_default=False),
+    ] = None,
+    level: Annotated[str | None, typer.Option(metavar="A", help="Whose paths are drawn.")] = None,
+) -> None:
+    """Draw a store: the errors over the axis, or, if it keeps paths at a single level, these."""
+    from diransac.plots.paths import levels_with_paths, plot_paths
+    from diransac.plots.study import plot_study
+
+    if level is not None and flown is False:
+        raise typer.BadParameter("--level chooses whose paths are drawn, --errors draws none; give one of them")
+    with staged([output], [store]) as (written,):
+        if flown is None:
+            flown = level is not None or len(levels_with_paths(store)) == 1
+        if flown:
+            plot_paths(store, written, level=level)
+        else:
+            plot_study(store, written)
+
+
+@study.command("report")
+def _report(
+    store: StoreArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.html", help="Where to write it.")],
+) -> None:
+    """Write a store as one HTML page: figures, the numbers behind them, what failed and what took its time."""
+    from diransac.report.study import write_study_report
+
+    with staged([output], [store]) as (written,):
+        write_study_report(store, written)
+
+
 @study.command("list")
 def _list(as_json: JsonFlag = False) -> None:
     """List the studies that are built in, and the methods there are."""

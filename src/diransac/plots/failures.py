@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,8 +27,7 @@ _ROW, _NAME, _FREE, _LEFT, _RIGHT = 0.19, 0.21, 0.1, 1.75, 8.83
 
 def failures_height(share: Floats) -> float:
     """Height of the strip, inches: a row a method that failed anywhere, one line if none did."""
-    n_rows = len(_failing(share))
-    return _NAME + _FREE + _ROW * (n_rows + 1 if n_rows else 0)
+    return _NAME + _FREE + _ROW * len(_failing(share))
 
 
 def draw_failures(
@@ -69,15 +68,13 @@ def _draw_cell(figure: Figure, left: float, top: float, width: float, fraction: 
     full = figure.get_figheight()
     place = ((left + 0.015) / WIDTH, 1.0 - (top + _ROW - 0.02) / full)
     size = ((width - 0.03) / WIDTH, (_ROW - 0.02) / full)
-    look = {"transform": figure.transFigure, "linewidth": 0.0}
+    look: dict[str, Any] = {"transform": figure.transFigure, "linewidth": 0.0}
     figure.add_artist(Rectangle(place, *size, facecolor=SOFT, **look))
     if not fraction > 0.0:
         return
     figure.add_artist(Rectangle(place, *size, facecolor=FAILED, alpha=0.12 + 0.6 * fraction, **look))
     dark = fraction > 0.5
-    _write(
-        figure, left + width / 2.0, top + 0.025, _percent(fraction), color="#ffffff" if dark else INK, ha="center"
-    )
+    _write(figure, left + width / 2.0, top + 0.025, _percent(fraction), color="#ffffff" if dark else INK, ha="center")
 
 
 def _percent(fraction: float) -> str:
@@ -85,5 +82,5 @@ def _percent(fraction: float) -> str:
     return str(100 if fraction == 1.0 else min(99, max(1, round(100.0 * fraction))))
 
 
-def _write(figure: Figure, x: float, top: float, text: str, **look: str) -> None:
+def _write(figure: Figure, x: float, top: float, text: str, **look: Any) -> None:
     figure.text(x / WIDTH, 1.0 - top / figure.get_figheight(), text, fontsize=7.5, va="top", **look)

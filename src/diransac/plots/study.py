@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from diransac.errors import SettingsError
 from diransac.plots.failures import draw_failures, failures_height
 from diransac.plots.heading import draw_heading, header_height
 from diransac.plots.layout import WIDTH, name_panel, panel
@@ -34,13 +33,15 @@ _COLUMNS = 3
 _SPREAD = 0.5
 # Means this many times the median mean call for a logarithmic scale, of so many decades above a linear beginning.
 _MANY, _DECADES = 20.0, 3
+# The palette's fifth colour is too near the first where lines cross.
+_COLOURS = (*COLOURS[:4], INK, COLOURS[5])
 _MARKERS = ("o", "s", "^", "v", "D", "P")
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _CAPTION = (
-    "Mean of the RMS tracking error and one standard deviation, over {trials} trials; a dash is the median, for which a "
-    "failure is an infinite error.",
-    "A trial without a flight (no plan, or one that diverged) has failed: means leave it out, and are hollow where they "
-    "do.",
+    "Mean of the RMS tracking error and one standard deviation, over {trials} trials; a dash is the median, for which "
+    "a failed trial",
+    "has an infinite error. Without a flight (no plan, or one that diverged) a trial has failed: means leave it out, "
+    "and are then hollow.",
 )
 
 
@@ -77,7 +78,7 @@ def _drawn(summary: Summary, title: str) -> Figure:
     entries = list(looks.items())
     header = header_height(entries, title)
     heights = [_block_height(summary, flights) for flights in summary.flights.values()]
-    caption = _LINE * len(_CAPTION) + 0.12
+    caption = _LINE * len(_CAPTION) + 0.14
     figure = Figure(figsize=(WIDTH, header + sum(heights) + caption), facecolor=PAPER)
     top = header
     for (shape, flights), height in zip(summary.flights.items(), heights, strict=True):
@@ -86,7 +87,7 @@ def _drawn(summary: Summary, title: str) -> Figure:
     draw_heading(figure, entries, title)
     n_trials = _n_trials(summary)
     for row, line in enumerate(_CAPTION):
-        y = (caption - 0.06 - row * _LINE) / figure.get_figheight()
+        y = (caption - 0.04 - row * _LINE) / figure.get_figheight()
         figure.text(0.1 / WIDTH, y, line.format(trials=n_trials), fontsize=7.5, color=MUTED, va="top")
     return figure
 
@@ -105,7 +106,7 @@ def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, 
         row, column = divmod(i, _COLUMNS)
         last = i + _COLUMNS >= len(states)
         axes = panel(figure, column * width, top + _NAME + row * _ROW, width, _ROW, last=last)
-        _draw_state(axes, summary, flights, state)
+        _draw_state(axes, summary, flights, state, _spans_decades(flights))
         name_panel(axes, state, summary.units[state])
     below = top + _NAME + -(-len(states) // _COLUMNS) * _ROW
     figure.text(0.5, 1.0 - (below + 0.2) / full, axis_label(summary), fontsize=8.5, color=INK, va="top", ha="center")
@@ -113,7 +114,7 @@ def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, 
     draw_failures(figure, below + _AXIS, rows, level_labels(summary), flights.failure_share)
 
 
-def _draw_state(axes: Axes, summary: Summary, flights: Flights, state: str) -> None:
+def _draw_state(axes: Axes, summary: Summary, flights: Flights, state: str, logarithmic: bool) -> None:
     mean, deviation, median = flights.mean(state), flights.deviation(state), flights.median(state)
     spread, hollow = np.nan_to_num(deviation), flights.failure_share > 0.0
     at = _placed(summary)
@@ -123,17 +124,31 @@ def _draw_state(axes: Axes, summary: Summary, flights: Flights, state: str) -> N
             axes.plot(x, y, **look, zorder=1.8)
             continue
         bars = np.vstack([np.minimum(spread[:, k], y), spread[:, k]])
-        axes.errorbar(x, y, bars, fmt="none", ecolor=colour, elinewidth=0.8, capsize=1.6, capthick=0.8, zorder=2.2 + k / 9)
+        axes.errorbar(
+            x, y, bars, fmt="none", ecolor=colour, elinewidth=0.8, capsize=1.6, capthick=0.8, zorder=2.2 + k / 9
+        )
         axes.plot(x, y, **{**look, "marker": ""}, zorder=2.3 + k / 9)
         for is_hollow in (False, True):
             chosen = hollow[:, k] == is_hollow
             face = PAPER if is_hollow else colour
             style = {**look, "linestyle": "none", "markerfacecolor": face, "markeredgewidth": 0.9}
             axes.plot(x[chosen], y[chosen], **style, zorder=2.4 + k / 9)
-        dashes = {"linestyle": "none", "marker": "_", "markersize": 7, "markeredgewidth": 1.1, "alpha": 0.75}
+        dashes: dict[str, Any] = {
+            "linestyle": "none",
+            "marker": "_",
+            "markersize": 7,
+            "markeredgewidth": 1.1,
+            "alpha": 0.75,
+        }
         axes.plot(x, np.where(np.isfinite(median[:, k]), median[:, k], np.nan), color=colour, **dashes, zorder=2.1)
-    _scale(axes, mean, mean + spread)
+    _scale(axes, mean, mean + spread, logarithmic)
     _name_levels(axes, summary)
+
+
+def _spans_decades(flights: Flights) -> bool:
+    """Whether the means of some state differ so much that a linear scale shows the largest alone."""
+    seen = [mean[np.isfinite(mean)] for mean in map(flights.mean, flights.errors)]
+    return any(len(x) and float(x.max()) > _MANY * float(np.median(x)) for x in seen)
 
 
 # Axes ----------------------------------------------------------------------------------------------------------------
@@ -155,26 +170,30 @@ def _positions(summary: Summary) -> tuple[Floats, int]:
 
 
 def _name_levels(axes: Axes, summary: Summary) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     positions, _ = _positions(summary)
     margin = 0.6 * (float(np.diff(positions).min()) if len(positions) > 1 else 1.0)
     axes.set_xlim(positions[0] - margin, positions[-1] + margin)
     if not summary.is_numeric:
         axes.set_xticks(positions, [level.replace(" ", "\n") for level in summary.levels], fontsize=6)
-    elif len(positions) <= 6:
+    elif len(positions) <= _COLUMNS * 2:
         axes.set_xticks(positions, level_labels(summary))
+    else:
+        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
 
 
-def _scale(axes: Axes, mean: Floats, highest: Floats) -> None:
-    """Linear from 0; of means that differ by orders of magnitude logarithmic above the first decade."""
+def _scale(axes: Axes, mean: Floats, highest: Floats, logarithmic: bool) -> None:
+    """Linear from 0, or only up to a first decade and logarithmic from there."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-    seen = mean[np.isfinite(mean)]
-    largest, top = float(seen.max(initial=0.0)), float(np.nan_to_num(highest).max(initial=0.0))
+    largest = float(mean[np.isfinite(mean)].max(initial=0.0))
+    top = max(largest, float(np.nan_to_num(highest).max(initial=0.0)))
     if not largest > 0.0:
-        axes.set_ylim(0.0, 1.0)
+        axes.set_ylim(-0.04, 1.0)
         return
-    if largest <= _MANY * float(np.median(seen)):
-        axes.set_ylim(0.0, 1.06 * top)
+    if not logarithmic:
+        axes.set_ylim(-0.04 * top, 1.06 * top)
         return
     first = int(np.floor(np.log10(largest))) - _DECADES
     axes.set_yscale("symlog", linthresh=10.0**first, linscale=0.5)
@@ -182,7 +201,7 @@ def _scale(axes: Axes, mean: Floats, highest: Floats) -> None:
     axes.yaxis.set_major_locator(FixedLocator([0.0, *decades]))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: _decade(y)))
-    axes.set_ylim(-0.06 * 10.0**first, 1.5 * top)
+    axes.set_ylim(-0.35 * 10.0**first, 1.6 * top)
 
 
 def _decade(y: float) -> str:
@@ -202,7 +221,7 @@ def method_looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
     looks: dict[str, dict[str, Any]] = {TRUE: {"color": REFERENCE, "linewidth": 2.8, "solid_capstyle": "round"}}
     for i, label in enumerate(others):
         mark = {"marker": _MARKERS[i % len(_MARKERS)], "markersize": 4.0}
-        looks[label] = {"color": COLOURS[i % len(COLOURS)], "linewidth": 0.9, **mark}
+        looks[label] = {"color": _COLOURS[i % len(_COLOURS)], "linewidth": 0.9, **mark}
     return {label: looks[label] for label in methods}
 
 
@@ -221,6 +240,6 @@ def level_labels(summary: Summary) -> list[str]:
 
 
 def _n_trials(summary: Summary) -> str:
-    """How many trials a point has: ``50``, ``2 to 50``; SettingsError is not for a store that is yet to be filled."""
+    """How many trials a point has: ``50``, ``2 to 50`` where some are yet to run."""
     counts = np.concatenate([flights.ran.sum(axis=2).ravel() for flights in summary.flights.values()])
     return str(counts.max()) if counts.min() == counts.max() else f"{counts.min()} to {counts.max()}"

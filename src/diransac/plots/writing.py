@@ -29,7 +29,10 @@ def checked_ending(path: Path) -> str:
 
 
 def write(figure: Figure, path: Path) -> None:
-    """Write the figure, as its ending says.  Raises SettingsError: of that kind there is none, or it cannot be written."""
+    """Write the figure as its file's ending says.
+
+    Raises SettingsError: the ending is not known, or the file cannot be written.
+    """
     from matplotlib import rc_context
 
     ending = checked_ending(path)

@@ -1,0 +1,179 @@
+"""The paths that a study has flown, all trials over one another: Fig. 5 of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac.errors import SettingsError
+from diransac.plots.flights import Range, extent
+from diransac.plots.heading import draw_heading, header_height
+from diransac.plots.layout import WIDTH
+from diransac.plots.palette import INK, MUTED, PAPER, REFERENCE, RULE, SOFT
+from diransac.plots.study import method_looks, title_of
+from diransac.plots.writing import checked_ending, write
+from diransac.study.reading import paths
+from diransac.study.specification import TRUE
+from diransac.study.store import Store
+from diransac.study.summary import Summary, summarise
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["levels_with_paths", "plot_paths"]
+
+Path2 = npt.NDArray[np.float32]
+
+# Inches: left of the panels, between them, above a row of them (its trajectory), below (what is not seen), the caption.
+_LEFT, _GAP, _NAME, _BELOW, _CAPTION = 0.42, 0.12, 0.24, 0.42, 0.3
+# Of what a panel shows: room on each side of the reference, as a share of its larger side; of paths, every n-th row.
+_MARGIN, _EVERY = 0.3, 3
+_PALE = 0.35
+# Lines of the grid across a panel, at most.
+_LINES = 5.0
+
+
+def plot_paths(
+    store: str | Path, path: str | Path | None = None, *, level: str | None = None, title: str | None = None
+) -> Figure:
+    """The flown paths of every trial at one level: a row of panels a trajectory, a panel a method.
+
+    Parameters
+    ----------
+    store : of a study that keeps paths
+    path : ``.png``, ``.svg`` or ``.pdf`` to be written, whole or not at all; None writes nothing
+    level : None: the only one that has paths
+    title : None: the study's name and description
+
+    Below the flights lies, broad and grey, what was flown with the true parameters, if the study has the method
+    ``true``.  Panels show as much of the plane as that takes and some more; how many flights leave it, and how many
+    trials have none, stands below each.
+
+    Returns a Matplotlib figure. The same rows give the same file.
+    Raises StudyError: there is no such store, or it has no rows; SettingsError: it has no paths at that level, or the
+    file cannot be written.
+    """
+    if path is not None:
+        checked_ending(Path(path))
+    summary = summarise(store)
+    chosen = _chosen(levels_with_paths(store), level)
+    flown = {shape: _at(paths(store, shape), chosen, summary.methods) for shape in summary.flights}
+    figure = _drawn(summary, chosen, flown, title_of(summary) if title is None else title)
+    if path is not None:
+        write(figure, Path(path))
+    return figure
+
+
+def levels_with_paths(store: str | Path) -> list[str]:
+    """The levels at which a store keeps paths, in the order in which they were kept.  Raises StudyError: as above."""
+    with Store.existing(store) as kept:
+        return [level for (level,) in kept.select("SELECT DISTINCT level FROM trials WHERE paths NOT NULL")]
+
+
+def _chosen(levels: Sequence[str], level: str | None) -> str:
+    if not levels:
+        raise SettingsError("the store keeps no paths; run the study with evaluation.keep_paths = true")
+    if level is None and len(levels) == 1:
+        return levels[0]
+    if level is None or level not in levels:
+        asked = "paths were kept at several levels" if level is None else f'there are no paths at level "{level}"'
+        raise SettingsError(f"{asked}; name one of {', '.join(levels)}")
+    return level
+
+
+def _at(found: Mapping[tuple[str, int, str], Path2], level: str, methods: Sequence[str]) -> dict[str, list[Path2]]:
+    """The paths of each method at one level."""
+    return {m: [path for (at, _, method), path in found.items() if (at, method) == (level, m)] for m in methods}
+
+
+# Panels --------------------------------------------------------------------------------------------------------------
+def _drawn(summary: Summary, level: str, flown: Mapping[str, Mapping[str, list[Path2]]], title: str) -> Figure:
+    from matplotlib.figure import Figure
+
+    looks = method_looks(summary.methods)
+    entries = [("flown with the true parameters", looks[TRUE])] if TRUE in looks else []
+    width = (WIDTH - _LEFT - 0.1) / len(looks) - _GAP
+    boxes = {shape: _box(by_method) for shape, by_method in flown.items()}
+    heights = {shape: width * extent(box[1]) / extent(box[0]) for shape, box in boxes.items()}
+    header = header_height(entries, title)
+    full = header + sum(_NAME + height + _BELOW for height in heights.values()) + _CAPTION
+    figure = Figure(figsize=(WIDTH, full), facecolor=PAPER)
+    top = header
+    for shape, by_method in flown.items():
+        _write(figure, 0.1, top + 0.03, shape, fontsize=9.5, color=INK)
+        counts = _counts(summary, shape, level)
+        for k, (label, look) in enumerate(looks.items()):
+            left, below = _LEFT + k * (width + _GAP), top + _NAME + heights[shape]
+            place = (left / WIDTH, 1.0 - below / full, width / WIDTH, heights[shape] / full)
+            axes = figure.add_axes(place, facecolor=SOFT)
+            _draw_flights(axes, by_method[label], by_method.get(TRUE, []), look["color"], label == TRUE)
+            _dress(axes, boxes[shape], first=k == 0)
+            _write(figure, left + width, top + 0.06, label, fontsize=8, color=look["color"], ha="right")
+            unseen = _unseen(by_method[label], boxes[shape], *counts[label])
+            _write(figure, left + width, below + 0.17, unseen, fontsize=7, color=MUTED, ha="right")
+        top += _NAME + heights[shape] + _BELOW
+    draw_heading(figure, entries, title)
+    caption = f"Every trial's path in the XZ plane, m; {summary.axis} {level} {summary.unit}".rstrip()
+    _write(figure, 0.1, full - _CAPTION + 0.06, caption, fontsize=7.5, color=MUTED)
+    return figure
+
+
+def _box(by_method: Mapping[str, list[Path2]]) -> tuple[Range, Range]:
+    """What a panel shows in x and z: the flights with the true parameters, or the median extent, and some more."""
+    every = by_method.get(TRUE) or [path for some in by_method.values() for path in some]
+    low = np.median([path[:, :2].min(axis=0) for path in every], axis=0)
+    high = np.median([path[:, :2].max(axis=0) for path in every], axis=0)
+    margin = _MARGIN * max(float((high - low).max()), 1e-6)
+    return tuple((float(a) - margin, float(b) + margin) for a, b in zip(low, high, strict=True))  # type: ignore[return-value]
+
+
+def _draw_flights(axes: Axes, flown: Sequence[Path2], true: Sequence[Path2], colour: str, is_true: bool) -> None:
+    from matplotlib.collections import LineCollection
+
+    for reference in true[:1]:
+        axes.plot(*reference[::_EVERY, :2].T, color=REFERENCE, linewidth=2.6, solid_capstyle="round", zorder=1.8)
+    if not is_true:
+        lines = [path[::_EVERY, :2] for path in flown]
+        axes.add_collection(
+            LineCollection(lines, colors=colour, linewidths=0.6, alpha=_PALE, zorder=2.5), autolim=False
+        )
+
+
+def _dress(axes: Axes, box: tuple[Range, Range], first: bool) -> None:
+    from matplotlib.ticker import MultipleLocator
+
+    axes.set(xlim=box[0], ylim=box[1])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    axes.tick_params(length=0, labelsize=7, labelcolor=MUTED, labelleft=first, pad=2)
+    axes.grid(color=RULE, linewidth=0.6)
+    axes.set_axisbelow(True)
+    least = extent(box[0]) / _LINES
+    decade = 10.0 ** np.floor(np.log10(least))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MultipleLocator(next(n * decade for n in (1.0, 2.0, 5.0, 10.0) if n * decade >= least)))
+
+
+# Words ---------------------------------------------------------------------------------------------------------------
+def _counts(summary: Summary, shape: str, level: str) -> dict[str, tuple[int, int]]:
+    """Trials of each method at the level, and how many failed."""
+    flights, row = summary.flights[shape], summary.levels.index(level)
+    ran, failed = flights.ran[row].sum(axis=1), flights.failed[row].sum(axis=1)
+    return {label: (int(ran[k]), int(failed[k])) for k, label in enumerate(summary.methods)}
+
+
+def _unseen(flown: Sequence[Path2], box: tuple[Range, Range], ran: int, failed: int) -> str:
+    """How many flights leave the panel, and how many trials have none."""
+    low, high = np.transpose(box)
+    leaving = sum(bool(((path[:, :2] < low) | (path[:, :2] > high)).any()) for path in flown)
+    lines = [f"{leaving} of {ran} leave the panel"] * (leaving > 0) + [f"{failed} of {ran} failed"] * (failed > 0)
+    return "\n".join(lines)
+
+
+def _write(figure: Figure, x: float, top: float, text: str, **look: Any) -> None:
+    figure.text(x / WIDTH, 1.0 - top / figure.get_figheight(), text, va="top", **look)

@@ -1,0 +1,138 @@
+"""One HTML page of a study: its figures, the numbers behind them, what failed, and what took its time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac.atomic import write_text
+from diransac.errors import ResultError
+from diransac.plots.paths import levels_with_paths, plot_paths
+from diransac.plots.study import axis_label, level_labels, plot_study, title_of
+from diransac.plots.writing import svg
+from diransac.report.markup import Html, join, number, percent, plural, table, tag
+from diransac.study.summary import Flights, Summary, summarise
+
+__all__ = ["write_study_report"]
+
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'"
+_STYLE = """
+figure svg { width: 100%; height: auto; max-width: 70rem; border-radius: .4rem; }
+details { margin: .5rem 0; } summary { cursor: pointer; font-weight: 600; }
+"""
+
+
+def write_study_report(store: str | Path, path: str | Path) -> None:
+    """Write a page about a store; it appears whole or not at all, needs nothing else and runs no script.
+
+    The same rows give the same page.
+    Raises StudyError: there is no such store, or it has no rows yet; ResultError: the page cannot be written.
+    """
+    summary = summarise(store)
+    figures = [svg(plot_study(store, title=""))]
+    figures += [svg(plot_paths(store, level=level, title="")) for level in levels_with_paths(store)]
+    try:
+        write_text(path, _page(summary, figures))
+    except OSError as error:
+        raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _page(summary: Summary, figures: Sequence[str]) -> str:
+    style = (files("diransac.report") / "page.css").read_text(encoding="utf-8")
+    head = [
+        tag("meta", charset="utf-8"),
+        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        tag("meta", http_equiv="Content-Security-Policy", content=_POLICY),
+        tag("title", title_of(summary)),
+        tag("style", Html(style + _STYLE)),
+    ]
+    main = [
+        *(tag("figure", _scoped(figure)) for figure in figures),
+        tag("h2", "In short"),
+        *(_short(summary, shape, flights) for shape, flights in summary.flights.items()),
+        tag("h2", "Every level"),
+        *(part for shape, flights in summary.flights.items() for part in _levels(summary, shape, flights)),
+        tag("h2", "What failed"),
+        _failed(summary),
+        tag("h2", "What took its time"),
+        _seconds(summary),
+        tag("p", f"Computed by {'; '.join(summary.versions)}.", class_="how"),
+    ]
+    body = [tag("h1", summary.name), tag("p", summary.description, class_="about"), tag("main", *main)]
+    return f"<!DOCTYPE html>\n{tag('html', tag('head', *head), tag('body', *body), lang='en')}\n"
+
+
+def _scoped(figure: str) -> Html:
+    """A figure whose rules of style hold for figures alone."""
+    return Html(figure.replace("*{stroke-linejoin", "svg *{stroke-linejoin"))
+
+
+# Numbers -------------------------------------------------------------------------------------------------------------
+def _short(summary: Summary, shape: str, flights: Flights) -> Html:
+    """The least and the largest mean of each method over all levels."""
+    means = {state: flights.mean(state) for state in summary.units}
+    rows = [
+        [label, _failures(flights, k), *(_range(mean[:, k]) for mean in means.values())]
+        for k, label in enumerate(summary.methods)
+    ]
+    header = ["method", "failed", *(f"{state}, {unit}" for state, unit in summary.units.items())]
+    caption = f"{shape}: mean RMS tracking error over the flights there are, least to largest of all levels"
+    return table(header, rows, caption)
+
+
+def _levels(summary: Summary, shape: str, flights: Flights) -> Iterator[Html]:
+    """A table a state, to be opened: mean ± standard deviation, and the median."""
+    yield tag("h3", shape)
+    for state, unit in summary.units.items():
+        mean, deviation, median = flights.mean(state), flights.deviation(state), flights.median(state)
+        rows = [
+            [label, *(_spread(mean[i, k], deviation[i, k], median[i, k]) for k in range(len(summary.methods)))]
+            for i, label in enumerate(level_labels(summary))
+        ]
+        caption = "mean ± standard deviation of the flights there are (median of all trials, a failure being infinite)"
+        inner = table([axis_label(summary), *summary.methods], rows, caption)
+        yield tag("details", tag("summary", f"{state}, {unit}"), inner)
+
+
+def _failed(summary: Summary) -> Html:
+    """Every reason, and how often."""
+    if not summary.failures:
+        return tag("p", "No trial failed.")
+    rows = [[method, str(count), why] for (method, why), count in summary.failures.items()]
+    about = "A trial without a flight has no error: means leave it out, medians count it as infinite."
+    return join([tag("p", about), table(["method", "trials", "why"], rows, "Over all levels and trajectories")])
+
+
+def _seconds(summary: Summary) -> Html:
+    """Seconds of each method by stage."""
+    rows = [
+        [label, *(number(x, 3) for x in seconds), number(float(seconds.sum()), 3)]
+        for label, seconds in zip(summary.methods, summary.seconds, strict=True)
+    ]
+    total = summary.seconds.sum(axis=0)
+    rows.append(["all", *(number(x, 3) for x in total), number(float(total.sum()), 3)])
+    n_rows = sum(int(flights.ran.sum()) for flights in list(summary.flights.values())[:1])
+    caption = f"Seconds of one process, over {plural(n_rows, 'row')}; what is done for several together is divided"
+    return table(["method", *summary.stages, "all"], rows, caption)
+
+
+def _failures(flights: Flights, k: int) -> str:
+    ran, failed = int(flights.ran[:, k].sum()), int(flights.failed[:, k].sum())
+    return f"{failed} of {ran} ({percent(failed / ran)})" if failed else "none"
+
+
+def _range(values: npt.NDArray[np.float64]) -> str:
+    there: Iterable[float] = values[np.isfinite(values)]
+    found = [number(x, 2) for x in (min(there, default=np.nan), max(there, default=np.nan))]
+    return found[0] if found[0] == found[1] else f"{found[0]} … {found[1]}"
+
+
+def _spread(mean: float, deviation: float, median: float) -> str:
+    if np.isnan(mean):
+        return "–"
+    about = "" if np.isnan(deviation) else f" ± {number(deviation, 2)}"
+    return f"{number(mean, 3)}{about} ({number(median, 3)})"
