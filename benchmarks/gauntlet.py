@@ -45,6 +45,8 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--json", action="store_true", help="every record instead of tables")
     chosen = parser.parse_args(arguments)
     chosen.methods = chosen.methods or list(METHODS)
+    if not list(_trials(chosen)):
+        parser.error("nothing to run: no vehicle chosen has such a flight and scenario")
     return chosen
 
 
@@ -81,10 +83,16 @@ def _run_all(trials: Sequence[Trial], methods: Sequence[str], jobs: int) -> list
     records = list[Record]()
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
         waiting = [pool.submit(run, trial, methods) for trial in trials]
-        for k, done in enumerate(as_completed(waiting), start=1):
-            records += done.result()
-            trial = records[-1].trial
-            print(f"{k}/{len(trials)} {trial.vehicle}, {trial.flight}, {trial.scenario}", file=sys.stderr, flush=True)
+        try:
+            for k, done in enumerate(as_completed(waiting), start=1):
+                records += done.result()
+                trial = records[-1].trial
+                print(
+                    f"{k}/{len(trials)} {trial.vehicle}, {trial.flight}, {trial.scenario}", file=sys.stderr, flush=True
+                )
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # a method that breaks ends the run now, not after the other logs
+            raise
     return records
 
 

@@ -138,6 +138,16 @@ def test_faults_strike_about_a_fifth_of_the_samples():
         assert np.mean(shares) == pytest.approx(0.2, abs=0.02)
 
 
+def test_a_scenario_may_be_any_function_that_spoils_a_log(monkeypatch):
+    def weak(log, seed):
+        return dr.Log.from_arrays(log.time, {**log.signals, "force": log["force"] / 2}, log.units)
+
+    monkeypatch.setitem(scenarios.SCENARIOS, "servo-axis", [scenarios.Scenario("weak", weak)])
+    (found,) = judging.run(judging.Trial("servo-axis", "wander", "weak", 0), ["ols"])
+    assert list(found.errors.values()) == pytest.approx([0.5] * 4)
+    assert not found.bound
+
+
 def test_names_are_unique_and_have_no_commas():
     names = [*methods.METHODS, *vehicles.VEHICLES]
     for some in scenarios.SCENARIOS.values():
