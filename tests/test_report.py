@@ -289,6 +289,153 @@ def test_a_page_that_cannot_be_written_is_an_error_that_names_it(result, log, tm
         dr.write_report(result, log, tmp_path / "nowhere" / "report.html")
 
 
+# ---------------------------------------------------------------------- what a diagnosis adds
+
+
+HIT = np.arange(10, 600, 37)
+
+
+@pytest.fixture(scope="module")
+def hit(log):
+    """A log whose velocity alone has outliers."""
+    speed = log["x_dot"].copy()
+    speed[HIT] += 30.0
+    return with_signals(log, x_dot=speed)
+
+
+@pytest.fixture(scope="module")
+def diagnosed(model, hit):
+    return dr.identify(model, hit, seed=0)
+
+
+def figure_of(page, name):
+    """Paths of the figure of a signal, as (name that is read, attributes)."""
+    begin = next(i for i, (n, a) in enumerate(page.elements) if n == "svg" and a["aria-label"].startswith(f"{name} in"))
+    paths = []
+    for element, attributes in page.elements[begin + 1 :]:
+        if element == "svg":
+            return paths
+        if element == "path" and "data-name" in attributes:
+            paths.append((attributes["data-name"], attributes))
+    return paths
+
+
+def test_noise_outliers_and_what_is_unexplained_stand_in_a_table_with_units(diagnosed, hit, tmp_path):
+    page = Page(written(diagnosed, hit, tmp_path))
+    found = diagnosed.diagnosis
+    share = markup.percent(found.outlier_fraction["x_dot"])
+    assert f"x_dot m/s {markup.number(found.noise_scale['x_dot'], 2)} {share}" in page.text
+    left = np.sqrt(np.mean(found.latent_accelerations["x_ddot"] ** 2))
+    assert f" {markup.number(left, 2)} What acts on the machine and is not in the model" in page.text
+    assert any(a["aria-label"] == "What the model does not explain: force on x in N" for a in page.all("svg"))
+    assert page.all("section")[2]["id"] == "diagnosis"
+
+
+def test_a_page_without_a_diagnosis_has_no_such_section_and_starts_at_the_first_row(result, log, tmp_path):
+    page = Page(written(result, log, tmp_path))
+    assert "diagnosis" not in [a["id"] for a in page.all("section")]
+    assert "Each simulation starts at the first row" in page.text
+    assert not page.all("path", "long")
+
+
+def test_faults_are_marked_in_their_own_signal_and_apart_from_rows_that_do_not_agree(diagnosed, hit, tmp_path):
+    mask = np.ones(len(hit), dtype=bool)
+    mask[[7, 300]] = False
+    page = Page(written(dataclasses.replace(diagnosed, inliers=mask), hit, tmp_path))
+    speed, place = dict(figure_of(page, "x_dot")), dict(figure_of(page, "x"))
+    assert set(HIT) <= set(vertices(speed["measured (outlier)"]["d"])[:, 0].tolist())
+    assert speed["measured (outlier)"]["class"].split() == ["trace", "dots", "fault"]
+    if "measured (outlier)" in place:
+        assert not set(HIT) & set(vertices(place["measured (outlier)"]["d"])[:, 0].tolist())
+    assert vertices(place["measured (row does not agree)"]["d"])[:, 0].tolist() == [7, 300]
+    assert set(HIT).isdisjoint(vertices(speed["measured"]["d"])[:, 0].tolist())
+
+
+def test_simulations_begin_anew_where_the_machine_was_and_the_whole_log_stays_to_be_seen(model, log, tmp_path):
+    t = log.time - log.time[0]
+    pushed = with_signals(log, thrust=log["thrust"] - 3.0 * np.sin(0.2 * t) ** 2)  # the log lacks a part of what acts
+    found = dr.identify(model, pushed, seed=0)
+    run = simulate_on("it", found, pushed, found.diagnosis)
+    n_rows = round(run.period / pushed.dt)
+    assert 5 <= len(pushed) / n_rows <= 25
+    begin, end = n_rows, 2 * n_rows
+    start = [np.interp(pushed.time[begin], found.diagnosis.motion_time, x) for x in found.diagnosis.motion.values()]
+    expected = rollouts(model).trajectories(
+        [list(found.parameters.values())], np.array(start), pushed["thrust"][begin:end, None], pushed.dt
+    )[0]
+    np.testing.assert_allclose(run.simulated[begin:end], expected, rtol=1e-12)
+    drift = np.abs(run.throughout - run.observations.measured).max(axis=0)
+    assert (np.nanmax(np.abs(run.errors), axis=0)[:2] < drift[:2]).all()
+    page = Page(written(found, pushed, tmp_path))
+    assert "begins anew every" in page.text
+    assert [a for name, a in figure_of(page, "x") if name == "through the whole log"]
+
+
+def test_beside_a_diagnosis_every_method_begins_anew_at_the_same_places(diagnosed, model, hit, tmp_path):
+    page = Page(written([dr.identify(model, hit, "ols"), diagnosed], hit, tmp_path))
+    assert [a["id"] for a in page.all("section")].count("diagnosis") == 1
+    assert not page.all("path", "long")
+    names = [name for name, _ in figure_of(page, "x")]
+    assert "ols" in names
+    assert "lo-diransac" in names
+    alone = simulate_on("ols", dr.identify(model, hit, "ols"), hit)
+    beside = simulate_on("ols", dr.identify(model, hit, "ols"), hit, diagnosed.diagnosis)
+    np.testing.assert_array_equal(alone.throughout, beside.throughout)
+    assert np.isfinite(beside.period)
+    assert np.isinf(alone.period)
+
+
+def test_a_held_out_log_is_not_judged_by_another_logs_diagnosis(diagnosed, model, tmp_path):
+    other = dive(model, 500, source="another dive")
+    page = Page(written(diagnosed, other, tmp_path))
+    assert "Held-out validation" in page.text
+    assert not page.all("path", "fault")
+    assert not any("does not explain" in a["aria-label"] for a in page.all("svg"))
+
+
+def test_a_parameter_that_the_log_cannot_tell_is_no_number(diagnosed, hit, tmp_path):
+    covariance = diagnosed.covariance.copy()
+    covariance[3] = covariance[:, 3] = np.inf
+    vague = dataclasses.replace(
+        diagnosed,
+        covariance=covariance,
+        parameters={**diagnosed.parameters, "bias": 123.456},
+        diagnosis=dataclasses.replace(diagnosed.diagnosis, undetermined=("bias",)),
+    )
+    page = Page(written([vague, dr.identify(vague.model, hit, "ols")], hit, tmp_path))
+    assert "bias N lo-diransac the log cannot tell ols" in page.text
+    assert "The log cannot tell bias: record a motion that depends on it." in page.text
+    assert "123.4" not in page.text
+    alone = Page(written(vague, hit, tmp_path))
+    assert "bias N lo-diransac the log cannot tell" in alone.text
+
+
+def test_an_input_that_acts_late_is_said_and_the_simulation_allows_for_it(model, log, tmp_path):
+    late = with_signals(log, thrust=np.r_[log["thrust"][4:], np.full(4, log["thrust"][-1])])
+    found = dr.identify(model, late, seed=0)
+    assert level_of(found, late, "Inputs act 80 ms later than the log says") == "care"
+    assert "ms later than the log says; that is allowed for" in Page(written(found, late, tmp_path)).text
+    run = simulate_on("it", found, late, found.diagnosis)
+    assert run.typical_errors["x_dot"] < 0.01 * np.ptp(log["x_dot"])
+
+
+def test_positions_alone_are_simulated_from_the_motion_that_was_found(model, log, tmp_path):
+    bare = dr.Log.from_arrays(log.time, {"x": log["x"], "thrust": log["thrust"]}, source="bare")
+    found = dr.identify(model, bare, differentiate=True)
+    page = Page(written(found, bare, tmp_path))
+    assert "x_ddot m/s^2 not measured" in page.text
+    assert "method='lo-diransac', seed=0, differentiate=True)" in page.text
+
+
+def test_what_the_model_leaves_out_is_graded(diagnosed, hit):
+    assert level_of(diagnosed, hit, "The model leaves out what is worth") == "good"
+    latent = {"x_ddot": diagnosed.diagnosis.latent_accelerations["x_ddot"] + 2.0}
+    pushed = dataclasses.replace(
+        diagnosed, diagnosis=dataclasses.replace(diagnosed.diagnosis, latent_accelerations=latent)
+    )
+    assert level_of(pushed, hit, "The model leaves out what is worth") == "care"
+
+
 # ---------------------------------------------------------------------- safe to open
 
 
