@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.diagnosis import Diagnosis
-from diransac.report.figures import Timeline, Trace, padded, time_axis, time_plot
+from diransac.report.figures import Scale, Timeline, Trace, padded, time_axis, time_plot
 from diransac.report.markup import Html, join, number, percent, table, tag
 from diransac.report.runs import Run
 
@@ -16,6 +16,7 @@ __all__ = ["diagnoses"]
 
 FloatArray = npt.NDArray[np.float64]
 
+_VISIBLE = 0.01
 _FORCES = {"m/s^2": "N", "rad/s^2": "N m"}
 
 
@@ -84,12 +85,18 @@ def _figure(run: Run, name: str, values: FloatArray, found: Diagnosis, i: int, t
     moved = model.rate_names[list(model.accelerations).index(name)]
     what = f"force on {moved}" if found.latent_forces else name
     trace = Trace(what, f"m{i}", "line", *_steps(found, values, timeline))
-    scale = padded(min(0.0, float(values.min())), max(0.0, float(values.max())))
+    scale = _scale(values, run.unexplained.get(name, 0.0))
     size = f"RMS {number(_rms(values), 2)} {unit}".strip()
     heading = tag("h3", what, " ", tag("span", unit, class_="unit"))
     caption = tag("figcaption", heading, tag("p", f"{size}, {_share(run, name)}"))
     label = f"What the model does not explain: {what}{f' in {unit}' if unit else ''}"
     return tag("figure", caption, time_plot([trace], scale, timeline, label, levels=(0.0,)), time_axis(timeline))
+
+
+def _scale(values: FloatArray, share: float) -> Scale:
+    """The values' range, and at least so much of what moves the machine that nothing looks like nothing."""
+    least = _VISIBLE * _rms(values) / share if share > 0.0 else 0.0
+    return padded(min(-least, float(values.min())), max(least, float(values.max())))
 
 
 def _share(run: Run, name: str) -> str:

@@ -24,6 +24,7 @@ __all__ = ["equations", "heading", "making", "parameters", "scores", "short"]
 _PACKAGES = ("diransac", "numpy", "scipy", "casadi", "llvmlite")
 _DEFAULT_ESTIMATORS = ("OrdinaryLeastSquares", "NonlinearLeastSquares")
 _WIDEST = 2.0
+_LONG = 6
 _SYMBOLS = {"good": "✓", "care": "!", "bad": "✗", "note": "i"}
 
 
@@ -115,12 +116,21 @@ def _parameter(name: str, having: Sequence[tuple[int, Run]]) -> Html:
     first = tag("th", name, " ", tag("span", about, class_="unit"), scope="rowgroup", rowspan=len(having) + 1)
     scale = _parameter_scale(name, [run for _, run in having])
     rows = [_estimate(name, run, i, scale) for i, run in having]
-    shown = ticks(scale.low, scale.high, 4) if any(run.tells(name) for _, run in having) else []
+    shown = _parameter_ticks(scale) if any(run.tells(name) for _, run in having) else []
     marks = [tag("span", text, class_="tick x", style=f"left:{_at(x, scale)}") for x, text in shown]
     axis = tag(
         "tr", tag("td", colspan=4), tag("td", tag("div", *marks, class_="times"), aria_hidden="true"), class_="scale"
     )
     return tag("tbody", tag("tr", first, *rows[0]), *(tag("tr", *row) for row in rows[1:]), axis)
+
+
+def _parameter_ticks(scale: Scale) -> list[tuple[float, str]]:
+    """Fewer where they are long, and none at the edges then."""
+    found = ticks(scale.low, scale.high, 4)
+    if max(len(text) for _, text in found) <= _LONG:
+        return found
+    margin = 0.15 * (scale.high - scale.low)
+    return [(x, text) for x, text in found[1::2] if scale.low + margin < x < scale.high - margin]
 
 
 def _parameter_scale(name: str, runs: Sequence[Run]) -> Scale:
