@@ -16,6 +16,7 @@ from diransac.report.diagnosed import diagnoses
 from diransac.report.figures import Timeline
 from diransac.report.markup import Html, tag
 from diransac.report.over_time import inliers_over_time, signals_over_time
+from diransac.report.parameters import parameters
 from diransac.report.runs import Run, diagnosis_of, labelled, simulate_on
 from diransac.result import Result
 
@@ -55,7 +56,7 @@ def _page(runs: Sequence[Run], log: Log) -> str:
         tag(
             "main",
             sections.short(runs),
-            sections.parameters(runs),
+            parameters(runs),
             *diagnoses(runs, timeline),
             signals_over_time(runs, timeline),
             inliers_over_time(runs, timeline),
