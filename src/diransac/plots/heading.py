@@ -31,7 +31,11 @@ def _columns(entries: Sequence[Entry]) -> int:
 def header_height(entries: Sequence[Entry], title: str | None) -> float:
     """Height of title and legend, inches."""
     lines = -(-len(entries) // _columns(entries))
-    return _FREE + _LEGEND_LINE * lines + _TITLE * bool(title)
+    return _FREE + _LEGEND_LINE * lines + _title_height(title)
+
+
+def _title_height(title: str | None) -> float:
+    return _TITLE * len(title.splitlines()) if title else 0.0
 
 
 def draw_heading(figure: Figure, entries: Sequence[Entry], title: str | None) -> None:
@@ -42,7 +46,7 @@ def draw_heading(figure: Figure, entries: Sequence[Entry], title: str | None) ->
     top = 1.0 - _FREE / 2.0 * inch
     if title:
         figure.text(0.08 / WIDTH, top, title, fontsize=11.5, fontweight="bold", color=INK, va="top")
-        top -= _TITLE * inch
+        top -= _title_height(title) * inch
     n_columns = _columns(entries)
     in_lines = [entry for column in range(n_columns) for entry in entries[column::n_columns]]
     figure.legend(

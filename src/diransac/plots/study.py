@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,6 +34,9 @@ _COLUMNS = 3
 _SPREAD = 0.5
 # Means this many times the median mean call for a logarithmic scale, of so many decades above a linear beginning.
 _MANY, _DECADES = 20.0, 3
+_LETTERS = 92
+"""Of a title's line."""
+
 # The palette's fifth colour is too near the first where lines cross.
 _COLOURS = (*COLOURS[:4], INK, COLOURS[5])
 _MARKERS = ("o", "s", "^", "v", "D", "P")
@@ -211,8 +215,8 @@ def _decade(y: float) -> str:
 
 # Words and looks -----------------------------------------------------------------------------------------------------
 def title_of(summary: Summary) -> str:
-    """The study's name and what it is about."""
-    return f"{summary.name}: {summary.description}".removesuffix(": ")
+    """The study's name and what it is about, in as many lines as it needs."""
+    return "\n".join(wrap(f"{summary.name}: {summary.description}".removesuffix(": "), _LETTERS))
 
 
 def method_looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -22,6 +22,7 @@ __all__ = ["write_study_report"]
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 _STYLE = """
 figure svg { width: 100%; height: auto; max-width: 70rem; border-radius: .4rem; }
+main td:not(:last-child), main tbody th { white-space: nowrap; }
 details { margin: .5rem 0; } summary { cursor: pointer; font-weight: 600; }
 """
 
@@ -47,13 +48,13 @@ def _page(summary: Summary, figures: Sequence[str]) -> str:
         tag("meta", charset="utf-8"),
         tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
         tag("meta", http_equiv="Content-Security-Policy", content=_POLICY),
-        tag("title", title_of(summary)),
+        tag("title", " ".join(title_of(summary).split())),
         tag("style", Html(style + _STYLE)),
     ]
     main = [
         *(tag("figure", _scoped(figure)) for figure in figures),
         tag("h2", "In short"),
-        *(_short(summary, shape, flights) for shape, flights in summary.flights.items()),
+        *(part for shape, flights in summary.flights.items() for part in _short(summary, shape, flights)),
         tag("h2", "Every level"),
         *(part for shape, flights in summary.flights.items() for part in _levels(summary, shape, flights)),
         tag("h2", "What failed"),
@@ -72,16 +73,19 @@ def _scoped(figure: str) -> Html:
 
 
 # Numbers -------------------------------------------------------------------------------------------------------------
-def _short(summary: Summary, shape: str, flights: Flights) -> Html:
-    """The least and the largest mean of each method over all levels."""
-    means = {state: flights.mean(state) for state in summary.units}
-    rows = [
-        [label, _failures(flights, k), *(_range(mean[:, k]) for mean in means.values())]
-        for k, label in enumerate(summary.methods)
-    ]
+def _short(summary: Summary, shape: str, flights: Flights) -> Iterator[Html]:
+    """The least and the largest mean, and median, of each method over all levels."""
     header = ["method", "failed", *(f"{state}, {unit}" for state, unit in summary.units.items())]
-    caption = f"{shape}: mean RMS tracking error over the flights there are, least to largest of all levels"
-    return table(header, rows, caption)
+    for about, of in (
+        ("mean RMS tracking error of the flights there are", flights.mean),
+        ("median RMS tracking error of all trials, one that failed having ∞", flights.median),
+    ):
+        figures = [of(state) for state in summary.units]
+        rows = [
+            [label, _failures(flights, k), *(_range(one[:, k]) for one in figures)]
+            for k, label in enumerate(summary.methods)
+        ]
+        yield table(header, rows, f"{shape}: {about}, least … largest of all levels")
 
 
 def _levels(summary: Summary, shape: str, flights: Flights) -> Iterator[Html]:
@@ -126,7 +130,7 @@ def _failures(flights: Flights, k: int) -> str:
 
 
 def _range(values: npt.NDArray[np.float64]) -> str:
-    there: Iterable[float] = values[np.isfinite(values)]
+    there: Iterable[float] = values[~np.isnan(values)]
     found = [number(x, 2) for x in (min(there, default=np.nan), max(there, default=np.nan))]
     return found[0] if found[0] == found[1] else f"{found[0]} … {found[1]}"
 
