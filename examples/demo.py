@@ -49,6 +49,7 @@ def identify(log: dr.Log) -> dict[str, dr.Result]:
         seconds = time.perf_counter() - begin
         print(f"{_row(method, found.parameters)}{100 * found.inlier_fraction:9.1f} %{seconds:8.2f} s")
         results[method] = found
+    print("(Times include compiling the model for a method's first use.)")
     return results
 
 
