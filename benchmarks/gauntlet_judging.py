@@ -14,6 +14,7 @@ from gauntlet_vehicles import VEHICLES, effective_parameters, recorded
 import diransac as dr
 from diransac.simulate import rollouts
 
+Array = np.ndarray[Any, Any]
 ErrorsByName = Mapping[str, float]
 _ROUNDING, _VISIBLE = 1e-6, 1e-5
 Mission = Callable[..., dr.Trajectory]
@@ -42,7 +43,7 @@ class Record:
     tracking, tracking_of_truth : RMS distance from the mission, m, flown by what was identified and by the truth;
         infinite where there is no plan or the flight diverges, NaN where none is flown
     mismatch : whether the plant has more to it than the model
-    bound : by parameter, Cramer-Rao's relative standard deviation; empty where more is wrong than Gaussian noise
+    bound : by parameter, Cramer-Rao's relative standard deviation; empty without Gaussian noise
     seconds : that it took
     refusal : why there is no estimate
     """
@@ -83,7 +84,7 @@ def run(trial: Trial, methods: Sequence[str], *, fly: bool = True) -> list[Recor
     clean = recorded(trial.vehicle, trial.flight, plant, trial.seed)
     log = scenario.recorded(plant, clean, trial.seed)
     best = effective_parameters(plant, clean)
-    bound = cramer_rao(plant, clean, scenario.noise) if scenario.gaussian else {}
+    bound = cramer_rao(*_as_the_model_says(trial), scenario.noise) if scenario.bounded else {}
     records = []
     for method in methods:
         estimate, seconds, refusal = _estimated(method, plant.model, log)
@@ -149,19 +150,25 @@ def _tracking_of_truth(vehicle: str, world: tuple[tuple[str, Any], ...], seed: i
     return tracking(mission, plant, plant.parameters, seed) if mission else np.nan
 
 
-def cramer_rao(plant: dr.Plant, clean: dr.Log, noise: dr.Noise) -> dict[str, float]:
-    """Relative standard deviation of each parameter that no unbiased estimate beats, from the whole log.
+def _as_the_model_says(trial: Trial) -> tuple[dr.Plant, dr.Log]:
+    """The plant without what the model does not know, and its log of the same flight."""
+    plant = VEHICLES[trial.vehicle].plant()
+    return plant, recorded(trial.vehicle, trial.flight, plant, trial.seed)
 
-    Unknown are the parameters and the initial state; each signal's noise is as `dr.corrupt` makes it, measured.
+
+def cramer_rao(plant: dr.Plant, clean: dr.Log, noise: dr.Noise) -> dict[str, float]:
+    """Relative standard deviation of each parameter that no unbiased estimate from the whole log beats.
+
+    Unknown are the parameters and the initial state; known is which samples are faulty, and those tell nothing. Each
+    signal's Gaussian noise is as `dr.corrupt` makes it, measured on the others.
     """
-    model = plant.model
+    model, p = plant.model, np.array(list(plant.parameters.values()))
     noisy = dr.corrupt(clean, noise, seed=0, signals=model.signals)
-    sigma = np.array([np.std(noisy[name] - clean[name]) for name in model.signals])
-    spread = np.array([np.std(clean[name]) for name in model.signals])
-    weights = 1.0 / np.maximum(sigma, 1e-9 * spread) ** 2
     measured = np.column_stack([clean[name] for name in model.signals])
     inputs = np.column_stack([clean[name] for name in model.inputs])
-    p = np.array(list(plant.parameters.values()))
+    weights = np.column_stack(
+        [_weights(noisy[n] - clean[n], noisy.planted[n], np.std(clean[n])) for n in model.signals]
+    )
     sums = rollouts(model, substeps=4).gauss_newton(
         p[None], measured[0, : len(model.state)], inputs, measured, np.ones(len(clean), bool), clean.dt, weights
     )
@@ -169,3 +176,8 @@ def cramer_rao(plant: dr.Plant, clean: dr.Log, noise: dr.Noise) -> dict[str, flo
     scale = 1.0 / np.sqrt(np.diag(N))
     covariance = np.linalg.pinv(N * np.outer(scale, scale)) * np.outer(scale, scale)
     return dict(zip(model.parameters, (np.sqrt(np.diag(covariance))[: model.n_p] / np.abs(p)).tolist(), strict=True))
+
+
+def _weights(errors: Array, faulty: Array, spread: float) -> Array:
+    """One over the variance (N,) of samples without fault; a signal without noise is good to a billionth."""
+    return np.where(faulty, 0.0, 1.0 / max(np.std(errors[~faulty]), 1e-9 * spread) ** 2)

@@ -36,16 +36,13 @@ class Scenario:
         return corrupt(log, self.noise, seed, signals=plant.model.signals) if self._is_noise else self.noise(log, seed)
 
     @property
-    def gaussian(self) -> bool:
-        """Whether Gaussian noise is all that is wrong, so that the Cramer-Rao bound holds."""
-        return self._is_noise and set(MIDDLE) <= set(self.noise.changed) <= _GAUSSIAN and not self.world
+    def bounded(self) -> bool:
+        """Whether there is Gaussian noise, so that Cramer-Rao's bound is above zero."""
+        return self._is_noise and set(MIDDLE) <= set(self.noise.changed)
 
     @property
     def _is_noise(self) -> bool:
         return isinstance(self.noise, Noise)
-
-
-_GAUSSIAN = {*MIDDLE, "angular_acceleration_std"}
 
 
 def _outliers(probability: float, magnitude: float, **more: Any) -> Noise:

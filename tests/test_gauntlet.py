@@ -65,21 +65,23 @@ def test_what_other_vehicles_do_not_know_pulls_to_and_fro_and_has_no_mean(vehicl
     assert np.std(calm - np.hypot.reduce([log[n] for n in plant.model.accelerations], axis=0)) > 0.01
 
 
-def test_the_bound_is_that_of_a_mean_where_the_answer_is_a_mean():
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_the_bound_is_that_of_a_parabola_where_the_answer_is_a_parabola(share):
     sledge = dr.Model(
         "sledge", {"s": "m"}, {"force": "N"}, {"mass": dr.Parameter("kg", positive=True)},
         lambda q, v, a, u, p: [p.mass * a.s - u.force],
     )  # fmt: skip
-    time = np.arange(2000) * 0.01
-    force = np.full(2000, 2.0)
-    columns = {"s": 0.5 * time**2, "s_dot": time, "s_ddot": np.ones(2000), "force": force}
+    time, one = np.arange(2000) * 0.01, np.ones(2000)
+    columns = {"s": 0.5 * time**2, "s_dot": time, "s_ddot": one, "force": 2.0 * one}
     log = dr.Log.from_arrays(time, columns, sledge.units)
-    plant, noise = dr.Plant(sledge, {"mass": 2.0}), dr.Noise(acceleration_std=0.5)
-    # Unknown a, s0, v0 of s = s0 + v0 t + a t^2 / 2, measured with sigma, sigma dt, sigma dt^2 / 2.
-    columns = [(0.5 * time**2, np.ones(2000), time), (time, 0 * time, np.ones(2000)), (time**0, 0 * time, 0 * time)]
-    information = sum(np.array(c) @ np.array(c).T / s**2 for c, s in zip(columns, (2.5e-5, 5e-3, 0.5), strict=True))
-    of_acceleration = np.sqrt(np.linalg.inv(information)[0, 0])
-    assert judging.cramer_rao(plant, log, noise)["mass"] == pytest.approx(of_acceleration, rel=0.05)
+    noise = dr.Noise(acceleration_std=0.5, outlier_probability=share, outlier_magnitude=50.0)
+    # Unknown are a, s0 and v0 of s = s0 + v0 t + a t^2 / 2, measured with sigma, sigma dt and sigma dt^2 / 2.
+    slopes = [(0.5 * time**2, one, time), (time, 0 * one, one), (one, 0 * one, 0 * one)]
+    information = sum(np.array(c) @ np.array(c).T / s**2 for c, s in zip(slopes, (2.5e-5, 5e-3, 0.5), strict=True))
+    of_acceleration = np.sqrt(np.linalg.inv(information)[0, 0] / (1 - share))
+    assert judging.cramer_rao(dr.Plant(sledge, {"mass": 2.0}), log, noise)["mass"] == pytest.approx(
+        of_acceleration, rel=0.05
+    )
 
 
 @pytest.mark.parametrize("method", ["SciPy soft-L1", "SciPy Cauchy", "sklearn Huber", "sklearn RANSAC"])
