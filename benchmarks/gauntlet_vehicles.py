@@ -20,6 +20,9 @@ DT, DURATION = 0.01, 25.0
 SUBSTEPS = 20
 """Integration steps from row to row, at least: a log is of the machine, not of an identifier's own discretisation."""
 
+RIPPLES = 126
+"""Of a motor's torque in a turn of its joint: 21 pairs of poles behind a gear of 6."""
+
 
 @dataclass(frozen=True)
 class Vehicle:
@@ -155,7 +158,7 @@ def servo_axis(cogging: float = 0.0) -> dr.Plant:
 
 
 def double_pendulum(ripple: float = 0.0) -> dr.Plant:
-    """A double pendulum whose motors ripple by so many N m, 18 times a turn of each joint."""
+    """A double pendulum whose motors ripple by so many N m."""
     model = dr.models.double_pendulum()
     truth = {
         "inertia1": 0.09, "moment1": 0.3, "inertia2": 0.025, "moment2": 0.12, "rotor_inertia": 6e-5,
@@ -165,12 +168,12 @@ def double_pendulum(ripple: float = 0.0) -> dr.Plant:
         model,
         "motors",
         forces=lambda q, v, u, p, d: {
-            "q1": d.ripple * cos(18 * q.q1 + d.phase_1),
-            "q2": d.ripple * cos(18 * q.q2 + d.phase_2),
+            "q1": d.ripple * cos(RIPPLES * q.q1 + d.phase_1),
+            "q2": d.ripple * cos(RIPPLES * q.q2 + d.phase_2),
         },
         constants={"ripple": ripple},
         **_anywhere("phase_1", "phase_2"),
-        highest_frequency=30.0,
+        highest_frequency=200.0,
     )
     return dr.Plant(model, truth, (motors,))
 
@@ -193,10 +196,12 @@ def pendulum(ripple: float = 0.0) -> dr.Plant:
     motor = dr.Disturbance(
         model,
         "motor",
-        accelerations=lambda q, v, u, p, d: {"angle": d.ripple * cos(18 * q.angle + d.phase) / (p.mass * p.length**2)},
+        accelerations=lambda q, v, u, p, d: {
+            "angle": d.ripple * cos(RIPPLES * q.angle + d.phase) / (p.mass * p.length**2)
+        },
         constants={"ripple": ripple},
         **_anywhere("phase"),
-        highest_frequency=30.0,
+        highest_frequency=200.0,
     )
     return dr.Plant(model, {"mass": 0.5, "length": 0.6, "friction": 0.05}, (motor,))
 
