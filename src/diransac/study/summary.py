@@ -54,7 +54,7 @@ class Flights:
         """Standard deviation of the flights there are, with n - 1; NaN where there are fewer than two."""
         there = ~np.isnan(self.errors[state])
         enough = there & (there.sum(axis=2, keepdims=True) > 1)
-        return self._over_trials(self.errors[state], enough, lambda x: np.std(x, ddof=1))
+        return self._over_trials(self.errors[state], enough, _sample_deviation)
 
     def median(self, state: str) -> Floats:
         """Median over all trials, of which one that failed counts as an infinite error; NaN where there is none."""
@@ -187,3 +187,8 @@ def _value(level: str) -> float | None:
 def _upper_median(values: Floats) -> np.floating:
     """The median; of an even number the upper one, so that infinities are not averaged with numbers."""
     return np.float64(np.sort(values)[len(values) // 2])
+
+
+def _sample_deviation(values: Floats) -> np.floating:
+    """The standard deviation with n - 1; exactly 0 of equal values, whose mean rounds."""
+    return np.float64(np.std(values - values[0], ddof=1))
