@@ -286,3 +286,9 @@ def test_the_command_writes_the_page_and_never_over_the_store(store: Path, tmp_p
     for words in (("report", store, "-o", store), ("plot", store, "-o", store), ("plot", store, "-o", "a.jpg")):
         assert run("study", *words).exit_code == 1
     assert contents(tmp_path) == before
+
+
+def test_the_command_takes_a_title_of_ones_own(store: Path, tmp_path: Path):
+    assert run("study", "plot", store, "-o", tmp_path / "a.svg", "--title", "As printed").exit_code == 0
+    plot_study(store, tmp_path / "b.svg", title="As printed")
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()

@@ -145,6 +145,7 @@ def _plot(
         typer.Option("--paths/--errors", help="Flown paths at one level, or errors over the axis.", show_default=False),
     ] = None,
     level: Annotated[str | None, typer.Option(metavar="A", help="Whose paths are drawn.")] = None,
+    title: Annotated[str | None, typer.Option(metavar="TEXT", help="In place of the study's name.")] = None,
 ) -> None:
     """Draw a store: the errors over the axis, or, if it keeps paths at a single level, these."""
     from diransac.plots.paths import levels_with_paths, plot_paths
@@ -156,9 +157,9 @@ def _plot(
         if flown is None:
             flown = level is not None or len(levels_with_paths(store)) == 1
         if flown:
-            plot_paths(store, written, level=level)
+            plot_paths(store, written, level=level, title=title)
         else:
-            plot_study(store, written)
+            plot_study(store, written, title=title)
 
 
 @study.command("report")
