@@ -9,6 +9,7 @@ import diransac as dr
 from diransac.errors import IdentificationError, LogError
 from diransac.lo_diransac import find
 from diransac.observations import observe
+from diransac.simulate import rollouts
 from simulated import MACHINES, as_log, flight, with_outliers
 from test_nonlinear import log_of, swing
 from user_models import hanging_mass
@@ -193,3 +194,42 @@ def test_intervals_cover_under_noise_and_outliers():
         span = 1.96 * np.sqrt(np.diag(findings.covariance))
         missed += (np.abs(findings.parameters - truth("underwater-vehicle")) > span).sum()
     assert missed <= 15
+
+
+def held(n_rows, seed=3):
+    """A mass with drag under a force that is held for ten rows and then leaps: its log without noise."""
+    force = np.repeat(np.random.default_rng(seed).uniform(-30.0, 30.0, n_rows // 10), 10)
+    machine = MACHINES["underwater-vehicle"]
+    return machine, force[:, None]
+
+
+def test_a_delay_of_inputs_that_leap_now_and_then_is_found_where_there_is_no_noise():
+    """One sample in five of the acceleration could pass for an outlier instead."""
+    machine, inputs = held(2000)
+    p = np.array(list(machine.truth.values()))
+    model = dr.models.underwater_vehicle()
+    signals = rollouts(model).trajectories([p], np.zeros(2), inputs, 0.01)[0]
+    columns = dict(zip(model.signals, signals[:-2].T, strict=True)) | {"thrust": inputs[2:, 0]}
+    log = dr.Log.from_arrays(np.arange(len(signals) - 2) * 0.01, columns)
+    result = dr.identify(model, log)
+    assert result.diagnosis.input_delay == pytest.approx(0.02, abs=1e-4)
+    assert result.diagnosis.is_late
+    np.testing.assert_allclose(list(result.parameters.values()), p, rtol=1e-3)
+
+
+def test_windows_in_which_outliers_are_the_majority_are_carried_by_their_neighbours():
+    machine, inputs = held(2000, seed=4)
+    p = np.array(list(machine.truth.values()))
+    model = dr.models.underwater_vehicle()
+    signals = rollouts(model).trajectories([p], np.zeros(2), inputs, 0.01)[0]
+    rng, bad = np.random.default_rng(0), np.zeros(signals.shape, bool)
+    for first in (300, 900, 1500):
+        bad[first : first + 120] = rng.random((120, 3)) < 0.8
+    spoilt = np.where(bad, signals + rng.uniform(0.0, 20.0, signals.shape), signals)
+    columns = dict(zip(model.signals, spoilt.T, strict=True)) | {"thrust": inputs[:, 0]}
+    result = dr.identify(model, dr.Log.from_arrays(np.arange(len(signals)) * 0.01, columns))
+    np.testing.assert_allclose(list(result.parameters.values()), p, rtol=1e-3)
+    found = np.column_stack([result.diagnosis.outliers[name] for name in model.signals])
+    large = bad & (np.abs(spoilt - signals) > 1.0)
+    assert (found & large).sum() > 0.99 * large.sum()
+    assert (found & ~bad).sum() < 0.01 * bad.size

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.lo_diransac.gate import mended_inputs, stuck_rows
-from diransac.lo_diransac.hypotheses import find_hypotheses, n_samples
+from diransac.lo_diransac.hypotheses import find_hypotheses, n_samples, robust_scores
 from diransac.lo_diransac.mixture import BREAKDOWN
 from diransac.lo_diransac.readout import deviation_units, parameter_units, read_out, unexplained
 from diransac.lo_diransac.refinement import believe, refine, start
@@ -42,6 +42,8 @@ _WHOLE_ROW, _MAX_SHIFTS = 0.5, 3
 # Local optimisations at most, and the difference in their losses, nats, that shows nothing.
 _MAX_STARTS, _AS_LIKELY = 5, 5.0
 _OUTLIER = 0.5
+# Rows that inputs may be late by, to begin with.
+_SHIFTS = range(-3, 9)
 # A share of a signal's spread that is no noise any more.
 _ALL_OF_IT = 0.8
 # A delay that is worth a word: so many standard errors, and so many rows.
@@ -99,8 +101,10 @@ def find(observations: Observations, seed: int) -> Findings:
             f"{observations.log.source}: no sample of the log gives parameters within their bounds; check the model, "
             "the signs and units of inputs, and the bounds"
         )
+    late = _likeliest_shift(windows, motion, hypotheses[0])
+    windows = windows.delayed(late)
     belief = believe(windows, motion, deviation_units(windows, motion, hypotheses[0]))
-    windows, refined, delay = _shifted(windows, _best(windows, motion, hypotheses, belief), belief)
+    windows, refined, later = _shifted(windows, _best(windows, motion, hypotheses, belief), belief)
     result = read_out(windows, refined.fit)
     if not _admits(windows, result.parameters):
         # The fit keeps to the bounds, least squares on its motion need not.
@@ -111,7 +115,7 @@ def find(observations: Observations, seed: int) -> Findings:
         notes = (*notes, "the model explains hardly anything of this log: do not rely on these parameters")
     if not refined.settled:
         notes = (*notes, "local optimisation had not settled when it reached its limit of steps")
-    return _findings(observations, windows, motion, refined, result, delay, len(hypotheses), notes)
+    return _findings(observations, windows, motion, refined, result, late + later, len(hypotheses), notes)
 
 
 def _admits(windows: Windows, parameters: FloatArray) -> bool:
@@ -168,6 +172,17 @@ def _is_doubtful(windows: Windows, refined: Refinement) -> bool:
     fit = refined.fit
     inlying = (fit.noise.inlying(fit.residuals, windows.known) > _OUTLIER).reshape(len(windows), -1).sum(axis=1)
     return bool((inlying < BREAKDOWN * windows.known.reshape(len(windows), -1).sum(axis=1)).any())
+
+
+def _likeliest_shift(windows: Windows, motion: Motion, p: FloatArray) -> int:
+    """Rows that inputs are late by if simulations with the best hypothesis are to agree best with the log.
+
+    Inputs that are held for many rows and then leap make few outliers when they are taken to be early or late, and
+    local optimisation would rest there; so whole rows are settled before it begins.
+    """
+    every = np.arange(len(windows))
+    scores = {rows: float(robust_scores(windows.delayed(rows), motion, p[None], every)[0]) for rows in _SHIFTS}
+    return min(scores, key=lambda rows: (scores[rows], abs(rows)))
 
 
 def _shifted(windows: Windows, refined: Refinement, belief: Belief) -> tuple[Windows, Refinement, int]:

@@ -44,7 +44,7 @@ _SIGMA_FLOOR = 1e-4
 # Of the accelerations' spread: what a model may miss without any evidence for it; so many times that on the way down,
 # lest noise explain what the model does not.
 _BELIEF, _GUARDED = 1e-3, 10.0
-_MAX_STEPS, _MAX_TRIALS = 60, 8
+_MAX_STEPS, _MAX_TRIALS, _MAX_SWEEPS = 60, 8, 12
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
 
 
@@ -90,7 +90,7 @@ def believe(windows: Windows, motion: Motion, unit: FloatArray) -> Belief:
 
 
 def start(windows: Windows, motion: Motion, p: FloatArray, belief: Belief) -> Fit:
-    """From a hypothesis, and the smoothed motion at the windows' starts."""
+    """From a hypothesis, and the smoothed motion at the windows' starts, or what the windows before make of it."""
     n_x, n_v = windows.model.n_q + windows.model.n_v, windows.model.n_v
     x, d = motion.signals[windows.starts, :n_x].copy(), np.zeros((len(windows), n_v))
     shared = np.concatenate([p, np.zeros(windows.freed.n_shared - len(p))])
@@ -101,7 +101,32 @@ def start(windows: Windows, motion: Motion, p: FloatArray, belief: Belief) -> Fi
     high = np.where(windows.known, windows.measured, -np.inf).max(axis=0)
     noise = Mixture(sigma, np.full(len(sigma), 0.3), np.where(high > low, high - low, 1.0), floor)
     prior = belief.unit * np.r_[np.full(len(shared) - 1, belief.guarded), belief.delay]
-    return Fit(shared, x, d, residuals, noise, _TAU_START * motion.spread[n_x:], motion.spread[:n_x].copy(), prior)
+    tau, slack = _TAU_START * motion.spread[n_x:], motion.spread[:n_x].copy()
+    return _anchored(windows, Fit(shared, x, d, residuals, noise, tau, slack, prior))
+
+
+def _anchored(windows: Windows, fit: Fit) -> Fit:
+    """Let windows begin where their predecessors end, as far as that explains them better.
+
+    Where outliers are in the majority for longer than a window, nothing there tells the state; its neighbours do.
+    """
+    for _ in range(_MAX_SWEEPS):
+        x = fit.x.copy()
+        x[1:] = np.nan_to_num(windows.ends(fit.shared, fit.x, fit.d))
+        residuals = windows.residuals(fit.shared, x, fit.d)
+        losses = [_loss_by_window(windows, replace(fit, residuals=r)) for r in (residuals, fit.residuals)]
+        better = losses[0] < losses[1]
+        if not better.any():
+            break
+        rows = np.repeat(better, windows.length)[:, None]
+        fit = replace(fit, x=np.where(better[:, None], x, fit.x), residuals=np.where(rows, residuals, fit.residuals))
+    return fit
+
+
+def _loss_by_window(windows: Windows, fit: Fit) -> FloatArray:
+    """Minus the log of the likelihood of each window's samples, (W,)."""
+    losses = fit.noise.negative_log_likelihood(fit.residuals, windows.known)
+    return np.asarray(losses.reshape(len(windows), -1).sum(axis=1))
 
 
 def refine(windows: Windows, fit: Fit, belief: Belief) -> Refinement:

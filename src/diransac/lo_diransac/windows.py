@@ -112,6 +112,14 @@ class Windows:
         """Simulated less measured, (N, n_s); huge from a divergence on."""
         return np.nan_to_num(self._errors(shared, x, d), nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
 
+    def ends(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
+        """States (W - 1, n_x) in which the windows end, but for the last: where their successors begin."""
+        parameters, states, inputs = self.lanes(shared, x, d)
+        series = self.rollouts.trajectories(
+            parameters[:-1], states[:-1], inputs, self.dt, start_rows=self.starts[:-1], n_rows=self.length + 1
+        )
+        return series[:, -1, : x.shape[1]]
+
     def _errors(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
         series = self.rollouts.errors(
             *self.lanes(shared, x, d), self.measured, self.every, self.dt, start_rows=self.starts, n_rows=self.length
