@@ -16,7 +16,7 @@ from diransac.simulate import rollouts
 
 Array = np.ndarray[Any, Any]
 ErrorsByName = Mapping[str, float]
-_ROUNDING, _VISIBLE = 1e-6, 1e-5
+_ROUNDING, _VISIBLE = 1e-6, 2e-3
 Mission = Callable[..., dr.Trajectory]
 
 

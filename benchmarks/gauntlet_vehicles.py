@@ -4,13 +4,14 @@ A new vehicle is one more `Vehicle` in `VEHICLES`.  Nothing happens when this fi
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from casadi import cos, pi, sin
+from scipy.ndimage import uniform_filter1d
 
 import diransac as dr
 from diransac.planning.flights import PLANNED_SHARE, ROTORCRAFT_LIMITS
@@ -90,7 +91,10 @@ def mean_accelerations(plant: dr.Plant, log: dr.Log, n_phases: int = 8) -> Array
 
 
 def through_places(seed: int, speed: float, reach: float) -> Callable[[dr.Plant], dr.Trajectory]:
-    """From place to random place in the plane of x and z, at a mean speed (m/s), for 25 s; `reach` in m."""
+    """From place to random place in the plane of x and z, at a mean speed (m/s), for 25 s; `reach` in m.
+
+    A plan holds its inputs for 0.1 s, and a delay would hardly show; they are smoothed, and feedback does the rest.
+    """
     places = np.vstack([[0.0, 0.0], np.random.default_rng(seed).uniform(-reach, reach, (100, 2))])
     legs = np.linalg.norm(np.diff(places, axis=0), axis=1) / speed
     n = int(np.searchsorted(np.cumsum(legs), DURATION))
@@ -100,10 +104,11 @@ def through_places(seed: int, speed: float, reach: float) -> Callable[[dr.Plant]
     def planned(true: dr.Plant) -> dr.Trajectory:
         route = {"x": [w["x"] for w in waypoints], "z": [w["z"] for w in waypoints]}
         reference = {k: (lambda t, way=way: np.interp(t, times, way)) for k, way in route.items()}
-        return dr.plan(
+        plan = dr.plan(
             true, waypoints=waypoints, times=times, reference=reference, tracking={"x": 1.0, "z": 1.0},
             input_limits=ROTORCRAFT_LIMITS, input_share=PLANNED_SHARE,
         )  # fmt: skip
+        return replace(plan, inputs=uniform_filter1d(plan.inputs, 11, axis=0, mode="nearest"))
 
     return planned
 

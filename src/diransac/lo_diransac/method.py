@@ -101,10 +101,9 @@ def find(observations: Observations, seed: int) -> Findings:
             f"{observations.log.source}: no sample of the log gives parameters within their bounds; check the model, "
             "the signs and units of inputs, and the bounds"
         )
-    late = _likeliest_shift(windows, motion, hypotheses[0])
-    windows = windows.delayed(late)
     belief = believe(windows, motion, deviation_units(windows, motion, hypotheses[0]))
-    windows, refined, later = _shifted(windows, _best(windows, motion, hypotheses, belief), belief)
+    late, refined = _best_when_late(windows, motion, hypotheses, belief)
+    windows, refined, later = _shifted(windows.delayed(late), refined, belief)
     result = read_out(windows, refined.fit)
     if not _admits(windows, result.parameters):
         # The fit keeps to the bounds, least squares on its motion need not.
@@ -172,6 +171,24 @@ def _is_doubtful(windows: Windows, refined: Refinement) -> bool:
     fit = refined.fit
     inlying = (fit.noise.inlying(fit.residuals, windows.known) > _OUTLIER).reshape(len(windows), -1).sum(axis=1)
     return bool((inlying < BREAKDOWN * windows.known.reshape(len(windows), -1).sum(axis=1)).any())
+
+
+def _best_when_late(windows: Windows, motion: Motion, hypotheses: FloatArray, belief: Belief) -> tuple[int, Refinement]:
+    """How many rows inputs are late by, and the best fit then.
+
+    Where the hypotheses say that they are late at all, the neighbouring rows are tried, too, and theirs, as long as the
+    fit becomes likelier: hypotheses come from inputs that were taken to be in time.
+    """
+    late = _likeliest_shift(windows, motion, hypotheses[0])
+    fits = {late: _best(windows.delayed(late), motion, hypotheses, belief)}
+    for step in (-1, 1) if late else ():
+        while abs(late + step) < windows.length:
+            other = _best(windows.delayed(late + step), motion, hypotheses, belief)
+            fits[late + step] = other
+            if other.loss >= fits[late].loss:
+                break
+            late += step
+    return late, replace(fits[late], steps=sum(fit.steps for fit in fits.values()))
 
 
 def _likeliest_shift(windows: Windows, motion: Motion, p: FloatArray) -> int:
