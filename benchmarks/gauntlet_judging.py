@@ -63,7 +63,7 @@ class Record:
     @property
     def mean_effect(self) -> bool:
         """Whether what the model does not know has a mean, so that the best parameters are not the plant's own."""
-        return any(abs(x - self.errors_of_truth[name]) > _VISIBLE for name, x in self.errors.items())
+        return any(abs(x - self.errors_of_truth[name]) > _VISIBLE * (1.0 + x) for name, x in self.errors.items())
 
     @property
     def worst(self) -> float:
