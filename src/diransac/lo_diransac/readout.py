@@ -94,7 +94,7 @@ def _solution(windows: Windows, fit: Fit) -> Readout:
     at = linearize(windows, fit, weights_of(windows, fit))
     z, s = at.system.functional(of_z, of_s)
     covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s
-    sampled = _sampled(windows, fit, by_means, latent)
+    sampled = _sampled(windows, fit, by_rows, by_means, push, latent)
     delay = at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
     return Readout(p, covariance + sampled, unexplained(windows, fit, p), float(np.sqrt(delay)))
 
@@ -115,13 +115,17 @@ def _gains(windows: Windows, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArr
     return _instrumented(W, Z), by_means, push * logged, _means(windows, _matrices(M, model.n_v))
 
 
-def _sampled(windows: Windows, fit: Fit, by_means: FloatArray, latent: FloatArray) -> FloatArray:
-    """Covariance of the parameters over logs that hold other latent forces than this one's, which it estimates."""
+def _sampled(
+    windows: Windows, fit: Fit, by_rows: FloatArray, by_means: FloatArray, push: FloatArray, latent: FloatArray
+) -> FloatArray:
+    """Covariance of the parameters over logs that hold other unmodelled forces than this one, which it estimates."""
     q, v, a, u = _motion(windows, fit)
     W = _residual_map(windows.model)(q, v, a, u, fit.shared[: windows.model.n_p])[1] * windows.is_logged[:, None]
-    means = _means(windows, _matrices(W, windows.model.n_p))
-    left = latent - means @ np.einsum("pwi,wi->p", by_means, latent)
-    sums = _batch_sums(np.einsum("pwi,wi->wp", by_means, left))
+    W = _matrices(W, windows.model.n_p)
+    unmade = latent - _means(windows, W) @ np.einsum("pwi,wi->p", by_means, latent)
+    unpushed = push - W @ np.einsum("pni,ni->p", by_rows, push)
+    of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(windows), windows.length, -1).sum(axis=1)
+    sums = _batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
     return np.asarray(sums.T @ sums)
 
 
