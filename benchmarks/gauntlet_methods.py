@@ -33,7 +33,7 @@ class Estimate:
 Method = Callable[[dr.Model, dr.Log], Estimate]
 
 FAR = 1e6
-"""Standard deviations: what a diverged simulation is off by, and nothing is off by more."""
+"""Spreads of a signal: what a diverged simulation is off by, and nothing is off by more."""
 
 
 # ---------------------------------------------------------------------- this package's
@@ -107,27 +107,27 @@ def equation_error(loss: str, model: dr.Model, log: dr.Log) -> Estimate:
 
 
 def output_error(model: dr.Model, log: dr.Log, max_evaluations: int = 40) -> Estimate:
-    """Robust single shooting: simulate the whole log, soft-L1 loss in units of each signal's noise.
+    """Robust single shooting: simulate the whole log, soft-L1 loss in units of each signal's spread.
 
     Unknown are the parameters and the initial state; the start is Hampel + least squares, within bounds, and the first
-    row.  The noise is that of the second differences.  Evaluations are capped, not seconds: answers do not depend on
+    row.  Evaluations are capped, not seconds: answers do not depend on
     the machine.
     """
     seen, names = observe(model, log), (*model.parameters, *model.state)
     low, high = _bounds(model)
     first = np.clip(list(hampel_least_squares(model, log).parameters.values()), low[: model.n_p], high[: model.n_p])
     measured, valid = np.nan_to_num(seen.measured), np.isfinite(seen.measured)
-    noise = 1.4826 * np.nanmedian(np.abs(np.diff(seen.measured, n=2, axis=0)), axis=0) / np.sqrt(6.0) + 1e-9
+    spread = 1.4826 * np.nanmedian(np.abs(seen.measured - np.nanmedian(seen.measured, axis=0)), axis=0)
     engine, log_arrays = rollouts(model, seen.signals), (seen.inputs, measured, np.ones(len(seen), bool), log.dt)
 
     def errors(z: Array) -> Array:
-        e = engine.errors(z[None, : model.n_p], z[model.n_p :], *log_arrays)[0] / noise
+        e = engine.errors(z[None, : model.n_p], z[model.n_p :], *log_arrays)[0] / spread
         return np.where(valid, np.clip(np.nan_to_num(e, nan=FAR), -FAR, FAR), 0.0).ravel()
 
     def jacobian(z: Array) -> Array:
         found = engine.linearized_errors(z[None, : model.n_p], z[model.n_p :], *log_arrays, unknowns=names)
-        near = valid & (np.abs(found.errors[0] / noise) < FAR)
-        J = found.jacobian[0] / noise[:, None]
+        near = valid & (np.abs(found.errors[0] / spread) < FAR)
+        J = found.jacobian[0] / spread[:, None]
         return np.where(near[..., None] & (np.abs(J) < 1e100), J, 0.0).reshape(-1, len(names))
 
     start = np.concatenate([first, seen.initial_state("robust")])
