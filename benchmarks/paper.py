@@ -51,12 +51,12 @@ def studies() -> dict[str, Study]:
         "fig5": load("fig5"),
         "gaussian": load("gaussian"),
         "gaussian-exact": load("gaussian", {"noise.angular_acceleration_std": 0.0}),
-        "acceptance-outliers": variants("fig2", WEIGHTS, [20, 50, 80]),
+        "acceptance-outliers": variants("fig2", WEIGHTS, [40, 60, 80]),
         "acceptance-aerodynamic": variants("fig3", WEIGHTS, [1.4e-6]),
         "acceptance-mass": variants("fig4", WEIGHTS, [6e-5]),
         "acceptance-aerodynamic-printed": variants("fig3", WEIGHTS, [1.4e-6], plant__convention="printed"),
         "acceptance-mass-printed": variants("fig4", WEIGHTS, [1e-4], plant__convention="printed"),
-        "iterations": variants("fig2", CAPS, [20, 80]),
+        "iterations": variants("fig2", CAPS, [40, 80]),
     }
 
 
