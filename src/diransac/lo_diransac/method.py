@@ -40,7 +40,7 @@ _FEWEST_WINDOWS = 4
 # Half a row of delay or more is taken up by shifting the inputs, as often as needed.
 _WHOLE_ROW, _MAX_SHIFTS = 0.5, 3
 # Local optimisations at most, and the difference in their losses, nats, that shows nothing.
-_MAX_STARTS, _AS_LIKELY = 5, 5.0
+_MAX_STARTS, _MAX_FITS, _AS_LIKELY = 5, 8, 5.0
 _OUTLIER = 0.5
 # Rows that inputs may be late by, to begin with.
 _SHIFTS = range(-3, 9)
@@ -152,17 +152,21 @@ def _prepare(observations: Observations) -> tuple[Windows, Motion, tuple[str, ..
 
 
 def _best(windows: Windows, motion: Motion, hypotheses: FloatArray, belief: Belief) -> Refinement:
-    """Local optimisation from the best hypothesis; where it leaves a doubt, from the next ones; the likeliest of these.
+    """Local optimisation from the best hypothesis; where it leaves a doubt, from others; the likeliest of these.
 
-    Doubtful is what takes most of a window for outliers: sensors may have failed there, or the fit.  Doubt ends with a
+    Doubtful is what takes most of a window for outliers: sensors may have failed there, or the fit.  What was found
+    then becomes a hypothesis itself if it is the likeliest so far, or else the next one has its turn; doubt ends with a
     second fit that is as likely.
     """
+    waiting = list(hypotheses[:_MAX_STARTS])
     found: list[Refinement] = []
-    for p in hypotheses[:_MAX_STARTS]:
-        found.append(refine(windows, start(windows, motion, p, belief), belief))
+    while waiting and len(found) < _MAX_FITS:
+        found.append(refine(windows, start(windows, motion, waiting.pop(0), belief), belief))
         again = any(abs(found[-1].loss - x.loss) < _AS_LIKELY for x in found[:-1])
         if again or not _is_doubtful(windows, found[-1]):
             break
+        if all(found[-1].loss < x.loss for x in found[:-1]):
+            waiting.insert(0, found[-1].fit.shared[: windows.model.n_p])
     return replace(min(found, key=lambda x: x.loss), steps=sum(x.steps for x in found))
 
 

@@ -98,10 +98,7 @@ def _order(n_s: int, n_x: int, k: int) -> npt.NDArray[np.int64]:
 
 def cost(windows: Windows, fit: Fit, weights: FloatArray) -> float:
     """Twice the cost with the weights held; infinite where a rollout diverges."""
-    p, x, u = windows.lanes(fit.shared, fit.x[:-1], fit.d[:-1])
-    ends = windows.rollouts.trajectories(
-        p, x, u, windows.dt, start_rows=windows.starts[:-1], n_rows=windows.length + 1
-    )[:, -1, : fit.x.shape[1]]  # fmt: skip
+    ends = windows.ends(fit.shared, fit.x, fit.d)
     terms = (
         (weights * np.square(fit.residuals)).sum(),
         np.square((fit.x[1:] - ends) / fit.slack).sum(),

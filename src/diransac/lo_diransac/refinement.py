@@ -106,21 +106,28 @@ def start(windows: Windows, motion: Motion, p: FloatArray, belief: Belief) -> Fi
 
 
 def _anchored(windows: Windows, fit: Fit) -> Fit:
-    """Let windows begin where their predecessors end, as far as that explains them better.
+    """Let windows begin where their neighbours have them begin, as far as that explains them better.
 
     Where outliers are in the majority for longer than a window, nothing there tells the state; its neighbours do.
     """
     for _ in range(_MAX_SWEEPS):
-        x = fit.x.copy()
-        x[1:] = np.nan_to_num(windows.ends(fit.shared, fit.x, fit.d))
-        residuals = windows.residuals(fit.shared, x, fit.d)
-        losses = [_loss_by_window(windows, replace(fit, residuals=r)) for r in (residuals, fit.residuals)]
-        better = losses[0] < losses[1]
-        if not better.any():
+        before, after = fit.x.copy(), fit.x.copy()
+        before[1:] = np.nan_to_num(windows.ends(fit.shared, fit.x, fit.d))
+        fit, forward = _better(windows, fit, before)
+        after[:-1] = windows.origins(fit.shared, fit.x, fit.d)
+        fit, backward = _better(windows, fit, after)
+        if not (forward or backward):
             break
-        rows = np.repeat(better, windows.length)[:, None]
-        fit = replace(fit, x=np.where(better[:, None], x, fit.x), residuals=np.where(rows, residuals, fit.residuals))
     return fit
+
+
+def _better(windows: Windows, fit: Fit, x: FloatArray) -> tuple[Fit, bool]:
+    """The fit with those of other initial states that explain their windows better, and whether there are any."""
+    residuals = windows.residuals(fit.shared, x, fit.d)
+    found = _loss_by_window(windows, replace(fit, residuals=residuals)) < _loss_by_window(windows, fit)
+    rows = np.repeat(found, windows.length)[:, None]
+    x, residuals = np.where(found[:, None], x, fit.x), np.where(rows, residuals, fit.residuals)
+    return replace(fit, x=x, residuals=residuals), bool(found.any())
 
 
 def _loss_by_window(windows: Windows, fit: Fit) -> FloatArray:

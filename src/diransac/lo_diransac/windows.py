@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["Windows"]
 
 _DIVERGED = 1e6
+_WELL_CONDITIONED = 1e8
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -119,6 +120,23 @@ class Windows:
             parameters[:-1], states[:-1], inputs, self.dt, start_rows=self.starts[:-1], n_rows=self.length + 1
         )
         return series[:, -1, : x.shape[1]]
+
+    def origins(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
+        """States (W - 1, n_x) from which the windows, but for the last, would end where their successors begin.
+
+        By one of Newton's steps; states as they are where that has no answer.
+        """
+        sums = self.rollouts.gauss_newton(
+            *self.lanes(shared, x, d), self.measured, self.every, self.dt, np.zeros(self.measured.shape),
+            start_rows=self.starts, n_rows=self.length,
+        )  # fmt: skip
+        jumps, slopes = x[1:] - sums.final_states[:-1], sums.final_slopes[:-1, :, -x.shape[1] :]
+        finite = np.isfinite(jumps).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
+        usable = np.flatnonzero(finite)
+        usable = usable[np.linalg.cond(slopes[usable]) < _WELL_CONDITIONED]
+        found = x[:-1].copy()
+        found[usable] += np.linalg.solve(slopes[usable], jumps[usable][:, :, None])[:, :, 0]
+        return found
 
     def _errors(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
         series = self.rollouts.errors(
