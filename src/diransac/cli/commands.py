@@ -34,7 +34,6 @@ from diransac.cli.options import (
     known_methods,
 )
 from diransac.cli.outputs import staged
-from diransac.cli.study import study
 from diransac.cli.views import Equations, ModelList, compare_methods
 from diransac.identification import METHODS, identify
 from diransac.inspection import inspect
@@ -51,7 +50,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-app.add_typer(study, name="study")
 
 
 @app.callback()
@@ -66,8 +64,7 @@ def _diransac(
         typer.echo(f"diransac {version_of('diransac')}")
         raise typer.Exit
     if context.invoked_subcommand is None:
-        known = [one.name or "" for one in app.registered_commands] + [one.name or "" for one in app.registered_groups]
-        context.fail(f"Give a command: {', '.join(sorted(known))}.")
+        context.fail(f"Give a command: {', '.join(sorted(context.command.list_commands(context)))}.")  # type: ignore[attr-defined]
 
 
 @app.command("identify")

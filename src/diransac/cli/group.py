@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib
 import inspect
 import sys
 from collections.abc import Callable, Sequence
@@ -21,8 +22,24 @@ MAX_LINES = 3
 UsageError: type[Any] = typer.BadParameter.__mro__[1]
 
 
+_LATER = {"study": "diransac.cli.study"}
+"""Groups of commands that are imported when they are first asked for, by name: module."""
+
+
 class Group(TyperGroup):
     """Commands that end with 0, 1 (it could not be done), 2 (wrong usage) or 130 (Ctrl-C), and a short message."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Names of all commands."""
+        return [*super().list_commands(ctx), *_LATER]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """A command by name, imported now if it was not before."""
+        if cmd_name in _LATER and cmd_name not in self.commands:
+            found = typer.main.get_command(getattr(importlib.import_module(_LATER[cmd_name]), cmd_name))
+            found.name = cmd_name
+            self.commands[cmd_name] = found
+        return super().get_command(ctx, cmd_name)
 
     def main(self, args: Sequence[str] | None = None, *positional: Any, **extra: Any) -> NoReturn:
         """Run the command line; ``--debug`` is understood wherever it stands."""
