@@ -171,6 +171,19 @@ def test_errors_of_other_orders_of_magnitude_are_told_apart(tmp_path: Path):
     assert 0.02 < (of_quick - low) / (high - low) < 0.5 < (of_ols - low) / (high - low) < 1.0
 
 
+def test_a_median_above_every_mean_is_within_its_panel(tmp_path: Path):
+    """Two of five failed: the median is the largest error of the other three."""
+    with Store(tmp_path / "f.db", load(tiny(trials=5))) as kept:
+        failed = [row("0", trial, "ols", status="failed", error="no") for trial in (0, 1)]
+        kept.add(
+            [*failed, *(row("0", trial, "ols", **errors(size)) for trial, size in ((2, 0.1), (3, 0.2), (4, 60.0)))]
+        )
+        kept.add([row("40", 0, "quick", **errors(0.01))])
+    axes = panel(plot_study(tmp_path / "f.db"), "x")
+    (median,) = {y for line in axes.lines if line.get_marker() == "_" for y in line.get_ydata() if y > 1.0}
+    assert (median, axes.get_ylim()[1] > 60.0) == (60.0, True)
+
+
 def test_paths_are_drawn_for_every_trial_that_has_one(store_with_paths: Path):
     figure = plot_paths(store_with_paths)
     assert len(figure.axes) == len(METHODS)

@@ -34,8 +34,8 @@ _COLUMNS = 3
 _SPREAD = 0.5
 # Means this many times the median mean call for a logarithmic scale, of so many decades above a linear beginning.
 _MANY, _DECADES = 20.0, 3
-_LETTERS = 92
-"""Of a title's line."""
+# Letters of a title's line; lines of one title differ by so many at most.
+_LETTERS, _RAGGED = 92, 12
 
 # The palette's fifth colour is too near the first where lines cross.
 _COLOURS = (*COLOURS[:4], INK, COLOURS[5])
@@ -145,7 +145,8 @@ def _draw_state(axes: Axes, summary: Summary, flights: Flights, state: str, loga
             "alpha": 0.75,
         }
         axes.plot(x, np.where(np.isfinite(median[:, k]), median[:, k], np.nan), color=colour, **dashes, zorder=2.1)
-    _scale(axes, mean, mean + spread, logarithmic)
+    highest = np.fmax(mean + spread, np.where(np.isfinite(median), median, np.nan))
+    _scale(axes, mean, highest, logarithmic)
     _name_levels(axes, summary)
 
 
@@ -216,7 +217,9 @@ def _decade(y: float) -> str:
 # Words and looks -----------------------------------------------------------------------------------------------------
 def title_of(summary: Summary) -> str:
     """The study's name and what it is about, in as many lines as it needs."""
-    return "\n".join(wrap(f"{summary.name}: {summary.description}".removesuffix(": "), _LETTERS))
+    text = f"{summary.name}: {summary.description}".removesuffix(": ")
+    n_lines = -(-len(text) // _LETTERS)
+    return "\n".join(wrap(text, min(_LETTERS, len(text) // n_lines + _RAGGED)))
 
 
 def method_looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
