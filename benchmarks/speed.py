@@ -216,7 +216,7 @@ def compare_processes(bench: Bench) -> None:
         bench.log.write(path)
         environment = {k: x for k, x in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
         environment["PYTHONPYCACHEPREFIX"] = str(Path(folder) / "compiled")
-        command = ["-m", "diransac", "identify", str(path), "--model", "planar-rotorcraft"]
+        command = ["-m", "diransac", "identify", str(path), "--model", "planar-rotorcraft", "--method", "i-diransac"]
         run = partial(subprocess.run, env=environment, stdout=subprocess.DEVNULL, check=True)
         found = medians({
             "numpy, casadi": lambda: run([sys.executable, "-c", "import numpy, casadi"]),
