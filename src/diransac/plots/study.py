@@ -197,6 +197,7 @@ def _scale(axes: Axes, mean: Floats, highest: Floats, logarithmic: bool) -> None
     if not largest > 0.0:
         axes.set_ylim(-0.04, 1.0)
         return
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: _tick(y)))
     if not logarithmic:
         axes.set_ylim(-0.04 * top, 1.06 * top)
         return
@@ -205,13 +206,14 @@ def _scale(axes: Axes, mean: Floats, highest: Floats, logarithmic: bool) -> None
     decades = 10.0 ** np.arange(first, np.floor(np.log10(top)) + 1)
     axes.yaxis.set_major_locator(FixedLocator([0.0, *decades]))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: _decade(y)))
     axes.set_ylim(-0.35 * 10.0**first, 1.6 * top)
 
 
-def _decade(y: float) -> str:
-    exponent = round(np.log10(y)) if y > 0.0 else 0
-    return f"{y:g}" if -4 <= exponent < 5 else f"10{str(exponent).translate(_SUPERSCRIPTS)}"
+def _tick(y: float) -> str:
+    """``0.01``, ``5×10⁻⁵``, ``10⁶``."""
+    mantissa, _, exponent = f"{y:.6g}".partition("e")
+    power = f"10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if exponent else ""
+    return mantissa.replace("-", "−") if not power else power if mantissa == "1" else f"{mantissa}×{power}"
 
 
 # Words and looks -----------------------------------------------------------------------------------------------------
