@@ -19,7 +19,8 @@ def test_a_failing_command_leaves_outputs_as_they_were(folder: Path, existing: b
     if existing:
         Path("model.json").write_bytes(existing)
     before = contents(folder)
-    done = run("identify", "swim.csv", *MODEL, "--set", "sample_size=5000", "-o", "model.json", "--report", "page.html")
+    words = ("--method", "i-diransac", "--set", "sample_size=5000", "-o", "model.json", "--report", "page.html")
+    done = run("identify", "swim.csv", *MODEL, *words)
     assert done.exit_code == 1
     assert contents(folder) == before
 
