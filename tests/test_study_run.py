@@ -6,6 +6,7 @@ import signal
 import subprocess
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -362,6 +363,7 @@ def test_ctrl_c_ends_a_run_at_once_and_says_how_to_go_on(tmp_path: Path):
     process = subprocess.Popen(
         [*command(tmp_path / "a.db", 1)["args"][:1], *words],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # which a shell's background jobs ignore
     )  # fmt: skip
     while not ((tmp_path / "a.db").exists() and status(tmp_path / "a.db").done) and process.poll() is None:
         with suppress(subprocess.TimeoutExpired):

@@ -116,11 +116,15 @@ def _interrupts_noted() -> Iterator[list[int]]:
     if threading.current_thread() is not threading.main_thread():  # interrupts come to the main thread alone
         yield noted
         return
-    before = signal.signal(signal.SIGINT, lambda number, _frame: noted.append(number))
+    before = signal.getsignal(signal.SIGINT)
+    if before in (None, signal.SIG_IGN):  # not Python's to handle, or ignored, as in a background job of a shell
+        yield noted
+        return
+    signal.signal(signal.SIGINT, lambda number, _frame: noted.append(number))
     try:
         yield noted
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+        signal.signal(signal.SIGINT, before)
 
 
 class _Stopped(Exception):
