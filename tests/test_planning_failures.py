@@ -175,6 +175,15 @@ def test_nothing_is_printed(solver, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.fixture
+def interruptible():
+    """Ctrl-C as a terminal has it; a shell's background jobs ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop", "snopt"])
 def test_an_interrupt_stops_the_search(solver, monkeypatch, capfd):
     if solver == "snopt":
@@ -205,15 +214,12 @@ def test_an_error_in_the_midst_of_a_search_is_not_swallowed(monkeypatch):
         across(ROTORCRAFT)
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_at_any_moment_stops_the_search():
     """CasADi swallows half of the interrupts that it is left to find by itself."""
     far_off = rotorcraft(inertia=1e-5)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-    try:
-        for moment in (0.1, 0.17, 0.23, 0.31):
-            threading.Timer(moment, signal.raise_signal, [signal.SIGINT]).start()
-            with pytest.raises(KeyboardInterrupt):
-                dr.sine(far_off, max_iterations=3000)
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
+    for moment in (0.1, 0.17, 0.23, 0.31):
+        threading.Timer(moment, signal.raise_signal, [signal.SIGINT]).start()
+        with pytest.raises(KeyboardInterrupt):
+            dr.sine(far_off, max_iterations=3000)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
