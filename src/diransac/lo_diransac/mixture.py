@@ -21,6 +21,8 @@ BREAKDOWN, _OF_NORMAL = 0.35, 0.4538
 _FEWEST = 5
 _SHRINK = 0.4
 _FRACTION = (0.002, 0.95)
+# Sigmas from which on exp(-x^2 / 2) is 0 in double precision.
+_FAR = 40.0
 
 
 @dataclass(frozen=True)
@@ -34,15 +36,17 @@ class Mixture:
 
     def inlying(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Probability ``(N, n_s)`` that each sample is no outlier; 0 where there is none (the E step)."""
-        core = np.exp(-0.5 * np.square(residuals / self.sigma))
-        core *= (1.0 - self.pi) / (self.sigma * np.sqrt(2.0 * np.pi))
+        core = self._core(residuals)
         return np.where(known, core / (core + self.pi / (2.0 * self.span)), 0.0)
 
     def negative_log_likelihood(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Of each sample, ``(N, n_s)``; 0 where there is none."""
-        core = np.exp(-0.5 * np.square(residuals / self.sigma))
-        core *= (1.0 - self.pi) / (self.sigma * np.sqrt(2.0 * np.pi))
-        return np.where(known, -np.log(core + self.pi / (2.0 * self.span)), 0.0)
+        return np.where(known, -np.log(self._core(residuals) + self.pi / (2.0 * self.span)), 0.0)
+
+    def _core(self, residuals: FloatArray) -> FloatArray:
+        """Density of the Gaussian with its share; exactly 0 beyond 40 sigma, whose squares might overflow."""
+        distance = np.minimum(np.abs(residuals) / self.sigma, _FAR)
+        return np.asarray(np.exp(-0.5 * np.square(distance)) * (1.0 - self.pi) / (self.sigma * np.sqrt(2.0 * np.pi)))
 
     def updated(self, residuals: FloatArray, known: BoolArray, inlying: FloatArray) -> Mixture:
         """The M step; a scale shrinks by at most 0.4, which keeps the far in sight of the near at first."""
