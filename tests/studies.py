@@ -26,6 +26,23 @@ TINY = {
     "evaluation": {"trajectories": ["square"]},
     "axis": {"name": "outlier magnitude", "path": "noise.outlier_magnitude", "levels": [0, 40]},
 }
+TINY_TOML = """
+name = "tiny"
+trials = 2
+[plant]
+kind = "planar-rotorcraft"
+[data]
+trajectory = "square"
+[noise]
+outlier_probability = 0.1
+[methods.true]
+[methods.ols]
+[evaluation]
+trajectories = ["square"]
+[axis]
+path = "noise.outlier_magnitude"
+levels = [0, 40]
+"""
 MAY_DIFFER = ("seconds", "host")
 
 

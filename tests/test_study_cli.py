@@ -11,25 +11,8 @@ import pytest
 from command_line import contents, run
 from diransac.study import builtin_names, load, template
 from diransac.study.workers import Given
-from studies import rows
+from studies import TINY_TOML, rows
 
-TINY = """
-name = "tiny"
-trials = 2
-[plant]
-kind = "planar-rotorcraft"
-[data]
-trajectory = "square"
-[noise]
-outlier_probability = 0.1
-[methods.true]
-[methods.ols]
-[evaluation]
-trajectories = ["square"]
-[axis]
-path = "noise.outlier_magnitude"
-levels = [0, 40]
-"""
 QUICK = ["--store", "a.db", "--jobs", 1, "--trials", 1]
 
 
@@ -38,7 +21,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Working directory with a study in it; trials run in a thread of this process."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("diransac.study.run.workers_of", lambda *_: Given(ThreadPoolExecutor(1), 1))
-    (tmp_path / "tiny.toml").write_text(TINY)
+    (tmp_path / "tiny.toml").write_text(TINY_TOML)
     return tmp_path
 
 

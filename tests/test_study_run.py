@@ -15,7 +15,7 @@ import pytest
 import diransac as dr
 from diransac.study import connected, load, paths, status, trials
 from diransac.study.seeds import derived_seed
-from studies import TINY, command, rows, tiny
+from studies import TINY, TINY_TOML, command, rows, tiny
 
 PLANT = load(TINY).plant.plant
 STATES = PLANT.model.state
@@ -358,7 +358,7 @@ def test_a_script_that_begins_itself_again_in_each_worker_is_told_what_it_lacks(
 
 
 def test_ctrl_c_ends_a_run_at_once_and_says_how_to_go_on(tmp_path: Path):
-    (tmp_path / "tiny.toml").write_text(TOML)
+    (tmp_path / "tiny.toml").write_text(TINY_TOML)
     words = ["-m", "diransac", "study", "run", "tiny.toml", "--store", "a.db", "--trials", "2000", "--jobs", "2"]
     process = subprocess.Popen(
         [*command(tmp_path / "a.db", 1)["args"][:1], *words],
@@ -374,23 +374,6 @@ def test_ctrl_c_ends_a_run_at_once_and_says_how_to_go_on(tmp_path: Path):
     assert status(tmp_path / "a.db").failed == 0
     assert (process.returncode, out) == (130, "")
     assert err == f"{kept} of 8000 rows are kept in a.db; the same command runs the rest\ninterrupted\n"
-
-
-TOML = """
-name = "tiny"
-trials = 2
-[plant]
-kind = "planar-rotorcraft"
-[data]
-trajectory = "square"
-[methods.true]
-[methods.ols]
-[evaluation]
-trajectories = ["square"]
-[axis]
-path = "noise.outlier_magnitude"
-levels = [0, 40]
-"""
 
 
 # On a cluster ---------------------------------------------------------------------------------------------------------
