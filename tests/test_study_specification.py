@@ -4,10 +4,12 @@ import json
 import re
 import tomllib
 
+import numpy as np
 import pytest
 
 import diransac as dr
 from diransac.study import builtin_names, load, template
+from diransac.study.flights import Flight
 from diransac.study.seeds import derived_seed
 from studies import TINY, tiny
 
@@ -34,7 +36,7 @@ def test_the_figures_of_the_paper_vary_what_they_say():
     assert load("fig2").noise.outlier_probability == 0.1
     assert load("fig3").at("1.8e-06").plant.arguments["aerodynamic_imbalance"] == 1.8e-6
     assert load("fig4").at("0.00014").plant.arguments["mass_imbalance"] == 1.4e-4
-    assert all(load(name).data == "star" and load(name).trials == 50 for name in levels)
+    assert all(load(name).data == Flight("star") and load(name).trials == 50 for name in levels)
     assert load("fig5").keep_paths
 
 
@@ -93,6 +95,41 @@ def test_a_rotor_phase_may_be_drawn():
     assert drawn.plant.disturbances[0].start["phase_1"] == pytest.approx((0.0, 2 * 3.141592653589793))
 
 
+def test_a_data_flight_has_all_of_its_arguments_and_its_seed_may_be_drawn():
+    study = load(tiny(data={"trajectory": "places", "seed": "any", "speed": 2, "substeps": 20}))
+    assert study.data.is_drawn
+    assert study.data.substeps == 20
+    assert study.data.arguments == {"seed": "any", "speed": 2.0, "reach": 2.0, "duration": 25.0}
+    assert load(json.loads(json.dumps(study.to_dict()))) == study
+    assert not load(tiny(data={"trajectory": "places", "seed": 3})).data.is_drawn
+
+
+def test_a_drawn_flight_is_that_of_its_seed_and_any_other_that_of_its_own():
+    sines = {"trajectory": "sines", "duration": 0.5}
+    plant = dr.Plant(dr.models.servo_axis(), {"mass": 1.0, "viscous_friction": 1.0, "dry_friction": 1.0, "offset": 1.0})
+    drawn, fixed = (Flight.from_dict({**sines, "seed": seed}) for seed in ("any", 3))
+    expected = dr.sines(plant, seed=3, duration=0.5).states
+    np.testing.assert_array_equal(drawn.planned(plant, 3, time_limit=5.0).states, expected)
+    np.testing.assert_array_equal(fixed.planned(plant, 8).states, expected)
+    assert not np.array_equal(drawn.planned(plant, 8).states, expected)
+
+
+def test_a_store_of_before_there_were_drawn_flights_and_judged_parameters_is_still_the_same_study():
+    """What such stores keep as their configuration: further keys would have them refused."""
+    parts = STUDY.configuration["study"]
+    assert {path for path in parts if not path.startswith(("noise.", "plant."))} == {
+        "seed", "data.trajectory", "evaluation.trajectories", "evaluation.keep_paths",
+    }  # fmt: skip
+
+
+def test_where_parameters_are_judged_no_flight_need_be():
+    study = load(tiny(evaluation={"trajectories": [], "parameters": True}))
+    assert study.judges_parameters
+    assert study.evaluation == ()
+    assert not STUDY.judges_parameters
+    assert study.configuration != load(tiny(evaluation={"trajectories": ["square"], "parameters": True})).configuration
+
+
 def test_what_people_call_things_and_how_many_there_are_decide_nothing():
     other = load(tiny(name="b", description="c", trials=9, axis__name="d", methods__ols__settings={"threads": 1}))
     assert other.configuration == STUDY.configuration
@@ -112,6 +149,14 @@ def test_what_people_call_things_and_how_many_there_are_decide_nothing():
         ({"plant.parameters.mas": 0.2}, "plant: .*parameters are mass, inertia, drag; found mas"),
         ({"plant.parameters.mass": "heavy"}, "plant.parameters is .*heavy.*; give a table of numbers"),
         ({"data.trajectory": "loop"}, "data.trajectory is 'loop'; there are square, star, sine"),
+        ({"data.speed": 2}, 'no key "data.speed"; in data there are trajectory, substeps'),
+        ({"data": {"trajectory": "places", "speed": "fast"}}, "data.speed is 'fast'; give a number"),
+        ({"data": {"trajectory": "places", "speed": [1, 2]}}, r"data.speed is \[1, 2\]; give a number"),
+        ({"data": {"trajectory": "places", "speed": -2}}, "data.speed is -2; give a number above 0"),
+        ({"data": {"trajectory": "places", "seed": 1.5}}, "data.seed is 1.5; give a whole number from 0"),
+        ({"data": {"trajectory": "places", "reach": "any"}}, "data.reach is 'any'; give a number"),
+        ({"data.substeps": 0}, "data.substeps is 0; give a whole number of at least 1"),
+        ({"evaluation.parameters": 1}, "evaluation.parameters is 1; give true or false"),
         ({"noise.outlier_probability": 2}, "noise.outlier_probability is 2; give a number from 0 to 1"),
         ({"noise.wind": 2}, 'no key "noise.wind"; in noise there are outlier_probability'),
         ({"methods": {}}, "methods is empty; there are true, ols"),

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from diransac.log import Log
     from diransac.noise import CorruptedLog, Noise, corrupt
     from diransac.nonlinear import NonlinearLeastSquares
-    from diransac.planning import plan, sine, square, star
+    from diransac.planning import places, plan, sine, sines, square, star
     from diransac.plots import plot_flight
     from diransac.prepare import despike, differentiate, rename, resample, scale, shift
     from diransac.readers import read_log
@@ -74,6 +74,7 @@ __all__ = [
     "fly_all",
     "identify",
     "models",
+    "places",
     "plan",
     "plot_flight",
     "read_log",
@@ -83,6 +84,7 @@ __all__ = [
     "scale",
     "shift",
     "sine",
+    "sines",
     "square",
     "star",
     "tracking_error",
@@ -100,7 +102,7 @@ _FOUND_IN = {
     "log": ("Log",),
     "noise": ("CorruptedLog", "Noise", "corrupt"),
     "nonlinear": ("NonlinearLeastSquares",),
-    "planning": ("plan", "sine", "square", "star"),
+    "planning": ("places", "plan", "sine", "sines", "square", "star"),
     "plots": ("plot_flight",),
     "prepare": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
     "readers": ("read_log",),

@@ -4,6 +4,7 @@
 |---|---|
 | `planner.py` | `plan`, the one entry |
 | `flights.py` | the paper's square, star and sine |
+| `excitations.py` | flights for data, another with every seed: through random places, sums of sines |
 | `request.py`, `trim.py` | what is asked for, checked; the inputs that hold a plant at rest |
 | `problem.py` | from a task to a nonlinear program, and from its solution to a trajectory |
 | `transcription.py` | the program: where each unknown stands, values and exact derivatives |
@@ -12,7 +13,8 @@
 | `diagnosis.py` | why there is no plan |
 """
 
+from diransac.planning.excitations import places, sines
 from diransac.planning.flights import sine, square, star
 from diransac.planning.planner import plan
 
-__all__ = ["plan", "sine", "square", "star"]
+__all__ = ["places", "plan", "sine", "sines", "square", "star"]

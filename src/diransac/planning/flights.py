@@ -32,7 +32,17 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-__all__ = ["MEAN_SPEED", "PLANNED_SHARE", "ROTORCRAFT_LIMITS", "sine", "square", "star"]
+__all__ = [
+    "MEAN_SPEED",
+    "PLANNED_SHARE",
+    "ROTORCRAFT_LIMITS",
+    "Limits",
+    "check_plane",
+    "sine",
+    "square",
+    "star",
+    "through",
+]
 
 CORNERS = ((2.0, 2.0), (2.0, -2.0), (-2.0, -2.0), (-2.0, 2.0))
 """m, x and z: 4 m a side, all as far from the origin."""
@@ -83,7 +93,7 @@ def square(plant: ModelWithParameters, *, input_limits: Limits | None = None, **
 
     References: Dimmig et al. 2023, section V-A.
     """
-    return _through(plant, [(0.0, 0.0), *CORNERS, CORNERS[0]], input_limits, options)
+    return _at_mean_speed(plant, [(0.0, 0.0), *CORNERS, CORNERS[0]], input_limits, options)
 
 
 def star(plant: ModelWithParameters, *, input_limits: Limits | None = None, **options: Any) -> Trajectory:
@@ -96,7 +106,7 @@ def star(plant: ModelWithParameters, *, input_limits: Limits | None = None, **op
     half = np.sqrt(0.5)
     turned = [(half * (x - z), half * (x + z)) for x, z in CORNERS]
     first = [(0.0, 0.0), *CORNERS, CORNERS[0], (0.0, 0.0)]
-    return _through(plant, [*first, *turned, turned[0]], input_limits, options)
+    return _at_mean_speed(plant, [*first, *turned, turned[0]], input_limits, options)
 
 
 def sine(plant: ModelWithParameters, *, input_limits: Limits | None = None, **options: Any) -> Trajectory:
@@ -107,7 +117,7 @@ def sine(plant: ModelWithParameters, *, input_limits: Limits | None = None, **op
 
     References: Dimmig et al. 2023, section V-A.
     """
-    _check_plane(plant.model)
+    check_plane(plant.model)
     speed = PERIODS * WAVELENGTH / SINE_DURATION
 
     def along(time: Floats) -> Floats:
@@ -124,17 +134,31 @@ def sine(plant: ModelWithParameters, *, input_limits: Limits | None = None, **op
     return plan(plant, **fixed, **_limits(plant.model, input_limits), **options)
 
 
-def _through(
+def _at_mean_speed(
     plant: ModelWithParameters,
     places: Sequence[tuple[float, float]],
     input_limits: Limits | None,
     options: Mapping[str, Any],
 ) -> Trajectory:
-    """Through places in the plane at the mean speed, rest to rest."""
-    _check_plane(plant.model)
+    """Through places in the plane, each segment as long as its length takes."""
     lengths = np.linalg.norm(np.diff(np.array(places), axis=0), axis=1)
     rows = np.rint(lengths / MEAN_SPEED / TIME_STEP)
-    times = TIME_STEP * np.concatenate([[0.0], np.cumsum(rows)])
+    return through(plant, places, TIME_STEP * np.concatenate([[0.0], np.cumsum(rows)]), input_limits, options)
+
+
+def through(
+    plant: ModelWithParameters,
+    places: Sequence[tuple[float, float]],
+    times: Floats,
+    input_limits: Limits | None,
+    options: Mapping[str, Any],
+) -> Trajectory:
+    """Through places in the plane of x and z at given times (s), rest to rest, with the choices of this file.
+
+    Raises SettingsError: the model has no coordinates x and z.
+    Raises PlanningError: no such trajectory.
+    """
+    check_plane(plant.model)
     fixed: dict[str, Any] = {
         "waypoints": [{"x": float(x), "z": float(z)} for x, z in places],
         "times": times.tolist(),
@@ -159,10 +183,11 @@ def _limits(model: Model, given: Limits | None) -> dict[str, Any]:
     return {"input_limits": given, "input_share": PLANNED_SHARE}
 
 
-def _check_plane(model: Model) -> None:
+def check_plane(model: Model) -> None:
+    """Raises SettingsError: the model has no coordinates x and z."""
     missing = [name for name in ("x", "z") if name not in model.coordinates]
     if missing:
         raise SettingsError(
-            f'square, star and sine are flown in x and z; model "{model.name}" has no coordinate {missing[0]}: it has '
-            f"{', '.join(model.coordinates)}. Use plan(plant, waypoints=...)"
+            f'square, star, sine and places are flown in x and z; model "{model.name}" has no coordinate {missing[0]}: '
+            f"it has {', '.join(model.coordinates)}. Use plan(plant, waypoints=...)"
         )

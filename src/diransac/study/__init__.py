@@ -3,7 +3,7 @@
 | file | what it holds |
 |---|---|
 | `run.py` | `run_study`, the one entry: hand out trials, keep what comes back |
-| `specification.py`, `axis.py`, `plants.py`, `tables.py` | what a study is, checked |
+| `specification.py`, `axis.py`, `plants.py`, `flights.py`, `arguments.py`, `tables.py` | what a study is, checked |
 | `library.py`, `builtin/`, `template.toml` | where studies come from; those of the paper's figures |
 | `trials.py`, `seeds.py` | what a worker does; the seeds of a trial |
 | `workers.py`, `cluster.py` | where it does it |

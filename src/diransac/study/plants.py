@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,12 +11,10 @@ from typing import Any
 from diransac.errors import DiransacError, SettingsError
 from diransac.models import TABLE_I, builtin, extended_rotorcraft
 from diransac.plant import Plant
-from diransac.study.tables import Reader, is_number
+from diransac.study.arguments import ANY, given_arguments
+from diransac.study.tables import Reader
 
 __all__ = ["PlantChoice"]
-
-ANYWHERE = "any"
-"""As a rotor's phase: drawn anew for each flight."""
 
 
 def _undisturbed(parameters: Mapping[str, float] = TABLE_I) -> Plant:
@@ -46,19 +43,14 @@ class PlantChoice:
     arguments: Mapping[str, Any]
 
     @classmethod
-    def from_dict(cls, table: object) -> PlantChoice:
+    def from_dict(cls, table: Mapping[str, Any]) -> PlantChoice:
         """The plant of a study's table.
 
         Raises SettingsError: an unknown kind or key, or a value that makes no plant.
         """
         reader = Reader(table, "plant")
         kind = reader.text("kind", choices=tuple(_KINDS))
-        arguments = {}
-        for name, parameter in inspect.signature(_KINDS[kind]).parameters.items():
-            default = _as_written(parameter.default)
-            given = reader.has(name)
-            value = table[name] if given else default  # type: ignore[index]  # a reader reads tables alone
-            arguments[name] = _checked(f"plant.{name}", value, default) if given else default
+        arguments = given_arguments(_KINDS[kind], table, reader, drawn="rotor_phase", pairs=True)
         reader.end()
         found = cls(kind, arguments)
         try:
@@ -88,34 +80,8 @@ def _made(kind: str, arguments: str) -> Plant:
     return _KINDS[kind](**{name: _as_meant(name, value) for name, value in json.loads(arguments).items()})
 
 
-def _as_written(default: Any) -> Any:
-    """A default as TOML would have it."""
-    if isinstance(default, Mapping):
-        return dict(default)
-    return list(default) if isinstance(default, tuple) else default
-
-
 def _as_meant(name: str, value: Any) -> Any:
     """An argument as the plant's function takes it."""
-    if name == "rotor_phase" and value == ANYWHERE:
+    if name == "rotor_phase" and value == ANY:
         return None
     return tuple(value) if isinstance(value, list) else value
-
-
-def _checked(path: str, value: Any, default: Any) -> Any:
-    """The value, if it is of its default's kind.  Raises SettingsError: it isn't."""
-    if isinstance(default, dict):
-        fits, wanted = isinstance(value, Mapping) and all(map(is_number, value.values())), "a table of numbers"
-        value = {**default, **{name: float(x) for name, x in value.items()}} if fits else value
-    elif isinstance(default, list):
-        fits = isinstance(value, list | tuple) and all(isinstance(x, str) for x in value)
-        wanted, value = "a list of words", list(value) if fits else value
-    elif isinstance(default, str):
-        fits, wanted = isinstance(value, str), "a word"
-    else:
-        pair = isinstance(value, list | tuple) and len(value) == 2 and all(map(is_number, value))
-        fits, wanted = is_number(value) or pair or (value == ANYWHERE and path.endswith("rotor_phase")), "a number"
-        value = [float(x) for x in value] if pair else float(value) if is_number(value) else value
-    if not fits:
-        raise SettingsError(f"{path} is {value!r:.60}; give {wanted}")
-    return value

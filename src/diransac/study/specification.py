@@ -11,18 +11,16 @@ from typing import Any
 from diransac.errors import DiransacError, SettingsError
 from diransac.identification import METHODS
 from diransac.noise import Noise
-from diransac.planning import sine, square, star
 from diransac.settings import Settings
 from diransac.study.axis import Axis
+from diransac.study.flights import MISSIONS, Flight
 from diransac.study.plants import PlantChoice
 from diransac.study.tables import Reader, changed, flat
 
-__all__ = ["TRAJECTORIES", "TRUE", "Method", "Study"]
+__all__ = ["TRUE", "Method", "Study"]
 
 TRUE = "true"
 """The method that identifies nothing: it knows the true parameters."""
-
-TRAJECTORIES = {"square": square, "star": star, "sine": sine}
 
 PRESETS = {"default": Settings, "table-iv": Settings.table_iv}
 
@@ -82,11 +80,13 @@ class Study:
     ----------
     name, description : for people
     plant : what flies, disturbances included
-    data : trajectory whose flight is recorded, a key of `TRAJECTORIES`
+    data : what is flown for data, and recorded
     noise : what spoils the record
     methods : what identifies from it, by label
-    evaluation : trajectories that are planned, steered and flown with what was identified
+    evaluation : trajectories that are planned, steered and flown with what was identified; none where
+        parameters alone are judged
     keep_paths : whether the paths of these flights are kept
+    judges_parameters : whether each trial finds the best parameters that the model can reach, to judge others by
     axis : what varies
     trials : at each level
     seed : trial k of a level depends on (seed, level, k) alone
@@ -97,11 +97,12 @@ class Study:
     name: str
     description: str
     plant: PlantChoice
-    data: str
+    data: Flight
     noise: Noise
     methods: Mapping[str, Method]
     evaluation: tuple[str, ...]
     keep_paths: bool
+    judges_parameters: bool
     axis: Axis
     trials: int
     seed: int
@@ -124,22 +125,24 @@ class Study:
     def _from_dict(cls, table: object) -> Study:
         """As `from_dict`, but for the levels."""
         reader = Reader(table)
-        data, evaluation = Reader(reader.table("data"), "data"), Reader(reader.table("evaluation"), "evaluation")
+        data, evaluation = reader.table("data"), Reader(reader.table("evaluation"), "evaluation")
+        judges_parameters = evaluation.flag("parameters", default=False)
         methods = reader.table("methods")
         found = cls(
             name=reader.text("name"),
             description=reader.text("description", ""),
             plant=PlantChoice.from_dict(reader.table("plant")),
-            data=data.text("trajectory", choices=tuple(TRAJECTORIES)),
+            data=Flight.from_dict(data),
             noise=_noise(reader.table("noise", needed=False)),
             methods={label: Method.from_dict(label, one) for label, one in methods.items()},
-            evaluation=_trajectories(evaluation.listed("trajectories")),
+            evaluation=_trajectories(evaluation.listed("trajectories", least=0 if judges_parameters else 1)),
             keep_paths=evaluation.flag("keep_paths", default=False),
+            judges_parameters=judges_parameters,
             axis=Axis.from_dict(reader.table("axis")),
             trials=reader.whole("trials", 1),
             seed=reader.whole("seed", 0, default=0),
         )
-        for one in (reader, data, evaluation):
+        for one in (reader, evaluation):
             one.end()
         if not found.methods:
             raise SettingsError(f"methods is empty; there are {TRUE}, {', '.join(METHODS)}")
@@ -153,10 +156,14 @@ class Study:
             "trials": self.trials,
             "seed": self.seed,
             "plant": self.plant.to_dict(),
-            "data": {"trajectory": self.data},
+            "data": self.data.to_dict(),
             "noise": dataclasses.asdict(self.noise),
             "methods": {label: method.to_dict() for label, method in self.methods.items()},
-            "evaluation": {"trajectories": list(self.evaluation), "keep_paths": self.keep_paths},
+            "evaluation": {
+                "trajectories": list(self.evaluation),
+                "keep_paths": self.keep_paths,
+                **({"parameters": True} if self.judges_parameters else {}),  # stores of before have no such key
+            },
             "axis": self.axis.to_dict(),
         }
 
@@ -231,6 +238,6 @@ def _noise(table: Mapping[str, Any]) -> Noise:
 
 def _trajectories(found: Sequence[object]) -> tuple[str, ...]:
     for name in found:
-        if name not in TRAJECTORIES:
-            raise SettingsError(f"evaluation.trajectories has {name!r}; there are {', '.join(TRAJECTORIES)}")
+        if name not in MISSIONS:
+            raise SettingsError(f"evaluation.trajectories has {name!r}; there are {', '.join(MISSIONS)}")
     return tuple(dict.fromkeys(map(str, found)))

@@ -59,10 +59,10 @@ class Reader:
             raise SettingsError(f"{self.path(key)} is {value!r:.60}; give true or false")
         return value
 
-    def listed(self, key: str) -> list[Any]:
-        """A list that isn't empty."""
+    def listed(self, key: str, least: int = 1) -> list[Any]:
+        """A list, of not less than so many."""
         value = self._value(key, None, "a list")
-        if not isinstance(value, list | tuple) or not value:
+        if not isinstance(value, list | tuple) or len(value) < least:
             raise SettingsError(f"{self.path(key)} is {value!r:.60}; give a list of one or more")
         return list(value)
 

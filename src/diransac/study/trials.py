@@ -28,9 +28,10 @@ from diransac.log import Log
 from diransac.noise import corrupt
 from diransac.plant import Plant
 from diransac.settings import Settings
+from diransac.study.flights import TRAJECTORIES
 from diransac.study.library import load
 from diransac.study.seeds import derived_seed
-from diransac.study.specification import TRAJECTORIES, TRUE, Study
+from diransac.study.specification import TRUE, Study
 from diransac.trajectory import Trajectory
 
 __all__ = ["STAGES", "run_trials"]
@@ -86,7 +87,7 @@ class _Point:
     @cached_property
     def controller(self) -> Controller:
         """What steers the flight that is recorded.  Raises PlanningError: there is no such flight."""
-        return tvlqr(self.plant, TRAJECTORIES[self.study.data](self.plant, time_limit=_PATIENCE))
+        return tvlqr(self.plant, self.study.data.planned(self.plant, 0, time_limit=_PATIENCE))
 
     def record(self, cases: Sequence[_Case]) -> None:
         """Fly for data, and spoil each trial's record; where nothing is drawn, one flight serves all trials."""

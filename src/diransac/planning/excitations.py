@@ -1,0 +1,155 @@
+"""Flights for data: they move all that a model has, and each seed gives another one.
+
+Nothing that is tuned on one of them has been tuned on the next.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from diransac.errors import SettingsError
+from diransac.planning.flights import Limits, check_plane, through
+from diransac.planning.planner import TIME_STEP
+from diransac.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from diransac.model import Model
+    from diransac.plant import ModelWithParameters
+
+    Floats = NDArray[np.float64]
+
+__all__ = ["check_fully_actuated", "places", "sines"]
+
+SHORTEST_LEG = 0.1
+"""s: as long as a plan holds its inputs."""
+
+SMOOTHED_ROWS = 11
+"""Rows over which inputs are averaged: a plan holds them for ten, and would hardly show that they arrive late."""
+
+SINES = 5
+"""Of each coordinate."""
+
+
+def places(
+    plant: ModelWithParameters,
+    *,
+    seed: int = 0,
+    speed: float = 1.6,
+    reach: float = 2.0,
+    duration: float = 25.0,
+    input_limits: Limits | None = None,
+    **options: Any,
+) -> Trajectory:
+    """From rest at the origin through random places in the plane of x and z, to rest at the last of them.
+
+    Parameters
+    ----------
+    plant : with coordinates x and z, m
+    seed : of the places, which are uniform in a square
+    speed : mean speed along the straight way from each place to the next, m/s
+    reach : half a side of that square, m
+    duration : s; the flight ends at the last place that is reached before
+    input_limits, options : as those of `square`
+
+    The plan's inputs are smoothed over 0.1 s, so that they move in every row; its states are those of the plan, from
+    which a flight under feedback then strays by a few millimetres. A place less than 0.1 s away is passed over.
+
+    Raises SettingsError: a model without coordinates x and z, a number that isn't above 0, a first place too far.
+    Raises PlanningError: no such trajectory; it says why.
+    """
+    check_plane(plant.model)
+    _check_positive(speed=speed, reach=reach, duration=duration)
+    way, times = _random_way(seed, speed, reach, duration)
+    planned = through(plant, way, times, input_limits, options)
+    return replace(planned, inputs=uniform_filter1d(planned.inputs, SMOOTHED_ROWS, axis=0, mode="nearest"))
+
+
+def _random_way(seed: int, speed: float, reach: float, duration: float) -> tuple[list[tuple[float, float]], Floats]:
+    """Places, m, and when they are reached (K,), s."""
+    rng = np.random.default_rng(seed)
+    way, times = [(0.0, 0.0)], [0.0]
+    while True:
+        x, z = rng.uniform(-reach, reach, 2).tolist()
+        leg = math.hypot(x - way[-1][0], z - way[-1][1]) / speed
+        if times[-1] + leg >= duration:
+            break
+        if leg >= SHORTEST_LEG:
+            way.append((x, z))
+            times.append(times[-1] + leg)
+    if len(way) < 2:
+        raise SettingsError(
+            f"the first place is {leg:.3g} s away at {speed:g} m/s, and the flight lasts {duration:g} s; "
+            "give more duration or speed, or less reach"
+        )
+    return way, TIME_STEP * np.rint(np.array(times) / TIME_STEP)
+
+
+def sines(
+    plant: ModelWithParameters, *, seed: int = 0, amplitude: float = 0.5, frequency: float = 1.0, duration: float = 25.0
+) -> Trajectory:
+    """Every coordinate a sum of five sines, with the inputs that inverse dynamics gives: a multisine.
+
+    Parameters
+    ----------
+    plant : fully actuated: as many inputs as coordinates, which the inputs can push at will
+    seed : of frequencies, sizes and phases, which are uniform
+    amplitude : each sine's is 0.2 to 0.6 of it, each coordinate's unit; together they come to about 0.66 of it, RMS
+    frequency : Hz; each sine's is 0.2 to 1.0 of it
+    duration : s
+
+    Nothing is searched for, and no limit is kept to. The flight starts in motion.
+
+    Raises SettingsError: a model that is not fully actuated, or a number that isn't above 0.
+
+    References: Swevers et al. 1997, "Optimal robot excitation and identification", IEEE Trans. Robotics and Automation
+    13(5), for sums of sines; theirs are optimised, these are drawn.
+    """
+    model = plant.model
+    inverse_dynamics = _inverse_dynamics(model)
+    _check_positive(amplitude=amplitude, frequency=frequency, duration=duration)
+    rng = np.random.default_rng(seed)
+    time = np.arange(round(duration / TIME_STEP) + 1, dtype=np.float64) * TIME_STEP
+    shape = (SINES, model.n_q, 1)
+    w, phase = 2 * np.pi * frequency * rng.uniform(0.2, 1.0, shape), rng.uniform(0.0, 2 * np.pi, shape)
+    size = amplitude * rng.uniform(0.2, 0.6, shape)
+    q, v, a = (
+        np.sum(size * w**order * np.sin(w * time + phase + order * np.pi / 2), axis=0) for order in range(3)
+    )  # a derivative is a factor w and a quarter turn
+    inputs = np.array(inverse_dynamics(q, v, a, model.parameter_vector(plant.parameters)))
+    return Trajectory(time, np.vstack([q, v]).T, inputs.T, model.state, tuple(model.inputs))
+
+
+def check_fully_actuated(model: Model) -> None:
+    """Raises SettingsError: inverse dynamics does not give this model's inputs, uniquely, for every acceleration."""
+    _inverse_dynamics(model)
+
+
+def _inverse_dynamics(model: Model) -> ca.Function:
+    """Inputs (n_u, K) from q, v, a (n_v, K) and p.  Raises SettingsError: as `check_fully_actuated`."""
+    sizes = model.n_q, model.n_v, model.n_v, model.n_u, model.n_p
+    q, v, a, u, p = (ca.SX.sym(name, size) for name, size in zip("qvaup", sizes, strict=True))
+    r = model.residual(q, v, a, u, p)
+    push = ca.jacobian(r, u)
+    square = model.kinematics is None and model.n_u == model.n_v
+    if not square or ca.depends_on(push, u) or ca.sprank(push) < model.n_v:
+        raise SettingsError(
+            f'model "{model.name}" is not fully actuated: its inputs ({", ".join(model.inputs)}) do not push each of '
+            f"its coordinates ({', '.join(model.coordinates)}) at will and linearly; plan a flight with diransac.plan"
+        )
+    inputs = -ca.solve(ca.densify(push), ca.densify(ca.substitute(r, u, 0)))
+    return ca.Function("inverse_dynamics", [q, v, a, p], [inputs])
+
+
+def _check_positive(**values: float) -> None:
+    """Raises SettingsError: a value isn't a finite number above 0."""
+    for name, value in values.items():
+        if not 0.0 < value < np.inf:
+            raise SettingsError(f"{name} is {value!r}; give a finite number above 0")
