@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 __all__ = ["check_fully_actuated", "places", "sines"]
 
-SHORTEST_LEG = 0.1
-"""s: as long as a plan holds its inputs."""
+SHORTEST_LEG = 1.0
+"""s: from rest, a rotorcraft must turn before it moves sideways."""
 
 SMOOTHED_ROWS = 11
 """Rows over which inputs are averaged: a plan holds them for ten, and would hardly show that they arrive late."""
@@ -59,10 +59,11 @@ def places(
     duration : s; the flight ends at the last place that is reached before
     input_limits, options : as those of `square`
 
-    The plan's inputs are smoothed over 0.1 s, so that they move in every row; its states are those of the plan, from
-    which a flight under feedback then strays by a few millimetres. A place less than 0.1 s away is passed over.
+    The plan's inputs are smoothed over 0.1 s, so that they move in every row; the states are still the plan's, from
+    which the paper's rotorcraft strays by less than a millimetre under feedback. A place less than 1 s away is passed
+    over: it could hardly be reached from rest.
 
-    Raises SettingsError: a model without coordinates x and z, a number that isn't above 0, a first place too far.
+    Raises SettingsError: a model without coordinates x and z, a number that isn't above 0, places too near or too far.
     Raises PlanningError: no such trajectory; it says why.
     """
     check_plane(plant.model)
@@ -73,7 +74,12 @@ def places(
 
 
 def _random_way(seed: int, speed: float, reach: float, duration: float) -> tuple[list[tuple[float, float]], Floats]:
-    """Places, m, and when they are reached (K,), s."""
+    """Places, m, and when they are reached (K,), s.  Raises SettingsError: there are none of that distance."""
+    if reach < speed * SHORTEST_LEG:
+        raise SettingsError(
+            f"places within a reach of {reach:g} m are too near for a speed of {speed:g} m/s: each is to be at least "
+            f"{SHORTEST_LEG:g} s from the one before; give a reach of {speed * SHORTEST_LEG:g} m or more"
+        )
     rng = np.random.default_rng(seed)
     way, times = [(0.0, 0.0)], [0.0]
     while True:
@@ -105,7 +111,8 @@ def sines(
     frequency : Hz; each sine's is 0.2 to 1.0 of it
     duration : s
 
-    Nothing is searched for, and no limit is kept to. The flight starts in motion.
+    Nothing is searched for, and no limit is kept to. The flight starts in motion. An input, held from row to row, is
+    that of the moment between them.
 
     Raises SettingsError: a model that is not fully actuated, or a number that isn't above 0.
 
@@ -120,11 +127,13 @@ def sines(
     shape = (SINES, model.n_q, 1)
     w, phase = 2 * np.pi * frequency * rng.uniform(0.2, 1.0, shape), rng.uniform(0.0, 2 * np.pi, shape)
     size = amplitude * rng.uniform(0.2, 0.6, shape)
-    q, v, a = (
-        np.sum(size * w**order * np.sin(w * time + phase + order * np.pi / 2), axis=0) for order in range(3)
-    )  # a derivative is a factor w and a quarter turn
-    inputs = np.array(inverse_dynamics(q, v, a, model.parameter_vector(plant.parameters)))
-    return Trajectory(time, np.vstack([q, v]).T, inputs.T, model.state, tuple(model.inputs))
+
+    def motion(t: Floats) -> list[Floats]:
+        """q, v and a (n_q, K): a derivative is a factor w and a quarter turn."""
+        return [np.sum(size * w**k * np.sin(w * t + phase + k * np.pi / 2), axis=0) for k in range(3)]
+
+    inputs = np.array(inverse_dynamics(*motion(time + TIME_STEP / 2), model.parameter_vector(plant.parameters)))
+    return Trajectory(time, np.vstack(motion(time)[:2]).T, inputs.T, model.state, tuple(model.inputs))
 
 
 def check_fully_actuated(model: Model) -> None:
