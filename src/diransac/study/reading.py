@@ -29,8 +29,9 @@ def read(store: str | Path) -> pl.DataFrame:
     """Every row of a store: a level, trial and method each, in the order in which levels and methods were asked for.
 
     ``level``, ``trial``, ``method``; ``status`` is done or failed, and ``error`` says why; ``seed``;
-    ``parameter_<name>`` in the parameter's unit; ``fit_error``, ``inlier_fraction``, ``iterations``, ``stop_reason`` of
-    the identification;
+    ``parameter_<name>`` in the parameter's unit, and where parameters are judged the best one that the model can reach
+    in the trial's flight, ``best_<name>``, and the ends of the 95 % interval, ``low_<name>`` and ``high_<name>``;
+    ``fit_error``, ``inlier_fraction``, ``iterations``, ``stop_reason`` of the identification;
     ``<trajectory>_<state>``, the RMS tracking error in the state's unit; ``versions``; ``seconds``, a struct by stage
     (what is done for several trials together is divided among them); ``host``.  What isn't known is null.
 

@@ -216,7 +216,8 @@ def _create(connection: sqlite3.Connection, study: Study) -> None:
 def _columns(study: Study) -> dict[str, str]:
     """SQL kind of each column of a row."""
     model = study.plant.plant.model
-    parameters = {f"parameter_{name}": "REAL" for name in model.parameters}
+    kinds = ("parameter", "best", "low", "high") if study.judges_parameters else ("parameter",)
+    parameters = {f"{kind}_{name}": "REAL" for kind in kinds for name in model.parameters}
     errors = {f"{shape}_{state}": "REAL" for shape in study.evaluation for state in model.state}
     return {
         "level": "TEXT NOT NULL",

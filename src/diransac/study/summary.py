@@ -1,4 +1,7 @@
-"""What a store says, level by level and method by method: errors of the flights there are, and how many are missing."""
+"""What a store says, level by level and method by method.
+
+How flights were tracked and how many are missing; where a study judges parameters, how far off these are.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,15 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from diransac.errors import StudyError
+from diransac.plant import Plant
 from diransac.study.plants import PlantChoice
 from diransac.study.reading import read
 from diransac.study.store import Store
@@ -21,10 +26,17 @@ from diransac.study.tables import changed
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Flights", "Summary", "summarise"]
+__all__ = ["Estimates", "Flights", "Summary", "summarise"]
 
 Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
 _Statistic = Callable[[Floats], np.floating]
+
+_ROUNDING = 1e-6
+"""Of a parameter: by so little an interval may miss it. Where nothing is wrong, intervals are points."""
+
+_VISIBLE = 2e-3
+"""Of a parameter: best ones that differ by less from the plant's own are taken for the same."""
 
 
 @dataclass(frozen=True)
@@ -43,34 +55,81 @@ class Flights:
     """
 
     errors: Mapping[str, Floats]
-    ran: npt.NDArray[np.bool_]
-    failed: npt.NDArray[np.bool_]
+    ran: Bools
+    failed: Bools
 
     def mean(self, state: str) -> Floats:
         """Mean over the flights there are, (n_levels, n_methods); NaN where there is none."""
-        return self._over_trials(self.errors[state], ~np.isnan(self.errors[state]), np.mean)
+        return _over_trials(self.errors[state], ~np.isnan(self.errors[state]), np.mean)
 
     def deviation(self, state: str) -> Floats:
         """Standard deviation of the flights there are, with n - 1; NaN where there are fewer than two."""
         there = ~np.isnan(self.errors[state])
         enough = there & (there.sum(axis=2, keepdims=True) > 1)
-        return self._over_trials(self.errors[state], enough, _sample_deviation)
+        return _over_trials(self.errors[state], enough, _sample_deviation)
 
     def median(self, state: str) -> Floats:
         """Median over all trials, of which one that failed counts as an infinite error; NaN where there is none."""
-        return self._over_trials(np.where(self.failed, np.inf, self.errors[state]), self.ran, _upper_median)
+        return _over_trials(np.where(self.failed, np.inf, self.errors[state]), self.ran, _upper_median)
 
     @property
     def failure_share(self) -> Floats:
         """Fraction of the trials that failed, (n_levels, n_methods); NaN where there are none."""
-        return self._over_trials(self.failed.astype(float), self.ran, np.mean)
+        return _over_trials(self.failed.astype(float), self.ran, np.mean)
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """How far parameters are off, by parameter and (n_levels, n_methods, n_trials).
+
+    An error is ``|found / reference - 1|``: infinite where nothing was found, NaN where there is no trial or nothing
+    to judge it by, and of a parameter that is 0 in the plant.
+
+    Parameters
+    ----------
+    errors : against the best parameters that the model can reach in the very flight
+    errors_of_own : against the plant's own
+    covered : 1 where the 95 % interval holds the best parameter, to a millionth; 0 where not, NaN without an interval
+    differs : (n_levels,) whether the best parameters are not the plant's own: some differ by more than 0.2 %
+    disturbed : (n_levels,) whether the plant has more to it than the model
+    """
+
+    errors: Mapping[str, Floats]
+    errors_of_own: Mapping[str, Floats]
+    covered: Mapping[str, Floats]
+    differs: Bools
+    disturbed: Bools
+
+    @cached_property
+    def worst(self) -> Floats:
+        """Error of the worst parameter against the best ones, (n_levels, n_methods, n_trials)."""
+        return _largest(self.errors)
+
+    @cached_property
+    def worst_of_own(self) -> Floats:
+        """The same against the plant's own parameters."""
+        return _largest(self.errors_of_own)
 
     @staticmethod
-    def _over_trials(values: Floats, counted: npt.NDArray[np.bool_], statistic: _Statistic) -> Floats:
-        found = np.full(values.shape[:2], np.nan)
-        for cell in np.argwhere(counted.any(axis=2)):
-            found[tuple(cell)] = statistic(values[tuple(cell)][counted[tuple(cell)]])
-        return found
+    def median(errors: Floats) -> Floats:
+        """Median over the trials that were judged, (n_levels, n_methods); NaN where there is none."""
+        return _over_trials(errors, ~np.isnan(errors), _upper_median)
+
+    @staticmethod
+    def largest(errors: Floats) -> Floats:
+        """Largest error of the trials that were judged, (n_levels, n_methods); NaN where there is none."""
+        return _over_trials(errors, ~np.isnan(errors), np.max)
+
+    def coverage(self, *, disturbed: bool) -> list[tuple[int, int]]:
+        """Of each method's intervals, how many hold the best parameter, and how many there are.
+
+        Parameters
+        ----------
+        disturbed : at the levels whose plant has more to it than the model, or at the others
+        """
+        some = np.array([one[self.disturbed == disturbed] for one in self.covered.values()])
+        held, there = np.nansum(some, axis=(0, 1, 3)), (~np.isnan(some)).sum(axis=(0, 1, 3))
+        return [(int(a), int(n)) for a, n in zip(held, there, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -82,7 +141,9 @@ class Summary:
     name, description, axis, unit : the study's words, and the unit of its axis
     levels, methods : numbers in ascending order, words in the order in which they were asked for
     units : state -> its unit
+    ran : (n_levels, n_methods, n_trials), which trials there are
     flights : by trajectory
+    estimates : None where the study judges no parameters
     failures : (method, why) -> how many trials, the most frequent first
     seconds : (n_methods, n_stages), s of one process, summed over trials
     stages : what these are of
@@ -96,7 +157,9 @@ class Summary:
     levels: tuple[str, ...]
     methods: tuple[str, ...]
     units: Mapping[str, str]
+    ran: Bools
     flights: Mapping[str, Flights]
+    estimates: Estimates | None
     failures: Mapping[tuple[str, str], int]
     seconds: Floats
     stages: tuple[str, ...]
@@ -121,13 +184,15 @@ def summarise(store: str | Path) -> Summary:
     """
     rows = read(store)
     with Store.existing(store) as kept:
-        words, configuration = kept.about, kept.configuration["study"]
+        words, parts = kept.about, kept.configuration
         cells = kept.select("SELECT level, method FROM cells ORDER BY rowid")
     if not len(rows):
         raise StudyError(f'store "{store}" has no rows yet; run its study first')
     levels = _in_order(list(dict.fromkeys(level for level, _ in cells)))
     methods = tuple(dict.fromkeys(method for _, method in cells))
-    model = PlantChoice.from_dict(changed({}, configuration)["plant"]).plant.model
+    plants = [_plant_at(level, parts) for level in levels]
+    model = plants[0].model
+    table = _Table(rows, levels, methods)
     seconds = rows.select("method", "seconds").unnest("seconds")
     stages = tuple(seconds.columns[1:])
     by_method = {method: seconds.filter(method=method).select(stages).sum().row(0) for method in methods}
@@ -136,10 +201,9 @@ def summarise(store: str | Path) -> Summary:
         levels=levels,
         methods=methods,
         units={name: model.units[name] for name in model.state},
-        flights={
-            shape: _flights(rows, shape, model.state, levels, methods)
-            for shape in configuration["evaluation.trajectories"]
-        },
+        ran=table.ran,
+        flights={shape: _flights(table, shape, model.state) for shape in parts["study"]["evaluation.trajectories"]},
+        estimates=_estimates(table, plants) if parts["study"].get("evaluation.parameters") else None,
         failures=_failures(rows),
         seconds=np.array(list(by_method.values()), dtype=float),
         stages=stages,
@@ -147,22 +211,72 @@ def summarise(store: str | Path) -> Summary:
     )
 
 
-def _flights(
-    rows: pl.DataFrame, shape: str, states: Sequence[str], levels: Sequence[str], methods: Sequence[str]
-) -> Flights:
-    cells = [
-        (levels.index(level), methods.index(method), trial)
-        for level, method, trial in rows.select("level", "method", "trial").iter_rows()
-    ]
-    where = tuple(np.array(cells).T)
-    size = (len(levels), len(methods), int(where[2].max()) + 1)
-    errors = {}
-    for state in states:
-        errors[state] = np.full(size, np.nan)
-        errors[state][where] = rows[f"{shape}_{state}"].to_numpy()
-    ran = np.zeros(size, dtype=bool)
-    ran[where] = True
-    return Flights(errors, ran, ran & np.isnan(errors[states[0]]))
+def _plant_at(level: str, parts: Mapping[str, Mapping[str, Any]]) -> Plant:
+    """What flies at a level, from a store's configuration."""
+    table = changed(changed({}, parts["study"]), parts[f"levels.{level}"])
+    return PlantChoice.from_dict(table["plant"]).plant
+
+
+class _Table:
+    """A store's rows as arrays (n_levels, n_methods, n_trials)."""
+
+    def __init__(self, rows: pl.DataFrame, levels: Sequence[str], methods: Sequence[str]) -> None:
+        cells = [
+            (levels.index(level), methods.index(method), trial)
+            for level, method, trial in rows.select("level", "method", "trial").iter_rows()
+        ]
+        self._rows, self._where = rows, tuple(np.array(cells).T)
+        self.ran = np.zeros((len(levels), len(methods), int(self._where[2].max()) + 1), dtype=bool)
+        self.ran[self._where] = True
+
+    def column(self, name: str) -> Floats:
+        """A column of numbers, NaN where there is none."""
+        found = np.full(self.ran.shape, np.nan)
+        found[self._where] = self._rows[name].to_numpy()
+        return found
+
+
+def _flights(table: _Table, shape: str, states: Sequence[str]) -> Flights:
+    errors = {state: table.column(f"{shape}_{state}") for state in states}
+    return Flights(errors, table.ran, table.ran & np.isnan(errors[states[0]]))
+
+
+def _estimates(table: _Table, plants: Sequence[Plant]) -> Estimates:
+    errors, errors_of_own, covered, differs = {}, {}, {}, np.zeros(len(plants), dtype=bool)
+    for name in plants[0].parameters:
+        found, best, low, high = (table.column(f"{what}_{name}") for what in ("parameter", "best", "low", "high"))
+        own = np.broadcast_to(np.array([plant.parameters[name] for plant in plants])[:, None, None], best.shape)
+        judged = ~np.isnan(best) & (own != 0.0)
+        errors[name], errors_of_own[name] = (_relative(found, reference, judged) for reference in (best, own))
+        slack = _ROUNDING * np.abs(best)
+        holds = (low - slack <= best) & (best <= high + slack)
+        covered[name] = np.where(np.isnan(best + low + high), np.nan, holds)
+        differs |= (_relative(best, own, judged) > _VISIBLE).any(axis=(1, 2))
+    return Estimates(errors, errors_of_own, covered, differs, np.array([_is_disturbed(plant) for plant in plants]))
+
+
+def _relative(found: Floats, reference: Floats, judged: Bools) -> Floats:
+    """``|found / reference - 1|`` of what is judged, infinite without a number; NaN of the rest."""
+    ratio = np.divide(found, reference, out=np.full(found.shape, np.nan), where=judged)
+    return np.where(judged, np.nan_to_num(np.abs(ratio - 1.0), nan=np.inf, posinf=np.inf), np.nan)
+
+
+def _largest(errors: Mapping[str, Floats]) -> Floats:
+    """The largest of errors by name; NaN where all are."""
+    return np.asarray(np.fmax.reduce(list(errors.values())))
+
+
+def _is_disturbed(plant: Plant) -> bool:
+    """Whether something acts on it: a disturbance whose constants aren't all zero."""
+    return any(not one.constants or any(one.constants.values()) for one in plant.disturbances)
+
+
+def _over_trials(values: Floats, counted: Bools, statistic: _Statistic) -> Floats:
+    """A statistic of those trials that count, (n_levels, n_methods); NaN where none does."""
+    found = np.full(values.shape[:2], np.nan)
+    for cell in np.argwhere(counted.any(axis=2)):
+        found[tuple(cell)] = statistic(values[tuple(cell)][counted[tuple(cell)]])
+    return found
 
 
 def _failures(rows: pl.DataFrame) -> dict[tuple[str, str], int]:

@@ -11,7 +11,7 @@ import json
 import platform
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -29,6 +29,7 @@ from diransac.noise import corrupt
 from diransac.plant import Plant
 from diransac.settings import Settings
 from diransac.study.flights import TRAJECTORIES
+from diransac.study.judging import best_parameters
 from diransac.study.library import load
 from diransac.study.seeds import derived_seed
 from diransac.study.specification import TRUE, Study
@@ -41,6 +42,9 @@ STAGES = ("record", "identify", "plan", "steer", "fly")
 
 _PATIENCE = 600.0
 """s that a plan may take: so many that a solver's limit of iterations ends it first, however slow a machine is."""
+
+_INTERVAL = 0.95
+"""Level of the intervals that are kept where parameters are judged."""
 
 _PACKAGES = ("diransac", "casadi", "llvmlite", "numpy", "scipy")
 
@@ -84,44 +88,51 @@ class _Point:
         """What flies."""
         return self.study.plant.plant
 
-    @cached_property
-    def controller(self) -> Controller:
-        """What steers the flight that is recorded.  Raises PlanningError: there is no such flight."""
-        return tvlqr(self.plant, self.study.data.planned(self.plant, 0, time_limit=_PATIENCE))
-
     def record(self, cases: Sequence[_Case]) -> None:
-        """Fly for data, and spoil each trial's record; where nothing is drawn, one flight serves all trials."""
-        seeds = {case.trial: case.seed for case in cases}
+        """Fly for data, spoil each trial's record, and find what can be made of the flight at best."""
+        by_seed: dict[int, list[_Case]] = defaultdict(list)
+        for case in cases:
+            by_seed[case.seed].append(case)
         begin = time.perf_counter()
-        try:
-            flights = self._flights(list(seeds.values()))
-        except DiransacError as error:
-            for case in cases:
-                case.fail(error)
-        else:
-            for (trial, seed), flight in zip(seeds.items(), flights, strict=True):
-                self._spoil(flight, seed, [case for case in cases if case.trial == trial])
+        for (seed, some), flight in zip(by_seed.items(), self._flights(list(by_seed)), strict=True):
+            try:
+                if isinstance(flight, DiransacError):
+                    raise flight
+                self._hand_out(flight, seed, some)
+            except DiransacError as error:
+                for case in some:
+                    case.fail(error)
         _share(cases, "record", time.perf_counter() - begin)
 
-    def _flights(self, seeds: Sequence[int]) -> list[Log]:
-        """The flight that is recorded, of each trial."""
-        drawn = [derived_seed(seed, "data flight") for seed in (seeds if self.study.plant.is_drawn else seeds[:1])]
-        n = len(drawn)
-        flights = fly_all([self.plant] * n, [self.controller] * n, seeds=drawn, threads=1)
-        return flights if n == len(seeds) else flights * len(seeds)
+    def _flights(self, seeds: Sequence[int]) -> list[Log | DiransacError]:
+        """The flight that is recorded in each trial, or why there is none; one serves all where nothing is drawn."""
+        data = self.study.data
+        different = seeds if data.is_drawn or self.study.plant.is_drawn else seeds[:1]
+        plans = [derived_seed(seed, "data plan") if data.is_drawn else 0 for seed in different]
+        steering = [_steering(self, plan) for plan in plans]
+        flown = {k: one for k, one in enumerate(steering) if isinstance(one, Controller)}
+        drawn = [derived_seed(different[k], "data flight") for k in flown]
+        logs = iter(_flown(self.plant, list(flown.values()), drawn, data.substeps))
+        found = [one if isinstance(one, DiransacError) else next(logs) for one in steering]
+        return found if len(found) == len(seeds) else found * len(seeds)
 
-    def _spoil(self, flight: Log, seed: int, cases: Sequence[_Case]) -> None:
-        """Give the cases of one trial its record."""
-        noise = derived_seed(seed, "noise")
-        try:
-            _check_ended(flight)
-            log = corrupt(flight, self.study.noise, noise, signals=self.plant.model.signals)
-        except DiransacError as error:
-            for case in cases:
-                case.fail(error)
-        else:
-            for case in cases:
-                case.log = log
+    def _hand_out(self, flight: Log, seed: int, cases: Sequence[_Case]) -> None:
+        """Give the cases of one trial its record, and what they are judged by.  Raises DiransacError: neither is."""
+        _check_ended(flight)
+        log = corrupt(flight, self.study.noise, derived_seed(seed, "noise"), signals=self.plant.model.signals)
+        best = best_parameters(self.plant, flight) if self.study.judges_parameters else {}
+        for case in cases:
+            case.log = log
+            case.figures |= {f"best_{name}": value for name, value in best.items()}
+
+
+@lru_cache(maxsize=64)
+def _steering(point: _Point, seed: int) -> Controller | DiransacError:
+    """What steers the flight that is recorded, or why there is none; trials with the same plan share it."""
+    try:
+        return tvlqr(point.plant, point.study.data.planned(point.plant, seed, time_limit=_PATIENCE))
+    except DiransacError as error:
+        return error
 
 
 @dataclass
@@ -170,6 +181,7 @@ class _Case:
             seed = derived_seed(self.seed, "identify")
             result = identify(plant.model, self.log, method.method, seed=seed, settings=settings)
             self.found = Plant(plant.model, result.parameters)
+            self.figures |= _ends(result.intervals(_INTERVAL)) if self.point.study.judges_parameters else {}
             self.figures |= {
                 "fit_error": result.fit_error,
                 "inlier_fraction": result.inlier_fraction,
@@ -211,19 +223,32 @@ def _evaluate(point: _Point, cases: Sequence[_Case], shape: str) -> None:
     plans = _plans(cases, shape)
     planned = [case for case in cases if id(case) in plans]
     controllers = _controllers(planned, plans)
+    steered = [case for case in planned if id(case) in controllers]
+    begin = time.perf_counter()
+    seeds = [derived_seed(case.seed, shape) for case in steered]
+    logs = _flown(point.plant, [controllers[id(case)] for case in steered], seeds)
+    _share(steered, "fly", time.perf_counter() - begin)
+    for case, log in zip(steered, logs, strict=True):
+        with case.attempt("fly"):
+            case.judge(shape, plans[id(case)], log)
+
+
+def _flown(
+    plant: Plant, controllers: Sequence[Controller], seeds: Sequence[int], least_substeps: int | None = None
+) -> list[Log]:
+    """A flight by each controller; those of one length are lanes of one simulation."""
     groups = defaultdict(list)
-    for case in planned:
-        if id(case) in controllers:
-            groups[len(controllers[id(case)])].append(case)
-    for group in groups.values():
-        begin = time.perf_counter()
-        seeds = [derived_seed(case.seed, shape) for case in group]
-        steering = [controllers[id(case)] for case in group]
-        logs = fly_all([point.plant] * len(group), steering, seeds=seeds, threads=1)
-        _share(group, "fly", time.perf_counter() - begin)
-        for case, log in zip(group, logs, strict=True):
-            with case.attempt("fly"):
-                case.judge(shape, plans[id(case)], log)
+    for k, controller in enumerate(controllers):
+        groups[len(controller)].append(k)
+    logs: dict[int, Log] = {}
+    for some in groups.values():
+        steering = [controllers[k] for k in some]
+        substeps = max(least_substeps, plant.substeps(steering[0].dt)) if least_substeps else None
+        drawn = [seeds[k] for k in some]
+        logs |= zip(
+            some, fly_all([plant] * len(some), steering, substeps=substeps, seeds=drawn, threads=1), strict=True
+        )
+    return [logs[k] for k in range(len(controllers))]
 
 
 def _plans(cases: Sequence[_Case], shape: str) -> dict[int, Trajectory]:
@@ -281,6 +306,15 @@ def _check_ended(log: Log) -> None:
     diverged = [note for note in log.notes if "diverged" in note]
     if diverged:
         raise PlanningError(diverged[0])
+
+
+def _ends(intervals: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Ends of the intervals that have both."""
+    found: dict[str, float] = {}
+    for name, (low, high) in intervals.items():
+        if np.isfinite([low, high]).all():
+            found |= {f"low_{name}": low, f"high_{name}": high}
+    return found
 
 
 def _share(cases: Sequence[_Case], stage: str, seconds: float) -> None:
