@@ -31,7 +31,7 @@ from diransac.planning.request import (
     waypoints_of,
     weights_of,
 )
-from diransac.planning.solvers import Outcome, SearchLimits, interior_point
+from diransac.planning.solvers import TIME_LIMIT, Manner, Outcome, SearchLimits, interior_point
 from diransac.planning.trim import trim_of
 from diransac.trajectory import Trajectory
 
@@ -72,7 +72,7 @@ def plan(
     rest: bool = True,
     guess: Trajectory | None = None,
     solver: str = "ipopt",
-    max_iterations: int = 200,
+    max_iterations: int = 100,
     time_limit: float = 30.0,
 ) -> Trajectory:
     """The cheapest trajectory through waypoints or along a reference, by direct transcription.
@@ -102,7 +102,7 @@ def plan(
     guess : a trajectory of the same model to start the search from
     solver : ``ipopt``; ``fatrop``, which takes two thirds of the time, but now and then searches for ever, beyond the
         reach of time_limit and Ctrl-C, where parameters are far off; or ``snopt``, with ``pip install diransac[snopt]``
-    max_iterations : of a solver
+    max_iterations : of each attempt: from the guess, from the straight way, and from there with bolder steps
     time_limit : s; to find out why there is no plan may take as long again
 
     Returns
@@ -238,6 +238,10 @@ def _path(model: Model, guess: Trajectory) -> Path:
     return Path(guess.time - guess.time[0], guess.states, guess.inputs)
 
 
+def _manner(path: Path | None) -> Manner:
+    return "careful" if path is None else "near"
+
+
 # Search --------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class _Search:
@@ -263,7 +267,7 @@ class _Search:
         n = len(program.layout.intervals)
         durations = None if path is None else np.full(n, path.time[-1] / n)
         straight = first_path(task, np.ones(n) if durations is None else durations)
-        outcome = self._search(program, unknowns_of(program, path or straight, durations), near=path is not None)
+        outcome = self._search(program, unknowns_of(program, path or straight, durations), _manner(path))
         if not outcome.success:
             raise PlanningError(
                 f"no durations were found for which the plan works: {outcome.words}; "
@@ -275,26 +279,35 @@ class _Search:
             rows = tuple(int(k) + more for k in shortest)
             whole = fixed_program(task, rows)
             along = path_of(program, outcome.unknowns, task.dt * np.array(rows))
-            rounded = self._search(whole, unknowns_of(whole, along), near=True)
+            rounded = self._search(whole, unknowns_of(whole, along), "near")
             if rounded.success:
                 return self._trajectory(whole, rounded)
         raise PlanningError(why_not(task, rows, rounded, self.search_limits))
 
     def _solved(self, program: Program, rows: tuple[int, ...], path: Path | None) -> Outcome:
-        straight = first_path(self.task, self.task.dt * np.array(rows))
-        if path is not None:
-            outcome = self._search(program, unknowns_of(program, path), near=True)
-            if outcome.success:
-                return outcome
-        return self._search(program, unknowns_of(program, straight), near=False)
+        """From the guess, if there is one, then from the straight way, at last with bolder steps.
 
-    def _search(self, program: Program, unknowns: Floats, *, near: bool) -> Outcome:
+        Parameters that are far off, such as an inertia a fiftieth of the true one, make the constraints so curved that
+        a search along each step creeps; whole steps get there.
+        """
+        straight = unknowns_of(program, first_path(self.task, self.task.dt * np.array(rows)))
+        attempts: list[tuple[Floats, Manner]] = [] if path is None else [(unknowns_of(program, path), "near")]
+        attempts.append((straight, "careful"))
+        if self.solver == "ipopt":
+            attempts.append((straight, "bold"))
+        for unknowns, manner in attempts:
+            outcome = self._search(program, unknowns, manner)
+            if outcome.success or outcome.status == TIME_LIMIT:
+                break
+        return outcome
+
+    def _search(self, program: Program, unknowns: Floats, manner: Manner) -> Outcome:
         """Solve by the solver that was chosen."""
         if self.solver == "snopt":
             from diransac.planning.snopt import active_set
 
             return active_set(program, unknowns, self.search_limits)
-        return interior_point(self.solver, program, unknowns, self.search_limits, near=near)
+        return interior_point(self.solver, program, unknowns, self.search_limits, manner)
 
     def _trajectory(self, program: Program, outcome: Outcome) -> Trajectory:
         kept = np.clip(outcome.unknowns, program.numbers.lower, program.numbers.upper)

@@ -27,6 +27,9 @@ INTERVAL_STEPS = 10
 FREE_INTERVALS = 20
 """Intervals of a segment whose duration is unknown; even, so that an input may switch half way."""
 
+_DIGITS = 9
+"""Of a time in s: the same moment, computed in two ways, is one."""
+
 _FIRST_DURATION = 1.0
 """s; where the search for a segment's duration starts."""
 
@@ -134,24 +137,34 @@ def _reference(task: Task, time: Floats) -> Floats:
 
 # Guesses -------------------------------------------------------------------------------------------------------------
 def first_path(task: Task, durations: Floats) -> Path:
-    """Straight from each waypoint to the next, along the reference where there is one, with the inputs of rest."""
-    at_waypoints = np.concatenate([[0.0], np.cumsum(durations)])
-    time = np.union1d(np.linspace(0.0, at_waypoints[-1], 1 + int(np.rint(at_waypoints[-1] / task.dt))), at_waypoints)
-    states = np.zeros((len(time), len(task.model.state)))
-    for j in range(states.shape[1]):
-        fixed = [
-            (t, waypoint.values[waypoint.states.index(j)])
-            for t, waypoint in zip(at_waypoints, task.waypoints, strict=True)
-            if j in waypoint.states
-        ]
-        if fixed:
-            states[:, j] = np.interp(time, *np.array(fixed).T)
-    for name, values in task.reference.at(time).items():
-        states[:, task.model.state.index(name)] = values
+    """Straight from each waypoint to the next, along the reference where there is one, with the inputs of rest.
+
+    A velocity is its coordinate's slope; where a waypoint or the reference says otherwise, that counts.
+    """
+    at_waypoints = np.round(np.concatenate([[0.0], np.cumsum(durations)]), _DIGITS)
+    rows = np.linspace(0.0, at_waypoints[-1], 1 + int(np.rint(at_waypoints[-1] / task.dt)))
+    time = np.union1d(np.round(rows, _DIGITS), at_waypoints)
+    fixed = [_fixed(task, at_waypoints, j) for j in range(len(task.model.state))]
+    states = np.column_stack([np.interp(time, *known) if len(known[0]) else np.zeros(len(time)) for known in fixed])
+    followed = {task.model.state.index(name): samples for name, samples in task.reference.at(time).items()}
+    for j, samples in followed.items():
+        states[:, j] = samples
+    if task.model.kinematics is None:
+        slopes = np.gradient(states[:, : task.model.n_q], time, axis=0)
+        for j in set(range(task.model.n_q, states.shape[1])) - set(followed):
+            states[:, j] = slopes[:, j - task.model.n_q]
+            states[np.searchsorted(time, fixed[j][0]), j] = fixed[j][1]
     for four in task.model.quaternions:
         lengths = np.linalg.norm(states[:, list(four)], axis=1, keepdims=True)
         states[:, list(four)] /= np.where(lengths > 0.0, lengths, 1.0)
     return Path(time, states, np.broadcast_to(task.trim, (len(time), len(task.trim))))
+
+
+def _fixed(task: Task, at_waypoints: Floats, j: int) -> tuple[Floats, Floats]:
+    """Times and values of a state that waypoints fix."""
+    there = [k for k, waypoint in enumerate(task.waypoints) if j in waypoint.states]
+    values = [task.waypoints[k].values[task.waypoints[k].states.index(j)] for k in there]
+    return at_waypoints[there], np.array(values)
 
 
 def unknowns_of(program: Program, path: Path, durations: Floats | None = None) -> Floats:

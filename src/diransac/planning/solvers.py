@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Integers = NDArray[np.int64]
 
-__all__ = ["TIME_LIMIT", "Outcome", "SearchLimits", "interior_point"]
+__all__ = ["TIME_LIMIT", "Manner", "Outcome", "SearchLimits", "interior_point"]
+
+Manner: TypeAlias = Literal["careful", "near", "bold"]
 
 _QUIET: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
 _TOLERANCE = 1e-9
@@ -91,22 +93,25 @@ class Outcome:
         return f"{self.solver} says {self.status}{count}"
 
 
-def interior_point(name: str, program: Program, guess: Floats, limits: SearchLimits, *, near: bool = False) -> Outcome:
+def interior_point(
+    name: str, program: Program, guess: Floats, limits: SearchLimits, manner: Manner = "careful"
+) -> Outcome:
     """Solve by ``ipopt`` or ``fatrop``.
 
     Parameters
     ----------
     guess : (n_unknowns,)   where to start
-    near : whether the guess is close to the solution: the barrier then starts small
+    manner : ``careful``; ``near``, from a guess that is close to the solution: the barrier starts small; ``bold``:
+        every Newton step is taken whole, for problems on which the search along each step creeps
 
     Raises KeyboardInterrupt: the user stopped it.
     """
-    return _solver(name, program.layout, limits.iterations, near).solve(program, guess, limits.deadline)
+    return _solver(name, program.layout, limits.iterations, manner).solve(program, guess, limits.deadline)
 
 
 @lru_cache(maxsize=64)
-def _solver(name: str, layout: Layout, iterations: int, near: bool) -> _Solver:
-    return _Solver(name, layout, iterations, near)
+def _solver(name: str, layout: Layout, iterations: int, manner: Manner) -> _Solver:
+    return _Solver(name, layout, iterations, manner)
 
 
 @contextmanager
@@ -134,9 +139,9 @@ class _Stopped(Exception):
 class _Solver:
     """An `nlpsol` object of one layout; one solve at a time."""
 
-    def __init__(self, name: str, layout: Layout, iterations: int, near: bool) -> None:
+    def __init__(self, name: str, layout: Layout, iterations: int, manner: Manner) -> None:
         self._name, self._layout = name, layout
-        self._options = {"ipopt": _ipopt_options, "fatrop": _fatrop_options}[name](layout, iterations, near)
+        self._options = {"ipopt": _ipopt_options, "fatrop": _fatrop_options}[name](layout, iterations, manner)
         self._lock = Lock()
         self._program: Program | None = None
         self._nlpsol: ca.Function | None = None
@@ -347,18 +352,19 @@ def _sorted(entries: tuple[Integers, Integers], shape: tuple[int, int]) -> tuple
     return ca.Sparsity(*shape, starts.tolist(), rows[order].tolist()), order
 
 
-def _ipopt_options(_layout: Layout, iterations: int, near: bool) -> dict[str, Any]:
-    return {"ipopt": {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, **_interior(iterations, near)}}
+def _ipopt_options(_layout: Layout, iterations: int, manner: Manner) -> dict[str, Any]:
+    options = {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, **_interior(iterations, manner)}
+    return {"ipopt": options | ({"accept_every_trial_step": "yes"} if manner == "bold" else {})}
 
 
-def _fatrop_options(layout: Layout, iterations: int, near: bool) -> dict[str, Any]:
-    options = {"print_level": 0, **_interior(iterations, near)}
+def _fatrop_options(layout: Layout, iterations: int, manner: Manner) -> dict[str, Any]:
+    options = {"print_level": 0, **_interior(iterations, manner)}
     return {"structure_detection": "auto", "equality": [True] * layout.n_constraints, "fatrop": options}
 
 
-def _interior(iterations: int, near: bool) -> dict[str, Any]:
+def _interior(iterations: int, manner: Manner) -> dict[str, Any]:
     """What both solvers call by the same name."""
     options = {"max_iter": iterations, "tol": _TOLERANCE}
-    if near:
+    if manner == "near":
         options |= {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
     return options
