@@ -156,6 +156,14 @@ def test_what_people_call_things_and_how_many_there_are_decide_nothing():
         ({"data": {"trajectory": "places", "seed": 1.5}}, "data.seed is 1.5; give a whole number from 0"),
         ({"data": {"trajectory": "places", "reach": "any"}}, "data.reach is 'any'; give a number"),
         ({"data.substeps": 0}, "data.substeps is 0; give a whole number of at least 1"),
+        (
+            {"data.trajectory": "sines"},
+            "data.trajectory has 'sines': model \"planar-rotorcraft\" is not fully actuated",
+        ),
+        (
+            {"plant.kind": "servo-axis", "data.trajectory": "sines"},
+            "evaluation.trajectories has 'square': .* model \"servo-axis\" has no coordinate x",
+        ),
         ({"evaluation.parameters": 1}, "evaluation.parameters is 1; give true or false"),
         ({"noise.outlier_probability": 2}, "noise.outlier_probability is 2; give a number from 0 to 1"),
         ({"noise.wind": 2}, 'no key "noise.wind"; in noise there are outlier_probability'),

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import re
-import runpy
-import sys
 import tomllib
-import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import typer
 
-from diransac.cli.silence import silenced
-from diransac.errors import DiransacError, ModelError, SettingsError
+from diransac.errors import ModelError, SettingsError
 from diransac.model import Model
 from diransac.settings import Settings
+from diransac.user_files import definitions, file_and_name
 
 __all__ = ["load_model", "load_settings", "model_file", "names", "numbers", "pairs", "toml_value"]
-
-_MODEL_FILE = re.compile(r"(.+\.py)(?::(\w+))?")
 
 
 # ---------------------------------------------------------------------- lists of pairs
@@ -134,8 +127,8 @@ def _none_where_meant(key: str, value: object) -> object:
 
 def model_file(text: str) -> Path | None:
     """The file of ``file.py[:name]``; None for a built-in model's name."""
-    match = _MODEL_FILE.fullmatch(text)
-    return None if match is None else Path(match[1])
+    found = file_and_name(text, "model")
+    return None if found is None else found[0]
 
 
 def load_model(text: str) -> Model:
@@ -143,54 +136,20 @@ def load_model(text: str) -> Model:
 
     Raises ModelError: there is none of that name, the file cannot be run, or what it defines is no model.
     """
-    match = _MODEL_FILE.fullmatch(text)
-    if match is None:
+    found = file_and_name(text, "model")
+    if found is None:
         from diransac.models import builtin
 
         return builtin(text)
-    file, name = Path(match[1]), match[2] or "model"
-    defined = _run(file)
+    file, name = found
+    defined = definitions(file, "model")
     if name not in defined:
-        found = ", ".join(key for key, value in defined.items() if isinstance(value, Model)) or "none"
+        models = ", ".join(key for key, value in defined.items() if isinstance(value, Model)) or "none"
         raise ModelError(
-            f'model file "{file}" does not define "{name}"; models found: {found}. Choose with {file}:NAME'
+            f'model file "{file}" does not define "{name}"; models found: {models}. Choose with {file}:NAME'
         )
     value = defined[name]
     if not isinstance(value, Model):
         hint = f"call it there: model = {name}()" if callable(value) else "assign a diransac.Model to it"
         raise ModelError(f'model file "{file}": "{name}" is of type {type(value).__name__}, not a Model; {hint}')
     return value
-
-
-def _run(file: Path) -> Mapping[str, object]:
-    """Names that a user's file defines; it may import its neighbours, and what it prints is not shown."""
-    if not file.is_file():
-        raise ModelError(f'model file "{file}" does not exist; give a built-in name or file.py[:name]')
-    try:
-        with _importable(file.resolve().parent), silenced():
-            return runpy.run_path(str(file), run_name="diransac_model_file")
-    except DiransacError as error:
-        raise ModelError(f'model file "{file}"{_line(error, file)}: {error}') from error
-    except (Exception, SystemExit) as error:
-        what = error.msg if isinstance(error, SyntaxError) else error
-        raise ModelError(f'model file "{file}"{_line(error, file)}: {type(error).__name__}: {what}') from error
-
-
-@contextlib.contextmanager
-def _importable(folder: Path) -> Iterator[None]:
-    """A folder on the module path; no bytecode is left in it."""
-    path, keep = list(sys.path), sys.dont_write_bytecode
-    sys.path.insert(0, str(folder))
-    sys.dont_write_bytecode = True
-    try:
-        yield
-    finally:
-        sys.path[:], sys.dont_write_bytecode = path, keep
-
-
-def _line(error: BaseException, file: Path) -> str:
-    """``, line 12``: where in the user's file an error arose; nothing where it did not."""
-    if isinstance(error, SyntaxError):
-        return f", line {error.lineno}" if error.lineno else ""
-    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)]
-    return f", line {lines[-1]}" if lines else ""

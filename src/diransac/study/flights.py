@@ -7,19 +7,27 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from diransac.errors import SettingsError
+from diransac.model import Model
 from diransac.planning import places, sine, sines, square, star
+from diransac.planning.excitations import check_fully_actuated
+from diransac.planning.flights import check_plane
 from diransac.plant import ModelWithParameters
 from diransac.study.arguments import ANY, given_arguments, takes_options
 from diransac.study.tables import Reader, is_number
 from diransac.trajectory import Trajectory
 
-__all__ = ["MISSIONS", "TRAJECTORIES", "Flight"]
+__all__ = ["MISSIONS", "TRAJECTORIES", "Flight", "check_flown"]
 
 MISSIONS: dict[str, Callable[..., Trajectory]] = {"square": square, "star": star, "sine": sine}
 """What identified models are judged by."""
 
 TRAJECTORIES: dict[str, Callable[..., Trajectory]] = {**MISSIONS, "places": places, "sines": sines}
 """What may be flown for data."""
+
+
+def check_flown(trajectory: str, model: Model) -> None:
+    """Raises SettingsError: a model of this kind cannot fly the trajectory, whatever its parameters."""
+    (check_fully_actuated if trajectory == "sines" else check_plane)(model)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from diransac.identification import METHODS
 from diransac.noise import Noise
 from diransac.settings import Settings
 from diransac.study.axis import Axis
-from diransac.study.flights import MISSIONS, Flight
+from diransac.study.flights import MISSIONS, Flight, check_flown
 from diransac.study.plants import PlantChoice
 from diransac.study.tables import Reader, changed, flat
 
@@ -146,7 +146,17 @@ class Study:
             one.end()
         if not found.methods:
             raise SettingsError(f"methods is empty; there are {TRUE}, {', '.join(METHODS)}")
+        found._check_flights()
         return found
+
+    def _check_flights(self) -> None:
+        """Raises SettingsError: the plant cannot fly what it is to fly."""
+        flown = {self.data.trajectory: "data.trajectory", **dict.fromkeys(self.evaluation, "evaluation.trajectories")}
+        for trajectory, key in flown.items():
+            try:
+                check_flown(trajectory, self.plant.plant.model)
+            except SettingsError as error:
+                raise SettingsError(f"{key} has {trajectory!r}: {error}") from error
 
     def to_dict(self) -> dict[str, Any]:
         """The tables that `from_dict` takes, with everything that has a default."""

@@ -1,0 +1,150 @@
+"""Plants of studies: those that come with the package, and those of users' files."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import diransac as dr
+from diransac.study import load
+from diransac.study.plants import PlantChoice
+from studies import tiny
+
+OWN = """
+import diransac as dr
+from sledge_mass import MASS
+
+def sledge(pull: float = 0.0, parameters={"mass": MASS}, teeth: int = 3, label: str = "a", stiff: bool = False):
+    if label == "broken":
+        raise RuntimeError("no such sledge")
+    if label == "model":
+        return model
+    hook = dr.Disturbance(model, "hook", forces=lambda q, v, u, p, d: {"s": d.pull}, constants={"pull": pull * teeth})
+    return dr.Plant(model, parameters, (hook,))
+
+def demanding(pull):
+    pass
+
+model = dr.Model("sledge", {"s": "m"}, {"force": "N"}, {"mass": dr.Parameter("kg", positive=True)},
+                 lambda q, v, a, u, p: [p.mass * a.s - u.force])
+"""
+
+SINES = {"trajectory": "sines", "duration": 5.0}
+JUDGED = {"evaluation": {"trajectories": [], "parameters": True}}
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    (tmp_path / "sledges.py").write_text(OWN)
+    (tmp_path / "sledge_mass.py").write_text("MASS = 3.5\n")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "sledges.py"
+
+
+def acceleration(plant: dr.Plant, state, inputs, phase: float) -> np.ndarray:
+    """What the plant really does, its drive at a phase."""
+    hidden = [phase] * (len(plant.simulated.state) - len(plant.model.state))
+    return np.array(plant.simulated.dynamics([*state, *hidden], inputs, plant.constants)[1]).ravel()
+
+
+def alone(plant: dr.Plant, state, inputs) -> np.ndarray:
+    """What its model says."""
+    return np.array(plant.model.dynamics(state, inputs, list(plant.parameters.values()))[1]).ravel()
+
+
+# ---------------------------------------------------------------------- those of the package
+
+
+def test_cogging_pulls_an_axis_to_and_fro_every_24_mm():
+    plant = PlantChoice.from_dict({"kind": "servo-axis", "cogging": 9.5, "parameters": {"mass": 50.0}}).plant
+    for position in np.linspace(0.0, 0.05, 11):
+        state, phase = [position, 0.3], 0.4
+        pull = 50.0 * (acceleration(plant, state, [7.0], phase) - alone(plant, state, [7.0]))
+        assert pull == pytest.approx(9.5 * np.cos(2 * np.pi * position / 0.024 + phase), abs=1e-9)
+    assert plant.parameters == {"mass": 50.0, "viscous_friction": 200.0, "dry_friction": 20.0, "offset": -12.0}
+
+
+def test_ripple_of_a_pendulum_is_a_torque():
+    plant = PlantChoice.from_dict({"kind": "pendulum", "ripple": 0.1}).plant
+    state, phase = [0.5, 1.0], 1.1
+    torque = 0.5 * 0.6**2 * (acceleration(plant, state, [0.2], phase) - alone(plant, state, [0.2]))
+    assert torque == pytest.approx(0.1 * np.cos(126 * 0.5 + phase))
+    by_hand = -9.81 / 0.6 * np.sin(0.5) + (0.2 - 0.05 * 1.0) / (0.5 * 0.6**2)
+    assert alone(plant, state, [0.2]) == pytest.approx(by_hand)
+
+
+def test_ripple_of_a_double_pendulum_is_a_torque_at_each_joint():
+    plant = PlantChoice.from_dict({"kind": "double-pendulum", "ripple": 0.02}).plant
+    state, phase, torques = [0.3, -0.8, 0.5, 0.2], 0.7, np.array([0.1, 0.05])
+    ripples = 0.02 * np.cos(126 * np.array(state[:2]) + phase)
+    assert acceleration(plant, state, torques, phase) == pytest.approx(alone(plant, state, torques + ripples))
+
+
+@pytest.mark.parametrize("kind", ["servo-axis", "double-pendulum", "pendulum"])
+def test_without_anything_given_a_plant_is_what_its_model_says_and_draws_its_phase(kind):
+    choice = PlantChoice.from_dict({"kind": kind})
+    plant, state = choice.plant, np.linspace(0.1, 0.4, 2 * choice.plant.model.n_q)
+    inputs = np.ones(plant.model.n_u)
+    np.testing.assert_allclose(acceleration(plant, state, inputs, 0.3), alone(plant, state, inputs), atol=1e-12)
+    assert choice.is_drawn
+    assert all(start == (0.0, 2 * np.pi) for start in plant.disturbances[0].start.values())
+
+
+# ---------------------------------------------------------------------- a user's own
+
+
+def test_a_users_plant_takes_its_keys_and_its_file_may_import_its_neighbours(own):
+    study = load(tiny(plant={"kind": "sledges.py:sledge", "pull": 2, "teeth": 4, "stiff": True}, data=SINES, **JUDGED))
+    plant = study.plant.plant
+    assert plant.parameters == {"mass": 3.5}
+    assert plant.disturbances[0].constants == {"pull": 8.0}
+    assert study.plant.arguments == {
+        "pull": 2.0, "parameters": {"mass": 3.5}, "teeth": 4, "label": "a", "stiff": True,
+    }  # fmt: skip
+
+
+def test_an_axis_may_lead_into_a_users_plant(own):
+    axis = {"path": "plant.pull", "levels": [0, 5]}
+    study = load(tiny(plant={"kind": "sledges.py:sledge"}, data=SINES, axis=axis, **JUDGED))
+    pulls = [study.at(level).plant.plant.disturbances[0].constants["pull"] for level in ("0", "5")]
+    assert pulls == [0.0, 15.0]
+
+
+def test_a_users_file_that_has_changed_is_another_study(own):
+    before = load(tiny(plant={"kind": "sledges.py:sledge"}, data=SINES, **JUDGED))
+    begun = json.loads(json.dumps(before.to_dict()))
+    assert load(begun) == before
+    own.write_text(OWN + "\n# changed\n")
+    after = load(tiny(plant={"kind": "sledges.py:sledge"}, data=SINES, **JUDGED))
+    assert after.configuration["study"] != before.configuration["study"]
+    begun["plant"]["file_digest"] = "0123456789abcdef"  # as another machine may have it
+    with pytest.raises(dr.SettingsError, match="is not the file that the study was begun with: its digest is"):
+        load(begun)
+
+
+@pytest.mark.parametrize(
+    ("plant", "message"),
+    [
+        ({"kind": "none.py:sledge"}, '"none.py" cannot be read: No such file or directory; it must be there wherever'),
+        ({"kind": "sledges.py"}, 'has no function "plant" that returns a diransac.Plant; functions found: sledge, dem'),
+        ({"kind": "sledges.py:model"}, 'has no function "model"'),
+        ({"kind": "sledges.py:demanding"}, '"demanding" needs pull; give every argument a default'),
+        ({"kind": "sledges.py:sledge", "wind": 1}, 'no key "plant.wind"; in plant there are kind, .*pull'),
+        ({"kind": "sledges.py:sledge", "pull": "hard"}, "plant.pull is 'hard'; give a number"),
+        ({"kind": "sledges.py:sledge", "teeth": 2.5}, "plant.teeth is 2.5; give a whole number from 0"),
+        ({"kind": "sledges.py:sledge", "stiff": 1}, "plant.stiff is 1; give true or false"),
+        ({"kind": "sledges.py:sledge", "label": "broken"}, r'sledges.py", line 7: RuntimeError: no such sledge'),
+        ({"kind": "sledges.py:sledge", "label": "model"}, '"sledge" returns a Model, not a diransac.Plant'),
+        ({"kind": "servo-axis", "cogging": [1.0, 2.0]}, "plant: .*cogging is .*give a finite number"),
+    ],
+)
+def test_a_plant_that_makes_no_sense_is_refused_with_its_line(own, plant, message):
+    with pytest.raises(dr.SettingsError, match=message):
+        PlantChoice.from_dict(plant)
+
+
+def test_a_file_that_cannot_be_run_is_refused_with_its_line(own):
+    own.write_text("import diransac\n\n1 / 0\n")
+    with pytest.raises(dr.SettingsError, match=re.escape('plant file "sledges.py", line 3: ZeroDivisionError')):
+        PlantChoice.from_dict({"kind": "sledges.py:sledge"})
