@@ -142,21 +142,33 @@ def _plot(
     ],
     flown: Annotated[
         bool | None,
-        typer.Option("--paths/--errors", help="Flown paths at one level, or errors over the axis.", show_default=False),
+        typer.Option(
+            "--paths/--errors", help="Flown paths at one level, or how flights were tracked.", show_default=False
+        ),
     ] = None,
+    parameters: Annotated[
+        bool, typer.Option("--parameters", help="Errors of the parameters, if the study judges these.")
+    ] = False,
     level: Annotated[str | None, typer.Option(metavar="A", help="Whose paths are drawn.")] = None,
     title: Annotated[str | None, typer.Option(metavar="TEXT", help="In place of the study's name.")] = None,
 ) -> None:
-    """Draw a store: the errors over the axis, or, if it keeps paths at a single level, these."""
+    """Draw a store: errors of the parameters if its study judges them, else of the flights, or, at one level, paths."""
+    from diransac.plots.estimates import judges_parameters, plot_estimates
     from diransac.plots.paths import levels_with_paths, plot_paths
     from diransac.plots.study import plot_study
 
     if level is not None and flown is False:
         raise typer.BadParameter("--level chooses whose paths are drawn, --errors draws none; give one of them")
+    if parameters and (flown is not None or level is not None):
+        raise typer.BadParameter("--parameters, --errors and --paths are pictures of their own; give one of them")
     with staged([output], [store]) as (written,):
+        if flown is None and level is None and not parameters:
+            parameters = judges_parameters(store)
         if flown is None:
             flown = level is not None or len(levels_with_paths(store)) == 1
-        if flown:
+        if parameters:
+            plot_estimates(store, written, title=title)
+        elif flown:
             plot_paths(store, written, level=level, title=title)
         else:
             plot_study(store, written, title=title)

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from diransac.errors import SettingsError
 from diransac.plots.failures import draw_failures, failures_height
+from diransac.plots.flight_rows import draw_flight_rows, flight_rows_height
 from diransac.plots.heading import draw_heading, header_height
 from diransac.plots.layout import WIDTH, name_panel, panel
 from diransac.plots.palette import COLOURS, INK, MUTED, PAPER, REFERENCE
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["axis_label", "level_labels", "method_looks", "plot_study", "title_of"]
+__all__ = ["axis_label", "level_labels", "method_looks", "n_trials", "plot_study", "title_of"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -37,15 +39,22 @@ _MANY, _DECADES = 20.0, 3
 # Letters of a title's line; lines of one title differ by so many at most.
 _LETTERS, _RAGGED = 92, 12
 
+# More words than these along a panel's axis cannot be read: they become rows.
+_WORDS = 6
+
 # The palette's fifth colour is too near the first where lines cross.
-_COLOURS = (*COLOURS[:4], INK, COLOURS[5])
-_MARKERS = ("o", "s", "^", "v", "D", "P")
+_COLOURS = (*COLOURS[:4], INK, COLOURS[5], "#d55e00")
+_MARKERS = ("o", "s", "^", "v", "D", "P", "X")
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _CAPTION = (
     "Mean of the RMS tracking error and one standard deviation, over {trials} trials; a dash is the median, for which "
     "a failed trial",
     "has an infinite error. Without a flight (no plan, or one that diverged) a trial has failed: means leave it out, "
     "and are then hollow.",
+)
+_CAPTION_OF_ROWS = (
+    "Marks are medians of the RMS tracking error over {trials} trials of a level, lines end at the worst.",
+    "none: no flight (no plan, or one that diverged), which is worse than any.",
 )
 
 
@@ -62,13 +71,18 @@ def plot_study(store: str | Path, path: str | Path | None = None, *, title: str 
     they end at 0), dashes medians over all trials.  A trial that has no flight fails and has no error: below the panels
     stands which share of the trials that is, and a mean that leaves some out is hollow, for these are the worst.
     Where means differ by orders of magnitude the scale is linear up to a first decade, and logarithmic from there.
+    Levels that are more than six words are rows, with a panel a coordinate on a logarithmic axis: marks are medians
+    over all trials, lines end at the worst.
 
     Returns a Matplotlib figure. The same rows give the same file.
-    Raises StudyError: there is no such store, or it has no rows; SettingsError: the file cannot be written.
+    Raises StudyError: there is no such store, or it has no rows; SettingsError: its study flies nothing with what was
+    identified, or the file cannot be written.
     """
     if path is not None:
         checked_ending(Path(path))
     summary = summarise(store)
+    if not summary.flights:
+        raise SettingsError("the study has no trajectories to evaluate; draw its parameters, with plot_estimates")
     figure = _drawn(summary, title_of(summary) if title is None else title)
     if path is not None:
         write(figure, Path(path))
@@ -82,22 +96,29 @@ def _drawn(summary: Summary, title: str) -> Figure:
     entries = list(looks.items())
     header = header_height(entries, title)
     heights = [_block_height(summary, flights) for flights in summary.flights.values()]
-    caption = _LINE * len(_CAPTION) + 0.14
+    words = _CAPTION_OF_ROWS if _in_rows(summary) else _CAPTION
+    caption = _LINE * len(words) + 0.14
     figure = Figure(figsize=(WIDTH, header + sum(heights) + caption), facecolor=PAPER)
     top = header
     for (shape, flights), height in zip(summary.flights.items(), heights, strict=True):
         _draw_block(figure, summary, shape, flights, top)
         top += height
     draw_heading(figure, entries, title)
-    n_trials = _n_trials(summary)
-    for row, line in enumerate(_CAPTION):
+    for row, line in enumerate(words):
         y = (caption - 0.04 - row * _LINE) / figure.get_figheight()
-        figure.text(0.1 / WIDTH, y, line.format(trials=n_trials), fontsize=7.5, color=MUTED, va="top")
+        figure.text(0.1 / WIDTH, y, line.format(trials=n_trials(summary)), fontsize=7.5, color=MUTED, va="top")
     return figure
 
 
 # A trajectory: panels, and what failed ------------------------------------------------------------------------------
+def _in_rows(summary: Summary) -> bool:
+    """Whether the levels are too many words for the axis of a panel."""
+    return not summary.is_numeric and len(summary.levels) > _WORDS
+
+
 def _block_height(summary: Summary, flights: Flights) -> float:
+    if _in_rows(summary):
+        return _NAME + flight_rows_height(flights, len(summary.levels), len(summary.methods))
     n_rows = -(-len(summary.units) // _COLUMNS)
     return _NAME + n_rows * _ROW + _AXIS + failures_height(flights.failure_share)
 
@@ -105,6 +126,11 @@ def _block_height(summary: Summary, flights: Flights) -> float:
 def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, top: float) -> None:
     full = figure.get_figheight()
     figure.text(0.1 / WIDTH, 1.0 - (top + 0.05) / full, f"Flown: {shape}", fontsize=9.5, color=INK, va="top")
+    if _in_rows(summary):
+        draw_flight_rows(
+            figure, top + _NAME, flights, summary.units, level_labels(summary), method_looks(summary.methods)
+        )
+        return
     width, states = WIDTH / _COLUMNS, list(summary.units)
     for i, state in enumerate(states):
         row, column = divmod(i, _COLUMNS)
@@ -248,7 +274,7 @@ def level_labels(summary: Summary) -> list[str]:
     return [f"{x:.6g}".replace("-", "−") for x in positions] if summary.is_numeric else list(summary.levels)
 
 
-def _n_trials(summary: Summary) -> str:
+def n_trials(summary: Summary) -> str:
     """How many trials a point has: ``50``, ``2 to 50`` where some are yet to run."""
-    counts = np.concatenate([flights.ran.sum(axis=2).ravel() for flights in summary.flights.values()])
+    counts = summary.ran.sum(axis=2)
     return str(counts.max()) if counts.min() == counts.max() else f"{counts.min()} to {counts.max()}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -11,11 +12,12 @@ import numpy.typing as npt
 
 from diransac.atomic import write_text
 from diransac.errors import ResultError
+from diransac.plots.estimates import LEAST, methods_and_errors, plot_estimates
 from diransac.plots.paths import levels_with_paths, plot_paths
 from diransac.plots.study import axis_label, level_labels, plot_study, title_of
 from diransac.plots.writing import svg
 from diransac.report.markup import Html, join, number, percent, plural, table, tag
-from diransac.study.summary import Flights, Summary, summarise
+from diransac.study.summary import Estimates, Flights, Summary, summarise
 
 __all__ = ["write_study_report"]
 
@@ -34,7 +36,8 @@ def write_study_report(store: str | Path, path: str | Path) -> None:
     Raises StudyError: there is no such store, or it has no rows yet; ResultError: the page cannot be written.
     """
     summary = summarise(store)
-    figures = [svg(plot_study(store, title=""))]
+    figures = [svg(plot_estimates(store, title=""))] if summary.estimates else []
+    figures += [svg(plot_study(store, title=""))] if summary.flights else []
     figures += [svg(plot_paths(store, level=level, title="")) for level in levels_with_paths(store)]
     try:
         write_text(path, _page(summary, figures))
@@ -53,10 +56,8 @@ def _page(summary: Summary, figures: Sequence[str]) -> str:
     ]
     main = [
         *(tag("figure", _scoped(figure)) for figure in figures),
-        tag("h2", "In short"),
-        *(part for shape, flights in summary.flights.items() for part in _short(summary, shape, flights)),
-        tag("h2", "Every level"),
-        *(part for shape, flights in summary.flights.items() for part in _levels(summary, shape, flights)),
+        *_parameters(summary),
+        *_flights(summary),
         tag("h2", "What failed"),
         _failed(summary),
         tag("h2", "What took its time"),
@@ -72,7 +73,70 @@ def _scoped(figure: str) -> Html:
     return Html(figure.replace("*{stroke-linejoin", "svg *{stroke-linejoin"))
 
 
-# Numbers -------------------------------------------------------------------------------------------------------------
+# Parameters ----------------------------------------------------------------------------------------------------------
+def _parameters(summary: Summary) -> Iterator[Html]:
+    """Errors of the worst parameter and, to be opened, of each; how far intervals can be trusted."""
+    if summary.estimates is None:
+        return
+    yield tag("h2", "Error of the worst parameter")
+    yield _errors(summary, None, "Error of the worst parameter, %: median over a level’s trials [worst]")
+    yield tag(
+        "p",
+        "Errors are relative to the best parameters that the model can reach in the very flight: least squares without "
+        "noise and without vibration. Where these differ from the plant’s own by more than 0.2 %, a second row has the "
+        "errors against the latter. 0 is less than 0.001 %; ∞ is no estimate, which is worse than any.",
+    )
+    for name in summary.estimates.errors:
+        inner = _errors(summary, name, f"Error of {name}, %: median [worst]")
+        yield tag("details", tag("summary", name), inner)
+    yield tag("h2", "Intervals")
+    yield _intervals(summary.methods, summary.estimates)
+
+
+def _errors(summary: Summary, parameter: str | None, caption: str) -> Html:
+    """A row a level, or two, a column a method."""
+    methods, rows = methods_and_errors(summary, parameter)
+    cells = [
+        [row.name, *(_median_and_worst(*pair) for pair in zip(row.median, row.worst, strict=True))] for row in rows
+    ]
+    return table([axis_label(summary), *methods], cells, caption)
+
+
+def _median_and_worst(median: float, worst: float) -> str:
+    return "" if math.isnan(median) else f"{_percent(median)} [{_percent(worst)}]"
+
+
+def _percent(x: float) -> str:
+    """Two figures of what is given in %: ``0``, ``0.042``, ``9.1``, ``103``, ``2.1×10³``."""
+    whole = 9.95 <= x < 999.5
+    return "0" if x < LEAST else f"{x:.0f}" if whole else number(x, 2)
+
+
+def _intervals(methods: Sequence[str], estimates: Estimates) -> Html:
+    """Of each method's intervals, which share holds the best parameter."""
+    pairs = zip(methods, estimates.coverage(disturbed=False), estimates.coverage(disturbed=True), strict=True)
+    rows = [[label, *(_share(*one) for one in both)] for label, *both in pairs if any(n for _, n in both)]
+    caption = "Share of the 95 % intervals that hold the best parameter, to a millionth; an infinite interval is none"
+    return table(["method", "where the model says all", "where the plant has more to it"], rows, caption)
+
+
+def _share(held: int, there: int) -> str:
+    return f"{held / there:.2f} of {there}" if there else "–"
+
+
+# Flights -------------------------------------------------------------------------------------------------------------
+def _flights(summary: Summary) -> Iterator[Html]:
+    """Tracking errors over all levels, and of each."""
+    if not summary.flights:
+        return
+    yield tag("h2", "In short")
+    for shape, flights in summary.flights.items():
+        yield from _short(summary, shape, flights)
+    yield tag("h2", "Every level")
+    for shape, flights in summary.flights.items():
+        yield from _levels(summary, shape, flights)
+
+
 def _short(summary: Summary, shape: str, flights: Flights) -> Iterator[Html]:
     """The least and the largest mean, and median, of each method over all levels."""
     header = ["method", "failed", *(f"{state}, {unit}" for state, unit in summary.units.items())]
@@ -119,7 +183,7 @@ def _seconds(summary: Summary) -> Html:
     ]
     total = summary.seconds.sum(axis=0)
     rows.append(["all", *(number(x, 3) for x in total), number(float(total.sum()), 3)])
-    n_rows = sum(int(flights.ran.sum()) for flights in list(summary.flights.values())[:1])
+    n_rows = int(summary.ran.sum())
     caption = f"Seconds of one process, over {plural(n_rows, 'row')}; what is done for several together is divided"
     return table(["method", *summary.stages, "all"], rows, caption)
 

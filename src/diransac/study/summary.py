@@ -72,6 +72,10 @@ class Flights:
         """Median over all trials, of which one that failed counts as an infinite error; NaN where there is none."""
         return _over_trials(np.where(self.failed, np.inf, self.errors[state]), self.ran, _upper_median)
 
+    def largest(self, state: str) -> Floats:
+        """Largest error of all trials, infinite where one failed; NaN where there is none."""
+        return _over_trials(np.where(self.failed, np.inf, self.errors[state]), self.ran, np.max)
+
     @property
     def failure_share(self) -> Floats:
         """Fraction of the trials that failed, (n_levels, n_methods); NaN where there are none."""
