@@ -53,6 +53,37 @@ def test_the_gaussian_sweep_moves_both_deviations_from_end_to_end_of_table_iii()
     assert [(noise.acceleration_std, noise.rate_std) for noise in ends] == [(0.04, 0.003), (2.5, 1.0)]
 
 
+GAUNTLET = [name for name in builtin_names() if name.startswith("gauntlet")]
+
+
+@pytest.mark.parametrize("name", GAUNTLET)
+def test_every_trial_of_the_gauntlet_flies_another_flight_and_is_judged_by_its_parameters(name: str):
+    study = load(name)
+    assert study.data.is_drawn
+    assert study.data.substeps == 20
+    assert study.plant.is_drawn
+    assert study.judges_parameters
+    assert study.evaluation == (("square",) if name == "gauntlet" else ())
+    assert {"i-diransac", "lo-diransac"} <= {method.method for method in study.methods.values()}
+
+
+@pytest.mark.parametrize("name", GAUNTLET)
+def test_runs_of_faults_strike_about_a_fifth_of_the_gauntlets_samples(name: str):
+    study = load(name)
+    log = dr.fly(plant := study.plant.plant, flown := study.data.planned(plant, 5), dr.tvlqr(plant, flown))
+    for level in ("bursts", "frozen", "missing"):
+        shares = [np.mean([*dr.corrupt(log, study.at(level).noise, seed).planted.values()]) for seed in range(20)]
+        assert np.mean(shares) == pytest.approx(0.2, abs=0.02)
+
+
+def test_the_gauntlet_goes_to_the_ends_of_the_papers_ranges():
+    study = load("gauntlet")
+    most = study.at("everything at its maximum")
+    assert (most.noise.acceleration_std, most.noise.rate_std, most.noise.outlier_probability) == (2.5, 1.0, 0.5)
+    assert most.plant.arguments["aerodynamic_imbalance"] == load("fig3").axis.levels[-1].value
+    assert most.plant.arguments["mass_imbalance"] == load("fig4").axis.levels[-1].value
+
+
 def test_the_template_is_a_study_and_comments_every_table():
     study = load(tomllib.loads(template()))
     assert study.methods["all-iterations"].settings.stop_inlier_fraction is None
@@ -70,6 +101,29 @@ def test_a_level_that_has_a_path_may_be_new_and_a_combination_may_not():
     assert STUDY.narrowed(levels=[55]).at("55").noise.outlier_magnitude == 55.0
     with pytest.raises(dr.SettingsError, match=r'no level "0.3".*there are 0, 0.25, 0.5, 0.75, 1'):
         load("gaussian").narrowed(levels=["0.3"])
+
+
+WORDS = {
+    "calm": {},
+    "some": {"noise.outlier_probability": 0.2, "noise": {"delay": 0.02}},
+    "much": {"noise": {"outlier_probability": 0.5}},
+}
+
+
+def test_levels_that_are_words_may_each_change_something_else():
+    study = load(tiny(axis={"name": "scenario", "levels": WORDS}))
+    assert [level.text for level in study.axis.levels] == ["calm", "some", "much"]
+    assert [study.at(level).noise.outlier_probability for level in WORDS] == [0.1, 0.2, 0.5]
+    assert [study.at(level).noise.delay for level in WORDS] == [0.0, 0.02, 0.0]
+    for some in (study, study.narrowed(levels=["calm"])):
+        assert load(json.loads(json.dumps(some.to_dict()))) == some
+
+
+def test_a_level_that_changes_nothing_is_noted_as_such():
+    """A store would take what it never noted for new, and go on with another study."""
+    parts = [load(tiny(axis={"levels": {**WORDS, "calm": some}})).configuration for some in ({}, {"noise.delay": 0.1})]
+    assert parts[0]["levels.calm"]
+    assert parts[0]["levels.calm"] != parts[1]["levels.calm"]
 
 
 def test_an_axis_may_lead_into_a_method():
@@ -191,6 +245,11 @@ def test_what_people_call_things_and_how_many_there_are_decide_nothing():
         ({"axis": {"levels": [1, 2], "values": {"noise.rate_std": [1]}}}, "axis.values.noise.rate_std is .*2 values"),
         ({"axis": {"levels": [1, 2], "values": {}}}, "axis.values is empty"),
         ({"axis": 3}, "axis is 3; give a table"),
+        ({"axis": {"levels": {}}}, "axis.levels is empty; give a table, or a list, of one or more"),
+        ({"axis": {"levels": {"a,b": {}}}}, 'axis.levels has "a,b"; give numbers, or words without commas'),
+        ({"axis": {"levels": {"a": 3}}}, 'axis.levels."a" is 3; give a table of what it changes, or {}'),
+        ({"axis": {"levels": {"a": {"noise.wind": 3}}}}, 'axis: at level a, there is no key "noise.wind"'),
+        ({"axis": {"levels": {"a": {}}, "path": "noise.delay"}}, 'no key "axis.path"; in axis there are levels, name'),
     ],
 )
 def test_a_study_that_makes_no_sense_is_refused_by_its_key(changes: dict, message: str):

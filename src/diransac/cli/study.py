@@ -201,13 +201,13 @@ class _Studies:
         return {"studies": {name: load(name).to_dict() for name in builtin_names()}, "methods": [TRUE, *METHODS]}
 
     def __str__(self) -> str:
-        rows = [["study", "varies", "levels", "flights", "trials", "about"]]
+        rows = [["study", "varies", "levels", "judged by", "trials", "about"]]
         for name in builtin_names():
             one = load(name)
             levels = [level.text for level in one.axis.levels]
             span = levels[0] if len(levels) == 1 else f"{levels[0]} .. {levels[-1]} ({len(levels)})"
-            about = one.description
-            rows.append([name, one.axis.name, span, ", ".join(one.evaluation), str(one.trials), about])
+            judges = [*(["parameters"] if one.judges_parameters else []), *one.evaluation]
+            rows.append([name, one.axis.name, span, ", ".join(judges), str(one.trials), one.description])
         return "\n".join([*aligned(rows), "", f"methods: {', '.join((TRUE, *METHODS))}"])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -51,32 +51,37 @@ class Axis:
 
     @classmethod
     def from_dict(cls, table: object) -> Axis:
-        """The axis of a study's table: ``path`` and ``levels``, or ``levels`` and ``values.<path>``, a list each.
+        """The axis of a study's table.
+
+        It has ``path`` and a list of ``levels``; or a list of ``levels`` and ``values.<path>``, a list each; or a table
+        of ``levels``, which are words, each with a table of what it changes.
 
         Raises SettingsError: a key is missing, unknown or holds something else.
         """
         reader = Reader(table, "axis")
-        values = [_checked(reader.path("levels"), value) for value in reader.listed("levels")]
-        if reader.has("values"):
-            path, changes = "", _changes(reader.table("values"), len(values))
+        path = ""
+        if reader.holds_table("levels"):
+            levels = _named_levels(reader)
+        elif reader.has("values"):
+            levels = _levels(reader, lambda values: _changes(reader.table("values"), len(values)))
         else:
             path = reader.text("path")
-            changes = [{path: _as_number(value)} for value in values]
-        levels = tuple(Level(level_text(v), v, change) for v, change in zip(values, changes, strict=True))
-        texts = [level.text for level in levels]
-        if len(set(texts)) < len(texts):
-            raise SettingsError(f"axis.levels has a level twice; found {', '.join(texts)}")
+            levels = _levels(reader, lambda values: [{path: _as_number(value)} for value in values])
         found = cls(reader.text("name", path or "level"), reader.text("unit", ""), levels, path)
         reader.end()
         return found
 
     def to_dict(self) -> dict[str, Any]:
         """The table that `from_dict` takes."""
-        table: dict[str, Any] = {"name": self.name, "unit": self.unit, "levels": [x.value for x in self.levels]}
+        about = {"name": self.name, "unit": self.unit}
+        values = [level.value for level in self.levels]
         if self.path:
-            return {**table, "path": self.path}
+            return {**about, "levels": values, "path": self.path}
+        if all(isinstance(value, str) for value in values):
+            return {**about, "levels": {level.text: dict(level.changes) for level in self.levels}}
         paths = self.levels[0].changes
-        return {**table, "values": {path: [level.changes[path] for level in self.levels] for path in paths}}
+        columns = {path: [level.changes[path] for level in self.levels] for path in paths}
+        return {**about, "levels": values, "values": columns}
 
     def narrowed(self, texts: Sequence[str]) -> Axis:
         """The same axis with these levels; one that takes its level as a value may get new ones.
@@ -126,6 +131,30 @@ def _checked(where: str, value: object) -> float | str:
     if isinstance(value, str) and value.strip() == value and value and "," not in value:
         return value
     raise SettingsError(f"{where} has {json.dumps(value, default=str):.60}; give numbers, or words without commas")
+
+
+def _levels(reader: Reader, changes_of: Callable[[list[float | str]], list[dict[str, Any]]]) -> tuple[Level, ...]:
+    """Levels that are a list, with the changes that belong to their values."""
+    values = [_checked(reader.path("levels"), value) for value in reader.listed("levels")]
+    levels = tuple(Level(level_text(v), v, change) for v, change in zip(values, changes_of(values), strict=True))
+    texts = [level.text for level in levels]
+    if len(set(texts)) < len(texts):
+        raise SettingsError(f"axis.levels has a level twice; found {', '.join(texts)}")
+    return levels
+
+
+def _named_levels(reader: Reader) -> tuple[Level, ...]:
+    """Levels that are a table of words, each with its own changes."""
+    found, path = reader.table("levels"), reader.path("levels")
+    if not found:
+        raise SettingsError(f"{path} is empty; give a table, or a list, of one or more")
+    for word, changes in found.items():
+        _checked(path, word)
+        if not isinstance(changes, Mapping):
+            raise SettingsError(
+                f'{path}."{word}" is {changes!r:.60}; give a table of what it changes, {{}} for nothing'
+            )
+    return tuple(Level(word, word, dict(flat(changes))) for word, changes in found.items())
 
 
 def _changes(values: Mapping[str, Any], n_levels: int) -> list[dict[str, Any]]:

@@ -228,7 +228,8 @@ class Study:
         for label, method in table["methods"].items():
             silent = [f"settings.{name}" for name in _NO_ANSWER_CHANGES]
             parts[f"methods.{label}"] = {path: value for path, value in flat(method) if path not in silent}
-        return parts | {f"levels.{level.text}": dict(level.changes) for level in self.axis.levels}
+        changes = {level.text: dict(level.changes) or {"changes": "none"} for level in self.axis.levels}
+        return parts | {f"levels.{text}": some for text, some in changes.items()}
 
 
 def _none_where_meant(name: str, value: object) -> object:

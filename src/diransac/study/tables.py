@@ -37,6 +37,10 @@ class Reader:
         self._asked[key] = None
         return key in self._table
 
+    def holds_table(self, key: str) -> bool:
+        """Whether the key is there, and holds a table."""
+        return self.has(key) and isinstance(self._table[key], Mapping)
+
     def text(self, key: str, default: str | None = None, choices: Collection[str] = ()) -> str:
         """Text, one of the choices if there are any."""
         value = self._value(key, default, f"one of {', '.join(choices)}" if choices else "text")
