@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 import numpy.typing as npt
 
 from diransac import prepare
@@ -174,7 +175,8 @@ class _Task:
 
         judged = judged_signals(self.model, self.given, self.settings)
         observations = observe(self.model, self.given, judged, pointwise=not derivable)
-        findings = find(observations, int(self.seed))
+        with threadpool_limits(limits=1, user_api="blas"):  # its matrices are small: other cores would only wait
+            findings = find(observations, int(self.seed))
         scoring = choose_scoring(observations, self.settings)
         diagnosis = self._diagnosis(observations, findings)
         acting, settings = as_diagnosed(observations, self.settings, diagnosis)

@@ -19,6 +19,7 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from diransac.controller import Controller, tvlqr, tvlqr_all
 from diransac.errors import DiransacError, PlanningError
@@ -62,12 +63,13 @@ def run_trials(study: str, level: str, trials: Sequence[int], methods: Sequence[
     """
     point = _point(study, level)
     cases = [_Case(point, trial, label) for trial in trials for label in methods]
-    point.record(cases)
-    for case in cases:
-        with case.attempt("identify"):
-            case.identify()
-    for shape in point.study.evaluation:
-        _evaluate(point, [case for case in cases if case.found], shape)
+    with threadpool_limits(limits=1, user_api="blas"):  # every core is busy with trials already
+        point.record(cases)
+        for case in cases:
+            with case.attempt("identify"):
+                case.identify()
+        for shape in point.study.evaluation:
+            _evaluate(point, [case for case in cases if case.found], shape)
     return [case.row() for case in cases]
 
 
