@@ -247,7 +247,7 @@ def test_what_people_call_things_and_how_many_there_are_decide_nothing():
         ({"axis": 3}, "axis is 3; give a table"),
         ({"axis": {"levels": {}}}, "axis.levels is empty; give a table, or a list, of one or more"),
         ({"axis": {"levels": {"a,b": {}}}}, 'axis.levels has "a,b"; give numbers, or words without commas'),
-        ({"axis": {"levels": {"a": 3}}}, 'axis.levels."a" is 3; give a table of what it changes, or {}'),
+        ({"axis": {"levels": {"a": 3}}}, 'axis.levels."a" is 3; give a table of what it changes, {} for nothing'),
         ({"axis": {"levels": {"a": {"noise.wind": 3}}}}, 'axis: at level a, there is no key "noise.wind"'),
         ({"axis": {"levels": {"a": {}}, "path": "noise.delay"}}, 'no key "axis.path"; in axis there are levels, name'),
     ],
