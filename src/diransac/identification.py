@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 import numpy.typing as npt
+from threadpoolctl import threadpool_limits
 
 from diransac import prepare
 from diransac.consensus import Diransac, InlierBiasedDiransac, Score, Variant
