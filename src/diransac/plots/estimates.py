@@ -12,7 +12,7 @@ from diransac.errors import SettingsError
 from diransac.plots.heading import draw_heading, header_height
 from diransac.plots.layout import WIDTH
 from diransac.plots.palette import INK, MUTED, PAPER
-from diransac.plots.rows import Row, Scale, draw_rows, name_rows, names_width, row_height
+from diransac.plots.rows import Row, Scale, as_marks, draw_rows, name_rows, names_width, row_height
 from diransac.plots.study import level_labels, method_looks, n_trials, title_of
 from diransac.plots.writing import checked_ending, write
 from diransac.study.specification import TRUE
@@ -110,8 +110,9 @@ def _drawn(summary: Summary, title: str) -> Figure:
     from matplotlib.figure import Figure
 
     methods, rows = methods_and_errors(summary)
-    looks = method_looks(summary.methods)
-    entries = [(label, looks[label]) for label in methods]
+    every = as_marks(method_looks(summary.methods))
+    looks = {label: every[label] for label in methods}
+    entries = list(looks.items())
     header, height = header_height(entries, title), row_height(len(methods)) * len(rows)
     full = header + _ABOVE + height + _BELOW + _LINE * len(_CAPTION) + 0.08
     figure = Figure(figsize=(WIDTH, full), facecolor=PAPER)
@@ -120,7 +121,7 @@ def _drawn(summary: Summary, title: str) -> Figure:
     figure.text(left / WIDTH, 1.0 - header / full, what, fontsize=9.5, color=INK, va="top")
     top = header + _ABOVE
     name_rows(figure, (left, top), rows, len(methods))
-    draw_rows(figure, (left, top, WIDTH - left - 0.12), rows, dict(entries), Scale.of(rows, LEAST))
+    draw_rows(figure, (left, top, WIDTH - left - 0.12), rows, looks, Scale.of(rows, LEAST))
     for line, text in enumerate(_CAPTION):
         y = 1.0 - (top + height + _BELOW + line * _LINE) / full
         figure.text(0.1 / WIDTH, y, text.format(trials=n_trials(summary)), fontsize=7.5, color=MUTED, va="top")

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["Row", "Scale", "draw_rows", "name_rows", "names_width", "row_height"]
+__all__ = ["Row", "Scale", "as_marks", "draw_rows", "name_rows", "names_width", "row_height"]
 
 Floats = npt.NDArray[np.float64]
 Looks = Mapping[str, Mapping[str, Any]]
@@ -113,6 +113,12 @@ class Scale:
         return found | ({self.none: "none"} if self.endless else {})
 
 
+def as_marks(looks: Looks) -> dict[str, dict[str, Any]]:
+    """The looks of methods as marks without lines; what has no mark gets a square."""
+    plain = {"marker": "s", "markersize": 4.0}
+    return {label: {**plain, **look, "linestyle": "none"} for label, look in looks.items()}
+
+
 def row_height(n_methods: int) -> float:
     """Height of a row, inches."""
     return _METHOD * n_methods + _FREE
@@ -126,7 +132,7 @@ def draw_rows(
     Parameters
     ----------
     place : left, top and width, inches from the figure's top left
-    looks : of each method, as `method_looks` has them; within a row the first is uppermost
+    looks : of each method's mark, as `as_marks` has them; within a row the first is uppermost
     """
     left, top, width = place
     full, n_methods = figure.get_figheight(), len(looks)
@@ -150,8 +156,7 @@ def _mark(axes: Axes, x: float, end: float, y: float, look: Mapping[str, Any], *
     colour = look["color"]
     axes.plot([x, end], [y, y], color=colour, **_WORST, zorder=2.2)
     face = PAPER if hollow else colour
-    style = {"marker": look.get("marker", "s"), "markersize": look.get("markersize", 4.0), "markerfacecolor": face}
-    axes.plot([x], [y], linestyle="none", color=colour, markeredgewidth=0.8, **style, zorder=2.5)
+    axes.plot([x], [y], **{**look, "markerfacecolor": face, "markeredgewidth": 0.8 if hollow else 0.3}, zorder=2.5)
 
 
 def _shade(axes: Axes, rows: Sequence[Row], scale: Scale) -> None:

@@ -17,6 +17,7 @@ from diransac.plots.flight_rows import draw_flight_rows, flight_rows_height
 from diransac.plots.heading import draw_heading, header_height
 from diransac.plots.layout import WIDTH, name_panel, panel
 from diransac.plots.palette import COLOURS, INK, MUTED, PAPER, REFERENCE
+from diransac.plots.rows import as_marks
 from diransac.plots.writing import checked_ending, write
 from diransac.study.specification import TRUE
 from diransac.study.summary import Flights, Summary, summarise
@@ -92,7 +93,7 @@ def plot_study(store: str | Path, path: str | Path | None = None, *, title: str 
 def _drawn(summary: Summary, title: str) -> Figure:
     from matplotlib.figure import Figure
 
-    looks = method_looks(summary.methods)
+    looks = _looks(summary)
     entries = list(looks.items())
     header = header_height(entries, title)
     heights = [_block_height(summary, flights) for flights in summary.flights.values()]
@@ -116,6 +117,12 @@ def _in_rows(summary: Summary) -> bool:
     return not summary.is_numeric and len(summary.levels) > _WORDS
 
 
+def _looks(summary: Summary) -> dict[str, dict[str, Any]]:
+    """Lines, or marks where levels are rows."""
+    looks = method_looks(summary.methods)
+    return as_marks(looks) if _in_rows(summary) else looks
+
+
 def _block_height(summary: Summary, flights: Flights) -> float:
     if _in_rows(summary):
         return _NAME + flight_rows_height(flights, len(summary.levels), len(summary.methods))
@@ -127,9 +134,7 @@ def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, 
     full = figure.get_figheight()
     figure.text(0.1 / WIDTH, 1.0 - (top + 0.05) / full, f"Flown: {shape}", fontsize=9.5, color=INK, va="top")
     if _in_rows(summary):
-        draw_flight_rows(
-            figure, top + _NAME, flights, summary.units, level_labels(summary), method_looks(summary.methods)
-        )
+        draw_flight_rows(figure, top + _NAME, flights, summary.units, level_labels(summary), _looks(summary))
         return
     width, states = WIDTH / _COLUMNS, list(summary.units)
     for i, state in enumerate(states):

@@ -97,7 +97,11 @@ def _errors(summary: Summary, parameter: str | None, caption: str) -> Html:
     """A row a level, or two, a column a method."""
     methods, rows = methods_and_errors(summary, parameter)
     cells = [
-        [row.name, *(_median_and_worst(*pair) for pair in zip(row.median, row.worst, strict=True))] for row in rows
+        [
+            f"… {row.name}" if row.quiet else row.name,
+            *(_median_and_worst(*pair) for pair in zip(row.median, row.worst, strict=True)),
+        ]
+        for row in rows
     ]
     return table([axis_label(summary), *methods], cells, caption)
 
@@ -172,6 +176,8 @@ def _failed(summary: Summary) -> Html:
         return tag("p", "No trial failed.")
     rows = [[method, str(count), why] for (method, why), count in summary.failures.items()]
     about = "A trial without a flight has no error: means leave it out, medians count it as infinite."
+    if not summary.flights:
+        about = "A trial without an estimate is worse than any: medians count its error as infinite."
     return join([tag("p", about), table(["method", "trials", "why"], rows, "Over all levels and trajectories")])
 
 
