@@ -7,6 +7,7 @@ the order of its rows: no result depends on how many hypotheses are fitted at a 
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
@@ -141,6 +142,7 @@ class _BoundSums:
         self._blocks = np.zeros((self.n_rows, len(i)))
         for row in range(W.shape[1]):
             self._blocks += columns[:, row, i] * columns[:, row, j]
+        self._latest: tuple[Sequence[IntArray], FloatArray] = ([], np.empty((0, self._n_p + 1, self._n_p + 1)))
 
     def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
         gram = self._gram(row_sets)[:, :-1, :-1]
@@ -161,7 +163,13 @@ class _BoundSums:
             return np.asarray(scaled * self._scale[-1] / self._scale[:-1])
 
     def _gram(self, row_sets: Sequence[IntArray]) -> FloatArray:
-        """Sums ``(n_sets, n_p + 1, n_p + 1)``, each in the order of its rows."""
+        """Sums ``(n_sets, n_p + 1, n_p + 1)``, each in the order of its rows; kept for who asks for the same again.
+
+        Whether a set is well-defined is asked right before it is fitted.
+        """
+        before, gram = self._latest
+        if len(before) == len(row_sets) and all(map(operator.is_, before, row_sets)):
+            return gram
         sums = np.empty((len(row_sets), self._blocks.shape[1]))
         lengths = np.array([len(rows) for rows in row_sets])
         for length in np.unique(lengths):
@@ -171,6 +179,7 @@ class _BoundSums:
         gram = np.empty((len(row_sets), self._n_p + 1, self._n_p + 1))
         i, j = self._upper
         gram[:, i, j] = gram[:, j, i] = sums
+        self._latest = list(row_sets), gram
         return gram
 
 

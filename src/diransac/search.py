@@ -48,7 +48,7 @@ class Evaluator(Protocol):
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Parameters ``(n_p,)``, the usable rows that they were fitted to, and their score."""
+    """Parameters ``(n_p,)``, the usable rows that they were fitted to, ascending, and their score."""
 
     parameters: FloatArray
     rows: IntArray
@@ -143,7 +143,7 @@ def _speculate(
     parameters = estimator.fit(samples)
     admitted = np.flatnonzero(evaluator.admits(parameters))
     scores = dict(zip(admitted.tolist(), evaluator.scores(parameters[admitted]), strict=True)) if len(admitted) else {}
-    return [Hypothesis(parameters[i], s, scores[i]) if i in scores else None for i, s in enumerate(samples)]
+    return [Hypothesis(parameters[i], np.sort(s), scores[i]) if i in scores else None for i, s in enumerate(samples)]
 
 
 def _grow(sample: IntArray, k: IntArray, estimator: BoundEstimator, sampler: Sampler, seed: int) -> IntArray:
@@ -183,14 +183,21 @@ def _replay(
         stored = _judge(hypothesis, outcome, variant)
         if stored is None or settings.refit == "none" or not variant.refits(stored=stored):
             return
-        used.add(np.sort(hypothesis.rows).tobytes())
+        used.add(_fingerprint(hypothesis.rows, estimator.n_rows))
         inliers = evaluator.inliers(hypothesis.parameters)
-        if inliers.tobytes() in used or not estimator.well_defined([inliers])[0]:
+        if _fingerprint(inliers, estimator.n_rows) in used or not estimator.well_defined([inliers])[0]:
             return
         limit = outcome.iterations >= settings.max_iterations
         if limit or variant.is_finished(outcome.score, settings.stop_inlier_fraction):
             return
         hypothesis = _refit(inliers, estimator, evaluator)
+
+
+def _fingerprint(rows: IntArray, n_rows: int) -> bytes:
+    """A bit a row: a chain may be thousands of refits long, and knows every set of inliers that it has met."""
+    chosen = np.zeros(n_rows, bool)
+    chosen[rows] = True
+    return np.packbits(chosen).tobytes()
 
 
 def _judge(hypothesis: Hypothesis, outcome: Outcome, variant: Variant) -> bool | None:
