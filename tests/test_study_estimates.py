@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 import diransac as dr
-from diransac.study import export, load, read, status, trials
+from diransac.study import export, load, read, record, recording, status, trials
 from diransac.study.flights import Flight
 from diransac.study.seeds import derived_seed
 from diransac.study.store import Store
@@ -25,7 +25,7 @@ DRAWN = tiny(
 
 def run(tmp_path: Path, spec: dict = DRAWN, **options: object) -> dict[tuple, dict]:
     """Rows of a run in this process, which plans anew what an earlier run has planned."""
-    trials._steering.cache_clear()
+    recording._steering.cache_clear()
     with ThreadPoolExecutor(1) as here:
         dr.run_study(spec, store=tmp_path / "a.db", executor=here, **options)
     return rows(tmp_path / "a.db")
@@ -52,6 +52,17 @@ def test_rows_are_those_of_what_users_call(whole: dict):
             high,
         )
         assert row[f"best_{name}"] == pytest.approx(plant.parameters[name], rel=1e-9)
+
+
+def test_the_data_of_a_trial_are_to_be_had_alone(whole: dict):
+    data, row = record(load(DRAWN), 40, trial=1), whole["40", 1, "ols"]
+    result = dr.identify(dr.models.planar_rotorcraft(), data.log, "ols", settings=load(DRAWN).methods["ols"].settings)
+    assert {name: row[f"parameter_{name}"] for name in NAMES} == dict(result.parameters)
+    assert {name: row[f"best_{name}"] for name in NAMES} == data.best
+    assert any(samples.any() for samples in data.log.planted.values())
+    assert not (data.flight["x"] == data.log["x"]).all()
+    with pytest.raises(dr.SettingsError, match='no level "some" of outlier magnitude'):
+        record(load(DRAWN), "some")
 
 
 def test_trials_fly_different_flights_and_methods_of_a_trial_the_same(whole: dict):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.study import connected, load, paths, status, trials
+from diransac.study import connected, load, paths, recording, status, trials
 from diransac.study.seeds import derived_seed
 from studies import TINY, TINY_TOML, command, rows, tiny
 
@@ -223,7 +223,7 @@ def test_a_flight_that_diverges_is_a_row_that_says_so(tmp_path: Path, monkeypatc
             dr.Log(log.time, {n: log[n] for n in log.names}, notes=("the flight diverged at t = 1 s",)) for log in logs
         ]
 
-    monkeypatch.setattr(trials, "fly_all", runaway)
+    monkeypatch.setattr(recording, "fly_all", runaway)
     found = run(tmp_path, trials=1, levels=[40])
     assert {row["error"] for row in found.values()} == {"the flight diverged at t = 1 s"}
 
@@ -246,7 +246,7 @@ def test_a_data_flight_that_diverges_fails_its_own_trial_alone(tmp_path: Path, m
             logs[1] = dr.Log(lost.time, {n: lost[n] for n in lost.names}, notes=("the flight diverged at t = 1 s",))
         return logs
 
-    monkeypatch.setattr(trials, "fly_all", one_runs_away)
+    monkeypatch.setattr(recording, "fly_all", one_runs_away)
     plant = {"kind": "extended-rotorcraft", "rotor_phase": "any"}
     found = run(tmp_path, tiny(plant=plant), levels=[40], methods=["ols"], batch_size=2)
     assert flown == [2, 1]

@@ -3,9 +3,11 @@
 | file | what it holds |
 |---|---|
 | `run.py` | `run_study`, the one entry: hand out trials, keep what comes back |
-| `specification.py`, `axis.py`, `plants.py`, `flights.py`, `arguments.py`, `tables.py` | what a study is, checked |
+| `specification.py`, `axis.py`, `flights.py`, `arguments.py`, `tables.py` | what a study is, checked |
+| `plants.py`, `vehicles.py` | what may fly: the paper's rotorcraft, other machines, users' own |
 | `library.py`, `builtin/`, `template.toml` | where studies come from; those of the paper's figures |
-| `trials.py`, `seeds.py` | what a worker does; the seeds of a trial |
+| `recording.py`, `judging.py`, `seeds.py` | the data of a trial; what estimates are judged against; seeds |
+| `trials.py` | what a worker does |
 | `workers.py`, `cluster.py` | where it does it |
 | `store.py` | one SQLite file |
 | `reading.py` | what is in it, for tables and pictures |
@@ -14,12 +16,14 @@
 from diransac.study.cluster import connected
 from diransac.study.library import builtin_names, load, template
 from diransac.study.reading import Cell, Status, about, export, paths, read, status
+from diransac.study.recording import Recording, record
 from diransac.study.run import run_study
 from diransac.study.specification import Method, Study
 
 __all__ = [
     "Cell",
     "Method",
+    "Recording",
     "Status",
     "Study",
     "about",
@@ -29,6 +33,7 @@ __all__ = [
     "load",
     "paths",
     "read",
+    "record",
     "run_study",
     "status",
     "template",

@@ -23,15 +23,14 @@ from threadpoolctl import threadpool_limits
 
 from diransac.controller import Controller, tvlqr, tvlqr_all
 from diransac.errors import DiransacError, PlanningError
-from diransac.flight import fly_all, tracking_error
+from diransac.flight import tracking_error
 from diransac.identification import identify
 from diransac.log import Log
-from diransac.noise import corrupt
 from diransac.plant import Plant
 from diransac.settings import Settings
 from diransac.study.flights import TRAJECTORIES
-from diransac.study.judging import best_parameters
 from diransac.study.library import load
+from diransac.study.recording import PATIENCE, Recording, check_ended, flown, record_all, trial_seed
 from diransac.study.seeds import derived_seed
 from diransac.study.specification import TRUE, Study
 from diransac.trajectory import Trajectory
@@ -40,9 +39,6 @@ __all__ = ["STAGES", "run_trials"]
 
 STAGES = ("record", "identify", "plan", "steer", "fly")
 """What `seconds` is split by."""
-
-_PATIENCE = 600.0
-"""s that a plan may take: so many that a solver's limit of iterations ends it first, however slow a machine is."""
 
 _INTERVAL = 0.95
 """Level of the intervals that are kept where parameters are judged."""
@@ -92,49 +88,15 @@ class _Point:
 
     def record(self, cases: Sequence[_Case]) -> None:
         """Fly for data, spoil each trial's record, and find what can be made of the flight at best."""
-        by_seed: dict[int, list[_Case]] = defaultdict(list)
+        by_trial: dict[int, list[_Case]] = defaultdict(list)
         for case in cases:
-            by_seed[case.seed].append(case)
+            by_trial[case.trial].append(case)
         begin = time.perf_counter()
-        for (seed, some), flight in zip(by_seed.items(), self._flights(list(by_seed)), strict=True):
-            try:
-                if isinstance(flight, DiransacError):
-                    raise flight
-                self._hand_out(flight, seed, some)
-            except DiransacError as error:
-                for case in some:
-                    case.fail(error)
+        found = record_all(self.study, self.level, list(by_trial))
+        for some, recording in zip(by_trial.values(), found, strict=True):
+            for case in some:
+                case.receive(recording)
         _share(cases, "record", time.perf_counter() - begin)
-
-    def _flights(self, seeds: Sequence[int]) -> list[Log | DiransacError]:
-        """The flight that is recorded in each trial, or why there is none; one serves all where nothing is drawn."""
-        data = self.study.data
-        different = seeds if data.is_drawn or self.study.plant.is_drawn else seeds[:1]
-        plans = [derived_seed(seed, "data plan") if data.is_drawn else 0 for seed in different]
-        steering = [_steering(self, plan) for plan in plans]
-        flown = {k: one for k, one in enumerate(steering) if isinstance(one, Controller)}
-        drawn = [derived_seed(different[k], "data flight") for k in flown]
-        logs = iter(_flown(self.plant, list(flown.values()), drawn, data.substeps))
-        found = [one if isinstance(one, DiransacError) else next(logs) for one in steering]
-        return found if len(found) == len(seeds) else found * len(seeds)
-
-    def _hand_out(self, flight: Log, seed: int, cases: Sequence[_Case]) -> None:
-        """Give the cases of one trial its record, and what they are judged by.  Raises DiransacError: neither is."""
-        _check_ended(flight)
-        log = corrupt(flight, self.study.noise, derived_seed(seed, "noise"), signals=self.plant.model.signals)
-        best = best_parameters(self.plant, flight) if self.study.judges_parameters else {}
-        for case in cases:
-            case.log = log
-            case.figures |= {f"best_{name}": value for name, value in best.items()}
-
-
-@lru_cache(maxsize=64)
-def _steering(point: _Point, seed: int) -> Controller | DiransacError:
-    """What steers the flight that is recorded, or why there is none; trials with the same plan share it."""
-    try:
-        return tvlqr(point.plant, point.study.data.planned(point.plant, seed, time_limit=_PATIENCE))
-    except DiransacError as error:
-        return error
 
 
 @dataclass
@@ -154,7 +116,7 @@ class _Case:
     @cached_property
     def seed(self) -> int:
         """Of all that is random in the trial, whatever the method."""
-        return derived_seed(self.point.study.seed, self.point.level, self.trial)
+        return trial_seed(self.point.study, self.point.level, self.trial)
 
     @contextmanager
     def attempt(self, stage: str) -> Iterator[None]:
@@ -170,6 +132,14 @@ class _Case:
         """Note why there is no figure."""
         known = isinstance(error, DiransacError)
         self.errors.append(str(error) if known else f"internal error: {type(error).__name__}: {error}")
+
+    def receive(self, recording: Recording | DiransacError) -> None:
+        """Take the trial's data, or note why there are none."""
+        if isinstance(recording, DiransacError):
+            self.fail(recording)
+        else:
+            self.log = recording.log
+            self.figures |= {f"best_{name}": value for name, value in recording.best.items()}
 
     def identify(self) -> None:
         """Find parameters in the log.  Raises DiransacError: nothing is found."""
@@ -195,7 +165,7 @@ class _Case:
     def judge(self, shape: str, trajectory: Trajectory, log: Log) -> None:
         """Note the tracking error of a flight.  Raises PlanningError: it diverged."""
         try:
-            _check_ended(log)
+            check_ended(log)
         except PlanningError as error:
             raise PlanningError(f"{shape}: {error}") from error
         self.figures |= {f"{shape}_{name}": error for name, error in tracking_error(trajectory, log).items()}
@@ -228,29 +198,11 @@ def _evaluate(point: _Point, cases: Sequence[_Case], shape: str) -> None:
     steered = [case for case in planned if id(case) in controllers]
     begin = time.perf_counter()
     seeds = [derived_seed(case.seed, shape) for case in steered]
-    logs = _flown(point.plant, [controllers[id(case)] for case in steered], seeds)
+    logs = flown(point.plant, [controllers[id(case)] for case in steered], seeds)
     _share(steered, "fly", time.perf_counter() - begin)
     for case, log in zip(steered, logs, strict=True):
         with case.attempt("fly"):
             case.judge(shape, plans[id(case)], log)
-
-
-def _flown(
-    plant: Plant, controllers: Sequence[Controller], seeds: Sequence[int], least_substeps: int | None = None
-) -> list[Log]:
-    """A flight by each controller; those of one length are lanes of one simulation."""
-    groups = defaultdict(list)
-    for k, controller in enumerate(controllers):
-        groups[len(controller)].append(k)
-    logs: dict[int, Log] = {}
-    for some in groups.values():
-        steering = [controllers[k] for k in some]
-        substeps = max(least_substeps, plant.substeps(steering[0].dt)) if least_substeps else None
-        drawn = [seeds[k] for k in some]
-        logs |= zip(
-            some, fly_all([plant] * len(some), steering, substeps=substeps, seeds=drawn, threads=1), strict=True
-        )
-    return [logs[k] for k in range(len(controllers))]
 
 
 def _plans(cases: Sequence[_Case], shape: str) -> dict[int, Trajectory]:
@@ -276,7 +228,7 @@ def _planned(point: _Point, shape: str, parameters: tuple[float, ...]) -> Trajec
     model = point.plant.model
     plant = Plant(model, dict(zip(model.parameters, parameters, strict=True)))
     try:
-        return TRAJECTORIES[shape](plant, time_limit=_PATIENCE)
+        return TRAJECTORIES[shape](plant, time_limit=PATIENCE)
     except DiransacError as error:
         return error
 
@@ -303,13 +255,6 @@ def _controllers_alone(cases: Sequence[_Case], plans: dict[int, Trajectory]) -> 
 
 
 # What a row holds ----------------------------------------------------------------------------------------------------
-def _check_ended(log: Log) -> None:
-    """Raises PlanningError: the flight diverged."""
-    diverged = [note for note in log.notes if "diverged" in note]
-    if diverged:
-        raise PlanningError(diverged[0])
-
-
 def _ends(intervals: Mapping[str, tuple[float, float]]) -> dict[str, float]:
     """Ends of the intervals that have both."""
     found: dict[str, float] = {}
