@@ -26,15 +26,15 @@ __all__ = ["LEAST", "judges_parameters", "methods_and_errors", "plot_estimates"]
 
 Floats = npt.NDArray[np.float64]
 
-LEAST = 0.001
-"""%: what is less is shown as nothing."""
+LEAST = -3
+"""Power of ten, %: what is less is shown as nothing."""
 
 OF_OWN = "against the plant’s own"
 
 # Inches: what names the picture with the values above the rows, values below, a line of the caption.
 _ABOVE, _BELOW, _LINE = 0.42, 0.3, 0.155
 _CAPTION = (
-    "Marks are medians over {trials} trials of a level, lines end at the worst. Errors are relative to the best "
+    "Marks are medians over {trials} of a level, lines end at the worst. Errors are relative to the best "
     "parameters that the model can reach in the",
     "very flight; where those differ from the plant’s own, a second row has the errors against the latter. "
     "none: no estimate, which is worse than any.",

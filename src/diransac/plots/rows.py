@@ -22,8 +22,8 @@ __all__ = ["Row", "Scale", "as_marks", "draw_rows", "name_rows", "names_width", 
 Floats = npt.NDArray[np.float64]
 Looks = Mapping[str, Mapping[str, Any]]
 
-# Inches: of a row, what each method takes and what is free; the least between two names of decades.
-_METHOD, _FREE, _APART = 0.044, 0.075, 0.5
+# Inches: of a row, what each method takes, what is free, and the least in all; the least between two names of decades.
+_METHOD, _FREE, _LEAST, _APART = 0.044, 0.075, 0.24, 0.5
 # Inches: a letter of a row's name; letters of a line of it.
 _LETTER, _LETTERS = 0.059, 40
 # Decades that an axis has at most, and the room beyond its ends, in decades: for too little, too much, none at all.
@@ -55,28 +55,30 @@ class Scale:
 
     Parameters
     ----------
-    low, high : powers of ten where it begins and ends
+    least : the power of ten below which everything is too small
+    low, high : powers of ten where the axis begins and ends
     exceeded : whether something is larger
     endless : whether something is infinite
     """
 
+    least: int
     low: int
     high: int
     exceeded: bool
     endless: bool
 
     @classmethod
-    def of(cls, rows: Sequence[Row], least: float) -> Scale:
-        """The axis for these rows, on which what is below `least` is too small."""
+    def of(cls, rows: Sequence[Row], least: int) -> Scale:
+        """The axis for these rows."""
         values = np.array([[row.median, row.worst] for row in rows])
-        seen = values[np.isfinite(values) & (values > least)]
-        smallest, largest = (float(seen.min()), float(seen.max())) if len(seen) else (least, least)
+        seen = values[np.isfinite(values) & (values >= 10.0**least)]
+        smallest, largest = (float(seen.min()), float(seen.max())) if len(seen) else (10.0**least, 10.0**least)
         low = int(np.floor(np.log10(smallest)))
         high = min(max(int(np.ceil(np.log10(largest))), low + 1), low + _DECADES)
-        return cls(low, high, largest > 10.0**high, bool(np.isinf(values).any()))
+        return cls(least, low, high, largest > 10.0**high, bool(np.isinf(values).any()))
 
     @property
-    def least(self) -> float:
+    def nothing(self) -> float:
         """Where what is too small stands, in decades."""
         return self.low - _ROOM
 
@@ -94,13 +96,13 @@ class Scale:
     def ends(self) -> tuple[float, float]:
         """Of the panel."""
         last = self.none if self.endless else self.most if self.exceeded else self.high
-        return self.least - 0.6 * _ROOM, last + 0.6 * _ROOM
+        return self.nothing - 0.6 * _ROOM, last + 0.6 * _ROOM
 
     def place(self, values: Floats) -> Floats:
         """Where values stand, in decades; NaN of NaN."""
         with np.errstate(divide="ignore"):
             decades = np.log10(values)
-        inside = np.where(decades < self.low, self.least, np.where(decades > self.high, self.most, decades))
+        inside = np.where(decades < self.low, self.nothing, np.where(decades > self.high, self.most, decades))
         return np.where(np.isinf(values), self.none, inside)
 
     def names(self, width: float) -> dict[float, str]:
@@ -108,7 +110,7 @@ class Scale:
         decades = range(self.low, self.high + 1)
         step = 1 if width > _APART * (self.ends[1] - self.ends[0]) else 2
         name = _decade if step == 1 else _power
-        found = {self.least: f"<{name(self.low)}"} | {float(k): name(k) for k in decades[step - 1 :: step]}
+        found = {self.nothing: f"<{name(self.least)}"} | {float(k): name(k) for k in decades[step - 1 :: step]}
         found |= {self.most: f">{name(self.high)}"} if self.exceeded else {}
         return found | ({self.none: "none"} if self.endless else {})
 
@@ -121,7 +123,7 @@ def as_marks(looks: Looks) -> dict[str, dict[str, Any]]:
 
 def row_height(n_methods: int) -> float:
     """Height of a row, inches."""
-    return _METHOD * n_methods + _FREE
+    return max(_LEAST, _METHOD * n_methods + _FREE)
 
 
 def draw_rows(
@@ -144,10 +146,11 @@ def draw_rows(
     axes.set_xticks(*map(list, zip(*scale.names(width).items(), strict=True)))
     axes.tick_params(length=0, labelsize=7.5, labelcolor=MUTED, pad=3, labeltop=True)
     _shade(axes, rows, scale)
-    heights = _FREE / 2.0 + _METHOD * (np.arange(n_methods) + 0.5)
+    free = _FREE / row_height(n_methods)
+    within = free / 2.0 + (1.0 - free) * (np.arange(n_methods) + 0.5) / n_methods
     for i, row in enumerate(rows):
         medians, ends = scale.place(row.median), scale.place(row.worst)
-        for y, x, end, look in zip(i + heights / row_height(n_methods), medians, ends, looks.values(), strict=True):
+        for y, x, end, look in zip(i + within, medians, ends, looks.values(), strict=True):
             _mark(axes, x, end, y, look, hollow=x == scale.none)
 
 
@@ -160,16 +163,16 @@ def _mark(axes: Axes, x: float, end: float, y: float, look: Mapping[str, Any], *
 
 
 def _shade(axes: Axes, rows: Sequence[Row], scale: Scale) -> None:
-    """Bands behind every other level, lines at the decades, and one that sets apart what has no number."""
+    """Bands behind every other level, lines at the decades, dotted ones that set apart what has no place among them."""
     band = 0
     for i, row in enumerate(rows):
         band += not row.quiet
         if band % 2:
             axes.axhspan(i, i + 1, color=SOFT, linewidth=0.0, zorder=0.5)
     axes.vlines(np.arange(scale.low, scale.high + 1), 0, len(rows), color=RULE, linewidth=0.7, zorder=1.0)
-    if scale.endless:
-        apart = scale.none - 0.6 * _ROOM
-        axes.vlines([apart], 0, len(rows), color=MUTED, linewidth=0.7, linestyle=":", zorder=1.0)
+    apart = [scale.none - 0.6 * _ROOM] * scale.endless + [scale.low - 0.4 * _ROOM] * (scale.least < scale.low)
+    if apart:
+        axes.vlines(apart, 0, len(rows), color=MUTED, linewidth=0.7, linestyle=":", zorder=1.0)
 
 
 def names_width(names: Sequence[str]) -> float:

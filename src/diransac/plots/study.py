@@ -48,13 +48,13 @@ _COLOURS = (*COLOURS[:4], INK, COLOURS[5], "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _CAPTION = (
-    "Mean of the RMS tracking error and one standard deviation, over {trials} trials; a dash is the median, for which "
+    "Mean of the RMS tracking error and one standard deviation, over {trials}; a dash is the median, for which "
     "a failed trial",
     "has an infinite error. Without a flight (no plan, or one that diverged) a trial has failed: means leave it out, "
     "and are then hollow.",
 )
 _CAPTION_OF_ROWS = (
-    "Marks are medians of the RMS tracking error over {trials} trials of a level, lines end at the worst.",
+    "Marks are medians of the RMS tracking error over {trials} of a level, lines end at the worst.",
     "none: no flight (no plan, or one that diverged), which is worse than any.",
 )
 
@@ -83,7 +83,9 @@ def plot_study(store: str | Path, path: str | Path | None = None, *, title: str 
         checked_ending(Path(path))
     summary = summarise(store)
     if not summary.flights:
-        raise SettingsError("the study has no trajectories to evaluate; draw its parameters, with plot_estimates")
+        raise SettingsError(
+            "the study has no trajectories to evaluate; draw its parameters, as study plot --parameters does"
+        )
     figure = _drawn(summary, title_of(summary) if title is None else title)
     if path is not None:
         write(figure, Path(path))
@@ -280,6 +282,7 @@ def level_labels(summary: Summary) -> list[str]:
 
 
 def n_trials(summary: Summary) -> str:
-    """How many trials a point has: ``50``, ``2 to 50`` where some are yet to run."""
+    """How many trials a point has: ``50 trials``, ``2 to 50 trials`` where some are yet to run."""
     counts = summary.ran.sum(axis=2)
-    return str(counts.max()) if counts.min() == counts.max() else f"{counts.min()} to {counts.max()}"
+    least, most = int(counts.min()), int(counts.max())
+    return f"{least} to {most} trials" if least < most else f"{most} trial{'s' * (most != 1)}"

@@ -113,7 +113,7 @@ def _median_and_worst(median: float, worst: float) -> str:
 def _percent(x: float) -> str:
     """Two figures of what is given in %: ``0``, ``0.042``, ``9.1``, ``103``, ``2.1×10³``."""
     whole = 9.95 <= x < 999.5
-    return "0" if x < LEAST else f"{x:.0f}" if whole else number(x, 2)
+    return "0" if x < 10.0**LEAST else f"{x:.0f}" if whole else number(x, 2)
 
 
 def _intervals(methods: Sequence[str], estimates: Estimates) -> Html:
