@@ -166,6 +166,11 @@ def test_errors_are_relative_to_the_best_and_infinite_without_an_estimate(estima
     assert estimates.largest(estimates.errors["inertia"])[1, 1] == pytest.approx(0.0)
 
 
+def test_of_an_even_number_the_median_is_between_the_middle_two_or_infinite_if_one_of_them_is(estimates):
+    errors = np.array([[[1.0, 3.0], [1.0, np.inf], [np.inf, np.inf]]])
+    assert estimates.median(errors).tolist() == [[2.0, np.inf, np.inf]]
+
+
 def test_a_trial_that_has_nothing_to_be_judged_by_counts_neither_way(estimates):
     assert np.isnan(estimates.worst[1, 1, 1:]).all()
     assert np.isnan(estimates.worst[0, 0]).all(), "that of a method that was not run"

@@ -117,7 +117,7 @@ class Estimates:
     @staticmethod
     def median(errors: Floats) -> Floats:
         """Median over the trials that were judged, (n_levels, n_methods); NaN where there is none."""
-        return _over_trials(errors, ~np.isnan(errors), _upper_median)
+        return _over_trials(errors, ~np.isnan(errors), np.median)
 
     @staticmethod
     def largest(errors: Floats) -> Floats:
