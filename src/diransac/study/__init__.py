@@ -10,7 +10,7 @@
 | `trials.py` | what a worker does |
 | `workers.py`, `cluster.py` | where it does it |
 | `store.py` | one SQLite file |
-| `reading.py` | what is in it, for tables and pictures |
+| `reading.py`, `summary.py` | what is in it, and what it says, for tables and pictures |
 """
 
 from diransac.study.cluster import connected
@@ -19,13 +19,17 @@ from diransac.study.reading import Cell, Status, about, export, paths, read, sta
 from diransac.study.recording import Recording, record
 from diransac.study.run import run_study
 from diransac.study.specification import Method, Study
+from diransac.study.summary import Estimates, Flights, Summary, summarise
 
 __all__ = [
     "Cell",
+    "Estimates",
+    "Flights",
     "Method",
     "Recording",
     "Status",
     "Study",
+    "Summary",
     "about",
     "builtin_names",
     "connected",
@@ -36,5 +40,6 @@ __all__ = [
     "record",
     "run_study",
     "status",
+    "summarise",
     "template",
 ]
