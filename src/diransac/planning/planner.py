@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -51,6 +51,9 @@ TIME_STEP = 0.01
 
 SOLVERS = ("ipopt", "fatrop", "snopt")
 
+_FIRST_ATTEMPTS = 0.4
+"""Share of the iterations that an attempt gets which is not the last: most plans take a tenth of them."""
+
 _MORE_ROWS = (0, 1, 2, 4, 8)
 """Rows that a free duration is lengthened by, one after the other, until the rounded plan can be flown on the grid."""
 
@@ -72,7 +75,7 @@ def plan(
     rest: bool = True,
     guess: Trajectory | None = None,
     solver: str = "ipopt",
-    max_iterations: int = 100,
+    max_iterations: int = 200,
     time_limit: float = 30.0,
 ) -> Trajectory:
     """The cheapest trajectory through waypoints or along a reference, by direct transcription.
@@ -102,7 +105,7 @@ def plan(
     guess : a trajectory of the same model to start the search from
     solver : ``ipopt``; ``fatrop``, which takes two thirds of the time, but now and then searches for ever, beyond the
         reach of time_limit and Ctrl-C, where parameters are far off; or ``snopt``, with ``pip install diransac[snopt]``
-    max_iterations : of each attempt: from the guess, from the straight way, and from there with bolder steps
+    max_iterations : of the last attempt; those before it, from the guess, or more carefully, get two fifths of them
     time_limit : s; to find out why there is no plan may take as long again
 
     Returns
@@ -295,19 +298,24 @@ class _Search:
         attempts.append((straight, "careful"))
         if self.solver == "ipopt":
             attempts.append((straight, "bold"))
-        for unknowns, manner in attempts:
-            outcome = self._search(program, unknowns, manner)
+        whole = self.search_limits
+        short = replace(whole, iterations=max(1, round(_FIRST_ATTEMPTS * whole.iterations)))
+        for k, (unknowns, manner) in enumerate(attempts, start=1):
+            outcome = self._search(program, unknowns, manner, whole if k == len(attempts) else short)
             if outcome.success or outcome.status == TIME_LIMIT:
                 break
         return outcome
 
-    def _search(self, program: Program, unknowns: Floats, manner: Manner) -> Outcome:
+    def _search(
+        self, program: Program, unknowns: Floats, manner: Manner, limits: SearchLimits | None = None
+    ) -> Outcome:
         """Solve by the solver that was chosen."""
+        limits = limits or self.search_limits
         if self.solver == "snopt":
             from diransac.planning.snopt import active_set
 
-            return active_set(program, unknowns, self.search_limits)
-        return interior_point(self.solver, program, unknowns, self.search_limits, manner)
+            return active_set(program, unknowns, limits)
+        return interior_point(self.solver, program, unknowns, limits, manner)
 
     def _trajectory(self, program: Program, outcome: Outcome) -> Trajectory:
         kept = np.clip(outcome.unknowns, program.numbers.lower, program.numbers.upper)

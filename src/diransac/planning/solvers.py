@@ -102,7 +102,7 @@ def interior_point(
     ----------
     guess : (n_unknowns,)   where to start
     manner : ``careful``; ``near``, from a guess that is close to the solution: the barrier starts small; ``bold``:
-        every Newton step is taken whole, for problems on which the search along each step creeps
+        every Newton step is taken whole, for problems on which the search along each step creeps (IPOPT alone)
 
     Raises KeyboardInterrupt: the user stopped it.
     """
@@ -354,7 +354,9 @@ def _sorted(entries: tuple[Integers, Integers], shape: tuple[int, int]) -> tuple
 
 def _ipopt_options(_layout: Layout, iterations: int, manner: Manner) -> dict[str, Any]:
     options = {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, **_interior(iterations, manner)}
-    return {"ipopt": options | ({"accept_every_trial_step": "yes"} if manner == "bold" else {})}
+    if manner == "bold":
+        options |= {"accept_every_trial_step": "yes", "mu_init": 1e-3}
+    return {"ipopt": options}
 
 
 def _fatrop_options(layout: Layout, iterations: int, manner: Manner) -> dict[str, Any]:
