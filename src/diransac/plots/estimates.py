@@ -77,7 +77,7 @@ def judges_parameters(store: str | Path) -> bool:
 def methods_and_errors(summary: Summary, parameter: str | None = None) -> tuple[list[str], list[Row]]:
     """The methods that have errors worth showing, and their errors at each level, in %.
 
-    What ``true`` has found is no news but where the best parameters are others.
+    What ``true`` has found is no news but where the best parameters are others; where it is alone, nothing is shown.
 
     Parameters
     ----------
@@ -90,7 +90,8 @@ def methods_and_errors(summary: Summary, parameter: str | None = None) -> tuple[
         raise SettingsError("the study judges no parameters; run one with evaluation.parameters = true")
     best = estimates.worst if parameter is None else estimates.errors[parameter]
     own = estimates.worst_of_own if parameter is None else estimates.errors_of_own[parameter]
-    kept = [k for k, label in enumerate(summary.methods) if label != TRUE or estimates.differs.any()]
+    is_news = estimates.differs.any() or summary.methods == (TRUE,)
+    kept = [k for k, label in enumerate(summary.methods) if label != TRUE or is_news]
     is_true = np.array([summary.methods[k] == TRUE for k in kept])
     rows = []
     for i, name in enumerate(level_labels(summary)):
