@@ -1,6 +1,7 @@
-"""The gauntlet: robust identification of dynamics, vehicles x flights x scenarios x seeds x methods.
+"""The gauntlet with other people's methods: vehicles x scenarios x seeds x methods.
 
 Run it as ``python benchmarks/gauntlet.py [--vehicle pendulum] [--scenario clean,bursts] [--methods ols,tls]``;
+The logs are those of the studies that the package brings, ``diransac study run gauntlet``, trial by trial;
 docs/gauntlet.md says what the tables mean, and how a method or a scenario is added.
 """
 
@@ -18,8 +19,7 @@ from statistics import median
 
 from gauntlet_judging import Record, Trial, run
 from gauntlet_methods import METHODS
-from gauntlet_scenarios import SCENARIOS
-from gauntlet_vehicles import VEHICLES
+from gauntlet_studies import DRAWN, VEHICLES, flights_of, scenarios_of
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -35,8 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    flights = sorted({name for vehicle in VEHICLES.values() for name in vehicle.flights})
-    scenarios = sorted({one.name for some in SCENARIOS.values() for one in some})
+    flights = dict.fromkeys(name for vehicle in VEHICLES for name in flights_of(vehicle))
+    scenarios = dict.fromkeys(name for vehicle in VEHICLES for name in scenarios_of(vehicle))
     for option, known in (("vehicle", VEHICLES), ("flight", flights), ("scenario", scenarios), ("methods", METHODS)):
         parser.add_argument(f"--{option}", type=_names_of(known), metavar="A,B", help=f"of {', '.join(known)}")
     parser.add_argument("--seeds", type=int, default=1, help="logs of each flight and scenario (1)")
@@ -68,12 +68,11 @@ def _names_of(known: Iterable[str]) -> Callable[[str], list[str]]:
 
 def _trials(chosen: argparse.Namespace) -> Iterable[Trial]:
     """Every log that is asked for; flights that others have tuned on only by name."""
-    for name in chosen.vehicle or VEHICLES:
-        vehicle = VEHICLES[name]
-        for flight in chosen.flight or [one for one in vehicle.flights if one not in vehicle.shown_apart]:
-            for scenario in SCENARIOS[name]:
-                if flight in vehicle.flights and (not chosen.scenario or scenario.name in chosen.scenario):
-                    yield from (Trial(name, flight, scenario.name, seed) for seed in range(chosen.seeds))
+    for vehicle in chosen.vehicle or VEHICLES:
+        for flight in chosen.flight or [DRAWN]:
+            for scenario in scenarios_of(vehicle):
+                if flight in flights_of(vehicle) and (not chosen.scenario or scenario in chosen.scenario):
+                    yield from (Trial(vehicle, flight, scenario, seed) for seed in range(chosen.seeds))
 
 
 def _run_all(trials: Sequence[Trial], methods: Sequence[str], jobs: int) -> list[Record]:
@@ -99,9 +98,8 @@ def _run_all(trials: Sequence[Trial], methods: Sequence[str], jobs: int) -> list
 def _place(record: Record) -> tuple[int, ...]:
     """Where a record stands, whenever it was finished."""
     trial = record.trial
-    scenarios = [one.name for one in SCENARIOS[trial.vehicle]]
-    flights = list(VEHICLES[trial.vehicle].flights)
-    order = (list(VEHICLES).index(trial.vehicle), scenarios.index(trial.scenario), flights.index(trial.flight))
+    scenario, flight = scenarios_of(trial.vehicle).index(trial.scenario), flights_of(trial.vehicle).index(trial.flight)
+    order = (list(VEHICLES).index(trial.vehicle), scenario, flight)
     return (*order, trial.seed, list(METHODS).index(record.method))
 
 

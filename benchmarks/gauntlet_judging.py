@@ -1,28 +1,29 @@
 """How the gauntlet judges: one log, every method, and what came of it.  Nothing happens when this file is run."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 from gauntlet_methods import METHODS, Estimate
-from gauntlet_scenarios import SCENARIOS
-from gauntlet_vehicles import VEHICLES, effective_parameters, recorded
+from gauntlet_studies import study_of
 
 import diransac as dr
 from diransac.simulate import rollouts
+from diransac.study import Study, record
+from diransac.study.flights import MISSIONS
+from diransac.study.recording import record_all
 
 Array = np.ndarray[Any, Any]
 ErrorsByName = Mapping[str, float]
 _ROUNDING, _VISIBLE = 1e-6, 2e-3
-Mission = Callable[..., dr.Trajectory]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One log."""
+    """One log: of a study's vehicle on one of its flights, at the scenario that is its level, in the trial `seed`."""
 
     vehicle: str
     flight: str
@@ -77,26 +78,23 @@ class Record:
 
 
 def run(trial: Trial, methods: Sequence[str], *, fly: bool = True) -> list[Record]:
-    """Record a log, spoil it, and let every method at it."""
-    vehicle = VEHICLES[trial.vehicle]
-    scenario = next(one for one in SCENARIOS[trial.vehicle] if one.name == trial.scenario)
-    plant = vehicle.plant(**scenario.world)
-    clean = recorded(trial.vehicle, trial.flight, plant, trial.seed)
-    log = scenario.recorded(plant, clean, trial.seed)
-    best = effective_parameters(plant, clean)
-    bound = cramer_rao(*_as_the_model_says(trial), scenario.noise) if scenario.bounded else {}
+    """Let every method at the log that the study's trial of that number has."""
+    study = study_of(trial.vehicle, trial.flight)
+    at = study.at(trial.scenario)
+    plant, data = at.plant.plant, record(study, trial.scenario, trial.seed)
+    bound = cramer_rao(*_as_the_model_says(study, trial), at.noise) if _is_gaussian(at.noise) else {}
     records = []
     for method in methods:
-        estimate, seconds, refusal = _estimated(method, plant.model, log)
+        estimate, seconds, refusal = _estimated(method, plant.model, data.log)
         found = estimate.parameters if estimate else {}
         flown = (np.nan, np.nan)
-        if fly and vehicle.mission:
-            true = _tracking_of_truth(trial.vehicle, tuple(scenario.world.items()), trial.seed)
-            flown = (tracking(vehicle.mission, plant, found, trial.seed), true)
+        if fly and study.evaluation:
+            true = _tracking_of_truth(trial.vehicle, trial.scenario, trial.seed)
+            flown = (tracking(study.evaluation[0], plant, found, trial.seed), true)
         records.append(
             Record(
-                trial, method, relative(found, best), relative(found, plant.parameters), _covered(estimate, best),
-                *flown, bool(scenario.world), bound, seconds, refusal,
+                trial, method, relative(found, data.best), relative(found, plant.parameters),
+                _covered(estimate, data.best), *flown, at.plant != study.plant, bound, seconds, refusal,
             )
         )  # fmt: skip
     return records
@@ -130,13 +128,13 @@ def _covered(estimate: Estimate | None, best: ErrorsByName) -> dict[str, bool]:
     }
 
 
-def tracking(mission: Mission, plant: dr.Plant, parameters: ErrorsByName, seed: int) -> float:
+def tracking(mission: str, plant: dr.Plant, parameters: ErrorsByName, seed: int) -> float:
     """RMS distance (m) from the mission that a model with these parameters plans, steers and flies on the plant."""
     if not parameters:
         return np.inf
     try:
         known = dr.Plant(plant.model, parameters)
-        trajectory = mission(known, time_limit=5.0)
+        trajectory = MISSIONS[mission](known, time_limit=5.0)
         log = dr.fly(plant, trajectory, dr.tvlqr(known, trajectory), seed=seed)
     except dr.DiransacError:
         return np.inf
@@ -145,15 +143,23 @@ def tracking(mission: Mission, plant: dr.Plant, parameters: ErrorsByName, seed: 
 
 
 @cache
-def _tracking_of_truth(vehicle: str, world: tuple[tuple[str, Any], ...], seed: int) -> float:
-    plant, mission = VEHICLES[vehicle].plant(**dict(world)), VEHICLES[vehicle].mission
-    return tracking(mission, plant, plant.parameters, seed) if mission else np.nan
+def _tracking_of_truth(vehicle: str, scenario: str, seed: int) -> float:
+    at = study_of(vehicle).at(scenario)
+    return tracking(at.evaluation[0], at.plant.plant, at.plant.plant.parameters, seed)
 
 
-def _as_the_model_says(trial: Trial) -> tuple[dr.Plant, dr.Log]:
+def _is_gaussian(noise: dr.Noise) -> bool:
+    """Whether there is Gaussian noise on everything that is measured, so that Cramer-Rao's bound is above zero."""
+    return noise.acceleration_std > 0.0 and noise.rate_std > 0.0
+
+
+def _as_the_model_says(study: Study, trial: Trial) -> tuple[dr.Plant, dr.Log]:
     """The plant without what the model does not know, and its log of the same flight."""
-    plant = VEHICLES[trial.vehicle].plant()
-    return plant, recorded(trial.vehicle, trial.flight, plant, trial.seed)
+    calm = replace(study.at(trial.scenario), plant=study.plant)
+    (found,) = record_all(calm, trial.scenario, [trial.seed])
+    if isinstance(found, dr.DiransacError):
+        raise found
+    return calm.plant.plant, found.flight
 
 
 def cramer_rao(plant: dr.Plant, clean: dr.Log, noise: dr.Noise) -> dict[str, float]:
