@@ -136,6 +136,14 @@ def test_an_axis_holds_all_that_is_beyond_it_in_order():
     assert scale.names(9.0)[places[-2]] == f">{10**scale.high:,}"
 
 
+@pytest.mark.parametrize("width", [2.0, 9.0])
+def test_names_along_an_axis_do_not_touch(width: float):
+    scale = Scale.of([Row("a", np.array([0.002, 50.0]), np.array([np.inf, 1e9]))], -3)
+    at = np.sort(list(scale.names(width)))
+    assert len(at) > 4
+    assert np.diff(at).min() * width / (scale.ends[1] - scale.ends[0]) > 0.3
+
+
 def test_long_names_of_many_levels_are_within_the_picture_and_beside_their_panel(tmp_path: Path):
     wordy = {"name": "scenario", "levels": WORDS, "values": {"noise.outlier_magnitude": list(range(len(WORDS)))}}
     with Store(tmp_path / "w.db", load(tiny(trials=1, axis=wordy, evaluation__parameters=True))) as kept:

@@ -17,7 +17,7 @@ __all__ = ["draw_flight_rows", "flight_rows_height"]
 
 _COLUMNS = 3
 # Inches: between panels, the name of a panel with the values above its rows, the values below them.
-_GAP, _ABOVE, _BELOW = 0.1, 0.42, 0.3
+_GAP, _ABOVE, _BELOW = 0.26, 0.42, 0.3
 _LEAST = -3
 """Power of ten, m or rad: what is less is shown as nothing."""
 

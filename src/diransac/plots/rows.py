@@ -22,8 +22,10 @@ __all__ = ["Row", "Scale", "as_marks", "draw_rows", "name_rows", "names_width", 
 Floats = npt.NDArray[np.float64]
 Looks = Mapping[str, Mapping[str, Any]]
 
-# Inches: of a row, what each method takes, what is free, and the least in all; the least between two names of decades.
-_METHOD, _FREE, _LEAST, _APART = 0.044, 0.075, 0.24, 0.5
+# Inches: of a row, what each method takes, what is free, and the least in all; decades that have a name each are so far
+# apart, and names no nearer.
+_METHOD, _FREE, _LEAST = 0.044, 0.075, 0.24
+_APART, _NEAR = 0.5, 0.32
 # Inches: a letter of a row's name; letters of a line of it.
 _LETTER, _LETTERS = 0.059, 40
 # Decades that an axis has at most, and the room beyond its ends, in decades: for too little, too much, none at all.
@@ -90,7 +92,7 @@ class Scale:
     @property
     def none(self) -> float:
         """Where what is infinite stands."""
-        return self.high + (2.2 if self.exceeded else 1.2) * _ROOM
+        return self.high + (3.6 if self.exceeded else 1.2) * _ROOM
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -106,13 +108,14 @@ class Scale:
         return np.where(np.isinf(values), self.none, inside)
 
     def names(self, width: float) -> dict[float, str]:
-        """What stands where along a panel of so many inches."""
-        decades = range(self.low, self.high + 1)
-        step = 1 if width > _APART * (self.ends[1] - self.ends[0]) else 2
-        name = _decade if step == 1 else _power
-        found = {self.nothing: f"<{name(self.least)}"} | {float(k): name(k) for k in decades[step - 1 :: step]}
-        found |= {self.most: f">{name(self.high)}"} if self.exceeded else {}
-        return found | ({self.none: "none"} if self.endless else {})
+        """What stands where along a panel of so many inches; no name is near another."""
+        decade = width / (self.ends[1] - self.ends[0])
+        name, step = (_decade, 1) if decade > _APART else (_power, 2)
+        beyond = {self.nothing: f"<{name(self.least)}"}
+        beyond |= {self.most: f">{name(self.high)}"} if self.exceeded else {}
+        beyond |= {self.none: "none"} if self.endless else {}
+        decades = range(self.low + step - 1, self.high + 1, step)
+        return beyond | {float(k): name(k) for k in decades if all(abs(k - x) * decade > _NEAR for x in beyond)}
 
 
 def as_marks(looks: Looks) -> dict[str, dict[str, Any]]:
