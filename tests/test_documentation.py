@@ -3,8 +3,9 @@ r"""What README.md, docs/ and examples/ show is run, so that they cannot lie.
 A page runs from top to bottom in a folder of its own, with ``examples/`` inside and the real logs in
 ``../shared/data``:
 
-- every ``python`` block, in one namespace a page; a block whose first line is a comment that names a file
-  (``# rover.py``) is written to that file as well;
+- every ``python`` block, in one namespace a page;
+- a ``python`` or ``toml`` block whose first line is a comment that names a file (``# rover.py``) is written to that
+  file;
 - in every ``console`` block, each ``$ diransac ...`` and ``$ python ...`` line, continued over ``\``
   at a line's end. Lines of `NOT_RUN` are shown only. Any other command belongs into a
   ``text`` block, as does what cannot run.
@@ -62,11 +63,15 @@ def run_command(command: list[str], folder: Path) -> None:
     assert done.returncode == 0, f"{shlex.join(command)}: exit code {done.returncode}\n{done.stdout}{done.stderr}"
 
 
-def run_python(block: Block, page: Path, folder: Path, namespace: dict[str, object]) -> None:
-    """Run one Python block, with the page's own line numbers in a traceback."""
-    named = re.match(r"# ([\w-]+\.py)\n", block.body)
+def write_named(block: Block, folder: Path) -> None:
+    """Write a block to the file that its first line names, if it names one."""
+    named = re.match(rf"# ([\w-]+\.{'py' if block.info == 'python' else 'toml'})\n", block.body)
     if named:
         (folder / named[1]).write_text(block.body)
+
+
+def run_python(block: Block, page: Path, namespace: dict[str, object]) -> None:
+    """Run one Python block, with the page's own line numbers in a traceback."""
     exec(compile("\n" * (block.line - 1) + block.body, str(page), "exec"), namespace)
 
 
@@ -88,8 +93,10 @@ def test_page_runs_as_it_is_shown(page: Path, folder: Path):
     for block in blocks(page.read_text()):
         if "../shared/" in block.body and block.info in {"python", "console"} and not SHARED.is_dir():
             pytest.skip(f"{page.name} NOT CHECKED from line {block.line} on: {SHARED} is missing")
+        if block.info in {"python", "toml"}:
+            write_named(block, folder)
         if block.info == "python":
-            run_python(block, page, folder, namespace)
+            run_python(block, page, namespace)
         if block.info == "console":
             for command in commands(block.body):
                 run_command(command, folder)

@@ -55,14 +55,14 @@ def test_rows_are_those_of_what_users_call(whole: dict):
 
 
 def test_the_data_of_a_trial_are_to_be_had_alone(whole: dict):
-    data, row = record(load(DRAWN), 40, trial=1), whole["40", 1, "ols"]
+    data, row = record(DRAWN, 40, trial=1), whole["40", 1, "ols"]
     result = dr.identify(dr.models.planar_rotorcraft(), data.log, "ols", settings=load(DRAWN).methods["ols"].settings)
     assert {name: row[f"parameter_{name}"] for name in NAMES} == dict(result.parameters)
     assert {name: row[f"best_{name}"] for name in NAMES} == data.best
     assert any(samples.any() for samples in data.log.planted.values())
     assert not (data.flight["x"] == data.log["x"]).all()
     with pytest.raises(dr.SettingsError, match='no level "some" of outlier magnitude'):
-        record(load(DRAWN), "some")
+        record(DRAWN, "some")
 
 
 def test_trials_fly_different_flights_and_methods_of_a_trial_the_same(whole: dict):

@@ -7,6 +7,8 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 from diransac.controller import Controller, tvlqr
 from diransac.errors import DiransacError, PlanningError
@@ -16,6 +18,7 @@ from diransac.noise import corrupt
 from diransac.plant import Plant
 from diransac.study.flights import Flight
 from diransac.study.judging import best_parameters
+from diransac.study.library import load
 from diransac.study.plants import PlantChoice
 from diransac.study.seeds import derived_seed
 from diransac.study.specification import Study
@@ -43,14 +46,20 @@ class Recording:
     best: Mapping[str, float]
 
 
-def record(study: Study, level: str | float, trial: int = 0) -> Recording:
+def record(study: Study | Mapping[str, Any] | str | Path, level: str | float, trial: int = 0) -> Recording:
     """The data of one trial, as `run_study` gives them to every method: to look at, or to try a method of one's own on.
 
-    Raises SettingsError: there is no such level.
-    Raises DiransacError: such a trial fails; it says why.
+    Parameters
+    ----------
+    study : what `load` takes: a built-in study's name, a TOML file, its tables
+    level, trial : which
+
+    Raises SettingsError: there is no such study or level.
+    Raises DiransacError: the trial has no data; it says why.
     """
-    (point,) = study.axis.narrowed([str(level)]).levels
-    (found,) = record_all(study.at(point.text), point.text, [trial])
+    known = load(study)
+    (point,) = known.axis.narrowed([str(level)]).levels
+    (found,) = record_all(known.at(point.text), point.text, [trial])
     if isinstance(found, DiransacError):
         raise found
     return found
