@@ -106,12 +106,7 @@ def everything() -> list:
 
 def samples() -> list:
     """One hypothesis, from all of the log: no samples, no consensus."""
-    return [patch.object(hypotheses, "_COUNT", 0), patch.object(hypotheses, "_CONCENTRATIONS", 0)]
-
-
-def concentration() -> list:
-    """Random samples as they are."""
-    return [patch.object(hypotheses, "_CONCENTRATIONS", 0)]
+    return [patch.object(hypotheses, "_COUNT", 0)]
 
 
 def further_starts() -> list:
@@ -220,7 +215,6 @@ def gate() -> list:
 LEFT_OUT = {
     "nothing": everything,
     "samples": samples,
-    "concentration": concentration,
     "local optimisation": refinement_stage,
     "further starts": further_starts,
     "neighbours": neighbours,

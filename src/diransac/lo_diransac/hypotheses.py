@@ -2,11 +2,11 @@
 
 An equation that holds at every moment holds under any average, too.  Rows ``W p = b`` of the smoothed motion are
 averaged under a bump of a window's length: vibration and noise average out, and since the bump ends in zero, as if by
-parts, little depends on the accelerations.  A sample of few averages of each equation gives a first guess; it is
-concentrated on the averages that it explains best, and every guess is judged by simulation.
+parts, little depends on the accelerations.  A sample of few averages of each equation gives a first guess, and every
+guess is judged by simulation.
 
-References: Fischler, Bolles 1981 (RANSAC); Messenger, Bortz 2021 (weak form); Rousseeuw, Van Driessen 2006
-(concentration); Nister 2005 (judging many on little, few on all); Torr, Zisserman 2000.
+References: Fischler, Bolles 1981 (RANSAC); Messenger, Bortz 2021 (weak form); Nister 2005 (judging many on little, few
+on all); Torr, Zisserman 2000.
 """
 
 from __future__ import annotations
@@ -38,8 +38,6 @@ BoolArray = npt.NDArray[np.bool_]
 _COUNT = 200
 _NONLINEAR_SAMPLES, _NONLINEAR_ROWS = 20, 60
 _OVERLAP = 5
-_KEPT = 0.4
-_CONCENTRATIONS = 3
 _FIRST_WINDOWS, _FINALISTS = 12, 12
 
 
@@ -53,12 +51,12 @@ def find_hypotheses(
 ) -> tuple[FloatArray, FloatArray]:
     """Hypotheses ``(n, n_p)`` within their bounds, and their scores ``(n,)``, best first.
 
-    Samples are judged on a few windows; the best are concentrated, and judged on all.
+    Samples are judged on a few windows, the best on all.
     """
     if windows.model.nonlinear_parameters:
         finalists = _nonlinear(motion, seed, observations)
     else:
-        finalists = _concentrated(windows, motion, seed)
+        finalists = _linear(windows, motion, seed)
     if not len(finalists):
         return finalists, np.zeros(0)
     scores = robust_scores(windows, motion, finalists, np.arange(len(windows)))
@@ -66,19 +64,14 @@ def find_hypotheses(
     return finalists[order], scores[order]
 
 
-def _concentrated(windows: Windows, motion: Motion, seed: int) -> FloatArray:
-    """Finalists of a model that is affine in its parameters."""
+def _linear(windows: Windows, motion: Motion, seed: int) -> FloatArray:
+    """Finalists of a model that is affine in its parameters: the best of least squares of random averages."""
     weak = weak_form(windows, motion)
     few = np.unique(np.linspace(0, len(windows) - 1, min(_FIRST_WINDOWS, len(windows))).astype(int))
     samples = _admitted(windows, weak.solve(_samples(weak, seed)))
     if not len(samples):
         return samples
-    ranked = samples[np.argsort(robust_scores(windows, motion, samples, few), kind="stable")]
-    found = [ranked[:_FINALISTS]]
-    for _ in range(_CONCENTRATIONS):
-        if len(found[-1]):
-            found.append(_admitted(windows, weak.solve(weak.explained(found[-1]))))
-    return np.concatenate(found)
+    return samples[np.argsort(robust_scores(windows, motion, samples, few), kind="stable")[:_FINALISTS]]
 
 
 def _nonlinear(motion: Motion, seed: int, observations: Observations) -> FloatArray:
@@ -110,11 +103,6 @@ class WeakForm:
         d = np.sqrt(np.einsum("kii->ki", G)) + 1e-300
         G = G / d[:, :, None] / d[:, None, :] + 1e-10 * np.eye(n_p)
         return np.asarray(np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d)
-
-    def explained(self, p: FloatArray) -> BoolArray:
-        """Of each equation, the rows that each hypothesis explains best."""
-        misfit = np.abs(np.einsum("nri,ki->knr", self.W, p) - self.b)
-        return np.asarray(misfit <= np.quantile(misfit, _KEPT, axis=1, keepdims=True))
 
 
 def _samples(weak: WeakForm, seed: int) -> BoolArray:
