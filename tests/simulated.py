@@ -256,7 +256,7 @@ def rollout(machine, parameters, start, inputs, dt):
     return signals
 
 
-def flight(machine, n_rows, dt, truth=None):
+def flight(machine, n_rows, dt, truth=None, substeps=1):
     """Signals ``(N, n_signals)`` and inputs ``(N, n_u)`` of the machine under its law, held between rows."""
     n = len(machine.coordinates)
     p = np.array(list((truth or machine.truth).values()))
@@ -264,9 +264,9 @@ def flight(machine, n_rows, dt, truth=None):
     signals, inputs = np.empty((n_rows, 3 * n)), np.empty((n_rows, len(machine.inputs)))
     for row in range(n_rows):
         inputs[row] = machine.law(row * dt, x[:n], x[n:])
-        k1, after = runge_kutta_step(machine, x, inputs[row], p, dt)
-        signals[row] = np.concatenate([x, k1[n:]])
-        x = after
+        signals[row] = np.concatenate([x, slope(machine, x, inputs[row], p)[n:]])
+        for _ in range(substeps):
+            x = runge_kutta_step(machine, x, inputs[row], p, dt / substeps)[1]
     return signals, inputs
 
 

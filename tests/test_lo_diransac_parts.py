@@ -21,7 +21,7 @@ TRUTH = np.array(list(MACHINES["planar-rotorcraft"].truth.values()))
 
 
 def windows_of(n_rows=200, length=25, dt=0.01):
-    signals, inputs = flight(MACHINES["planar-rotorcraft"], n_rows, dt)
+    signals, inputs = flight(MACHINES["planar-rotorcraft"], n_rows, dt, substeps=5)
     return Windows(ROTORCRAFT, signals, np.ones(signals.shape, bool), inputs, dt, length), signals
 
 
