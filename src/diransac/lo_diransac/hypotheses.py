@@ -36,14 +36,16 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 _COUNT = 200
-_NONLINEAR_SAMPLES, _NONLINEAR_ROWS = 20, 60
+_NONLINEAR_COUNT = 100
+# Rows of a sample at most, in parameters: the fewer, the likelier that none of them is wrong.
+_MOST = 4
 _OVERLAP = 5
 _FIRST_WINDOWS, _FINALISTS = 12, 12
 
 
 def n_samples(model: Model) -> int:
     """Samples that are drawn for a model."""
-    return _NONLINEAR_SAMPLES if model.nonlinear_parameters else _COUNT
+    return _NONLINEAR_COUNT if model.nonlinear_parameters else _COUNT
 
 
 def find_hypotheses(
@@ -75,16 +77,18 @@ def _linear(windows: Windows, motion: Motion, seed: int) -> FloatArray:
 
 
 def _nonlinear(motion: Motion, seed: int, observations: Observations) -> FloatArray:
-    """Finalists of any model: nonlinear least squares of random rows of the smoothed motion."""
+    """Finalists of any model: nonlinear least squares of all and of random rows of the smoothed motion."""
     smoothed = replace(
         observations,
         signals=tuple(observations.model.signals),
         measured=motion.signals,
         valid=np.ones(len(motion.signals), bool),
     )
-    n = len(smoothed)
-    rows = sample_rows(seed, np.arange(_NONLINEAR_SAMPLES), n, 0, min(n, _NONLINEAR_ROWS))
-    return NonlinearLeastSquares().bind(smoothed).fit([np.sort(x) for x in rows])
+    n, n_p = len(smoothed), observations.model.n_p
+    rows = sample_rows(seed, np.arange(_NONLINEAR_COUNT), n, 0, min(n, _MOST * n_p))
+    sizes = _generator(seed).integers(n_p, rows.shape[1] + 1, len(rows))
+    samples = [np.sort(some[:size]) for some, size in zip(rows, sizes, strict=True)]
+    return NonlinearLeastSquares().bind(smoothed).fit([np.arange(n), *samples])
 
 
 @dataclass(frozen=True)
@@ -106,12 +110,16 @@ class WeakForm:
 
 
 def _samples(weak: WeakForm, seed: int) -> BoolArray:
-    """All rows, and random sets of n_p to 4 n_p rows of each equation."""
-    rng = np.random.default_rng([int(seed < 0), abs(seed)])
+    """All rows, and random sets of n_p to `_MOST` n_p rows of each equation."""
+    rng = _generator(seed)
     n, r, n_p = weak.W.shape
-    sizes = np.r_[n, np.minimum(rng.integers(n_p, 4 * n_p + 1, _COUNT), n)]
+    sizes = np.r_[n, np.minimum(rng.integers(n_p, _MOST * n_p + 1, _COUNT), n)]
     ranks = rng.random((len(sizes), n, r)).argsort(axis=1).argsort(axis=1)
     return np.asarray(ranks < sizes[:, None, None])
+
+
+def _generator(seed: int) -> np.random.Generator:
+    return np.random.default_rng([int(seed < 0), abs(seed)])
 
 
 def weak_form(windows: Windows, motion: Motion) -> WeakForm:
