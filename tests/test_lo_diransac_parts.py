@@ -12,7 +12,7 @@ from diransac.lo_diransac.gate import mended_inputs, stuck_rows
 from diransac.lo_diransac.hypotheses import robust_scores, weak_form
 from diransac.lo_diransac.mixture import Mixture, lower_scale
 from diransac.lo_diransac.normal_equations import Fit, cost, linearize
-from diransac.lo_diransac.smoothing import choose_half_width, smooth
+from diransac.lo_diransac.smoothing import choose_half_width, running_median, smooth
 from diransac.lo_diransac.windows import Windows
 from simulated import MACHINES, flight, rollout
 
@@ -23,6 +23,11 @@ TRUTH = np.array(list(MACHINES["planar-rotorcraft"].truth.values()))
 def windows_of(n_rows=200, length=25, dt=0.01):
     signals, inputs = flight(MACHINES["planar-rotorcraft"], n_rows, dt, substeps=5)
     return Windows(ROTORCRAFT, signals, np.ones(signals.shape, bool), inputs, dt, length), signals
+
+
+def smoothed(measured, known):
+    """The motion of a log at 100 Hz, from 25 rows to either side."""
+    return smooth(ROTORCRAFT, measured, known, running_median(measured, known), 0.01, 25)
 
 
 # ---------------------------------------------------------------------- arrowhead
@@ -114,7 +119,7 @@ def test_smoothing_leaves_a_quartic_as_it_is_though_four_samples_in_ten_are_wron
     truth = quartic(t)
     rng = np.random.default_rng(5)
     measured = truth + (rng.random(truth.shape) < 0.4) * rng.uniform(-50.0, 50.0, truth.shape)
-    motion = smooth(ROTORCRAFT, measured, np.ones(truth.shape, bool), 0.01, 25)
+    motion = smoothed(measured, np.ones(truth.shape, bool))
     assert np.median(np.abs(motion.signals - truth), axis=0) == pytest.approx(np.zeros(9), abs=1e-4)
 
 
@@ -122,7 +127,7 @@ def test_smoothing_finds_velocities_and_accelerations_from_coordinates_alone():
     t = 0.01 * np.arange(400)
     truth, known = quartic(t), np.zeros((400, 9), bool)
     known[:, :3] = True
-    motion = smooth(ROTORCRAFT, np.where(known, truth, 0.0), known, 0.01, 25)
+    motion = smoothed(np.where(known, truth, 0.0), known)
     assert np.abs(motion.signals - truth).max() < 1e-4
 
 
@@ -131,10 +136,8 @@ def test_half_width_is_wider_where_the_motion_is_slower():
     noise = 0.02 * np.random.default_rng(6).normal(size=(4000, 9))
     known = np.zeros((4000, 9), bool)
     known[:, :3] = True
-    widths = [
-        choose_half_width(ROTORCRAFT, np.repeat(np.sin(w * t)[:, None], 9, axis=1) + noise, known, 0.01)
-        for w in (10.0, 0.5)
-    ]
+    logs = [np.repeat(np.sin(w * t)[:, None], 9, axis=1) + noise for w in (10.0, 0.5)]
+    widths = [choose_half_width(ROTORCRAFT, log, known, running_median(log, known), 0.01) for log in logs]
     assert widths[0] == 25
     assert widths[1] > 25
 
@@ -253,7 +256,7 @@ def test_a_gauss_newton_step_solves_a_linear_problem_at_once():
 def test_weak_form_of_a_clean_log_is_near_the_parameters():
     """Within what smoothing does to a motion as lively as this one."""
     windows, signals = windows_of(n_rows=600)
-    motion = smooth(ROTORCRAFT, signals, windows.known, 0.01, 25)
+    motion = smoothed(signals, windows.known)
     weak = weak_form(windows, motion)
     everything = np.ones((1, *weak.b.shape), bool)
     assert weak.solve(everything)[0] == pytest.approx(TRUTH, rel=0.1)
@@ -265,7 +268,7 @@ def test_consensus_ranks_the_truth_first_though_half_of_the_samples_are_wrong():
     hit = rng.random(signals.shape) < 0.5
     measured = signals + hit * rng.uniform(-50.0, 50.0, signals.shape)
     windows = Windows(ROTORCRAFT, measured, windows.known, windows.inputs, 0.01, 25)
-    motion = smooth(ROTORCRAFT, measured, windows.known, 0.01, 25)
+    motion = smoothed(measured, windows.known)
     others = TRUTH * np.exp(rng.normal(scale=0.2, size=(50, 3)))
     scores = robust_scores(windows, motion, np.vstack([others, TRUTH]), np.arange(len(windows)))
     assert np.argmin(scores) == 50
@@ -273,7 +276,7 @@ def test_consensus_ranks_the_truth_first_though_half_of_the_samples_are_wrong():
 
 def test_consensus_is_the_sum_of_log_scales_of_a_plain_simulation():
     windows, signals = windows_of(n_rows=100)
-    motion = smooth(ROTORCRAFT, signals, windows.known, 0.01, 25)
+    motion = smoothed(signals, windows.known)
     p = TRUTH * [1.1, 0.9, 1.3]
     machine = MACHINES["planar-rotorcraft"]
     starts = motion.signals[windows.starts, :6]

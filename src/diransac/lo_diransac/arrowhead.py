@@ -14,7 +14,7 @@ References: Hockney 1965 and Heller 1976 (cyclic reduction); Takahashi, Fagan, C
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -53,7 +53,17 @@ class Arrowhead:
     corner: FloatArray
 
     def solve(self, right_z: FloatArray, right_p: FloatArray, damping: float = 0.0) -> Factored:
-        """Solution for the right-hand side ``(W, k)`` and ``(m,)``, the diagonal grown by a factor ``1 + damping``.
+        """Solution for the right-hand side ``(W, k)`` and ``(m,)``, the diagonal grown by a factor ``1 + damping``."""
+        found = self._solved(right_z[:, :, None], right_p[:, None], damping)
+        return replace(found, step_z=found.step_z[:, :, 0], step_p=found.step_p[:, 0])
+
+    def functional(self, of_z: FloatArray, of_p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Inverse times columns ``(W, k, c)`` over ``(m, c)``: what each unknown contributes to linear functionals."""
+        found = self._solved(of_z, of_p, 0.0)
+        return found.step_z, found.step_p
+
+    def _solved(self, right_z: FloatArray, right_p: FloatArray, damping: float) -> Factored:
+        """Solutions ``(W, k, c)`` and ``(m, c)`` for as many right-hand sides.
 
         Unknowns are scaled to a diagonal of one first: metres and radians per second squared differ by decades.
         """
@@ -64,20 +74,19 @@ class Arrowhead:
         E = self.below * sz[1:, :, None] * sz[:-1, None, :]
         B = self.border * sz[:, :, None] * sp
         C = self.corner * sp[:, None] * sp + (damping + _RIDGE) * np.eye(m)
-        solved, var, _ = _reduce(D, E, np.concatenate([B, (right_z * sz)[:, :, None]], axis=2))
-        gain, alone = solved[:, :, :m], solved[:, :, m]
+        solved, var, _ = _reduce(D, E, np.concatenate([B, right_z * sz[:, :, None]], axis=2))
+        gain, alone = solved[:, :, :m], solved[:, :, m:]
         var_p = _inverse(C - np.einsum("wki,wkj->ij", B, gain))
-        p = var_p @ (right_p * sp - np.einsum("wki,wk->i", B, alone))
+        p = var_p @ (right_p * sp[:, None] - np.einsum("wki,wkc->ic", B, alone))
         z = alone - gain @ p
         var = var + gain @ var_p @ gain.swapaxes(1, 2)
         return Factored(
-            z * sz, p * sp, var * sz[:, :, None] * sz[:, None, :], var_p * sp[:, None] * sp, gain * sz[:, :, None] / sp
+            z * sz[:, :, None],
+            p * sp[:, None],
+            var * sz[:, :, None] * sz[:, None, :],
+            var_p * sp[:, None] * sp,
+            gain * sz[:, :, None] / sp,
         )
-
-    def functional(self, of_z: FloatArray, of_p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Inverse times columns ``(W, k, c)`` over ``(m, c)``: what each unknown contributes to linear functionals."""
-        columns = [self.solve(of_z[:, :, i], of_p[:, i]) for i in range(of_p.shape[1])]
-        return np.stack([c.step_z for c in columns], axis=2), np.stack([c.step_p for c in columns], axis=1)
 
 
 # Below what rounding leaves of a diagonal of one; keeps what no measurement shows (a heading that nothing depends on).

@@ -21,7 +21,7 @@ from diransac.lo_diransac.hypotheses import find_hypotheses, n_samples, robust_s
 from diransac.lo_diransac.mixture import BREAKDOWN
 from diransac.lo_diransac.readout import deviation_units, parameter_units, read_out, unexplained
 from diransac.lo_diransac.refinement import believe, refine, start
-from diransac.lo_diransac.smoothing import choose_half_width, smooth
+from diransac.lo_diransac.smoothing import choose_half_width, running_median, smooth
 from diransac.lo_diransac.windows import Windows
 
 if TYPE_CHECKING:
@@ -141,13 +141,14 @@ def _prepare(observations: Observations) -> tuple[Windows, Motion, tuple[str, ..
         notes.append(f"{stuck.sum()} rows repeat the row before in every signal, and were taken as missing")
     if n_leaps:
         notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median stands in for them")
-    half = choose_half_width(model, measured, known, dt)
+    centre = running_median(measured, known)
+    half = choose_half_width(model, measured, known, centre, dt)
     if len(observations) < _FEWEST_WINDOWS * half:
         raise LogError(
             f"{observations.log.source}: {len(observations)} rows are too few; lo-diransac needs at least "
             f"{_FEWEST_WINDOWS * half}. Give a longer log"
         )
-    motion = smooth(model, measured, known, dt, half)
+    motion = smooth(model, measured, known, centre, dt, half)
     return Windows(model, measured, known, inputs, dt, half), motion, tuple(notes)
 
 

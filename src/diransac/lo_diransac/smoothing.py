@@ -23,7 +23,7 @@ from diransac.lo_diransac.mixture import lower_scale
 if TYPE_CHECKING:
     from diransac.model import Model
 
-__all__ = ["Motion", "choose_half_width", "smooth"]
+__all__ = ["Motion", "choose_half_width", "running_median", "smooth"]
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -56,16 +56,17 @@ def _chains(model: Model) -> list[list[int]]:
     return [[d] for d in range(n_q)] + [[n_q + d, n_q + n_v + d] for d in range(n_v)]
 
 
-def smooth(model: Model, measured: FloatArray, known: BoolArray, dt: float, half: int) -> Motion:
+def smooth(model: Model, measured: FloatArray, known: BoolArray, centre: FloatArray, dt: float, half: int) -> Motion:
     """Smoothed signals of all rows from what is known.
 
     Parameters
     ----------
     measured, known : (N, n_signals)   in the model's order
+    centre : (N, n_signals)   their `running_median`
     half : rows that a polynomial looks at to either side
     """
     N, n = measured.shape
-    centre, step = _running_median(measured, known), max(1, half // 2)
+    step = max(1, half // 2)
     rows, inside = _neighbourhoods(np.arange(0, N, step), half, N)
     offsets = np.arange(-half, half + 1)
     basis = _basis(offsets / half, half * dt)
@@ -82,14 +83,13 @@ def smooth(model: Model, measured: FloatArray, known: BoolArray, dt: float, half
     return Motion(signals, _spread(middle) + 1e-9, scale)
 
 
-def choose_half_width(model: Model, measured: FloatArray, known: BoolArray, dt: float) -> int:
+def choose_half_width(model: Model, measured: FloatArray, known: BoolArray, centre: FloatArray, dt: float) -> int:
     """The half width, of 25, 75, 225, ... rows, whose polynomials best foretell rows that they were not fitted to.
 
     A narrow window is noisy, a wide one is stiff; every other row is left out and predicted (cross-validation), and the
     error is a low quantile, so that outliers have no say.
     """
     N = len(measured)
-    centre = _running_median(measured, known)
     widths = [_NARROWEST * 3**k for k in range(20) if k == 0 or 8 * _NARROWEST * 3**k < N]
     losses = [_prediction_error(model, measured, known, centre, dt, half) for half in widths]
     return int(widths[int(np.argmin(losses))])
@@ -130,7 +130,7 @@ def _spread(values: FloatArray) -> FloatArray:
     return np.asarray(np.where(mad > _AT_REST * wide, mad, wide))
 
 
-def _running_median(measured: FloatArray, known: BoolArray) -> FloatArray:
+def running_median(measured: FloatArray, known: BoolArray) -> FloatArray:
     """Median over 31 rows, gaps bridged by straight lines; 0 for what is not measured."""
     rows, bridged = np.arange(len(measured)), np.zeros(measured.shape)
     for i in np.flatnonzero(known.any(axis=0)):
