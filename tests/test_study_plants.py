@@ -1,7 +1,10 @@
 """Plants of studies: those that come with the package, and those of users' files."""
 
 import json
+import os
 import re
+import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -93,6 +96,31 @@ def test_without_anything_given_a_plant_is_what_its_model_says_and_draws_its_pha
 
 # ---------------------------------------------------------------------- a user's own
 
+MEETING = """
+import threading
+
+both, met = threading.Barrier(2), []
+
+def meet():
+    try:
+        both.wait(0.1)
+    except threading.BrokenBarrierError:
+        both.reset()
+    else:
+        met.append("two threads ran users' code at once")
+"""
+MET_BY = """
+import meeting
+from sledges import model
+import diransac as dr
+
+meeting.meet()
+
+def plant(label: str = "a"):
+    meeting.meet()
+    return dr.Plant(model, {"mass": 1.0})
+"""
+
 
 def test_a_users_plant_takes_its_keys_and_its_file_may_import_its_neighbours(own):
     study = load(tiny(plant={"kind": "sledges.py:sledge", "pull": 2, "teeth": 4, "stiff": True}, data=SINES, **JUDGED))
@@ -109,6 +137,20 @@ def test_an_axis_may_lead_into_a_users_plant(own):
     study = load(tiny(plant={"kind": "sledges.py:sledge"}, data=SINES, axis=axis, **JUDGED))
     pulls = [study.at(level).plant.plant.disturbances[0].constants["pull"] for level in ("0", "5")]
     assert pulls == [0.0, 15.0]
+
+
+def test_threads_run_users_code_one_at_a_time_and_leave_the_process_as_it_was(own):
+    (own.parent / "meeting.py").write_text(MEETING)
+    (own.parent / "met.py").write_text(MET_BY)
+
+    def shared() -> tuple:
+        return os.fstat(1).st_ino, os.fstat(2).st_ino, list(sys.path), sys.dont_write_bytecode
+
+    before = shared()
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(PlantChoice.from_dict, [{"kind": "met.py", "label": label} for label in "ab"]))
+    assert sys.modules.pop("meeting").met == []
+    assert shared() == before
 
 
 def test_a_users_file_that_has_changed_is_another_study(own):

@@ -14,7 +14,11 @@ _STDOUT, _STDERR = 1, 2
 
 @contextmanager
 def silenced() -> Iterator[None]:
-    """Drop what is printed meanwhile, in whatever language; with ``--debug`` it goes to stderr."""
+    """Drop what is printed meanwhile, in whatever language; with ``--debug`` it goes to stderr.
+
+    By every thread of the process; two of them must not do so at a time: the later would put back what the earlier
+    had put there.
+    """
     _flush()
     kept = {channel: os.dup(channel) for channel in (_STDOUT, _STDERR) if _is_open(channel)}
     sink = os.dup(_STDERR) if "--debug" in sys.argv and _STDERR in kept else os.open(os.devnull, os.O_WRONLY)

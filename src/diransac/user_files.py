@@ -6,6 +6,7 @@ import contextlib
 import re
 import runpy
 import sys
+import threading
 import traceback
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,7 +14,10 @@ from pathlib import Path
 from diransac.errors import DiransacError, ModelError
 from diransac.silence import silenced
 
-__all__ = ["blaming", "definitions", "file_and_name"]
+__all__ = ["blaming", "definitions", "file_and_name", "running"]
+
+_ALONE = threading.RLock()
+"""Held while users' code runs, which may run more of it: threads share stdout, stderr and the module path."""
 
 _FILE = re.compile(r"(.+\.py)(?::(\w+))?")
 
@@ -36,8 +40,15 @@ def definitions(file: Path, what: str) -> Mapping[str, object]:
     """
     if not file.is_file():
         raise ModelError(f'{what} file "{file}" does not exist; give a built-in name or file.py[:name]')
-    with blaming(file, what), _importable(file.resolve().parent), silenced():
+    with running(file, what):
         return runpy.run_path(str(file), run_name=f"diransac_{what}_file")
+
+
+@contextlib.contextmanager
+def running(file: Path, what: str) -> Iterator[None]:
+    """A file's own code runs, one thread at a time: its neighbours can be imported, nothing is shown, errors name it."""
+    with _ALONE, blaming(file, what), _importable(file.resolve().parent), silenced():
+        yield
 
 
 @contextlib.contextmanager

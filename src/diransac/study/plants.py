@@ -14,11 +14,10 @@ from typing import Any
 from diransac.errors import DiransacError, ModelError, SettingsError
 from diransac.models import TABLE_I, builtin, extended_rotorcraft
 from diransac.plant import Plant
-from diransac.silence import silenced
 from diransac.study.arguments import ANY, given_arguments
 from diransac.study.tables import Reader
 from diransac.study.vehicles import double_pendulum, pendulum, servo_axis
-from diransac.user_files import blaming, definitions, file_and_name
+from diransac.user_files import definitions, file_and_name, running
 
 __all__ = ["PlantChoice"]
 
@@ -160,7 +159,7 @@ def _blamed(function: Callable[..., Any], file: Path, name: str) -> Callable[...
 
     @functools.wraps(function)  # the arguments of what is wrapped are those that a study may give
     def made(**arguments: Any) -> Plant:
-        with blaming(file, "plant"), silenced():
+        with running(file, "plant"):
             found = function(**arguments)
         if not isinstance(found, Plant):
             raise ModelError(f'plant file "{file}": "{name}" returns a {type(found).__name__}, not a diransac.Plant')
