@@ -43,6 +43,29 @@ trajectories = ["square"]
 path = "noise.outlier_magnitude"
 levels = [0, 40]
 """
+OWN_PLANT = """
+import diransac as dr
+
+model = dr.Model("sledge", {"s": "m"}, {"force": "N"}, {"M": dr.Parameter("kg", positive=True), "m": dr.Parameter("N s/m")},
+                 lambda q, v, a, u, p: [p.M * a.s + p.m * v.s - u.force])
+
+def plant(pull=0.0, M=1.0):
+    hook = dr.Disturbance(model, "hook", forces=lambda q, v, u, p, d: {"s": d.pull}, constants={"pull": pull})
+    return dr.Plant(model, {"M": M, "m": 0.5}, (hook,))
+"""
+"""A user's file, with parameters that differ in case alone."""
+
+OWN = {
+    "name": "own",
+    "trials": 2,
+    "plant": {"kind": "own.py"},
+    "data": {"trajectory": "sines", "duration": 2.0},
+    "methods": {"ols": {}},
+    "evaluation": {"trajectories": [], "parameters": True},
+    "axis": {"levels": {"calm": {}, "pulled": {"plant.pull": 2.0, "plant.M": 1.5}}},
+}
+"""A study of it."""
+
 MAY_DIFFER = ("seconds", "host")
 
 

@@ -15,7 +15,7 @@ import pytest
 import diransac as dr
 from diransac.study import about, export, load, paths, read, status
 from diransac.study.store import Store
-from studies import SECONDS, TINY, row, rows, tiny, write_rows
+from studies import OWN, OWN_PLANT, SECONDS, TINY, row, rows, tiny, write_rows
 
 STUDY = load(TINY)
 
@@ -76,6 +76,20 @@ def test_processes_that_write_at_once_lose_nothing_and_repeat_nothing(tmp_path: 
         worker.join()
     assert [worker.exitcode for worker in workers] == [0, 0]
     assert set(rows(store)) == {("0", trial, method) for trial in range(90) for method in ("ols", "true")}
+
+
+def test_parameters_that_differ_in_case_alone_are_kept_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text(OWN_PLANT)
+    values = {"parameter_M": 1.0, "parameter_m": 2.0, "best_M": 3.0, "best_m": 4.0}
+    with Store("a.db", load(OWN)) as kept:
+        kept.add([row("calm", **values)])
+    with Store("a.db", load(OWN)) as kept:
+        kept.add([row("calm", 1, **{name: 10 * value for name, value in values.items()})])
+    found = read("a.db").select(list(values))
+    assert found.rows(named=True) == [values, {name: 10 * value for name, value in values.items()}]
+    export("a.db", "a.csv", "csv")
+    assert pl.read_csv("a.csv").select(list(values)).equals(found)
 
 
 # One configuration ----------------------------------------------------------------------------------------------------

@@ -40,13 +40,13 @@ def read(store: str | Path) -> pl.DataFrame:
     import polars as pl
 
     with Store.existing(store) as kept:
-        columns = [(name, kind) for _, name, kind, *_ in kept.select("PRAGMA table_info(trials)") if name != "paths"]
-        names = ", ".join(f't."{name}"' for name, _ in columns)
+        columns = {name: column for name, column in kept.columns.items() if name != "paths"}
+        names = ", ".join(f't."{column}"' for column, _ in columns.values())
         rows = kept.select(
             f"SELECT {names} FROM trials t JOIN cells c USING (level, method) "
             "ORDER BY (SELECT min(rowid) FROM cells WHERE level = t.level), t.trial, c.rowid"
         )
-    frame = pl.DataFrame(rows, schema={name: _KINDS[kind] for name, kind in columns}, orient="row")
+    frame = pl.DataFrame(rows, schema={name: _KINDS[kind] for name, (_, kind) in columns.items()}, orient="row")
     stages = list(json.loads(frame["seconds"][0])) if len(frame) else []
     return frame.with_columns(pl.col("seconds").str.json_decode(pl.Struct(dict.fromkeys(stages, pl.Float64))))
 

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -33,6 +34,9 @@ _APPLICATION = 0x6469726E
 _FORMAT = 1
 _PATIENCE = 120.0
 """s to wait while another process writes."""
+
+_AGAIN = "~"
+"""Follows the name of a column that differs from another in case alone: to SQLite ``m`` and ``M`` are the same."""
 
 _MANY = 6
 """Differences that a refusal lists; it counts the others."""
@@ -92,9 +96,10 @@ class Store:
     def add(self, rows: Sequence[Mapping[str, Any]]) -> int:
         """Keep rows, in one transaction; those that another process kept meanwhile stay.  How many were new."""
         before = self._connection.total_changes
+        columns = {name: column for name, (column, _) in self.columns.items()}
         with _transaction(self._connection, self.path):
             for row in rows:
-                names = ", ".join(_quoted(name) for name in row)
+                names = ", ".join(_quoted(columns.get(name, name)) for name in row)
                 marks = ", ".join("?" * len(row))
                 values = [json.dumps(value) if isinstance(value, Mapping) else value for value in row.values()]
                 self._connection.execute(f"INSERT OR IGNORE INTO trials ({names}) VALUES ({marks})", values)
@@ -104,6 +109,12 @@ class Store:
         """What a query gives."""
         with _reported(self.path):
             return self._connection.execute(query, values).fetchall()
+
+    @property
+    def columns(self) -> dict[str, tuple[str, str]]:
+        """Column of each name in a row, and its SQL kind."""
+        found = self.select("PRAGMA table_info(trials)")
+        return {column.rstrip(_AGAIN): (column, kind) for _, column, kind, *_ in found}
 
     @property
     def about(self) -> dict[str, Any]:
@@ -201,7 +212,8 @@ def _check_format(connection: sqlite3.Connection, path: Path) -> None:
 
 def _create(connection: sqlite3.Connection, study: Study) -> None:
     """Tables of a new store."""
-    columns = ", ".join(f"{_quoted(name)} {kind}" for name, kind in _columns(study).items())
+    kinds = _columns(study)
+    columns = ", ".join(f"{_quoted(name)} {kind}" for name, kind in zip(_apart(kinds), kinds.values(), strict=True))
     for statement in (
         f"PRAGMA application_id = {_APPLICATION}",
         f"PRAGMA user_version = {_FORMAT}",
@@ -237,6 +249,14 @@ def _columns(study: Study) -> dict[str, str]:
         "seconds": "TEXT NOT NULL",
         "host": "TEXT NOT NULL",
     }
+
+
+def _apart(names: Iterable[str]) -> Iterator[str]:
+    """Names that SQLite takes for different ones, too."""
+    before = Counter[str]()
+    for name in names:
+        yield name + _AGAIN * before[name.lower()]
+        before[name.lower()] += 1
 
 
 def _quoted(name: str) -> str:
