@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
 from diransac import prepare
+from diransac.blas import single_threaded
 from diransac.consensus import Diransac, InlierBiasedDiransac, Score, Variant
 from diransac.diagnosis import Diagnosis
 from diransac.errors import DiransacError, IdentificationError, LogError, SettingsError
@@ -175,7 +175,7 @@ class _Task:
 
         judged = judged_signals(self.model, self.given, self.settings)
         observations = observe(self.model, self.given, judged, pointwise=not derivable)
-        with threadpool_limits(limits=1, user_api="blas"):  # its matrices are small: other cores would only wait
+        with single_threaded():  # its matrices are small: other cores would only wait
             findings = find(observations, int(self.seed))
         scoring = choose_scoring(observations, self.settings)
         diagnosis = self._diagnosis(observations, findings)

@@ -46,7 +46,7 @@ def definitions(file: Path, what: str) -> Mapping[str, object]:
 
 @contextlib.contextmanager
 def running(file: Path, what: str) -> Iterator[None]:
-    """A file's own code runs, one thread at a time: its neighbours can be imported, nothing is shown, errors name it."""
+    """A file's own code, one thread at a time: it can import its neighbours, nothing is shown, and errors name it."""
     with _ALONE, blaming(file, what), _importable(file.resolve().parent), silenced():
         yield
 

@@ -10,6 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from diransac.blas import single_threaded
 from diransac.controller import Controller, tvlqr
 from diransac.errors import DiransacError, PlanningError
 from diransac.flight import fly_all
@@ -75,11 +76,12 @@ def record_all(study: Study, level: str, trials: Sequence[int]) -> list[Recordin
     """
     seeds = [trial_seed(study, level, trial) for trial in trials]
     found: list[Recording | DiransacError] = []
-    for seed, flight in zip(seeds, _flights(study, seeds), strict=True):
-        try:
-            found.append(_recording(study, flight, seed))
-        except DiransacError as error:
-            found.append(error)
+    with single_threaded():  # in or out of a study's run, the same sums
+        for seed, flight in zip(seeds, _flights(study, seeds), strict=True):
+            try:
+                found.append(_recording(study, flight, seed))
+            except DiransacError as error:
+                found.append(error)
     return found
 
 

@@ -19,8 +19,8 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from diransac.blas import single_threaded
 from diransac.controller import Controller, tvlqr, tvlqr_all
 from diransac.errors import DiransacError, PlanningError
 from diransac.flight import tracking_error
@@ -59,7 +59,7 @@ def run_trials(study: str, level: str, trials: Sequence[int], methods: Sequence[
     """
     point = _point(study, level)
     cases = [_Case(point, trial, label) for trial in trials for label in methods]
-    with threadpool_limits(limits=1, user_api="blas"):  # every core is busy with trials already
+    with single_threaded():  # every core is busy with trials already
         point.record(cases)
         for case in cases:
             with case.attempt("identify"):
