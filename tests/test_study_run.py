@@ -196,6 +196,24 @@ def test_an_error_that_nobody_foresaw_ends_one_trial_and_says_what_it_was(
     assert all(row == whole[key] for key, row in found.items() if key[2] != "quick")
 
 
+@pytest.mark.parametrize("purpose", ["data flight", "square"])
+def test_a_flight_that_ends_in_an_error_that_nobody_foresaw_takes_no_other_with_it(
+    purpose: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    spec = tiny(plant={"kind": "extended-rotorcraft", "rotor_phase": "any"})
+    fly_all, struck = dr.fly_all, derived_seed(recording.trial_seed(load(spec), "40", 1), purpose)
+
+    def breaks(plants: list, controllers: list, **more: object) -> list:
+        if struck in more["seeds"]:
+            raise ZeroDivisionError("by accident")
+        return fly_all(plants, controllers, **more)
+
+    monkeypatch.setattr(recording, "fly_all", breaks)
+    found = run(tmp_path, spec, levels=[40], methods=["ols"], batch_size=2)
+    assert found["40", 0, "ols"]["status"] == "done"
+    assert found["40", 1, "ols"]["error"] == "internal error: ZeroDivisionError: by accident"
+
+
 def test_a_controller_that_cannot_be_takes_no_other_with_it(
     whole: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -12,7 +12,7 @@ from typing import Any
 
 from diransac.blas import single_threaded
 from diransac.controller import Controller, tvlqr
-from diransac.errors import DiransacError, PlanningError
+from diransac.errors import PlanningError
 from diransac.flight import fly_all
 from diransac.log import Log
 from diransac.noise import corrupt
@@ -56,17 +56,17 @@ def record(study: Study | Mapping[str, Any] | str | Path, level: str | float, tr
     level, trial : which
 
     Raises SettingsError: there is no such study or level.
-    Raises DiransacError: the trial has no data; it says why.
+    Raises DiransacError: the trial has no data; it says why. An error that nobody foresaw is raised as it is.
     """
     known = load(study)
     (point,) = known.axis.narrowed([str(level)]).levels
     (found,) = record_all(known.at(point.text), point.text, [trial])
-    if isinstance(found, DiransacError):
+    if isinstance(found, Exception):
         raise found
     return found
 
 
-def record_all(study: Study, level: str, trials: Sequence[int]) -> list[Recording | DiransacError]:
+def record_all(study: Study, level: str, trials: Sequence[int]) -> list[Recording | Exception]:
     """The data of each trial at a level, or why there are none.
 
     Parameters
@@ -75,12 +75,12 @@ def record_all(study: Study, level: str, trials: Sequence[int]) -> list[Recordin
     level : its text
     """
     seeds = [trial_seed(study, level, trial) for trial in trials]
-    found: list[Recording | DiransacError] = []
+    found: list[Recording | Exception] = []
     with single_threaded():  # in or out of a study's run, the same sums
         for seed, flight in zip(seeds, _flights(study, seeds), strict=True):
             try:
                 found.append(_recording(study, flight, seed))
-            except DiransacError as error:
+            except Exception as error:  # noqa: BLE001  its rows say what it was
                 found.append(error)
     return found
 
@@ -90,7 +90,7 @@ def trial_seed(study: Study, level: str, trial: int) -> int:
     return derived_seed(study.seed, level, trial)
 
 
-def _flights(study: Study, seeds: Sequence[int]) -> list[Log | DiransacError]:
+def _flights(study: Study, seeds: Sequence[int]) -> list[Log | Exception]:
     """The flight that is recorded in each trial, or why there is none; one serves all where nothing is drawn."""
     data, plant = study.data, study.plant.plant
     different = seeds if data.is_drawn or study.plant.is_drawn else seeds[:1]
@@ -99,24 +99,24 @@ def _flights(study: Study, seeds: Sequence[int]) -> list[Log | DiransacError]:
     steered = {k: one for k, one in enumerate(steering) if isinstance(one, Controller)}
     drawn = [derived_seed(different[k], "data flight") for k in steered]
     logs = iter(flown(plant, list(steered.values()), drawn, data.substeps))
-    found = [one if isinstance(one, DiransacError) else next(logs) for one in steering]
+    found = [one if isinstance(one, Exception) else next(logs) for one in steering]
     return found if len(found) == len(seeds) else found * len(seeds)
 
 
 @lru_cache(maxsize=64)
-def _steering(plant: str, data: str, seed: int) -> Controller | DiransacError:
+def _steering(plant: str, data: str, seed: int) -> Controller | Exception:
     """What steers the flight that is recorded, or why there is none; trials and levels with the same plan share it."""
     known, flight = PlantChoice.from_dict(json.loads(plant)).plant, Flight.from_dict(json.loads(data))
     try:
         return tvlqr(known, flight.planned(known, seed, time_limit=PATIENCE))
-    except DiransacError as error:
+    except Exception as error:  # noqa: BLE001  rows of every trial that needs it say what it was
         return error
 
 
 def flown(
     plant: Plant, controllers: Sequence[Controller], seeds: Sequence[int], least_substeps: int | None = None
-) -> list[Log]:
-    """A flight by each controller; those of one length are lanes of one simulation.
+) -> list[Log | Exception]:
+    """A flight by each controller, or why there is none; those of one length are lanes of one simulation.
 
     Parameters
     ----------
@@ -126,18 +126,29 @@ def flown(
     groups = defaultdict(list)
     for k, controller in enumerate(controllers):
         groups[len(controller)].append(k)
-    logs: dict[int, Log] = {}
+    logs: dict[int, Log | Exception] = {}
     for some in groups.values():
         steering, drawn = [controllers[k] for k in some], [seeds[k] for k in some]
         substeps = max(least_substeps, plant.substeps(steering[0].dt)) if least_substeps else None
-        found = fly_all([plant] * len(some), steering, substeps=substeps, seeds=drawn, threads=1)
-        logs |= zip(some, found, strict=True)
+        logs |= zip(some, _lanes(plant, steering, drawn, substeps), strict=True)
     return [logs[k] for k in range(len(controllers))]
 
 
-def _recording(study: Study, flight: Log | DiransacError, seed: int) -> Recording:
-    """The recording of a flight.  Raises DiransacError: there is no flight, or nothing can be made of it."""
-    if isinstance(flight, DiransacError):
+def _lanes(
+    plant: Plant, controllers: Sequence[Controller], seeds: Sequence[int], substeps: int | None
+) -> Sequence[Log | Exception]:
+    """Flights of one length: all in one simulation, or each on its own where one of them cannot be."""
+    try:
+        return fly_all([plant] * len(controllers), controllers, substeps=substeps, seeds=seeds, threads=1)
+    except Exception as error:  # noqa: BLE001  its row says what it was, and it ends no other flight
+        if len(controllers) == 1:
+            return [error]
+        return [_lanes(plant, [one], [seed], substeps)[0] for one, seed in zip(controllers, seeds, strict=True)]
+
+
+def _recording(study: Study, flight: Log | Exception, seed: int) -> Recording:
+    """The recording of a flight.  Raises whatever there is no flight for, or why nothing can be made of it."""
+    if isinstance(flight, Exception):
         raise flight
     check_ended(flight)
     plant = study.plant.plant

@@ -133,9 +133,9 @@ class _Case:
         known = isinstance(error, DiransacError)
         self.errors.append(str(error) if known else f"internal error: {type(error).__name__}: {error}")
 
-    def receive(self, recording: Recording | DiransacError) -> None:
+    def receive(self, recording: Recording | Exception) -> None:
         """Take the trial's data, or note why there are none."""
-        if isinstance(recording, DiransacError):
+        if isinstance(recording, Exception):
             self.fail(recording)
         else:
             self.log = recording.log
@@ -162,8 +162,10 @@ class _Case:
             }
         self.figures |= {f"parameter_{name}": value for name, value in self.found.parameters.items()}
 
-    def judge(self, shape: str, trajectory: Trajectory, log: Log) -> None:
-        """Note the tracking error of a flight.  Raises PlanningError: it diverged."""
+    def judge(self, shape: str, trajectory: Trajectory, log: Log | Exception) -> None:
+        """Note the tracking error of a flight.  Raises PlanningError: it diverged; or why there is no flight."""
+        if isinstance(log, Exception):
+            raise log
         try:
             check_ended(log)
         except PlanningError as error:
@@ -239,7 +241,7 @@ def _controllers(cases: Sequence[_Case], plans: dict[int, Trajectory]) -> dict[i
     plants = [case.found for case in cases if case.found is not None]
     try:
         steering = tvlqr_all(plants, [plans[id(case)] for case in cases], threads=1)
-    except DiransacError:
+    except Exception:  # noqa: BLE001  it is raised again, and noted, where it belongs
         return _controllers_alone(cases, plans)
     _share(cases, "steer", time.perf_counter() - begin)
     return {id(case): controller for case, controller in zip(cases, steering, strict=True)}
