@@ -138,7 +138,7 @@ def _by_scenario(
 
 def _error_rows(by_method: Sequence[Sequence[Record]]) -> Iterable[tuple[str, list[str]]]:
     yield "", [_spread([100.0 * one.worst for one in some]) for some in by_method]
-    if any(one.mean_effect for some in by_method for one in some):
+    if any(one.differs for some in by_method for one in some):
         yield ", against the truth", [_spread([100.0 * one.worst_of_truth for one in some]) for some in by_method]
 
 

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,12 @@ import diransac as dr
 from diransac.simulate import rollouts
 from diransac.study import Study, record
 from diransac.study.flights import MISSIONS
-from diransac.study.recording import record_all
+from diransac.study.judging import differ, hold, is_disturbed, relative_errors
+from diransac.study.recording import PATIENCE, record_all, trial_seed
+from diransac.study.seeds import derived_seed
 
 Array = np.ndarray[Any, Any]
 ErrorsByName = Mapping[str, float]
-_ROUNDING, _VISIBLE = 1e-6, 2e-3
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Record:
     errors : by parameter, relative to the best parameters that the model can reach; empty where there is no estimate
     errors_of_truth : relative to the plant's own parameters
     covered : by parameter, whether its 95 % interval holds the best one; empty without finite intervals
+    differs : whether the best parameters are not the plant's own
     tracking, tracking_of_truth : RMS distance from the mission, m, flown by what was identified and by the truth;
         infinite where there is no plan or the flight diverges, NaN where none is flown
     mismatch : whether the plant has more to it than the model
@@ -54,17 +55,13 @@ class Record:
     errors: ErrorsByName
     errors_of_truth: ErrorsByName
     covered: Mapping[str, bool]
+    differs: bool
     tracking: float
     tracking_of_truth: float
     mismatch: bool
     bound: ErrorsByName
     seconds: float
     refusal: str = ""
-
-    @property
-    def mean_effect(self) -> bool:
-        """Whether what the model does not know has a mean, so that the best parameters are not the plant's own."""
-        return any(abs(x - self.errors_of_truth[name]) > _VISIBLE * (1.0 + x) for name, x in self.errors.items())
 
     @property
     def worst(self) -> float:
@@ -83,18 +80,17 @@ def run(trial: Trial, methods: Sequence[str], *, fly: bool = True) -> list[Recor
     at = study.at(trial.scenario)
     plant, data = at.plant.plant, record(study, trial.scenario, trial.seed)
     bound = cramer_rao(*_as_the_model_says(study, trial), at.noise) if _is_gaussian(at.noise) else {}
+    differs = any(differ(x, plant.parameters[name]) for name, x in data.best.items())
+    of_truth = _flown(at, trial, plant.parameters) if fly else np.nan
     records = []
     for method in methods:
         estimate, seconds, refusal = _estimated(method, plant.model, data.log)
         found = estimate.parameters if estimate else {}
-        flown = (np.nan, np.nan)
-        if fly and study.evaluation:
-            true = _tracking_of_truth(trial.vehicle, trial.scenario, trial.seed)
-            flown = (tracking(study.evaluation[0], plant, found, trial.seed), true)
+        flown = (_flown(at, trial, found) if fly else np.nan), of_truth
         records.append(
             Record(
                 trial, method, relative(found, data.best), relative(found, plant.parameters),
-                _covered(estimate, data.best), *flown, at.plant != study.plant, bound, seconds, refusal,
+                _covered(estimate, data.best), differs, *flown, is_disturbed(plant), bound, seconds, refusal,
             )
         )  # fmt: skip
     return records
@@ -113,19 +109,16 @@ def _estimated(method: str, model: dr.Model, log: dr.Log) -> tuple[Estimate | No
 
 
 def relative(found: ErrorsByName, reference: ErrorsByName) -> dict[str, float]:
-    """``|found / reference - 1|`` by name."""
-    return {name: abs(x / reference[name] - 1.0) for name, x in found.items()}
+    """``|found / reference - 1|`` by name, of what is not 0."""
+    errors = {name: float(relative_errors(x, reference[name])) for name, x in found.items()}
+    return {name: error for name, error in errors.items() if not np.isnan(error)}
 
 
 def _covered(estimate: Estimate | None, best: ErrorsByName) -> dict[str, bool]:
-    """Whether each interval holds the best parameter, to a millionth: where nothing is wrong, intervals are points."""
+    """Whether each finite interval holds the best parameter."""
     intervals = (estimate.intervals or {}) if estimate else {}
-    slack = {n: _ROUNDING * abs(x) for n, x in best.items()}
-    return {
-        n: low - slack[n] <= best[n] <= high + slack[n]
-        for n, (low, high) in intervals.items()
-        if np.isfinite(high - low)
-    }
+    holds = {name: float(hold(low, high, best[name])) for name, (low, high) in intervals.items()}
+    return {name: bool(one) for name, one in holds.items() if not np.isnan(one)}
 
 
 def tracking(mission: str, plant: dr.Plant, parameters: ErrorsByName, seed: int) -> float:
@@ -134,7 +127,7 @@ def tracking(mission: str, plant: dr.Plant, parameters: ErrorsByName, seed: int)
         return np.inf
     try:
         known = dr.Plant(plant.model, parameters)
-        trajectory = MISSIONS[mission](known, time_limit=5.0)
+        trajectory = MISSIONS[mission](known, time_limit=PATIENCE)
         log = dr.fly(plant, trajectory, dr.tvlqr(known, trajectory), seed=seed)
     except dr.DiransacError:
         return np.inf
@@ -142,10 +135,12 @@ def tracking(mission: str, plant: dr.Plant, parameters: ErrorsByName, seed: int)
     return float(np.hypot(errors["x"], errors["z"]))
 
 
-@cache
-def _tracking_of_truth(vehicle: str, scenario: str, seed: int) -> float:
-    at = study_of(vehicle).at(scenario)
-    return tracking(at.evaluation[0], at.plant.plant, at.plant.plant.parameters, seed)
+def _flown(at: Study, trial: Trial, parameters: ErrorsByName) -> float:
+    """`tracking` of the mission as the study flies it in this trial; NaN where it flies none."""
+    if not at.evaluation:
+        return np.nan
+    mission, seed = at.evaluation[0], trial_seed(at, trial.scenario, trial.seed)
+    return tracking(mission, at.plant.plant, parameters, derived_seed(seed, mission))
 
 
 def _is_gaussian(noise: dr.Noise) -> bool:

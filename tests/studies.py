@@ -46,7 +46,8 @@ levels = [0, 40]
 OWN_PLANT = """
 import diransac as dr
 
-model = dr.Model("sledge", {"s": "m"}, {"force": "N"}, {"M": dr.Parameter("kg", positive=True), "m": dr.Parameter("N s/m")},
+parameters = {"M": dr.Parameter("kg", positive=True), "m": dr.Parameter("N s/m")}
+model = dr.Model("sledge", {"s": "m"}, {"force": "N"}, parameters,
                  lambda q, v, a, u, p: [p.M * a.s + p.m * v.s - u.force])
 
 def plant(pull=0.0, M=1.0):

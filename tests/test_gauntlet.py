@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 import diransac as dr
+from diransac.study.store import Store
+from diransac.study.trials import run_trials
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 WORST = {"servo-axis": "cogging", "double-pendulum": "ripple", "pendulum": "ripple"}
@@ -121,6 +123,35 @@ def test_a_log_is_that_of_the_study():
     assert not found.mismatch
 
 
+@pytest.mark.parametrize(
+    ("vehicle", "level", "flown"), [("rotorcraft", "aerodynamic (physical)", ["square"]), ("servo-axis", "cogging", [])]
+)
+def test_the_benchmark_judges_and_flies_what_the_study_does(vehicle, level, flown, tmp_path):
+    study = studies.study_of(vehicle).narrowed(trials=1, levels=[level], methods=["ols", "tls"])
+    with Store(tmp_path / "a.db", study) as kept:
+        rows = run_trials(json.dumps(study.to_dict()), level, [0], list(study.methods))
+        kept.add(rows)
+    found = dr.study.summarise(tmp_path / "a.db").estimates
+    records = judging.run(judging.Trial(vehicle, "drawn", level, 0), study.methods)
+    for k, (one, row) in enumerate(zip(records, rows, strict=True)):
+        for name, error in one.errors.items():
+            of_study = (found.errors[name], found.errors_of_own[name], found.covered[name])
+            assert (error, one.errors_of_truth[name], one.covered[name]) == tuple(x[0, k, 0] for x in of_study)
+        assert [one.differs, one.mismatch] == [found.differs[0], found.disturbed[0]]
+        assert [one.tracking] * len(flown) == [np.hypot(row[f"{shape}_x"], row[f"{shape}_z"]) for shape in flown]
+
+
+def test_what_has_no_estimate_differs_from_the_truth_like_the_others(monkeypatch):
+    def refuse(model, log):
+        raise ValueError("no")
+
+    monkeypatch.setitem(judging.METHODS, "refuses", refuse)
+    trial = judging.Trial("rotorcraft", "drawn", "aerodynamic (physical)", 0)
+    refused, other = judging.run(trial, ["refuses", "ols"], fly=False)
+    assert refused.differs
+    assert other.differs
+
+
 def test_a_star_is_flown_where_it_is_asked_for(monkeypatch):
     monkeypatch.setitem(judging.METHODS, "length", lambda model, log: methods.Estimate({"mass": len(log) * 0.249}))
     (found,) = judging.run(judging.Trial("rotorcraft", "star", "clean", 0), ["length"], fly=False)
@@ -155,7 +186,13 @@ def test_processes_find_what_one_process_finds_and_in_order():
 def record(worst, **changes):
     trial = judging.Trial("servo-axis", "drawn", "cogging", 0)
     errors = {"mass": worst} if np.isfinite(worst) else {}
-    values = {"covered": {"mass": True}, "tracking": np.nan, "tracking_of_truth": np.nan, "mismatch": True}
+    values = {
+        "covered": {"mass": True},
+        "differs": False,
+        "tracking": np.nan,
+        "tracking_of_truth": np.nan,
+        "mismatch": True,
+    }
     return judging.Record(trial, "ols", errors, errors, **{**values, "bound": {}, "seconds": 1.0, **changes})
 
 

@@ -1,4 +1,4 @@
-"""What estimates are judged against: the best parameters that a model can reach in a flight.
+"""How estimates are judged: against the best parameters that a model can reach in a flight.
 
 They are not the plant's own. An excess of thrust in proportion to the thrust, as aerodynamic imbalance has it, *is* a
 smaller mass to a model that knows no excess; a method that finds the smaller mass has found what there is to be found.
@@ -17,9 +17,16 @@ from diransac.nonlinear import NonlinearLeastSquares
 from diransac.observations import observe
 from diransac.plant import DisturbedModel, Plant
 
-__all__ = ["best_parameters", "mean_accelerations"]
+__all__ = ["best_parameters", "differ", "hold", "is_disturbed", "mean_accelerations", "relative_errors"]
 
 Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+_ROUNDING = 1e-6
+"""Of a parameter: by so little an interval may miss it. Where nothing is wrong, intervals are points."""
+
+_VISIBLE = 2e-3
+"""Of a parameter: best ones that differ by less from the plant's own are taken for the same."""
 
 _N_PHASES = 8
 """Phases that a vibration is averaged over: harmonics up to the seventh vanish exactly."""
@@ -74,6 +81,35 @@ def mean_accelerations(plant: Plant, log: Log) -> Floats:
         _, accelerations = evaluate(np.hstack([x, np.full((len(x), n_own), phase)]), u, plant.constants)
         total += accelerations
     return total / _N_PHASES
+
+
+def relative_errors(found: npt.ArrayLike, reference: npt.ArrayLike) -> Floats:
+    """``|found / reference - 1|``: infinite where nothing was found, NaN where the reference is not known, or 0."""
+    x, p = np.broadcast_arrays(np.asarray(found, dtype=float), np.asarray(reference, dtype=float))
+    judged = ~np.isnan(p) & (p != 0.0)
+    ratio = np.divide(x, p, out=np.full(x.shape, np.nan), where=judged)
+    return np.where(judged, np.nan_to_num(np.abs(ratio - 1.0), nan=np.inf, posinf=np.inf), np.nan)
+
+
+def hold(low: npt.ArrayLike, high: npt.ArrayLike, best: npt.ArrayLike) -> Floats:
+    """1 where intervals hold the best parameter, to a millionth; 0 where not, NaN where one of the three is not known.
+
+    An end that is infinite is not known.
+    """
+    a, b, p = (np.asarray(one, dtype=float) for one in (low, high, best))
+    slack = _ROUNDING * np.abs(p)
+    known = np.isfinite(a) & np.isfinite(b) & np.isfinite(p)
+    return np.where(known, (a - slack <= p) & (p <= b + slack), np.nan)
+
+
+def differ(best: npt.ArrayLike, own: npt.ArrayLike) -> Bools:
+    """Whether best parameters are others than the plant's own: by more than 0.2 %."""
+    return relative_errors(best, own) > _VISIBLE
+
+
+def is_disturbed(plant: Plant) -> bool:
+    """Whether something acts on a plant that its model leaves out: a disturbance whose constants aren't all zero."""
+    return any(not one.constants or any(one.constants.values()) for one in plant.disturbances)
 
 
 def _is_phase(state: str) -> bool:

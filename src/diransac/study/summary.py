@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from diransac.errors import StudyError
 from diransac.plant import Plant
+from diransac.study.judging import differ, hold, is_disturbed, relative_errors
 from diransac.study.plants import PlantChoice
 from diransac.study.reading import read
 from diransac.study.store import Store
@@ -31,12 +32,6 @@ __all__ = ["Estimates", "Flights", "Summary", "summarise"]
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 _Statistic = Callable[[Floats], np.floating]
-
-_ROUNDING = 1e-6
-"""Of a parameter: by so little an interval may miss it. Where nothing is wrong, intervals are points."""
-
-_VISIBLE = 2e-3
-"""Of a parameter: best ones that differ by less from the plant's own are taken for the same."""
 
 
 @dataclass(frozen=True)
@@ -251,28 +246,16 @@ def _estimates(table: _Table, plants: Sequence[Plant]) -> Estimates:
         found, best, low, high = (table.column(f"{what}_{name}") for what in ("parameter", "best", "low", "high"))
         own = np.broadcast_to(np.array([plant.parameters[name] for plant in plants])[:, None, None], best.shape)
         judged = ~np.isnan(best) & (own != 0.0)
-        errors[name], errors_of_own[name] = (_relative(found, reference, judged) for reference in (best, own))
-        slack = _ROUNDING * np.abs(best)
-        holds = (low - slack <= best) & (best <= high + slack)
-        covered[name] = np.where(np.isnan(best + low + high), np.nan, holds)
-        differs |= (_relative(best, own, judged) > _VISIBLE).any(axis=(1, 2))
-    return Estimates(errors, errors_of_own, covered, differs, np.array([_is_disturbed(plant) for plant in plants]))
-
-
-def _relative(found: Floats, reference: Floats, judged: Bools) -> Floats:
-    """``|found / reference - 1|`` of what is judged, infinite without a number; NaN of the rest."""
-    ratio = np.divide(found, reference, out=np.full(found.shape, np.nan), where=judged)
-    return np.where(judged, np.nan_to_num(np.abs(ratio - 1.0), nan=np.inf, posinf=np.inf), np.nan)
+        errors[name] = relative_errors(found, np.where(judged, best, np.nan))
+        errors_of_own[name] = relative_errors(found, np.where(judged, own, np.nan))
+        covered[name] = hold(low, high, best)
+        differs |= (judged & differ(best, own)).any(axis=(1, 2))
+    return Estimates(errors, errors_of_own, covered, differs, np.array([is_disturbed(plant) for plant in plants]))
 
 
 def _largest(errors: Mapping[str, Floats]) -> Floats:
     """The largest of errors by name; NaN where all are."""
     return np.asarray(np.fmax.reduce(list(errors.values())))
-
-
-def _is_disturbed(plant: Plant) -> bool:
-    """Whether something acts on it: a disturbance whose constants aren't all zero."""
-    return any(not one.constants or any(one.constants.values()) for one in plant.disturbances)
 
 
 def _over_trials(values: Floats, counted: Bools, statistic: _Statistic) -> Floats:
