@@ -116,12 +116,13 @@ def test_other_constants_need_no_new_compilation():
     assert accelerations(blown(2.0), np.zeros(4))[0] == 2.0 * accelerations(blown(1.0), np.zeros(4))[0] == 1.0
 
 
-def test_a_start_in_a_range_is_drawn_with_the_seed():
+@pytest.mark.parametrize("bounds", [tuple, list, np.array])
+def test_a_start_in_a_range_is_drawn_with_the_seed(bounds):
     plant = pushed(
         forces=lambda q, v, u, p, d: {"x": ca.cos(d.phase)},
         states={"phase": "rad", "fixed": "rad"},
         rates=lambda q, v, u, p, d: {"phase": 1.0, "fixed": 0.0},
-        start={"phase": (0.0, 2.0 * pi), "fixed": 0.5},
+        start={"phase": bounds((0.0, 2.0 * pi)), "fixed": 0.5},
     )
     starts = np.array([plant.initial_state(np.ones(4), seed) for seed in range(200)])
     np.testing.assert_array_equal(starts[3], plant.initial_state(np.ones(4), 3))
@@ -173,6 +174,9 @@ def test_a_disturbed_plant_goes_through_a_pickle():
     np.testing.assert_array_equal(accelerations(again, x), accelerations(plant, x))
 
 
+STATE = {"states": {"s": "m"}, "rates": lambda *_: {"s": 0.0}}
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -183,6 +187,8 @@ def test_a_disturbed_plant_goes_through_a_pickle():
         ({"states": {"s": "m"}}, "states and rates need each other"),
         ({"rates": lambda *_: {}}, "states and rates need each other"),
         ({"start": {"s": 1.0}}, 'start names "s"; states are none'),
+        ({**STATE, "start": {"s": [1.0, 2.0, 3.0]}}, r"s is \(1.0, 2.0, 3.0\); give a finite number"),
+        ({**STATE, "start": {"s": [2, 1]}}, r"s is \(2, 1\); give the low end of a range first"),
         ({"constants": {"t": 1.0}}, "a name is used twice"),
         ({"constants": {"k": np.inf}}, "k is inf; give a finite number"),
         ({"highest_frequency": -1.0}, "highest_frequency is -1"),

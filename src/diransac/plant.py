@@ -56,7 +56,8 @@ class Disturbance:
     constants : name -> value, read as ``d.name``; another value needs no new compilation
     states : name -> unit, of states of its own (the phase of a rotor), read as ``d.name``
     rates : ``rates(q, v, u, p, d)`` returns the derivative of each state by name
-    start : name -> initial value of a state, or (low, high) to draw it from with a flight's seed; 0 where not named
+    start : name -> initial value of a state, or two, low and high, to draw it from with a flight's seed; 0 where not
+        named
     highest_frequency : Hz, of the fastest thing in it; a flight takes at least 8 integration steps in its period
 
     ``d.t`` is the time since the simulation's start, s. Mathematics is CasADi's.
@@ -75,12 +76,12 @@ class Disturbance:
         constants: Mapping[str, float] | None = None,
         states: Mapping[str, str] | None = None,
         rates: Effect | None = None,
-        start: Mapping[str, float | tuple[float, float]] | None = None,
+        start: Mapping[str, float | Sequence[float]] | None = None,
         highest_frequency: float = 0.0,
     ) -> None:
         self.model, self.name = model, name
         self.constants, self.states = dict(constants or {}), dict(states or {})
-        self.start: dict[str, float | tuple[float, float]] = {**dict.fromkeys(self.states, 0.0), **(start or {})}
+        self.start = {**dict.fromkeys(self.states, 0.0), **{n: _as_start(value) for n, value in (start or {}).items()}}
         self.highest_frequency = float(highest_frequency)
         self._check(rates is not None)
         sizes = {"q": model.n_q, "v": model.n_v, "u": model.n_u, "p": model.n_p, "d": len(self._own)}
@@ -121,8 +122,11 @@ class Disturbance:
             )
         numbers = {**self.constants, **self.start, "highest_frequency": self.highest_frequency}
         for name, value in numbers.items():
-            if not np.isfinite(value).all() or np.size(value) not in ((1, 2) if name in self.start else (1,)):
+            is_range = name in self.start and isinstance(value, tuple)
+            if np.size(value) != (2 if is_range else 1) or not np.isfinite(value).all():
                 raise ModelError(f"{self._label}: {name} is {value!r}; give a finite number")
+            if is_range and value[0] > value[1]:
+                raise ModelError(f"{self._label}: {name} is {value!r}; give the low end of a range first")
         if self.highest_frequency < 0:
             raise ModelError(f"{self._label}: highest_frequency is {self.highest_frequency}; give Hz, 0 or more")
 
@@ -154,6 +158,11 @@ class Disturbance:
 
     def __repr__(self) -> str:
         return f"Disturbance({self.name!r} of {self.model.name!r}, constants={self.constants})"
+
+
+def _as_start(value: Any) -> Any:
+    """A number itself, a range of whatever sequence as a pair."""
+    return tuple(value) if isinstance(value, Sequence | np.ndarray) else value
 
 
 def _restored(kept: Mapping[str, Any], effect: str) -> Disturbance:
