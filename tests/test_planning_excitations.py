@@ -147,7 +147,8 @@ def test_sines_are_refused_where_inputs_cannot_push_every_coordinate(plant):
     [
         ({"speed": 0.0}, "speed is 0.0; give a finite number above 0"),
         ({"reach": -1.0}, "reach is -1.0"),
-        ({"duration": np.inf}, "duration is inf"),
+        ({"duration": np.inf}, "duration is inf; give 0.01 to 3600 s"),
+        ({"seed": -1}, "seed is -1; give a whole number of at least 0"),
         ({"duration": 1.0, "seed": 1}, "first place is 1.* s away at 1.6 m/s, and the flight lasts 1 s; give more"),
         ({"reach": 0.5}, "within a reach of 0.5 m are too near for a speed of 1.6 m/s.*give a reach of 1.6 m or more"),
     ],
@@ -162,6 +163,17 @@ def test_random_places_are_refused_where_there_is_no_plane():
         dr.places(mass())
 
 
-def test_sines_of_no_size_are_refused():
-    with pytest.raises(dr.SettingsError, match="amplitude is 0; give a finite number above 0"):
-        dr.sines(mass(), amplitude=0)
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"amplitude": 0}, "amplitude is 0; give a finite number above 0"),
+        ({"seed": -1}, "seed is -1; give a whole number of at least 0"),
+        ({"seed": 1.5}, "seed is 1.5; give a whole number"),
+        ({"duration": 1e308}, "duration is 1e\\+308; give 0.01 to 3600 s"),
+        ({"duration": 3600.1}, "duration is 3600.1; give"),
+        ({"duration": 1e-9}, "duration is 1e-09; give"),
+    ],
+)
+def test_sines_that_make_no_sense_are_refused(wrong, message):
+    with pytest.raises(dr.SettingsError, match=message):
+        dr.sines(mass(), **wrong)

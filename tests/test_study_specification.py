@@ -207,6 +207,7 @@ def test_what_people_call_things_and_how_many_there_are_decide_nothing():
         ({"data": {"trajectory": "places", "speed": "fast"}}, "data.speed is 'fast'; give a number"),
         ({"data": {"trajectory": "places", "speed": [1, 2]}}, r"data.speed is \[1, 2\]; give a number"),
         ({"data": {"trajectory": "places", "speed": -2}}, "data.speed is -2; give a number above 0"),
+        ({"data": {"trajectory": "places", "duration": 1e12}}, r"data.duration is 1e\+12; give 3600 s or less"),
         ({"data": {"trajectory": "places", "seed": 1.5}}, "data.seed is 1.5; give a whole number from 0"),
         ({"data": {"trajectory": "places", "reach": "any"}}, "data.reach is 'any'; give a number"),
         ({"data.substeps": 0}, "data.substeps is 0; give a whole number of at least 1"),

@@ -26,7 +26,10 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-__all__ = ["check_fully_actuated", "places", "sines"]
+__all__ = ["LONGEST", "check_fully_actuated", "places", "sines"]
+
+LONGEST = 3600.0
+"""s: 360 000 rows; a longer flight is a slip of the pen, and would only fill the memory."""
 
 SHORTEST_LEG = 1.0
 """s: from rest, a rotorcraft must turn before it moves sideways."""
@@ -53,21 +56,21 @@ def places(
     Parameters
     ----------
     plant : with coordinates x and z, m
-    seed : of the places, which are uniform in a square
+    seed : of the places, which are uniform in a square; 0 or more
     speed : mean speed along the straight way from each place to the next, m/s
     reach : half a side of that square, m
-    duration : s; the flight ends at the last place that is reached before
+    duration : s, an hour at most; the flight ends at the last place that is reached before
     input_limits, options : as those of `square`
 
     The plan's inputs are smoothed over 0.1 s, so that they move in every row; the states are still the plan's, from
     which the paper's rotorcraft strays by less than a millimetre under feedback. A place less than 1 s away is passed
     over: it could hardly be reached from rest.
 
-    Raises SettingsError: a model without coordinates x and z, a number that isn't above 0, places too near or too far.
+    Raises SettingsError: a model without coordinates x and z, a number out of its range, places too near or too far.
     Raises PlanningError: no such trajectory; it says why.
     """
     check_plane(plant.model)
-    _check_positive(speed=speed, reach=reach, duration=duration)
+    _check(seed, duration, speed=speed, reach=reach)
     way, times = _random_way(seed, speed, reach, duration)
     planned = through(plant, way, times, input_limits, options)
     return replace(planned, inputs=uniform_filter1d(planned.inputs, SMOOTHED_ROWS, axis=0, mode="nearest"))
@@ -106,22 +109,22 @@ def sines(
     Parameters
     ----------
     plant : fully actuated: as many inputs as coordinates, which the inputs can push at will
-    seed : of frequencies, sizes and phases, which are uniform
+    seed : of frequencies, sizes and phases, which are uniform; 0 or more
     amplitude : each sine's is 0.2 to 0.6 of it, each coordinate's unit; together they come to about 0.66 of it, RMS
     frequency : Hz; each sine's is 0.2 to 1.0 of it
-    duration : s
+    duration : s, an hour at most
 
     Nothing is searched for, and no limit is kept to. The flight starts in motion. An input, held from row to row, is
     that of the moment between them.
 
-    Raises SettingsError: a model that is not fully actuated, or a number that isn't above 0.
+    Raises SettingsError: a model that is not fully actuated, or a number out of its range.
 
     References: Swevers et al. 1997, "Optimal robot excitation and identification", IEEE Trans. Robotics and Automation
     13(5), for sums of sines; theirs are optimised, these are drawn.
     """
     model = plant.model
     inverse_dynamics = _inverse_dynamics(model)
-    _check_positive(amplitude=amplitude, frequency=frequency, duration=duration)
+    _check(seed, duration, amplitude=amplitude, frequency=frequency)
     rng = np.random.default_rng(seed)
     time = np.arange(round(duration / TIME_STEP) + 1, dtype=np.float64) * TIME_STEP
     shape = (SINES, model.n_q, 1)
@@ -157,8 +160,12 @@ def _inverse_dynamics(model: Model) -> ca.Function:
     return ca.Function("inverse_dynamics", [q, v, a, p], [inputs])
 
 
-def _check_positive(**values: float) -> None:
-    """Raises SettingsError: a value isn't a finite number above 0."""
+def _check(seed: object, duration: float, **values: float) -> None:
+    """Raises SettingsError: no seed, no duration from a row to an hour, or a value that isn't finite and above 0."""
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise SettingsError(f"seed is {seed!r:.60}; give a whole number of at least 0")
+    if not TIME_STEP <= duration <= LONGEST:
+        raise SettingsError(f"duration is {duration!r:.60}; give {TIME_STEP:g} to {LONGEST:g} s")
     for name, value in values.items():
         if not 0.0 < value < np.inf:
-            raise SettingsError(f"{name} is {value!r}; give a finite number above 0")
+            raise SettingsError(f"{name} is {value!r:.60}; give a finite number above 0")

@@ -9,7 +9,7 @@ from typing import Any
 from diransac.errors import SettingsError
 from diransac.model import Model
 from diransac.planning import places, sine, sines, square, star
-from diransac.planning.excitations import check_fully_actuated
+from diransac.planning.excitations import LONGEST, check_fully_actuated
 from diransac.planning.flights import check_plane
 from diransac.plant import ModelWithParameters
 from diransac.study.arguments import ANY, given_arguments, takes_options
@@ -40,7 +40,7 @@ class Flight:
     arguments : keyword arguments of that function by name, as TOML has them; the seed may be the word ``any``
     substeps : integration steps from row to row, at least; None: as many as the plant itself asks for
 
-    Raises SettingsError: an argument that isn't above 0.
+    Raises SettingsError: an argument that isn't above 0, or a flight of more than an hour.
     """
 
     trajectory: str
@@ -51,6 +51,8 @@ class Flight:
         for name, value in self.arguments.items():
             if name != "seed" and is_number(value) and value <= 0:
                 raise SettingsError(f"data.{name} is {value:g}; give a number above 0")
+            if name == "duration" and value > LONGEST:
+                raise SettingsError(f"data.duration is {value:g}; give {LONGEST:g} s or less")
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Flight:
