@@ -2,6 +2,8 @@
 
 import multiprocessing
 import os
+import platform
+import re
 import signal
 import subprocess
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -350,6 +352,27 @@ def test_a_batch_that_is_lost_again_and_again_ends_the_run_and_keeps_the_rest(tm
     ):
         run(tmp_path, executor=pool)
     assert status(tmp_path / "a.db").missing == 12
+
+
+def test_a_worker_without_the_users_file_ends_the_run_at_once_and_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    file, handed_out = tmp_path / "own.py", []
+    file.write_text(
+        "import diransac as dr\ndef plant(): return dr.Plant(dr.models.planar_rotorcraft(), dr.models.TABLE_I)"
+    )
+    monkeypatch.chdir(tmp_path)
+
+    class Elsewhere(ThreadPoolExecutor):
+        def submit(self, function: object, *arguments: object) -> Future:
+            file.unlink(missing_ok=True)
+            handed_out.append(arguments)
+            return super().submit(function, *arguments)
+
+    message = rf'a worker on {re.escape(platform.node())} cannot run .* "own.py" cannot be read: .*; all that is done is kept$'
+    with Elsewhere(1) as pool, pytest.raises(dr.StudyError, match=message):
+        run(tmp_path, tiny(plant={"kind": "own.py"}), executor=pool, tasks=1)
+    assert len(handed_out) == 1
 
 
 def test_processes_give_the_same_rows_though_one_of_them_is_killed(whole: dict, tmp_path: Path):

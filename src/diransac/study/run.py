@@ -66,7 +66,8 @@ def run_study(
     Returns how far the store is.
 
     Raises SettingsError: an argument or the study has no meaning. StudyError: the store was made by another
-    configuration, or workers are lost again and again. KeyboardInterrupt: what is done is kept.
+    configuration, workers are lost again and again, or one of them lacks the file of the study's plant.
+    KeyboardInterrupt: what is done is kept.
     """
     study = load(spec).narrowed(trials, levels, methods)
     if batch_size < 1:
@@ -117,7 +118,7 @@ class _Work:
         self._note(())
 
     def run(self, workers: Workers) -> None:
-        """Run all.  Raises StudyError: a batch is lost again and again."""
+        """Run all.  Raises StudyError: a batch is lost again and again, or a worker cannot run the study."""
         while self._waiting or self._running:
             while self._waiting and len(self._running) < workers.tasks:
                 self._hand_out(workers, self._waiting.popleft())
@@ -140,6 +141,8 @@ class _Work:
             self._store.add(future.result())
             self._note(batch.rows)
             return
+        if isinstance(error, StudyError):  # the worker lives, and would fail again, each time at once
+            raise StudyError(f"{error}; all that is done is kept") from error
         if batch.attempts + 1 == _ATTEMPTS:
             which = ", ".join(map(str, batch.trials))
             guard = "" if not isinstance(error, BrokenExecutor) else ' (in a script, under if __name__ == "__main__":)'

@@ -22,7 +22,7 @@ import numpy as np
 
 from diransac.blas import single_threaded
 from diransac.controller import Controller, tvlqr, tvlqr_all
-from diransac.errors import DiransacError, PlanningError
+from diransac.errors import DiransacError, PlanningError, StudyError
 from diransac.flight import tracking_error
 from diransac.identification import identify
 from diransac.log import Log
@@ -56,8 +56,13 @@ def run_trials(study: str, level: str, trials: Sequence[int], methods: Sequence[
 
     Nothing is raised for a trial that fails: its row says why.  Rows are as the store has them, by column; what isn't
     known is None.  Everything in them is plain, so that they may come from another process or machine.
+
+    Raises StudyError: this machine cannot run the study at all, such as without the file of its plant.
     """
-    point = _point(study, level)
+    try:
+        point = _point(study, level)
+    except DiransacError as error:
+        raise StudyError(f"a worker on {platform.node()} cannot run the study: {error}") from error
     cases = [_Case(point, trial, label) for trial in trials for label in methods]
     with single_threaded():  # every core is busy with trials already
         point.record(cases)
