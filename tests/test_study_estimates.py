@@ -1,5 +1,8 @@
 """Studies that judge parameters, each trial by a flight of its own: what rows hold, and what a summary counts."""
 
+import sqlite3
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,7 +16,7 @@ from diransac.study.flights import Flight
 from diransac.study.seeds import derived_seed
 from diransac.study.store import Store
 from diransac.study.summary import summarise
-from studies import row, rows, tiny
+from studies import OWN, OWN_PLANT, row, rows, tiny
 
 NAMES = ("mass", "inertia", "drag")
 DRAWN = tiny(
@@ -197,3 +200,41 @@ def test_a_parameter_that_is_zero_has_no_relative_error(tmp_path: Path):
     found = summarise(tmp_path / "a.db").estimates
     assert np.isnan(found.errors["drag"]).all()
     assert found.worst[0, 1, 0] == pytest.approx(0.5)
+
+
+# Where a user's file is not ------------------------------------------------------------------------------------------
+@pytest.fixture
+def of_a_users_plant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A store of two levels of a user's plant, asked for one after the other."""
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text(OWN_PLANT)
+    values = {f"{kind}_{name}": 1.0 for kind in ("parameter", "best") for name in "Mm"}
+    for level in ("calm", "pulled"):
+        with Store("a.db", load(OWN).narrowed(levels=[level])) as kept:
+            kept.add([row(level, **values)])
+    return tmp_path / "a.db"
+
+
+def test_a_store_is_reported_without_the_file_of_its_plant(of_a_users_plant: Path):
+    store = of_a_users_plant
+    store.with_name("own.py").unlink()
+    command = [sys.executable, "-m", "diransac", "study", "report", store, "-o", "a.html"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=store.parent, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "<summary>M</summary>" in store.with_name("a.html").read_text()
+
+
+def test_facts_of_a_store_are_those_of_the_plant_that_one_of_before_makes_anew(of_a_users_plant: Path):
+    noted = summarise(of_a_users_plant)
+    assert noted.estimates.disturbed.tolist() == [False, True]
+    assert noted.estimates.errors_of_own["M"][:, 0, 0] == pytest.approx([0.0, 0.5 / 1.5])
+    assert noted.units == {"s": "m", "s_dot": "m/s"}
+    connection = sqlite3.connect(of_a_users_plant)
+    with connection:
+        assert connection.execute("DELETE FROM about WHERE key = 'plants'").rowcount == 1
+    connection.close()
+    anew = summarise(of_a_users_plant)
+    assert (anew.units, anew.estimates.disturbed.tolist()) == (noted.units, [False, True])
+    assert all(
+        np.array_equal(x, noted.estimates.errors_of_own[name]) for name, x in anew.estimates.errors_of_own.items()
+    )

@@ -9,7 +9,7 @@
 | `recording.py`, `judging.py`, `seeds.py` | the data of a trial; what estimates are judged against; seeds |
 | `trials.py` | what a worker does |
 | `workers.py`, `cluster.py` | where it does it |
-| `store.py` | one SQLite file |
+| `store.py`, `facts.py` | one SQLite file |
 | `reading.py`, `summary.py` | what is in it, and what it says, for tables and pictures |
 """
 

@@ -5,7 +5,7 @@
 | ``trials`` | a row a level, trial and method |
 | ``cells`` | how many trials of a level and method were asked for |
 | ``configuration`` | what decides the outcome of trials, as JSON; only studies with the same may write |
-| ``about`` | the names of things, for people |
+| ``about`` | the names of things, for people; facts about each level's plant, for whoever has not got a user's file |
 
 It has a rollback journal, not a write-ahead log: the latter needs memory that processes share, which file systems of
 clusters don't have.  Whatever is written is written in one transaction, so that a killed process leaves all of it or
@@ -19,11 +19,13 @@ import sqlite3
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from diransac.errors import StudyError
+from diransac.study.facts import PlantFacts
 from diransac.study.specification import Study
 
 __all__ = ["Store"]
@@ -37,6 +39,9 @@ _PATIENCE = 120.0
 
 _AGAIN = "~"
 """Follows the name of a column that differs from another in case alone: to SQLite ``m`` and ``M`` are the same."""
+
+_PLANTS = "plants"
+"""Key of what is no name of a thing."""
 
 _MANY = 6
 """Differences that a refusal lists; it counts the others."""
@@ -119,7 +124,14 @@ class Store:
     @property
     def about(self) -> dict[str, Any]:
         """Names of things, by key."""
-        return {key: json.loads(value) for key, value in self.select("SELECT key, value FROM about")}
+        rows = self.select("SELECT key, value FROM about WHERE key <> ?", (_PLANTS,))
+        return {key: json.loads(value) for key, value in rows}
+
+    @property
+    def plants(self) -> dict[str, PlantFacts]:
+        """Facts about the plant of each level; stores of before have none until they are written to again."""
+        rows = self.select("SELECT value FROM about WHERE key = ?", (_PLANTS,))
+        return {level: PlantFacts(**facts) for (value,) in rows for level, facts in json.loads(value).items()}
 
     @property
     def configuration(self) -> dict[str, dict[str, Any]]:
@@ -147,8 +159,11 @@ class Store:
             "INSERT INTO cells VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET trials = max(trials, excluded.trials)",
             [(level.text, label, study.trials) for level in study.axis.levels for label in study.methods],
         )
-        names = {"name": study.name, "description": study.description, "axis": study.axis.name, "unit": study.axis.unit}
-        execute("INSERT OR REPLACE INTO about VALUES (?, ?)", [(key, json.dumps(text)) for key, text in names.items()])
+        about = {"name": study.name, "description": study.description, "axis": study.axis.name, "unit": study.axis.unit}
+        facts = {level.text: PlantFacts.of(study.at(level.text).plant.plant) for level in study.axis.levels}
+        plants = {level: asdict(one) for level, one in {**self.plants, **facts}.items()}
+        noted = {**about, _PLANTS: plants}
+        execute("INSERT OR REPLACE INTO about VALUES (?, ?)", [(key, json.dumps(one)) for key, one in noted.items()])
 
 
 def _differences(kept: Mapping[str, Mapping[str, Any]], wanted: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:

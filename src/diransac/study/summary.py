@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.errors import StudyError
-from diransac.plant import Plant
-from diransac.study.judging import differ, hold, is_disturbed, relative_errors
+from diransac.study.facts import PlantFacts
+from diransac.study.judging import differ, hold, relative_errors
 from diransac.study.plants import PlantChoice
 from diransac.study.reading import read
 from diransac.study.store import Store
@@ -183,14 +183,14 @@ def summarise(store: str | Path) -> Summary:
     """
     rows = read(store)
     with Store.existing(store) as kept:
-        words, parts = kept.about, kept.configuration
+        words, parts, noted = kept.about, kept.configuration, kept.plants
         cells = kept.select("SELECT level, method FROM cells ORDER BY rowid")
     if not len(rows):
         raise StudyError(f'store "{store}" has no rows yet; run its study first')
     levels = _in_order(list(dict.fromkeys(level for level, _ in cells)))
     methods = tuple(dict.fromkeys(method for _, method in cells))
-    plants = [_plant_at(level, parts) for level in levels]
-    model = plants[0].model
+    plants = [noted.get(level) or _facts(level, parts) for level in levels]
+    units = plants[0].units
     table = _Table(rows, levels, methods)
     seconds = rows.select("method", "seconds").unnest("seconds")
     stages = tuple(seconds.columns[1:])
@@ -199,9 +199,9 @@ def summarise(store: str | Path) -> Summary:
         **words,
         levels=levels,
         methods=methods,
-        units={name: model.units[name] for name in model.state},
+        units=units,
         ran=table.ran,
-        flights={shape: _flights(table, shape, model.state) for shape in parts["study"]["evaluation.trajectories"]},
+        flights={shape: _flights(table, shape, list(units)) for shape in parts["study"]["evaluation.trajectories"]},
         estimates=_estimates(table, plants) if parts["study"].get("evaluation.parameters") else None,
         failures=_failures(rows),
         seconds=np.array(list(by_method.values()), dtype=float),
@@ -210,10 +210,10 @@ def summarise(store: str | Path) -> Summary:
     )
 
 
-def _plant_at(level: str, parts: Mapping[str, Mapping[str, Any]]) -> Plant:
-    """What flies at a level, from a store's configuration."""
+def _facts(level: str, parts: Mapping[str, Mapping[str, Any]]) -> PlantFacts:
+    """Facts about the plant of a level, made anew from the configuration: a store of before has not noted them."""
     table = changed(changed({}, parts["study"]), parts[f"levels.{level}"])
-    return PlantChoice.from_dict(table["plant"]).plant
+    return PlantFacts.of(PlantChoice.from_dict(table["plant"]).plant)
 
 
 class _Table:
@@ -240,7 +240,7 @@ def _flights(table: _Table, shape: str, states: Sequence[str]) -> Flights:
     return Flights(errors, table.ran, table.ran & np.isnan(errors[states[0]]))
 
 
-def _estimates(table: _Table, plants: Sequence[Plant]) -> Estimates:
+def _estimates(table: _Table, plants: Sequence[PlantFacts]) -> Estimates:
     errors, errors_of_own, covered, differs = {}, {}, {}, np.zeros(len(plants), dtype=bool)
     for name in plants[0].parameters:
         found, best, low, high = (table.column(f"{what}_{name}") for what in ("parameter", "best", "low", "high"))
@@ -250,7 +250,7 @@ def _estimates(table: _Table, plants: Sequence[Plant]) -> Estimates:
         errors_of_own[name] = relative_errors(found, np.where(judged, own, np.nan))
         covered[name] = hold(low, high, best)
         differs |= (judged & differ(best, own)).any(axis=(1, 2))
-    return Estimates(errors, errors_of_own, covered, differs, np.array([is_disturbed(plant) for plant in plants]))
+    return Estimates(errors, errors_of_own, covered, differs, np.array([plant.disturbed for plant in plants]))
 
 
 def _largest(errors: Mapping[str, Floats]) -> Floats:
