@@ -119,6 +119,12 @@ def test_levels_that_are_words_may_each_change_something_else():
         assert load(json.loads(json.dumps(some.to_dict()))) == some
 
 
+def test_levels_that_are_words_may_look_like_numbers():
+    study = load(tiny(axis={"levels": {"1e3": {"noise.delay": 0.01}, "1000": {"noise.delay": 0.02}, "007": {}}}))
+    assert [study.at(text).noise.delay for text in ("1e3", "1000", "007")] == [0.01, 0.02, 0.0]
+    assert [level.text for level in study.narrowed(levels=["007", "1e3"]).axis.levels] == ["007", "1e3"]
+
+
 def test_a_level_that_changes_nothing_is_noted_as_such():
     """A store would take what it never noted for new, and go on with another study."""
     parts = [load(tiny(axis={"levels": {**WORDS, "calm": some}})).configuration for some in ({}, {"noise.delay": 0.1})]

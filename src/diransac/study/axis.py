@@ -89,7 +89,7 @@ class Axis:
         Raises SettingsError: there is no such level.
         """
         known = {level.text: level for level in self.levels}
-        chosen = [self._level(_value_of(text), known) for text in texts]
+        chosen = [known.get(text) or self._level(_value_of(text), known) for text in texts]  # a word may look like 1e3
         if not chosen:
             raise SettingsError(f"no level is named; there are {', '.join(known)}")
         return replace(self, levels=tuple({level.text: level for level in chosen}.values()))
