@@ -19,7 +19,7 @@ __all__ = ["blaming", "definitions", "file_and_name", "running"]
 _ALONE = threading.RLock()
 """Held while users' code runs, which may run more of it: threads share stdout, stderr and the module path."""
 
-_FILE = re.compile(r"(.+\.py)(?::(\w+))?")
+_FILE = re.compile(r"([^\0\n]+\.py)(?::(\w+))?")
 
 
 def file_and_name(text: str, default: str) -> tuple[Path, str] | None:
