@@ -15,7 +15,9 @@ from diransac.study.plants import PlantChoice
 from studies import tiny
 
 OWN = """
+from pathlib import Path
 import diransac as dr
+import numpy as np
 from sledge_mass import MASS
 
 def sledge(pull: float = 0.0, parameters={"mass": MASS}, teeth: int = 3, label: str = "a", stiff: bool = False):
@@ -28,6 +30,23 @@ def sledge(pull: float = 0.0, parameters={"mass": MASS}, teeth: int = 3, label: 
 
 def demanding(pull):
     pass
+
+def open_to_all(gust=0, winds=(1, 2.5), *others, **more):
+    return sledge(gust + sum(winds))
+
+def of_an_array(pull=np.zeros(2)):
+    pass
+
+def of_a_numpy_number(teeth=np.int64(3)):
+    pass
+
+def of_a_path(route=Path("a")):
+    pass
+
+def endless(pull=float("inf")):
+    pass
+
+table = dict
 
 model = dr.Model("sledge", {"s": "m"}, {"force": "N"}, {"mass": dr.Parameter("kg", positive=True)},
                  lambda q, v, a, u, p: [p.mass * a.s - u.force])
@@ -132,6 +151,21 @@ def test_a_users_plant_takes_its_keys_and_its_file_may_import_its_neighbours(own
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("given", "kept", "pull"),
+    [
+        ({}, {"gust": 0, "winds": [1, 2.5]}, 3.5),
+        ({"gust": 2.5}, {"gust": 2.5, "winds": [1, 2.5]}, 6.0),
+        ({"gust": 1, "winds": [4, 5, 6.5]}, {"gust": 1, "winds": [4, 5, 6.5]}, 16.5),
+    ],
+)
+def test_numbers_of_a_users_plant_may_have_a_fraction_where_nothing_says_that_they_count(own, given, kept, pull):
+    choice = PlantChoice.from_dict({"kind": "sledges.py:open_to_all", **given})
+    assert choice.arguments == kept
+    assert choice.plant.disturbances[0].constants == {"pull": 3 * pull}
+    assert PlantChoice.from_dict(choice.to_dict()) == choice
+
+
 def test_an_axis_may_lead_into_a_users_plant(own):
     axis = {"path": "plant.pull", "levels": [0, 5]}
     study = load(tiny(plant={"kind": "sledges.py:sledge"}, data=SINES, axis=axis, **JUDGED))
@@ -172,11 +206,19 @@ def test_a_users_file_that_has_changed_is_another_study(own):
         ({"kind": "sledges.py"}, 'has no function "plant" that returns a diransac.Plant; functions found: sledge, dem'),
         ({"kind": "sledges.py:model"}, 'has no function "model"'),
         ({"kind": "sledges.py:demanding"}, '"demanding" needs pull; give every argument a default'),
+        ({"kind": "sledges.py:table"}, 'sledges.py": "table" does not tell which arguments it takes; wrap it in'),
+        ({"kind": "sledges.py:of_an_array"}, r'"of_an_array" has pull = array.* \(ndarray\); give a default that TOML'),
+        ({"kind": "sledges.py:of_a_numpy_number"}, r'"of_a_numpy_number" has teeth = .*3.* \(int64\); give a default'),
+        ({"kind": "sledges.py:of_a_path"}, r'"of_a_path" has route = .*Path\(.*; give a default that TOML'),
+        ({"kind": "sledges.py:endless"}, r'"endless" has pull = inf \(float\); give a default that TOML'),
+        ({"kind": "sledges.py:open_to_all", "winds": ["hard"]}, "plant.winds is .*hard.*; give a list of numbers"),
+        ({"kind": "sledges.py:open_to_all", "gust": 10**400}, "plant.gust is 1000.*; give a number"),
+        ({"kind": "sled\0ges.py"}, r"plant.kind is 'sled\\x00ges.py'; there are .* or give FILE.py:NAME"),
         ({"kind": "sledges.py:sledge", "wind": 1}, 'no key "plant.wind"; in plant there are kind, .*pull'),
         ({"kind": "sledges.py:sledge", "pull": "hard"}, "plant.pull is 'hard'; give a number"),
         ({"kind": "sledges.py:sledge", "teeth": 2.5}, "plant.teeth is 2.5; give a whole number from 0"),
         ({"kind": "sledges.py:sledge", "stiff": 1}, "plant.stiff is 1; give true or false"),
-        ({"kind": "sledges.py:sledge", "label": "broken"}, r'sledges.py", line 7: RuntimeError: no such sledge'),
+        ({"kind": "sledges.py:sledge", "label": "broken"}, r'sledges.py", line 9: RuntimeError: no such sledge'),
         ({"kind": "sledges.py:sledge", "label": "model"}, '"sledge" returns a Model, not a diransac.Plant'),
         ({"kind": "servo-axis", "cogging": [1.0, 2.0]}, "plant: .*cogging is .*give a finite number"),
     ],

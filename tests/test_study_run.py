@@ -369,7 +369,8 @@ def test_a_worker_without_the_users_file_ends_the_run_at_once_and_is_named(
             handed_out.append(arguments)
             return super().submit(function, *arguments)
 
-    message = rf'a worker on {re.escape(platform.node())} cannot run .* "own.py" cannot be read: .*; all that is done is kept$'
+    here = re.escape(platform.node())
+    message = rf'a worker on {here} cannot run .* "own.py" cannot be read: .*; all that is done is kept$'
     with Elsewhere(1) as pool, pytest.raises(dr.StudyError, match=message):
         run(tmp_path, tiny(plant={"kind": "own.py"}), executor=pool, tasks=1)
     assert len(handed_out) == 1

@@ -14,10 +14,10 @@ from typing import Any
 from diransac.errors import DiransacError, ModelError, SettingsError
 from diransac.models import TABLE_I, builtin, extended_rotorcraft
 from diransac.plant import Plant
-from diransac.study.arguments import ANY, given_arguments
+from diransac.study.arguments import ANY, check_signature, given_arguments
 from diransac.study.tables import Reader
 from diransac.study.vehicles import double_pendulum, pendulum, servo_axis
-from diransac.user_files import definitions, file_and_name, running
+from diransac.user_files import blaming, definitions, file_and_name, running
 
 __all__ = ["PlantChoice"]
 
@@ -137,9 +137,8 @@ def _function(kind: str, digest: str) -> Callable[..., Plant]:
         raise ModelError(
             f'plant file "{file}" has no function "{name}" that returns a diransac.Plant; functions found: {found}'
         )
-    needed = [key for key, one in inspect.signature(made_by).parameters.items() if one.default is one.empty]
-    if needed:
-        raise ModelError(f'plant file "{file}": "{name}" needs {", ".join(needed)}; give every argument a default')
+    with blaming(file, "plant"):
+        check_signature(made_by, name)
     return _blamed(made_by, file, name)
 
 
