@@ -10,6 +10,7 @@ import pytest
 import diransac as dr
 from diransac.study import builtin_names, load, template
 from diransac.study.flights import Flight
+from diransac.study.plants import PlantChoice
 from diransac.study.seeds import derived_seed
 from studies import TINY, tiny
 
@@ -123,6 +124,35 @@ def test_levels_that_are_words_may_look_like_numbers():
     study = load(tiny(axis={"levels": {"1e3": {"noise.delay": 0.01}, "1000": {"noise.delay": 0.02}, "007": {}}}))
     assert [study.at(text).noise.delay for text in ("1e3", "1000", "007")] == [0.01, 0.02, 0.0]
     assert [level.text for level in study.narrowed(levels=["007", "1e3"]).axis.levels] == ["007", "1e3"]
+
+
+def test_a_level_may_fly_another_trajectory_which_takes_over_what_was_given_but_no_defaults():
+    study = load(
+        tiny(data={"trajectory": "places", "substeps": 7}, axis={"path": "data.trajectory", "levels": ["star"]})
+    )
+    assert study.at("star").data == Flight("star", substeps=7)
+    given = {"trajectory": "places", "duration": 25.0, "seed": "any"}
+    study = load(tiny(data=given, axis={"path": "data.trajectory", "levels": ["places"]}))
+    assert study.at("places").data == study.data
+    with pytest.raises(dr.SettingsError, match=r'at level star, there is no key "data.seed"; in data there are'):
+        load(tiny(data=given, axis={"path": "data.trajectory", "levels": ["star"]}))
+
+
+def test_a_level_may_fly_another_plant_which_takes_over_what_was_given_but_no_defaults():
+    axis = {"path": "plant.kind", "levels": ["servo-axis", "pendulum"]}
+    data = {"trajectory": "sines", "seed": "any", "duration": 5.0}
+    judged = {"trajectories": [], "parameters": True}
+    study = load(tiny(plant={"kind": "servo-axis"}, data=data, evaluation=judged, axis=axis))
+    assert study.at("pendulum").plant == PlantChoice.from_dict({"kind": "pendulum"})
+    assert study.at("pendulum").data == study.data
+    rotorcraft = {"kind": "extended-rotorcraft", "parameters": {"mass": 0.3}}
+    study = load(tiny(plant=rotorcraft, axis={"path": "plant.kind", "levels": ["planar-rotorcraft"]}))
+    assert study.at("planar-rotorcraft").plant.plant.parameters == {**dr.models.TABLE_I, "mass": 0.3}
+
+
+def test_a_preset_cannot_vary_as_it_would_change_nothing():
+    with pytest.raises(dr.SettingsError, match=r'"methods.ols.preset" cannot vary.*a preset each'):
+        load(tiny(axis={"path": "methods.ols.preset", "levels": ["default", "table-iv"]}))
 
 
 def test_a_level_that_changes_nothing_is_noted_as_such():

@@ -180,11 +180,28 @@ class Study:
     def at(self, level: str) -> Study:
         """The study as it is at one level.
 
+        A level that flies another trajectory for data, or another kind of plant, takes over what was given to this
+        study's, but not its defaults.
+
         Raises SettingsError: there is no such level, or what it changes has no meaning.
         """
         changes = self.axis.narrowed([level]).levels[0].changes
         known = {path: value for path, value in changes.items() if self._concerns(path)}
-        return self._from_dict(changed(self.to_dict(), known))
+        return self._from_dict(changed(self._shared(known), known))
+
+    def _shared(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """The study's tables, without the defaults of what changes put another in place of."""
+        table = self.to_dict()
+        for part, key, made_from in (
+            ("data", "trajectory", Flight.from_dict),
+            ("plant", "kind", PlantChoice.from_dict),
+        ):
+            choice = {key: table[part][key]}
+            if changes.get(f"{part}.{key}", choice[key]) != choice[key]:
+                defaults = made_from(choice).to_dict()
+                given = {name: value for name, value in table[part].items() if defaults.get(name) != value}
+                table[part] = {**choice, **given}
+        return table
 
     def _concerns(self, path: str) -> bool:
         """Whether a path of the axis leads into this study, rather than to a method that it was narrowed from.
@@ -194,6 +211,10 @@ class Study:
         root, *way = path.split(".")
         if root not in VARIABLE or not way:
             raise SettingsError(f'"{path}" cannot vary; there are {", ".join(f"{name}.*" for name in VARIABLE)}')
+        if root == "methods" and way[1:] == ["preset"]:
+            raise SettingsError(
+                f'"{path}" cannot vary: all settings are known by then; give two methods, a preset each'
+            )
         return root != "methods" or way[0] in self.methods
 
     def narrowed(
