@@ -36,7 +36,7 @@ def check_signature(function: Callable[..., Any], name: str) -> None:
         if not _is_writable(one.default):
             raise SettingsError(
                 f'"{name}" has {one.name} = {one.default!r:.60} ({type(one.default).__name__}); give a default that '
-                "TOML can write: a number, a word, true or false, a tuple of numbers or words, a dict of numbers, or None"
+                "TOML can write: a number, a word, true or false, a tuple of either, a dict of numbers, or None"
             )
 
 
