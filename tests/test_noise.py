@@ -599,6 +599,8 @@ def test_a_delay_carries_masks_along_and_spreads_them_where_it_mixes_samples():
         ({"outlier_magnitude": -1.0}, "outlier_magnitude is -1.0; give a finite number from 0"),
         ({"acceleration_std": -0.1}, "acceleration_std is -0.1"),
         ({"rate_std": np.nan}, "rate_std is nan"),
+        ({"rate_std": 10**400}, "rate_std is 1000"),
+        ({"leverage_offset": -np.inf}, "leverage_offset is -inf"),
         ({"rate_std": "0.1"}, "rate_std is '0.1'"),
         ({"outlier_probability": True}, "outlier_probability is True"),
         ({"angular_acceleration_std": np.inf}, "angular_acceleration_std is inf"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -142,6 +143,7 @@ def _number(
     name: str, value: object, low: float = 0.0, high: float = math.inf, wanted: str = "a finite number from 0"
 ) -> float:
     real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not real or not low <= float(value) <= high or not math.isfinite(value):  # type: ignore[arg-type]
-        raise SettingsError(f"{name} is {value!r}; give {wanted}")
+    # An integer that no float holds is compared as it is: it is not converted before it is known to be small.
+    if not real or not (low <= value <= high and abs(value) <= sys.float_info.max):  # type: ignore[operator, arg-type]
+        raise SettingsError(f"{name} is {value!r:.60}; give {wanted}")
     return float(value)  # type: ignore[arg-type]
