@@ -123,6 +123,15 @@ def test_a_study_that_has_nothing_to_show_yet_has_a_picture_and_a_page(rows: lis
     write_study_report(tmp_path / "b.db", tmp_path / "page.html")
 
 
+def test_a_level_whose_trials_have_no_data_is_drawn_as_without_an_estimate(tmp_path: Path):
+    with Store(tmp_path / "b.db", load(JUDGED)) as kept:
+        kept.add([judged("clean", 0, "ols", 0.01)])
+        kept.add([row("pushed", k, m, status="failed", error="diverged") for k in range(3) for m in METHODS])
+    (axes,) = plot_estimates(tmp_path / "b.db").axes
+    for method in ("ols", "quick"):
+        assert marks(axes, method)[-1] == (1, pytest.approx(column(axes, "none")), True)
+
+
 def test_an_axis_holds_all_that_is_beyond_it_in_order():
     values = np.array([0.0, 1e-9, 0.01, 3.0, 9e3, 1e12, np.inf])
     scale = Scale.of([Row("a", values[:-1], values[1:])], -3)

@@ -166,7 +166,7 @@ def test_errors_are_relative_to_the_best_and_infinite_without_an_estimate(estima
     assert estimates.worst[0, 1] == pytest.approx([0.3, 0.02, np.inf])
     assert estimates.median(estimates.worst)[0, 1] == pytest.approx(0.3)
     assert estimates.largest(estimates.worst)[0, 1] == np.inf
-    assert estimates.largest(estimates.errors["inertia"])[1, 1] == pytest.approx(0.0)
+    assert estimates.errors["inertia"][1, 1, 0] == pytest.approx(0.0)
 
 
 def test_of_an_even_number_the_median_is_between_the_middle_two_or_infinite_if_one_of_them_is(estimates):
@@ -174,8 +174,10 @@ def test_of_an_even_number_the_median_is_between_the_middle_two_or_infinite_if_o
     assert estimates.median(errors).tolist() == [[2.0, np.inf, np.inf]]
 
 
-def test_a_trial_that_has_nothing_to_be_judged_by_counts_neither_way(estimates):
-    assert np.isnan(estimates.worst[1, 1, 1:]).all()
+def test_a_trial_without_data_has_no_estimate_and_one_that_was_not_run_counts_neither_way(estimates):
+    assert estimates.worst[1, 1, 1] == np.inf
+    assert estimates.worst_of_own[1, 1, 1] == np.inf
+    assert np.isnan(estimates.worst[1, 1, 2])
     assert np.isnan(estimates.worst[0, 0]).all(), "that of a method that was not run"
     assert np.isnan(estimates.median(estimates.worst)[0, 0])
 

@@ -81,8 +81,8 @@ class Flights:
 class Estimates:
     """How far parameters are off, by parameter and (n_levels, n_methods, n_trials).
 
-    An error is ``|found / reference - 1|``: infinite where nothing was found, NaN where there is no trial or nothing
-    to judge it by, and of a parameter that is 0 in the plant.
+    An error is ``|found / reference - 1|``: infinite where nothing was found, which includes trials without data, for
+    which no best parameters are known; NaN where there is no trial, and of a parameter that is 0 in the plant.
 
     Parameters
     ----------
@@ -245,11 +245,12 @@ def _estimates(table: _Table, plants: Sequence[PlantFacts]) -> Estimates:
     for name in plants[0].parameters:
         found, best, low, high = (table.column(f"{what}_{name}") for what in ("parameter", "best", "low", "high"))
         own = np.broadcast_to(np.array([plant.parameters[name] for plant in plants])[:, None, None], best.shape)
-        judged = ~np.isnan(best) & (own != 0.0)
-        errors[name] = relative_errors(found, np.where(judged, best, np.nan))
+        judged = table.ran & (own != 0.0)
+        reached = np.where(np.isnan(best), own, best)  # without data nothing is found, whatever it is compared to
+        errors[name] = relative_errors(found, np.where(judged, reached, np.nan))
         errors_of_own[name] = relative_errors(found, np.where(judged, own, np.nan))
         covered[name] = hold(low, high, best)
-        differs |= (judged & differ(best, own)).any(axis=(1, 2))
+        differs |= (judged & differ(reached, own)).any(axis=(1, 2))
     return Estimates(errors, errors_of_own, covered, differs, np.array([plant.disturbed for plant in plants]))
 
 
