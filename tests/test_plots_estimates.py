@@ -132,6 +132,10 @@ def test_a_level_whose_trials_have_no_data_is_drawn_as_without_an_estimate(tmp_p
         assert marks(axes, method)[-1] == (1, pytest.approx(column(axes, "none")), True)
 
 
+def test_what_is_missing_is_said_below_the_picture(store: Path):
+    assert "3 of 18 rows are missing." in texts(plot_estimates(store))
+
+
 def test_an_axis_holds_all_that_is_beyond_it_in_order():
     values = np.array([0.0, 1e-9, 0.01, 3.0, 9e3, 1e12, np.inf])
     scale = Scale.of([Row("a", values[:-1], values[1:])], -3)

@@ -185,6 +185,22 @@ def test_a_median_above_every_mean_is_within_its_panel(tmp_path: Path):
     assert axes.get_ylim()[1] > 60.0
 
 
+def test_what_is_missing_of_a_study_is_said_below_its_pictures_and_on_its_page(
+    store: Path, store_with_paths: Path, tmp_path: Path
+):
+    with Store(tmp_path / "half.db", load(tiny(trials=4))) as kept:
+        kept.add([row("0", trial, "ols", **errors(0.1)) for trial in range(3)])
+    with Store(store_with_paths, load(tiny(trials=6, evaluation__keep_paths=True, axis__levels=[40]))):
+        pass
+    write_study_report(tmp_path / "half.db", tmp_path / "half.html")
+    write_study_report(store, tmp_path / "whole.html")
+    assert "21 of 24 rows are missing." in texts(plot_study(tmp_path / "half.db"))
+    assert texts(plot_paths(store_with_paths))[-1].endswith(". 3 of 18 rows are missing.")
+    assert "<strong>21 of 24 rows are missing.</strong>" in (tmp_path / "half.html").read_text()
+    assert not [text for text in texts(plot_study(store)) if "missing" in text]
+    assert "missing" not in (tmp_path / "whole.html").read_text()
+
+
 def test_paths_are_drawn_for_every_trial_that_has_one(store_with_paths: Path):
     figure = plot_paths(store_with_paths)
     assert len(figure.axes) == len(METHODS)

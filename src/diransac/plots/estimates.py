@@ -114,8 +114,9 @@ def _drawn(summary: Summary, title: str) -> Figure:
     every = as_marks(method_looks(summary.methods))
     looks = {label: every[label] for label in methods}
     entries = list(looks.items())
+    caption = [line.format(trials=n_trials(summary)) for line in (*_CAPTION, summary.remark) if line]
     header, height = header_height(entries, title), row_height(len(methods)) * len(rows)
-    full = header + _ABOVE + height + _BELOW + _LINE * len(_CAPTION) + 0.08
+    full = header + _ABOVE + height + _BELOW + _LINE * len(caption) + 0.08
     figure = Figure(figsize=(WIDTH, full), facecolor=PAPER)
     draw_heading(figure, entries, title)
     what, left = "Error of the worst parameter, %", names_width([row.name for row in rows])
@@ -123,7 +124,7 @@ def _drawn(summary: Summary, title: str) -> Figure:
     top = header + _ABOVE
     name_rows(figure, (left, top), rows, len(methods))
     draw_rows(figure, (left, top, WIDTH - left - 0.12), rows, looks, Scale.of(rows, LEAST))
-    for line, text in enumerate(_CAPTION):
+    for line, text in enumerate(caption):
         y = 1.0 - (top + height + _BELOW + line * _LINE) / full
-        figure.text(0.1 / WIDTH, y, text.format(trials=n_trials(summary)), fontsize=7.5, color=MUTED, va="top")
+        figure.text(0.1 / WIDTH, y, text, fontsize=7.5, color=MUTED, va="top")
     return figure

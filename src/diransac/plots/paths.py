@@ -119,6 +119,7 @@ def _drawn(summary: Summary, level: str, flown: Mapping[str, Mapping[str, list[P
         top += _NAME + heights[shape] + _BELOW
     draw_heading(figure, entries, title)
     caption = f"Every trial's path in the XZ plane, m; {summary.axis} {level} {summary.unit}".rstrip()
+    caption += f". {summary.remark}" if summary.remark else ""
     _write(figure, 0.1, full - _CAPTION + 0.06, caption, fontsize=7.5, color=MUTED)
     return figure
 

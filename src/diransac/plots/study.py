@@ -99,7 +99,7 @@ def _drawn(summary: Summary, title: str) -> Figure:
     entries = list(looks.items())
     header = header_height(entries, title)
     heights = [_block_height(summary, flights) for flights in summary.flights.values()]
-    words = _CAPTION_OF_ROWS if _in_rows(summary) else _CAPTION
+    words = _caption(summary)
     caption = _LINE * len(words) + 0.14
     figure = Figure(figsize=(WIDTH, header + sum(heights) + caption), facecolor=PAPER)
     top = header
@@ -109,8 +109,14 @@ def _drawn(summary: Summary, title: str) -> Figure:
     draw_heading(figure, entries, title)
     for row, line in enumerate(words):
         y = (caption - 0.04 - row * _LINE) / figure.get_figheight()
-        figure.text(0.1 / WIDTH, y, line.format(trials=n_trials(summary)), fontsize=7.5, color=MUTED, va="top")
+        figure.text(0.1 / WIDTH, y, line, fontsize=7.5, color=MUTED, va="top")
     return figure
+
+
+def _caption(summary: Summary) -> list[str]:
+    """Lines that say what is drawn, and what is missing."""
+    lines = [*(_CAPTION_OF_ROWS if _in_rows(summary) else _CAPTION), summary.remark]
+    return [line.format(trials=n_trials(summary)) for line in lines if line]
 
 
 # A trajectory: panels, and what failed ------------------------------------------------------------------------------

@@ -64,7 +64,9 @@ def _page(summary: Summary, figures: Sequence[str]) -> str:
         _seconds(summary),
         tag("p", f"Computed by {'; '.join(summary.versions)}.", class_="how"),
     ]
-    body = [tag("h1", summary.name), tag("p", summary.description, class_="about"), tag("main", *main)]
+    about = [tag("p", summary.description, class_="about")]
+    about += [tag("p", tag("strong", summary.remark))] if summary.remark else []
+    body = [tag("h1", summary.name), *about, tag("main", *main)]
     return f"<!DOCTYPE html>\n{tag('html', tag('head', *head), tag('body', *body), lang='en')}\n"
 
 

@@ -20,7 +20,7 @@ from diransac.errors import StudyError
 from diransac.study.facts import PlantFacts
 from diransac.study.judging import differ, hold, relative_errors
 from diransac.study.plants import PlantChoice
-from diransac.study.reading import read
+from diransac.study.reading import read, status
 from diransac.study.store import Store
 from diransac.study.tables import changed
 
@@ -147,6 +147,7 @@ class Summary:
     seconds : (n_methods, n_stages), s of one process, summed over trials
     stages : what these are of
     versions : of what computed the rows
+    asked, missing : rows that were asked for, and how many of these are yet to come
     """
 
     name: str
@@ -163,6 +164,14 @@ class Summary:
     seconds: Floats
     stages: tuple[str, ...]
     versions: tuple[str, ...]
+    asked: int
+    missing: int
+
+    @property
+    def remark(self) -> str:
+        """How much of the study is not here yet, ``18 of 24 rows are missing.``; nothing once all is."""
+        verb = "is" if self.missing == 1 else "are"
+        return f"{self.missing} of {self.asked} rows {verb} missing." if self.missing else ""
 
     @property
     def positions(self) -> Floats:
@@ -181,7 +190,7 @@ def summarise(store: str | Path) -> Summary:
 
     Raises StudyError: there is no such store, or it has no rows yet.
     """
-    rows = read(store)
+    rows, progress = read(store), status(store)
     with Store.existing(store) as kept:
         words, parts, noted = kept.about, kept.configuration, kept.plants
         cells = kept.select("SELECT level, method FROM cells ORDER BY rowid")
@@ -207,6 +216,8 @@ def summarise(store: str | Path) -> Summary:
         seconds=np.array(list(by_method.values()), dtype=float),
         stages=stages,
         versions=tuple(dict.fromkeys(rows["versions"])),
+        asked=progress.asked,
+        missing=progress.missing,
     )
 
 
