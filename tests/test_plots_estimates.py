@@ -132,6 +132,21 @@ def test_a_level_whose_trials_have_no_data_is_drawn_as_without_an_estimate(tmp_p
         assert marks(axes, method)[-1] == (1, pytest.approx(column(axes, "none")), True)
 
 
+def test_levels_stand_below_what_varies_with_its_unit_and_power_of_ten(tmp_path: Path):
+    axis = {"name": "mass imbalance", "unit": "kg m^2", "path": "plant.mass_imbalance", "levels": [6e-5, 9e-5]}
+    with Store(tmp_path / "b.db", load(JUDGED | {"axis": axis})) as kept:
+        kept.add([judged(level, 0, "ols", 0.01) for level in ("6e-05", "9e-05")])
+    figure = plot_estimates(tmp_path / "b.db")
+    figure.draw_without_rendering()
+    heading, *levels = (
+        next(text for text in figure.texts if text.get_text() == wanted).get_window_extent()
+        for wanted in ("mass imbalance, 10⁻⁵ kg m²", "6", "9")
+    )
+    assert heading.x0 > 0.0
+    assert all(level.y1 < heading.y0 and level.x1 == pytest.approx(heading.x1, abs=1.0) for level in levels)
+    assert heading.x1 < figure.axes[0].get_window_extent().x0
+
+
 def test_what_is_missing_is_said_below_the_picture(store: Path):
     assert "3 of 18 rows are missing." in texts(plot_estimates(store))
 

@@ -13,7 +13,7 @@ from diransac.plots.heading import draw_heading, header_height
 from diransac.plots.layout import WIDTH
 from diransac.plots.palette import INK, MUTED, PAPER
 from diransac.plots.rows import Row, Scale, as_marks, draw_rows, name_rows, names_width, row_height
-from diransac.plots.study import level_labels, method_looks, n_trials, title_of
+from diransac.plots.study import axis_label, level_labels, method_looks, n_trials, title_of
 from diransac.plots.writing import checked_ending, write
 from diransac.study.specification import TRUE
 from diransac.study.store import Store
@@ -119,10 +119,11 @@ def _drawn(summary: Summary, title: str) -> Figure:
     full = header + _ABOVE + height + _BELOW + _LINE * len(caption) + 0.08
     figure = Figure(figsize=(WIDTH, full), facecolor=PAPER)
     draw_heading(figure, entries, title)
-    what, left = "Error of the worst parameter, %", names_width([row.name for row in rows])
+    heading = axis_label(summary)
+    what, left = "Error of the worst parameter, %", names_width([row.name for row in rows], heading)
     figure.text(left / WIDTH, 1.0 - header / full, what, fontsize=9.5, color=INK, va="top")
     top = header + _ABOVE
-    name_rows(figure, (left, top), rows, len(methods))
+    name_rows(figure, (left, top), rows, len(methods), heading)
     draw_rows(figure, (left, top, WIDTH - left - 0.12), rows, looks, Scale.of(rows, LEAST))
     for line, text in enumerate(caption):
         y = 1.0 - (top + height + _BELOW + line * _LINE) / full

@@ -33,6 +33,7 @@ def draw_flight_rows(
     flights: Flights,
     units: Mapping[str, str],
     levels: Sequence[str],
+    axis: str,
     looks: Mapping[str, Mapping[str, Any]],
 ) -> None:
     """Draw median and worst RMS tracking error over all trials, of which one that failed is worse than any.
@@ -41,10 +42,10 @@ def draw_flight_rows(
     ----------
     top : inches from the figure's top
     units : of the states
-    levels : what they are called
+    levels, axis : what they are called, and what varies from one to another
     looks : of each method
     """
-    full, height, beside = figure.get_figheight(), len(levels) * row_height(len(looks)), names_width(levels)
+    full, height, beside = figure.get_figheight(), len(levels) * row_height(len(looks)), names_width(levels, axis)
     width = (WIDTH - beside - 0.1) / _COLUMNS
     for i, state in enumerate(_shown(flights.errors)):
         row, column = divmod(i, _COLUMNS)
@@ -55,7 +56,7 @@ def draw_flight_rows(
         figure.text(left / WIDTH, y, state, fontsize=8.5, color=INK, va="top")
         figure.text((left + width - _GAP) / WIDTH, y, units[state], fontsize=7.5, color=MUTED, va="top", ha="right")
         if column == 0:
-            name_rows(figure, (left, above + _ABOVE), rows, len(looks))
+            name_rows(figure, (left, above + _ABOVE), rows, len(looks), axis)
         draw_rows(figure, (left, above + _ABOVE, width - _GAP), rows, looks, Scale.of(rows, _LEAST))
 
 

@@ -28,6 +28,8 @@ _METHOD, _FREE, _LEAST = 0.044, 0.075, 0.24
 _APART, _NEAR = 0.5, 0.32
 # Inches: a letter of a row's name; letters of a line of it.
 _LETTER, _LETTERS = 0.059, 40
+# Inches: how far the heading of the rows' names is above these, beside the values.
+_HEADING = 0.05
 # Decades that an axis has at most, and the room beyond its ends, in decades: for too little, too much, none at all.
 _DECADES, _ROOM = 6, 0.6
 _WORST: dict[str, Any] = {"linewidth": 1.0, "alpha": 0.45, "solid_capstyle": "butt"}
@@ -178,14 +180,23 @@ def _shade(axes: Axes, rows: Sequence[Row], scale: Scale) -> None:
         axes.vlines(apart, 0, len(rows), color=MUTED, linewidth=0.7, linestyle=":", zorder=1.0)
 
 
-def names_width(names: Sequence[str]) -> float:
-    """What names of rows take at the left, with what is free beside them, inches."""
-    return 0.25 + _LETTER * max(len(line) for name in names for line in _lines(name))
+def names_width(names: Sequence[str], heading: str) -> float:
+    """What names of rows and their heading take at the left, with what is free beside them, inches."""
+    return 0.25 + _LETTER * max(len(line) for name in (*names, heading) for line in _lines(name))
 
 
-def name_rows(figure: Figure, place: tuple[float, float], rows: Sequence[Row], n_methods: int) -> None:
-    """Names of the rows; `place` is where their panel begins: left and top, inches from the figure's top left."""
+def name_rows(figure: Figure, place: tuple[float, float], rows: Sequence[Row], n_methods: int, heading: str) -> None:
+    """Names of the rows below what they are names of.
+
+    Parameters
+    ----------
+    place : where their panel begins: left and top, inches from the figure's top left
+    heading : such as ``outlier magnitude, m/s²``
+    """
     left, top = place
+    above: dict[str, Any] = {"fontsize": 7.5, "color": MUTED, "va": "bottom", "ha": "right"}
+    y = 1.0 - (top - _HEADING) / figure.get_figheight()
+    figure.text((left - 0.1) / WIDTH, y, "\n".join(_lines(heading)), **above)
     for i, row in enumerate(rows):
         y = 1.0 - (top + (i + 0.5) * row_height(n_methods)) / figure.get_figheight()
         look: dict[str, Any] = {"fontsize": 7.5, "color": MUTED} if row.quiet else {"fontsize": 8.0, "color": INK}

@@ -142,7 +142,8 @@ def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, 
     full = figure.get_figheight()
     figure.text(0.1 / WIDTH, 1.0 - (top + 0.05) / full, f"Flown: {shape}", fontsize=9.5, color=INK, va="top")
     if _in_rows(summary):
-        draw_flight_rows(figure, top + _NAME, flights, summary.units, level_labels(summary), _looks(summary))
+        names = level_labels(summary), axis_label(summary)
+        draw_flight_rows(figure, top + _NAME, flights, summary.units, *names, _looks(summary))
         return
     width, states = WIDTH / _COLUMNS, list(summary.units)
     for i, state in enumerate(states):
