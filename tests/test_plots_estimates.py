@@ -1,4 +1,4 @@
-"""Pictures and pages of studies that judge parameters, or whose levels are many words."""
+"""Pictures and pages of studies that judge parameters, or whose levels are words."""
 
 import re
 from pathlib import Path
@@ -189,6 +189,23 @@ def test_long_names_of_many_levels_are_within_the_picture_and_beside_their_panel
             box = name.get_window_extent()
             assert box.x0 > 0.0
             assert box.x1 < left
+
+
+def test_no_line_joins_levels_that_are_words_however_few(tmp_path: Path):
+    wordy = {"name": "scenario", "levels": ["calm", "gusts"], "values": {"noise.outlier_magnitude": [0, 1]}}
+    with Store(tmp_path / "w.db", load(tiny(trials=1, axis=wordy))) as kept:
+        kept.add(
+            [
+                row(w, 0, m, **{f"square_{s}": 0.1 for s in ("x", "z", "theta")})
+                for w in wordy["levels"]
+                for m in METHODS
+            ]
+        )
+    figure = plot_study(tmp_path / "w.db")
+    assert {"calm", "gusts", "scenario"} <= set(texts(figure))
+    for axes in figure.axes:
+        assert all(len(set(line.get_ydata())) == 1 for line in axes.lines)
+        assert [at for at, *_ in marks(axes, "ols")] == [0, 1]
 
 
 def test_a_flight_that_failed_is_worse_than_any_in_rows(tmp_path: Path):

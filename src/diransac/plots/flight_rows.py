@@ -1,4 +1,4 @@
-"""How flights were tracked at levels that are many words: a row a level, a panel a coordinate."""
+"""How flights were tracked at levels that are words: a row a level, a panel a coordinate."""
 
 from __future__ import annotations
 

@@ -40,9 +40,6 @@ _MANY, _DECADES = 20.0, 3
 # Letters of a title's line; lines of one title differ by so many at most.
 _LETTERS, _RAGGED = 92, 12
 
-# More words than these along a panel's axis cannot be read: they become rows.
-_WORDS = 6
-
 # The palette's fifth colour is too near the first where lines cross.
 _COLOURS = (*COLOURS[:4], INK, COLOURS[5], "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
@@ -72,8 +69,8 @@ def plot_study(store: str | Path, path: str | Path | None = None, *, title: str 
     they end at 0), dashes medians over all trials.  A trial that has no flight fails and has no error: below the panels
     stands which share of the trials that is, and a mean that leaves some out is hollow, for these are the worst.
     Where means differ by orders of magnitude the scale is linear up to a first decade, and logarithmic from there.
-    Levels that are more than six words are rows, with a panel a coordinate on a logarithmic axis: marks are medians
-    over all trials, lines end at the worst.
+    Levels that are words are rows, with a panel a coordinate on a logarithmic axis: marks are medians over all trials,
+    lines end at the worst.
 
     Returns a Matplotlib figure. The same rows give the same file.
     Raises StudyError: there is no such store, or it has no rows; SettingsError: its study flies nothing with what was
@@ -115,24 +112,19 @@ def _drawn(summary: Summary, title: str) -> Figure:
 
 def _caption(summary: Summary) -> list[str]:
     """Lines that say what is drawn, and what is missing."""
-    lines = [*(_CAPTION_OF_ROWS if _in_rows(summary) else _CAPTION), summary.remark]
+    lines = [*(_CAPTION if summary.is_numeric else _CAPTION_OF_ROWS), summary.remark]
     return [line.format(trials=n_trials(summary)) for line in lines if line]
 
 
 # A trajectory: panels, and what failed ------------------------------------------------------------------------------
-def _in_rows(summary: Summary) -> bool:
-    """Whether the levels are too many words for the axis of a panel."""
-    return not summary.is_numeric and len(summary.levels) > _WORDS
-
-
 def _looks(summary: Summary) -> dict[str, dict[str, Any]]:
-    """Lines, or marks where levels are rows."""
+    """Lines, or marks where levels are words, which no line joins: they are rows."""
     looks = method_looks(summary.methods)
-    return as_marks(looks) if _in_rows(summary) else looks
+    return looks if summary.is_numeric else as_marks(looks)
 
 
 def _block_height(summary: Summary, flights: Flights) -> float:
-    if _in_rows(summary):
+    if not summary.is_numeric:
         return _NAME + flight_rows_height(flights, len(summary.levels), len(summary.methods))
     n_rows = -(-len(summary.units) // _COLUMNS)
     return _NAME + n_rows * _ROW + _AXIS + failures_height(flights.failure_share)
@@ -141,7 +133,7 @@ def _block_height(summary: Summary, flights: Flights) -> float:
 def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, top: float) -> None:
     full = figure.get_figheight()
     figure.text(0.1 / WIDTH, 1.0 - (top + 0.05) / full, f"Flown: {shape}", fontsize=9.5, color=INK, va="top")
-    if _in_rows(summary):
+    if not summary.is_numeric:
         names = level_labels(summary), axis_label(summary)
         draw_flight_rows(figure, top + _NAME, flights, summary.units, *names, _looks(summary))
         return
@@ -220,9 +212,7 @@ def _name_levels(axes: Axes, summary: Summary) -> None:
     positions, _ = _positions(summary)
     margin = 0.6 * (float(np.diff(positions).min()) if len(positions) > 1 else 1.0)
     axes.set_xlim(positions[0] - margin, positions[-1] + margin)
-    if not summary.is_numeric:
-        axes.set_xticks(positions, [level.replace(" ", "\n") for level in summary.levels], fontsize=6)
-    elif len(positions) <= _COLUMNS * 2:
+    if len(positions) <= _COLUMNS * 2:
         axes.set_xticks(positions, level_labels(summary))
     else:
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
