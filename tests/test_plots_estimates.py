@@ -147,6 +147,19 @@ def test_levels_stand_below_what_varies_with_its_unit_and_power_of_ten(tmp_path:
     assert heading.x1 < figure.axes[0].get_window_extent().x0
 
 
+def test_none_is_explained_where_it_is_drawn_alone(tmp_path: Path):
+    wordy = {"name": "scenario", "levels": ["calm"], "values": {"noise.outlier_magnitude": [0]}}
+    flown = {f"square_{s}": 0.1 for s in ("x", "z", "theta")}
+    with Store(tmp_path / "w.db", load(tiny(trials=2, axis=wordy, evaluation__parameters=True))) as kept:
+        kept.add([judged("calm", 0, method, 0.01) | flown for method in METHODS])
+    for draw in (plot_estimates, plot_study):
+        assert "none:" not in " ".join(texts(draw(tmp_path / "w.db")))
+    with Store(tmp_path / "w.db", load(tiny(trials=2, axis=wordy, evaluation__parameters=True))) as kept:
+        kept.add([judged("calm", 1, "ols", None)])
+    for draw, what in ((plot_estimates, "none: no estimate"), (plot_study, "none: no flight")):
+        assert what in " ".join(texts(draw(tmp_path / "w.db")))
+
+
 def test_what_is_missing_is_said_below_the_picture(store: Path):
     assert "3 of 18 rows are missing." in texts(plot_estimates(store))
 

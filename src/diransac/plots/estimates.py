@@ -36,9 +36,9 @@ _ABOVE, _BELOW, _LINE = 0.42, 0.3, 0.155
 _CAPTION = (
     "Marks are medians over {trials} of a level, lines end at the worst. Errors are relative to the best "
     "parameters that the model can reach in the",
-    "very flight; where those differ from the plant’s own, a second row has the errors against the latter. "
-    "none: no estimate, which is worse than any.",
+    "very flight; where those differ from the plant’s own, a second row has the errors against the latter.",
 )
+_NONE = " none: no estimate, which is worse than any."
 
 
 def plot_estimates(store: str | Path, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -114,7 +114,8 @@ def _drawn(summary: Summary, title: str) -> Figure:
     every = as_marks(method_looks(summary.methods))
     looks = {label: every[label] for label in methods}
     entries = list(looks.items())
-    caption = [line.format(trials=n_trials(summary)) for line in (*_CAPTION, summary.remark) if line]
+    scale = Scale.of(rows, LEAST)
+    caption = _caption(summary, scale)
     header, height = header_height(entries, title), row_height(len(methods)) * len(rows)
     full = header + _ABOVE + height + _BELOW + _LINE * len(caption) + 0.08
     figure = Figure(figsize=(WIDTH, full), facecolor=PAPER)
@@ -124,8 +125,15 @@ def _drawn(summary: Summary, title: str) -> Figure:
     figure.text(left / WIDTH, 1.0 - header / full, what, fontsize=9.5, color=INK, va="top")
     top = header + _ABOVE
     name_rows(figure, (left, top), rows, len(methods), heading)
-    draw_rows(figure, (left, top, WIDTH - left - 0.12), rows, looks, Scale.of(rows, LEAST))
+    draw_rows(figure, (left, top, WIDTH - left - 0.12), rows, looks, scale)
     for line, text in enumerate(caption):
         y = 1.0 - (top + height + _BELOW + line * _LINE) / full
         figure.text(0.1 / WIDTH, y, text, fontsize=7.5, color=MUTED, va="top")
     return figure
+
+
+def _caption(summary: Summary, scale: Scale) -> list[str]:
+    """Lines that say what is drawn, and what is missing."""
+    first, second = _CAPTION
+    lines = [first.format(trials=n_trials(summary)), second + _NONE * scale.endless]
+    return [*lines, summary.remark] if summary.remark else lines

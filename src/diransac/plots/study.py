@@ -50,10 +50,8 @@ _CAPTION = (
     "has an infinite error. Without a flight (no plan, or one that diverged) a trial has failed: means leave it out, "
     "and are then hollow.",
 )
-_CAPTION_OF_ROWS = (
-    "Marks are medians of the RMS tracking error over {trials} of a level, lines end at the worst.",
-    "none: no flight (no plan, or one that diverged), which is worse than any.",
-)
+_CAPTION_OF_ROWS = ("Marks are medians of the RMS tracking error over {trials} of a level, lines end at the worst.",)
+_NONE = "none: no flight (no plan, or one that diverged), which is worse than any."
 
 
 def plot_study(store: str | Path, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -112,7 +110,9 @@ def _drawn(summary: Summary, title: str) -> Figure:
 
 def _caption(summary: Summary) -> list[str]:
     """Lines that say what is drawn, and what is missing."""
-    lines = [*(_CAPTION if summary.is_numeric else _CAPTION_OF_ROWS), summary.remark]
+    some_failed = any(flights.failed.any() for flights in summary.flights.values())
+    of_rows = [*_CAPTION_OF_ROWS, _NONE if some_failed else ""]
+    lines = [*(_CAPTION if summary.is_numeric else of_rows), summary.remark]
     return [line.format(trials=n_trials(summary)) for line in lines if line]
 
 
