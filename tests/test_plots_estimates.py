@@ -255,6 +255,13 @@ def test_the_page_has_errors_of_every_parameter_and_counts_intervals(store: Path
     assert "In short" not in text
 
 
+def test_the_page_has_no_seconds_of_stages_that_the_study_lacks(store: Path, tmp_path: Path):
+    write_study_report(store, tmp_path / "page.html")
+    (table,) = re.findall(r"<caption>Seconds of one process.*?</table>", (tmp_path / "page.html").read_text())
+    assert re.findall(r"<th[^>]*>([^<]*)</th>", table)[:4] == ["method", "record", "identify", "all"]
+    assert "<td>1.5</td><td>0.75</td><td>2.25</td>" in table, "of three rows of ols"
+
+
 def test_the_command_draws_what_a_study_judges(store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     plot_estimates(store, "wanted.svg")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.resources import files
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -184,16 +185,18 @@ def _failed(summary: Summary) -> Html:
 
 
 def _seconds(summary: Summary) -> Html:
-    """Seconds of each method by stage."""
+    """Seconds of each method by stage, but for those that the study does not have."""
+    there = [bool(one.any()) for one in summary.seconds.T]
+    of_stages = summary.seconds[:, there]
     rows = [
         [label, *(number(x, 3) for x in seconds), number(float(seconds.sum()), 3)]
-        for label, seconds in zip(summary.methods, summary.seconds, strict=True)
+        for label, seconds in zip(summary.methods, of_stages, strict=True)
     ]
-    total = summary.seconds.sum(axis=0)
+    total = of_stages.sum(axis=0)
     rows.append(["all", *(number(x, 3) for x in total), number(float(total.sum()), 3)])
     n_rows = int(summary.ran.sum())
     caption = f"Seconds of one process, over {plural(n_rows, 'row')}; what is done for several together is divided"
-    return table(["method", *summary.stages, "all"], rows, caption)
+    return table(["method", *compress(summary.stages, there), "all"], rows, caption)
 
 
 def _failures(flights: Flights, k: int) -> str:
