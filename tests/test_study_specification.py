@@ -3,6 +3,7 @@
 import json
 import re
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -292,6 +293,12 @@ def test_what_people_call_things_and_how_many_there_are_decide_nothing():
 def test_a_study_that_makes_no_sense_is_refused_by_its_key(changes: dict, message: str):
     with pytest.raises(dr.SettingsError, match=message):
         load(TINY, changes)
+
+
+def test_a_level_that_stands_there_twice_is_refused_in_those_words(tmp_path: Path):
+    (tmp_path / "a.toml").write_text("[axis.levels]\ncalm = {}\ngusts = {}\ncalm = {}\n")
+    with pytest.raises(dr.SettingsError, match=r"a key, or a level, stands there twice \(at line 4, column"):
+        load(tmp_path / "a.toml")
 
 
 def test_a_missing_key_is_named_with_what_was_found():

@@ -44,7 +44,8 @@ def load(source: Study | Mapping[str, Any] | str | Path, changes: Mapping[str, A
     try:
         return Study.from_dict(changed(tomllib.loads(_text(source)), changes or {}))
     except tomllib.TOMLDecodeError as error:
-        raise SettingsError(f'study "{source}" is not TOML: {error}') from error
+        why = str(error).replace("Cannot overwrite a value", "a key, or a level, stands there twice")
+        raise SettingsError(f'study "{source}" is not TOML: {why}') from error
     except SettingsError as error:
         raise SettingsError(f'study "{source}": {error}') from error
 
