@@ -114,6 +114,7 @@ def test_what_cannot_be_done_is_said_in_a_line_and_leaves_nothing(
 ):
     before = contents(folder)
     done = run("study", *words)
+        (["plot", "a.db", "-o", "a.jpg"], 1, 'cannot write "a.jpg": its ending is not known; use one of .png'),
     assert (done.exit_code, done.stdout) == (code, "")
     assert message in " ".join(done.stderr.split())
     assert contents(folder) == before

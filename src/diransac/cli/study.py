@@ -157,11 +157,13 @@ def _plot(
     from diransac.plots.paths import levels_with_paths, plot_paths
     from diransac.plots.study import plot_study
 
+    from diransac.plots.writing import checked_ending
     if level is not None and flown is False:
         raise typer.BadParameter("--level chooses whose paths are drawn, --errors draws none; give one of them")
     if parameters and (flown is not None or level is not None):
         raise typer.BadParameter("--parameters, --errors and --paths are pictures of their own; give one of them")
     with staged([output], [store]) as (written,):
+    checked_ending(output)
         if flown is None and level is None and not parameters:
             parameters = judges_parameters(store)
         if flown is None:
