@@ -37,6 +37,13 @@ def test_new_writes_a_study_and_never_over_another(folder: Path):
     assert run("study", "new", "mine.toml").exit_code == 0
     assert load("mine.toml") == load(tomllib.loads(template()))
     (folder / "mine.toml").write_text("changed")
+def test_list_names_the_methods_of_every_study():
+    lines = run("study", "list").stdout.splitlines()
+    named = [line.removeprefix("methods of ").split(": ") for line in lines if line.startswith("methods of ")]
+    listed = {name: methods for names, methods in named for name in names.split(", ")}
+    assert listed == {name: ", ".join(load(name).methods) for name in builtin_names()}
+
+
     done = run("study", "new", "mine.toml")
     assert (done.exit_code, done.stderr) == (1, 'error: "mine.toml" is there already; give another name\n')
     assert (folder / "mine.toml").read_text() == "changed"

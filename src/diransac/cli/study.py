@@ -210,7 +210,15 @@ class _Studies:
             span = levels[0] if len(levels) == 1 else f"{levels[0]} .. {levels[-1]} ({len(levels)})"
             judges = [*(["parameters"] if one.judges_parameters else []), *one.evaluation]
             rows.append([name, one.axis.name, span, ", ".join(judges), str(one.trials), one.description])
-        return "\n".join([*aligned(rows), "", f"methods: {', '.join((TRUE, *METHODS))}"])
+        return "\n".join([*aligned(rows), "", *self._methods()])
+
+    def _methods(self) -> Iterator[str]:
+        """The methods of each study, one line for those that have the same, and all that there are."""
+        studies: dict[tuple[str, ...], list[str]] = {}
+        for name in builtin_names():
+            studies.setdefault(tuple(load(name).methods), []).append(name)
+        yield from (f"methods of {', '.join(names)}: {', '.join(labels)}" for labels, names in studies.items())
+        yield f"methods there are: {', '.join((TRUE, *METHODS))}"
 
 
 # What is shown meanwhile ---------------------------------------------------------------------------------------------
