@@ -1,14 +1,18 @@
 """``diransac study``: what it prints, writes and refuses."""
 
 import json
+import re
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import polars as pl
 import pytest
+from rich.console import Console
 
 from command_line import contents, run
+from diransac.cli.study import _bar
 from diransac.study import builtin_names, load, template
 from diransac.study.workers import Given
 from studies import TINY_TOML, rows
@@ -33,10 +37,6 @@ def test_list_shows_every_study_and_every_method():
     assert load(listed["studies"]["fig4"]) == load("fig4")
 
 
-def test_new_writes_a_study_and_never_over_another(folder: Path):
-    assert run("study", "new", "mine.toml").exit_code == 0
-    assert load("mine.toml") == load(tomllib.loads(template()))
-    (folder / "mine.toml").write_text("changed")
 def test_list_names_the_methods_of_every_study():
     lines = run("study", "list").stdout.splitlines()
     named = [line.removeprefix("methods of ").split(": ") for line in lines if line.startswith("methods of ")]
@@ -44,6 +44,10 @@ def test_list_names_the_methods_of_every_study():
     assert listed == {name: ", ".join(load(name).methods) for name in builtin_names()}
 
 
+def test_new_writes_a_study_and_never_over_another(folder: Path):
+    assert run("study", "new", "mine.toml").exit_code == 0
+    assert load("mine.toml") == load(tomllib.loads(template()))
+    (folder / "mine.toml").write_text("changed")
     done = run("study", "new", "mine.toml")
     assert (done.exit_code, done.stderr) == (1, 'error: "mine.toml" is there already; give another name\n')
     assert (folder / "mine.toml").read_text() == "changed"
@@ -110,6 +114,7 @@ def test_export_writes_rows(folder: Path):
         (["run", "tiny.toml", *QUICK, "--cluster", "tcp://a:1"], 2, "--jobs counts processes of this machine"),
         (["run", "tiny.toml", "--store", "a.db", "--trials", 0], 2, "--trials"),
         (["run", "tiny.toml"], 2, "--store"),
+        (["plot", "a.db", "-o", "a.jpg"], 1, 'cannot write "a.jpg": its ending is not known; use one of .png'),
         (["run", "tiny.toml", "--store", "none/a.db"], 1, "cannot be opened"),
         (["status", "none.db"], 1, 'store "none.db" does not exist'),
         (["status", "tiny.toml"], 1, "file is not a database"),
@@ -121,10 +126,23 @@ def test_what_cannot_be_done_is_said_in_a_line_and_leaves_nothing(
 ):
     before = contents(folder)
     done = run("study", *words)
-        (["plot", "a.db", "-o", "a.jpg"], 1, 'cannot write "a.jpg": its ending is not known; use one of .png'),
     assert (done.exit_code, done.stdout) == (code, "")
     assert message in " ".join(done.stderr.split())
     assert contents(folder) == before
+
+
+def test_from_the_first_rows_on_a_terminal_sees_rate_and_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    seconds = [0.0]
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr("rich.console.Console", partial(Console, get_time=lambda: seconds[0]))
+    with _bar("tiny") as show:
+        show(2, 8)
+        seconds[0] = 300.0
+        show(4, 8)
+    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
+    assert "4/8 rows, 0.4/min 0:10:00" in shown
 
 
 def test_a_terminal_sees_how_far_a_run_is(folder: Path, monkeypatch: pytest.MonkeyPatch):

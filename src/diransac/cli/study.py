@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -156,14 +157,14 @@ def _plot(
     from diransac.plots.estimates import judges_parameters, plot_estimates
     from diransac.plots.paths import levels_with_paths, plot_paths
     from diransac.plots.study import plot_study
-
     from diransac.plots.writing import checked_ending
+
     if level is not None and flown is False:
         raise typer.BadParameter("--level chooses whose paths are drawn, --errors draws none; give one of them")
     if parameters and (flown is not None or level is not None):
         raise typer.BadParameter("--parameters, --errors and --paths are pictures of their own; give one of them")
-    with staged([output], [store]) as (written,):
     checked_ending(output)
+    with staged([output], [store]) as (written,):
         if flown is None and level is None and not parameters:
             parameters = judges_parameters(store)
         if flown is None:
@@ -253,16 +254,19 @@ def _bar(label: str) -> Iterator[Progress]:
         progress.TextColumn("rows, {task.fields[rate]}"),
         progress.TimeRemainingColumn(),
     )
-    with progress.Progress(*columns, console=Console(stderr=True), transient=True, speed_estimate_period=120) as shown:
+    # However rarely rows come, the first of them tell a rate: since the start, which counts as a row of nothing.
+    options: dict[str, Any] = {"console": Console(stderr=True), "transient": True, "speed_estimate_period": math.inf}
+    with progress.Progress(*columns, **options) as shown:
         task = shown.add_task(label, total=None, rate="starting")
 
         def update(done: int, asked: int) -> None:
             if shown.tasks[0].total is None:  # what an earlier run kept says nothing about the rate
                 shown.reset(task, total=asked, completed=done)
+                shown.advance(task, 0)
                 return
             shown.update(task, completed=done)
             speed = shown.tasks[0].speed
             if speed:
-                shown.update(task, rate=f"{speed:.1f}/s")
+                shown.update(task, rate=f"{speed:.1f}/s" if speed >= 1.0 else f"{60.0 * speed:.1f}/min")
 
         yield update
