@@ -22,7 +22,7 @@ from sledge_mass import MASS
 
 def sledge(pull: float = 0.0, parameters={"mass": MASS}, teeth: int = 3, label: str = "a", stiff: bool = False):
     if label == "broken":
-        raise RuntimeError("no such sledge")
+        raise RuntimeError("no such sledge,\\n\\tnowhere")
     if label == "model":
         return model
     hook = dr.Disturbance(model, "hook", forces=lambda q, v, u, p, d: {"s": d.pull}, constants={"pull": pull * teeth})
@@ -218,7 +218,10 @@ def test_a_users_file_that_has_changed_is_another_study(own):
         ({"kind": "sledges.py:sledge", "pull": "hard"}, "plant.pull is 'hard'; give a number"),
         ({"kind": "sledges.py:sledge", "teeth": 2.5}, "plant.teeth is 2.5; give a whole number from 0"),
         ({"kind": "sledges.py:sledge", "stiff": 1}, "plant.stiff is 1; give true or false"),
-        ({"kind": "sledges.py:sledge", "label": "broken"}, r'sledges.py", line 9: RuntimeError: no such sledge'),
+        (
+            {"kind": "sledges.py:sledge", "label": "broken"},
+            r'sledges.py", line 9: RuntimeError: no such sledge, nowhere$',
+        ),
         ({"kind": "sledges.py:sledge", "label": "model"}, '"sledge" returns a Model, not a diransac.Plant'),
         ({"kind": "servo-axis", "cogging": [1.0, 2.0]}, "plant: .*cogging is .*give a finite number"),
     ],

@@ -53,14 +53,15 @@ def running(file: Path, what: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def blaming(file: Path, what: str) -> Iterator[None]:
-    """Whatever is raised meanwhile is a ModelError that names the file and its line."""
+    """Whatever is raised meanwhile is a ModelError of one line of text, which names the file and its line."""
     try:
         yield
     except DiransacError as error:
-        raise ModelError(f'{what} file "{file}"{_line(error, file)}: {error}') from error
+        raise ModelError(f'{what} file "{file}"{_line(error, file)}: {_in_one_line(error)}') from error
     except (Exception, SystemExit) as error:
         found = error.msg if isinstance(error, SyntaxError) else error
-        raise ModelError(f'{what} file "{file}"{_line(error, file)}: {type(error).__name__}: {found}') from error
+        said = f"{type(error).__name__}: {_in_one_line(found)}"
+        raise ModelError(f'{what} file "{file}"{_line(error, file)}: {said}') from error
 
 
 @contextlib.contextmanager
@@ -81,3 +82,8 @@ def _line(error: BaseException, file: Path) -> str:
         return f", line {error.lineno}" if error.lineno else ""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)]
     return f", line {lines[-1]}" if lines else ""
+
+
+def _in_one_line(said: object) -> str:
+    """Text without line breaks."""
+    return " ".join(str(said).split())
