@@ -66,6 +66,9 @@ def test_the_data_of_a_trial_are_to_be_had_alone(whole: dict):
     assert not (data.flight["x"] == data.log["x"]).all()
     with pytest.raises(dr.SettingsError, match='no level "some" of outlier magnitude'):
         record(DRAWN, "some")
+    for trial in (-1, 1.5, True):
+        with pytest.raises(dr.SettingsError, match=f"trial is {trial}; give a whole number of at least 0"):
+            record(DRAWN, 40, trial=trial)
 
 
 def test_trials_fly_different_flights_and_methods_of_a_trial_the_same(whole: dict):

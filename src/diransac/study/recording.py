@@ -23,6 +23,7 @@ from diransac.study.library import load
 from diransac.study.plants import PlantChoice
 from diransac.study.seeds import derived_seed
 from diransac.study.specification import Study
+from diransac.study.tables import Reader
 
 __all__ = ["PATIENCE", "Recording", "check_ended", "flown", "record", "record_all", "trial_seed"]
 
@@ -53,14 +54,15 @@ def record(study: Study | Mapping[str, Any] | str | Path, level: str | float, tr
     Parameters
     ----------
     study : what `load` takes: a built-in study's name, a TOML file, its tables
-    level, trial : which
+    level, trial : which; trials count from 0, and any number is one, whatever the study asks for
 
-    Raises SettingsError: there is no such study or level.
+    Raises SettingsError: there is no such study or level, or the trial is no whole number from 0.
     Raises DiransacError: the trial has no data; it says why. An error that nobody foresaw is raised as it is.
     """
     known = load(study)
     (point,) = known.axis.narrowed([str(level)]).levels
-    (found,) = record_all(known.at(point.text), point.text, [trial])
+    number = Reader({"trial": trial}).whole("trial", 0)
+    (found,) = record_all(known.at(point.text), point.text, [number])
     if isinstance(found, Exception):
         raise found
     return found
