@@ -214,7 +214,7 @@ def test_a_users_file_that_has_changed_is_another_study(own):
         ({"kind": "sledges.py:open_to_all", "winds": ["hard"]}, "plant.winds is .*hard.*; give a list of numbers"),
         ({"kind": "sledges.py:open_to_all", "gust": 10**400}, "plant.gust is 1000.*; give a number"),
         ({"kind": "sled\0ges.py"}, r"plant.kind is 'sled\\x00ges.py'; there are .* or give FILE.py:NAME"),
-        ({"kind": "sledges.py:sledge", "wind": 1}, 'no key "plant.wind"; in plant there are kind, .*pull'),
+        ({"kind": "sledges.py:sledge", "wind": 1}, 'no key "plant.wind"; in plant there are kind, pull, .*stiff$'),
         ({"kind": "sledges.py:sledge", "pull": "hard"}, "plant.pull is 'hard'; give a number"),
         ({"kind": "sledges.py:sledge", "teeth": 2.5}, "plant.teeth is 2.5; give a whole number from 0"),
         ({"kind": "sledges.py:sledge", "stiff": 1}, "plant.stiff is 1; give true or false"),

@@ -302,8 +302,12 @@ def test_a_level_that_stands_there_twice_is_refused_in_those_words(tmp_path: Pat
 
 
 def test_a_missing_key_is_named_with_what_was_found():
-    with pytest.raises(dr.SettingsError, match="data is missing; found name, trials: give a table"):
+    message = 'the key "data", which is to hold a table, is missing; in this study there are name, trials'
+    with pytest.raises(dr.SettingsError, match=message):
         load({"name": "a", "trials": 1})
+    message = 'the key "plant.kind", which is to hold text, is missing; in plant there are kindd'
+    with pytest.raises(dr.SettingsError, match=message):
+        load({**TINY, "plant": {"kindd": "pendulum"}})
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,7 @@ _KINDS: dict[str, Callable[..., Plant]] = {
     "pendulum": pendulum,
 }
 _DEFAULT_NAME = "plant"
+_DIGEST_KEY = "file_digest"
 
 
 @dataclass(frozen=True)
@@ -65,10 +66,10 @@ class PlantChoice:
         """
         reader = Reader(table, "plant")
         kind = _kind(reader.text("kind"))
-        digest = "" if kind in _KINDS else reader.text("file_digest", _digest(kind))
+        digest = "" if kind in _KINDS else reader.text(_DIGEST_KEY, _digest(kind))
         try:
             arguments = given_arguments(_function(kind, digest), table, reader, "rotor_phase", pairs=True)
-            reader.end()
+            reader.end(unnamed=[_DIGEST_KEY])
             found = cls(kind, arguments, digest)
             found.plant  # noqa: B018  refuses what makes no plant
         except SettingsError:
@@ -79,7 +80,7 @@ class PlantChoice:
 
     def to_dict(self) -> dict[str, Any]:
         """The table that `from_dict` takes."""
-        file = {"file_digest": self.file_digest} if self.file_digest else {}
+        file = {_DIGEST_KEY: self.file_digest} if self.file_digest else {}
         return {"kind": self.kind, **self.arguments, **file}
 
     @property

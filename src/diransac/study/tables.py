@@ -77,20 +77,27 @@ class Reader:
             raise SettingsError(f"{self.path(key)} is {value!r:.60}; give a table")
         return value
 
-    def end(self) -> None:
-        """Raises SettingsError: there is a key that nobody asked for."""
+    def end(self, unnamed: Collection[str] = ()) -> None:
+        """Raises SettingsError: there is a key that nobody asked for.
+
+        Parameters
+        ----------
+        unnamed : keys that people don't write, and are not told about
+        """
         unknown = [key for key in self._table if key not in self._asked]
         if unknown:
-            where = f"in {self._path} " if self._path else ""
-            raise SettingsError(
-                f'there is no key "{self.path(unknown[0])}"; {where or "in a study "}there are {", ".join(self._asked)}'
-            )
+            there = ", ".join(key for key in self._asked if key not in unnamed)
+            where = self._path or "a study"
+            raise SettingsError(f'there is no key "{self.path(unknown[0])}"; in {where} there are {there}')
 
     def _value(self, key: str, default: object, wanted: str) -> object:
         self._asked[key] = None
         if key not in self._table and default is None:
-            found = ", ".join(self._table) or "nothing"
-            raise SettingsError(f"{self.path(key)} is missing; found {found}: give {wanted}")
+            found = f"there are {', '.join(self._table)}" if self._table else "there is nothing"
+            where = self._path or "this study"
+            raise SettingsError(
+                f'the key "{self.path(key)}", which is to hold {wanted}, is missing; in {where} {found}'
+            )
         return self._table.get(key, default)
 
 
