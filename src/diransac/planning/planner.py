@@ -105,7 +105,8 @@ def plan(
     guess : a trajectory of the same model to start the search from
     solver : ``ipopt``; ``fatrop``, which takes two thirds of the time, but now and then searches for ever, beyond the
         reach of time_limit and Ctrl-C, where parameters are far off; or ``snopt``, with ``pip install diransac[snopt]``
-    max_iterations : of the last attempt; those before it, from the guess, or more carefully, get two fifths of them
+    max_iterations : of the last attempt; those before it, from the guess, or more carefully, get two fifths of them;
+        five of SNOPT's count as one
     time_limit : s; to find out why there is no plan may take as long again
 
     Returns

@@ -30,6 +30,9 @@ __all__ = ["active_set"]
 
 _TOLERANCE = 1e-8
 
+_MAJOR = 5
+"""Major iterations of SNOPT for one that is asked for: an active set changes more often than a barrier."""
+
 
 def active_set(program: Program, guess: Floats, limits: SearchLimits) -> Outcome:
     """Solve by SNOPT.
@@ -62,7 +65,7 @@ def _options(program: Program, limits: SearchLimits) -> dict[str, float | int]:
     return {
         "Major optimality tolerance": _TOLERANCE,
         "Major feasibility tolerance": _TOLERANCE,
-        "Major iterations limit": limits.iterations,
+        "Major iterations limit": _MAJOR * limits.iterations,
         "Iterations limit": 100 * limits.iterations * program.layout.n_stages,
         "Time limit": limits.left,
     }
