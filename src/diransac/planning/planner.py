@@ -242,10 +242,6 @@ def _path(model: Model, guess: Trajectory) -> Path:
     return Path(guess.time - guess.time[0], guess.states, guess.inputs)
 
 
-def _manner(path: Path | None) -> Manner:
-    return "careful" if path is None else "near"
-
-
 # Search --------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class _Search:
@@ -271,7 +267,8 @@ class _Search:
         n = len(program.layout.intervals)
         durations = None if path is None else np.full(n, path.time[-1] / n)
         straight = first_path(task, np.ones(n) if durations is None else durations)
-        outcome = self._search(program, unknowns_of(program, path or straight, durations), _manner(path))
+        manner: Manner = "careful" if path is None else "near"
+        outcome = self._search(program, unknowns_of(program, path or straight, durations), manner)
         if not outcome.success:
             raise PlanningError(
                 f"no durations were found for which the plan works: {outcome.words}; "
