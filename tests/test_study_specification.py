@@ -66,7 +66,7 @@ def test_every_trial_of_the_gauntlet_flies_another_flight_and_is_judged_by_its_p
     assert study.plant.is_drawn
     assert study.judges_parameters
     assert study.evaluation == (("square",) if name == "gauntlet" else ())
-    assert {"i-diransac", "lo-diransac"} <= {method.method for method in study.methods.values()}
+    assert {"diransac", "lo-diransac"} <= {method.method for method in study.methods.values()}
 
 
 @pytest.mark.parametrize("name", GAUNTLET)
