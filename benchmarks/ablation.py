@@ -20,9 +20,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import diransac as dr
+from diransac.data.dataset import observe
 from diransac.errors import DiransacError
-from diransac.lo_diransac import find, hypotheses, method, mixture, readout, refinement
-from diransac.observations import observe
+from diransac.identification.methods.lo_diransac import find, hypotheses, method, mixture, readout, refinement
 from simulated import MACHINES, as_log, flight
 
 MACHINE, MODEL, DT = MACHINES["planar-rotorcraft"], dr.models.planar_rotorcraft(), 0.01
@@ -159,7 +159,7 @@ def weak_belief() -> list:
     return _believing(tau=0.01)
 
 
-def latent_accelerations() -> list:
+def unmodelled_accelerations() -> list:
     """The model is exact: tau comes down to nothing, whatever the log says."""
     original = refinement._evidence
 
@@ -219,7 +219,7 @@ LEFT_OUT = {
     "further starts": further_starts,
     "neighbours": neighbours,
     "outliers in the noise": outlier_component,
-    "latent accelerations": latent_accelerations,
+    "latent accelerations": unmodelled_accelerations,
     "belief in a thousandth": weak_belief,
     "pushes": pushes,
     "delay": delay,

@@ -17,8 +17,8 @@ import numpy as np
 from kernel import timed
 
 import diransac as dr
-from diransac.planning.flights import CORNERS, MEAN_SPEED, PLANNED_SHARE, ROTORCRAFT_LIMITS, ROUTE_WEIGHT
-from diransac.simulate import rollouts
+from diransac.flight.planning.flights import CORNERS, MEAN_SPEED, PLANNED_SHARE, ROTORCRAFT_LIMITS, ROUTE_WEIGHT
+from diransac.simulation import rollouts
 
 Array = np.ndarray[Any, Any]
 MODEL = dr.models.planar_rotorcraft()
@@ -165,7 +165,7 @@ def compare_steering(nominal: dr.Trajectory, repetitions: int) -> None:
     rows = (nominal.time, nominal.states, nominal.inputs)
     calls: dict[str, Callable[[], Any]] = {
         "ours": partial(dr.tvlqr, NOMINAL, nominal),
-        "ours, many": partial(dr.tvlqr_all, plants, [nominal] * N_LANES),
+        "ours, many": partial(dr.tvlqr_batch, plants, [nominal] * N_LANES),
         "continuous": partial(drake_ways.regulator, parameters, rows, default_weights(), 0.0),
         "discrete": partial(drake_ways.regulator, parameters, rows, default_weights(), nominal.dt),
     }
@@ -192,21 +192,21 @@ def compare_steering(nominal: dr.Trajectory, repetitions: int) -> None:
 # Flying --------------------------------------------------------------------------------------------------------------
 def compare_flying(nominal: dr.Trajectory, repetitions: int) -> None:
     """Row (c): closed loops of the extended plant, one thread."""
-    from diransac.flight import fly_all
+    from diransac.flight.closed_loop import fly_batch
 
     plant = dr.models.extended_rotorcraft(aerodynamic_imbalance=1.4e-6, mass_imbalance=1e-4)
     vectors = parameter_vectors(3)
-    controllers = dr.tvlqr_all([plant_of(next(vectors)) for _ in range(N_LANES)], [nominal] * N_LANES)
+    controllers = dr.tvlqr_batch([plant_of(next(vectors)) for _ in range(N_LANES)], [nominal] * N_LANES)
     seeds, substeps = list(range(N_LANES)), plant.substeps(nominal.dt)
     starts = np.array([plant.initial_state(nominal.states[0], seed) for seed in seeds])
     hidden = [(0, starts.shape[1] - len(MODEL.state))]
     x_ref, gains = (np.pad(a, [(0, 0)] * (a.ndim - 1) + hidden) for a in (nominal.states, controllers[0].gains))
     law = dr.simulate.Law(nominal.inputs, x_ref, gains, controllers[0].u_min, controllers[0].u_max)
     engine, constants = rollouts(plant.simulated, substeps=substeps), np.tile(plant.constants, (N_LANES, 1))
-    logs = fly_all([plant] * N_LANES, controllers, seeds=seeds, threads=1)
+    logs = fly_batch([plant] * N_LANES, controllers, seeds=seeds, threads=1)
     found = in_turns(
         {
-            "logs": partial(fly_all, [plant] * N_LANES, controllers, seeds=seeds, threads=1),
+            "logs": partial(fly_batch, [plant] * N_LANES, controllers, seeds=seeds, threads=1),
             "rollouts": partial(engine.fly, constants, starts, law, nominal.dt),
         },
         repetitions,

@@ -10,7 +10,7 @@ from gauntlet_methods import METHODS, Estimate
 from gauntlet_studies import study_of
 
 import diransac as dr
-from diransac.simulate import rollouts
+from diransac.simulation import rollouts
 from diransac.study import Study, record
 from diransac.study.flights import MISSIONS
 from diransac.study.judging import differ, hold, is_disturbed, relative_errors

@@ -16,8 +16,9 @@ from scipy.optimize import least_squares
 from sklearn.linear_model import HuberRegressor, LinearRegression, RANSACRegressor, TheilSenRegressor
 
 import diransac as dr
-from diransac.observations import observe
-from diransac.simulate import rollouts
+from diransac.data.dataset import observe
+from diransac.identification.estimators import regression
+from diransac.simulation import rollouts
 
 Array = np.ndarray[Any, Any]
 
@@ -65,7 +66,7 @@ def hampel_i_diransac(model: dr.Model, log: dr.Log) -> Estimate:
 
 def regressed(regressor: Callable[[], Any], model: dr.Model, log: dr.Log) -> Estimate:
     """A robust regressor on all equations, each divided by its median |b|, with columns of equal size."""
-    W, b = observe(model, log).regression()
+    W, b = regression(observe(model, log))
     size = np.median(np.abs(b), axis=0)
     W, b = (W / size[:, None]).reshape(-1, model.n_p), (b / size).reshape(-1)
     scale = np.sqrt(np.mean(W**2, axis=0))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from diransac import Log, Model
-from diransac.observations import observe
+from diransac.data.dataset import observe
 
 AXIS = """
 <mujoco>

@@ -19,8 +19,8 @@ import casadi as ca
 import numpy as np
 
 import diransac as dr
-from diransac.kernel import Target
-from diransac.simulate import rollouts
+from diransac.simulation import rollouts
+from diransac.simulation.compiler import Target
 
 Array = np.ndarray[Any, Any]
 Call = Callable[[], Any]

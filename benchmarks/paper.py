@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import diransac as dr
-from diransac.models import TABLE_I
+from diransac.model.library import TABLE_I
 from diransac.study import Study, load
 from diransac.study.summary import Flights, Summary, summarise
 

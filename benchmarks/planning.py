@@ -17,9 +17,9 @@ from unittest.mock import patch
 import numpy as np
 
 import diransac as dr
-from diransac.planning import planner, solvers
-from diransac.planning.transcription import Program
-from diransac.simulate import rollouts
+from diransac.flight.planning import planner, solvers
+from diransac.flight.planning.transcription import Program
+from diransac.simulation import rollouts
 
 FLIGHTS: dict[str, Callable[..., dr.Trajectory]] = {"square": dr.square, "star": dr.star, "sine": dr.sine}
 REPETITIONS = 15

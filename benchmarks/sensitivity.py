@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import diransac as dr
-from diransac.models import BLADE_FLAPPING, TABLE_I, extended_rotorcraft
+from diransac.model.library import BLADE_FLAPPING, TABLE_I, extended_rotorcraft
 
 MODEL = dr.models.planar_rotorcraft()
 TRUE = dr.Plant(MODEL, TABLE_I)

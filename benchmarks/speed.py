@@ -23,9 +23,10 @@ import others
 from kernel import QUADROTOR, REPETITIONS, CLoops, medians, problem_of, quadrotor, timed
 
 import diransac as dr
-from diransac.observations import observe
-from diransac.sampling import sample_rows
-from diransac.simulate import rollouts
+from diransac.data.dataset import observe
+from diransac.identification.estimators import regression
+from diransac.identification.sampling import sample_rows
+from diransac.simulation import rollouts
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -163,7 +164,7 @@ def compare_lengths(bench: Bench) -> None:
     found = medians(calls)
     times = milliseconds(short=found["short"], long=found["long"])
     row("(e) identify N = 25,000 / N = 2,500, no refits", found["long"] / found["short"], "11, aim 10", times)
-    evaluated = [calls[n]().evaluated for n in ("short refits", "long refits")]
+    evaluated = [calls[n]().n_hypotheses for n in ("short refits", "long refits")]
     note = f"{evaluated[0]} and {evaluated[1]} hypotheses"
     row("    with refits", found["long refits"] / found["short refits"], "", note)
 
@@ -199,7 +200,7 @@ def measure_hour() -> None:
         code = (
             "import json, resource, sys, time, diransac as dr; log = dr.read_log(sys.argv[1]); begin = time.time();"
             "result = dr.identify(dr.models.planar_rotorcraft(), log); used = resource.getrusage(resource.RUSAGE_SELF);"
-            "print(json.dumps([time.time() - begin, used.ru_maxrss, result.evaluated]))"
+            "print(json.dumps([time.time() - begin, used.ru_maxrss, result.n_hypotheses]))"
         )
         done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
     seconds, kibibytes, evaluated = json.loads(done.stdout)
@@ -272,7 +273,7 @@ def compare_others(bench: Bench, seconds: float) -> None:
     note = f"{taken:.0f} s, scaled from 1 hypothesis and {ROWS_OF_SCIPY} rows"
     row("    score: SciPy, solve_ivp a row / ours on 2 threads", taken / found["ours"], note=note)
     try:
-        fit = others.scikit_learn_ransac(*observe(bench.model, bench.log).regression(), TRIALS)
+        fit = others.scikit_learn_ransac(*regression(observe(bench.model, bench.log)), TRIALS)
         theirs = medians({"theirs": fit})["theirs"] / TRIALS
     except ImportError as absent:
         row("    scikit-learn", None, note=f"{absent.name} is not installed: pip install .[bench]")

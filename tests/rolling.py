@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 
-from diransac.kernel import Target
 from diransac.model import Model, Parameter
+from diransac.simulation.compiler import Target
 
 TARGETS = {"host": None, "avx2": Target("haswell"), "avx512": Target("skylake-avx512")}
 INTEGRATORS = {"rk4": 4, "euler": 1, "semi-implicit-euler": 1}

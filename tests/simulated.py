@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diransac.log import Log
+from diransac.data.log import Log
 
 GRAVITY = 9.81
 ARM_LENGTH = 0.177

@@ -4,9 +4,9 @@ import casadi as ca
 import numpy as np
 
 import diransac as dr
-from diransac.plant import Plant
-from diransac.simulate import rollouts
-from diransac.trajectory import Trajectory
+from diransac.flight.trajectory import Trajectory
+from diransac.model.plant import Plant
+from diransac.simulation import rollouts
 from rolling import BODY, normalised
 
 ROTORCRAFT = Plant(dr.models.planar_rotorcraft(), {"mass": 0.249, "inertia": 0.004, "drag": 0.025})

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import diransac as dr
 from command_line import MODEL, QUICK, TRUE, contents, run, swim, working_folder
 from diransac.cli.commands import app
-from diransac.simulate import rollouts
+from diransac.simulation import rollouts
 
 
 @pytest.fixture

@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from diransac.consensus import Diransac, InlierBiasedDiransac, Score, mean_squared_error, rms_error
+from diransac.identification.methods.consensus import (
+    Diransac,
+    InlierBiasedDiransac,
+    Score,
+    mean_squared_error,
+    rms_error,
+)
 
 SQUARES = np.array([[8.0, 18.0, 2.0], [0.0, 50.0, 32.0]])
 WEIGHTS = np.array([1.0, 0.0, 0.5])

@@ -8,8 +8,8 @@ import pytest
 
 import diransac as dr
 from diransac.errors import ModelError, SettingsError
-from diransac.plant import Plant
-from diransac.simulate import rollouts
+from diransac.model.plant import Plant
+from diransac.simulation import rollouts
 from steering import PENDULUM, ROTORCRAFT, moving, resting
 
 LIMITS = {"thrust": (0.0, 6.0), "moment": (-0.5, 0.5)}
@@ -216,18 +216,18 @@ def test_what_has_a_model_and_parameters_serves_as_a_plant():
 def test_equal_models_are_compiled_once_and_different_ones_do_not_share_a_call():
     trajectory = moving("rotorcraft", 20)
     again = Plant(dr.models.planar_rotorcraft(), ROTORCRAFT.parameters)
-    found = dr.tvlqr_all([ROTORCRAFT, again], [trajectory, trajectory])
+    found = dr.tvlqr_batch([ROTORCRAFT, again], [trajectory, trajectory])
     np.testing.assert_array_equal(found[0].gains, found[1].gains)
     longer = Plant(dr.models.planar_rotorcraft(arm_length=0.2), ROTORCRAFT.parameters)
     with pytest.raises(SettingsError, match="the plants have different models"):
-        dr.tvlqr_all([ROTORCRAFT, longer], [trajectory, trajectory])
+        dr.tvlqr_batch([ROTORCRAFT, longer], [trajectory, trajectory])
     assert np.abs(dr.tvlqr(longer, trajectory).gains - found[0].gains).max() > 1e-3
 
 
 def test_plants_and_trajectories_come_in_pairs():
-    assert dr.tvlqr_all([], []) == []
+    assert dr.tvlqr_batch([], []) == []
     with pytest.raises(SettingsError, match="there are 2 plants and 1 trajectories"):
-        dr.tvlqr_all([ROTORCRAFT] * 2, [moving("rotorcraft", 20)])
+        dr.tvlqr_batch([ROTORCRAFT] * 2, [moving("rotorcraft", 20)])
 
 
 def test_a_trajectory_of_another_model_is_refused():

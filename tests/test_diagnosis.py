@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.diagnosis import Diagnosis
+from diransac.identification.diagnosis import Diagnosis
 
 DT, N = 0.01, 1500
 MASS, DRAG, EXTRA = 1.5, 2.0, 0.3
@@ -71,11 +71,11 @@ def test_unexplained_is_the_acceleration_less_what_the_model_makes_of_it(spoilt)
     state, acceleration, force = slide()
     p, found = result.parameters, result.diagnosis
     left = acceleration - (force - p["drag"] * state[:, 1]) / p["mass"]
-    rows = np.rint((found.motion_time - 2.0) / DT).astype(int)
+    rows = np.rint((found.smoothed_time - 2.0) / DT).astype(int)
     means = np.array([x.mean() for x in np.split(left, rows[1:])])
     assert np.sqrt(np.mean(means**2)) > 0.05
-    np.testing.assert_allclose(found.latent_accelerations["s_ddot"], means, atol=0.1 * np.abs(means).max())
-    np.testing.assert_allclose(found.latent_forces["s_ddot"], p["mass"] * found.latent_accelerations["s_ddot"])
+    np.testing.assert_allclose(found.unmodelled_accelerations["s_ddot"], means, atol=0.1 * np.abs(means).max())
+    np.testing.assert_allclose(found.unmodelled_forces["s_ddot"], p["mass"] * found.unmodelled_accelerations["s_ddot"])
 
 
 def test_motion_is_where_the_machine_was_though_rows_are_outliers_or_rates_are_not_measured(spoilt):
@@ -83,19 +83,19 @@ def test_motion_is_where_the_machine_was_though_rows_are_outliers_or_rates_are_n
     alone, _ = log_of(state, acceleration, force, hit=0.1, names=("s",))
     positions = dr.identify(sledge(), alone, seed=1, differentiate=True).diagnosis
     for found, truth in ((spoilt[0].diagnosis, slide()[0]), (positions, state)):
-        rows = np.rint((found.motion_time - 2.0) / DT).astype(int)
+        rows = np.rint((found.smoothed_time - 2.0) / DT).astype(int)
         assert rows[0] == 0
         for k, name in enumerate(("s", "s_dot")):
-            np.testing.assert_allclose(found.motion[name], truth[rows, k], atol=0.05)
+            np.testing.assert_allclose(found.smoothed_states[name], truth[rows, k], atol=0.05)
 
 
 def test_an_input_that_acts_late_is_said_with_its_delay():
     found = dr.identify(sledge(), log_of(*slide(extra=0.0, lag=6))[0], seed=0)
-    assert found.diagnosis.is_late
+    assert found.diagnosis.input_delay_significant
     assert found.diagnosis.input_delay == pytest.approx(0.06, abs=1e-3)
     assert "! inputs act 60 ms later than the log says" in str(found)
     punctual = dr.identify(sledge(), log_of(*slide(extra=0.0))[0], seed=0)
-    assert not punctual.diagnosis.is_late
+    assert not punctual.diagnosis.input_delay_significant
 
 
 # ---------------------------------------------------------------------- how it is printed
@@ -114,9 +114,9 @@ def test_an_acceleration_that_is_not_measured_shows_what_is_unexplained_alone(sp
     found = spoilt[0].diagnosis
     bare = replace(
         found,
-        noise_scale={"s": 0.1},
+        noise_std={"s": 0.1},
         outlier_fraction={"s": 0.0},
-        latent_accelerations={"s_ddot": np.array([3.0, -3.0])},
+        unmodelled_accelerations={"s_ddot": np.array([3.0, -3.0])},
     )
     assert bare.lines(sledge().units)[2] == ["s_ddot", "", "", "3", "m/s^2"]
 
@@ -125,7 +125,7 @@ def test_a_parameter_that_the_log_cannot_tell_is_printed_as_a_question(spoilt):
     result, _ = spoilt
     covariance = result.covariance.copy()
     covariance[1] = covariance[:, 1] = np.inf
-    vague = replace(result, covariance=covariance, diagnosis=replace(result.diagnosis, undetermined=("drag",)))
+    vague = replace(result, covariance=covariance, diagnosis=replace(result.diagnosis, unidentifiable=("drag",)))
     assert re.search(r"^drag +\? +unknown +N s/m$", str(vague), re.MULTILINE)
     assert "! the log cannot tell drag" in str(vague)
 
@@ -140,9 +140,9 @@ def test_what_is_saved_is_what_is_loaded(spoilt, tmp_path):
     assert loaded == result
     for name, mask in result.diagnosis.outliers.items():
         np.testing.assert_array_equal(loaded.diagnosis.outliers[name], mask)
-    for name in ("latent_time", "motion_time"):
+    for name in ("unmodelled_time", "smoothed_time"):
         np.testing.assert_array_equal(getattr(loaded.diagnosis, name), getattr(result.diagnosis, name))
-    for name in ("latent_accelerations", "latent_forces", "motion"):
+    for name in ("unmodelled_accelerations", "unmodelled_forces", "smoothed_states"):
         before, after = getattr(result.diagnosis, name), getattr(loaded.diagnosis, name)
         assert list(before) == list(after)
         assert all((before[n] == after[n]).all() for n in before)
@@ -151,8 +151,8 @@ def test_what_is_saved_is_what_is_loaded(spoilt, tmp_path):
 def test_nothing_of_it_can_be_changed(spoilt):
     result, _ = spoilt
     for found in (result.diagnosis, Diagnosis.from_dict(json.loads(json.dumps(result.diagnosis.to_dict())), N)):
-        arrays = [found.latent_time, found.motion_time]
-        for mapping in (found.outliers, found.latent_accelerations, found.latent_forces, found.motion):
+        arrays = [found.unmodelled_time, found.smoothed_time]
+        for mapping in (found.outliers, found.unmodelled_accelerations, found.unmodelled_forces, found.smoothed_states):
             arrays += mapping.values()
             with pytest.raises(TypeError, match="item assignment"):
                 mapping["s"] = None
@@ -160,20 +160,20 @@ def test_nothing_of_it_can_be_changed(spoilt):
             with pytest.raises(ValueError, match="read-only"):
                 array[0] = 1.0
         with pytest.raises(AttributeError):
-            found.is_late = True
+            found.input_delay_significant = True
 
 
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("noise_scale", None),
-        ("noise_scale", {"s": "loud"}),
+        ("noise_std", None),
+        ("noise_std", {"s": "loud"}),
         ("outliers", {"s": "AAAA"}),
         ("outliers", {"s": "no base 64!"}),
-        ("latent_time", ["soon"]),
-        ("motion", {"s": [[0.0], [0.0, 1.0]]}),
+        ("unmodelled_time", ["soon"]),
+        ("smoothed_states", {"s": [[0.0], [0.0, 1.0]]}),
         ("input_delay", None),
-        ("undetermined", None),
+        ("unidentifiable", None),
     ],
 )
 def test_damage_is_told_by_name_of_the_file(spoilt, tmp_path, key, value):

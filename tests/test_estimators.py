@@ -19,10 +19,10 @@ from sklearn.neighbors import KNeighborsRegressor
 from sklearn.svm import LinearSVR
 
 import diransac as dr
+from diransac.data.dataset import observe
 from diransac.errors import IdentificationError, SettingsError
-from diransac.estimators import as_estimator, solve_definite
-from diransac.models import builtin
-from diransac.observations import observe
+from diransac.identification.estimators import as_estimator, solve_definite
+from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight
 
 OURS = [dr.OrdinaryLeastSquares(), dr.TotalLeastSquares()]

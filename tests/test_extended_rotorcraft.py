@@ -8,8 +8,8 @@ import pytest
 
 import diransac as dr
 from diransac.errors import ModelError
-from diransac.models import BLADE_FLAPPING, TABLE_I, extended_rotorcraft, planar_rotorcraft
-from diransac.simulate import rollouts
+from diransac.model.library import BLADE_FLAPPING, TABLE_I, extended_rotorcraft, planar_rotorcraft
+from diransac.simulation import rollouts
 
 M, I, C = TABLE_I.values()
 G, CT, CP, D, L, LZ, RHO = 9.81, 0.06, 0.06, 0.127, 0.177, 0.01, 1.225

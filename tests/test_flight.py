@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.controller import Controller, tvlqr
 from diransac.errors import LogError, SettingsError
-from diransac.flight import fly, fly_all, tracking_error
-from diransac.models import TABLE_I, extended_rotorcraft, planar_rotorcraft
-from diransac.simulate import rollouts
-from diransac.trajectory import Trajectory
+from diransac.flight.closed_loop import fly, fly_batch, tracking_error
+from diransac.flight.trajectory import Trajectory
+from diransac.flight.tvlqr import Controller, tvlqr
+from diransac.model.library import TABLE_I, extended_rotorcraft, planar_rotorcraft
+from diransac.simulation import rollouts
 
 MODEL = planar_rotorcraft()
 TRUE = dr.Plant(MODEL, TABLE_I)
@@ -108,7 +108,7 @@ def test_flights_at_a_time_are_the_same_bits_as_one_by_one():
     controllers = [STEERING, tvlqr(dr.Plant(MODEL, {**TABLE_I, "inertia": 0.006}), REFERENCE)]
     pairs = [(plant, controller) for plant in plants for controller in controllers]
     starts = np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6))
-    together = fly_all(*zip(*pairs, strict=True), starts, threads=2)
+    together = fly_batch(*zip(*pairs, strict=True), starts, threads=2)
     for log, (plant, controller), x in zip(together, pairs, starts, strict=True):
         start = dict(zip(MODEL.state, x, strict=True))
         alone = fly(plant, REFERENCE, controller, initial_state=start)
@@ -181,15 +181,15 @@ def test_what_does_not_fit_together_is_refused():
     with pytest.raises(SettingsError, match="the trajectory has 6 states; the plant has 2"):
         fly(other, REFERENCE, STEERING)
     with pytest.raises(SettingsError, match=r'the controller is for x, z.* but the plant "servo-axis" has'):
-        fly_all([other], [STEERING])
+        fly_batch([other], [STEERING])
     with pytest.raises(SettingsError, match=r"give a dr.Plant or a dr.Result"):
         fly(MODEL, REFERENCE, STEERING)
     with pytest.raises(SettingsError, match="the plants' equations differ"):
-        fly_all([extended_rotorcraft(phase="instantaneous"), DISTURBED], [STEERING, STEERING])
+        fly_batch([extended_rotorcraft(phase="instantaneous"), DISTURBED], [STEERING, STEERING])
     with pytest.raises(SettingsError, match="of different lengths, steps or limits"):
-        fly_all([TRUE, TRUE], [STEERING, STEERING.at(REFERENCE.time[:100])])
+        fly_batch([TRUE, TRUE], [STEERING, STEERING.at(REFERENCE.time[:100])])
     with pytest.raises(SettingsError, match="2 plants, 1 controllers and 2 seeds do not make flights"):
-        fly_all([TRUE, TRUE], [STEERING])
+        fly_batch([TRUE, TRUE], [STEERING])
     with pytest.raises(SettingsError, match='initial_state names "y"; states are x, z'):
         fly(TRUE, REFERENCE, STEERING, initial_state={"y": 1.0})
     with pytest.raises(SettingsError, match="initial_state holds a NaN"):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.consensus import Score
 from diransac.errors import IdentificationError, LogError, ModelError, SettingsError
-from diransac.models import builtin
+from diransac.identification.methods.consensus import Score
+from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight, rollout, with_outliers
 from user_models import tumbling
 
@@ -265,7 +265,7 @@ def test_progress_is_told_up_to_the_end():
 
 def test_least_squares_says_that_it_fitted_everything():
     result = dr.identify(MODEL, as_log(PLANE, *spoilt(), 0.02), "ols")
-    assert (result.stop_reason, result.iterations, result.evaluated) == ("whole log fitted", 0, 1)
+    assert (result.stop_reason, result.iterations, result.n_hypotheses) == ("whole log fitted", 0, 1)
     assert result.estimator == "OrdinaryLeastSquares"
 
 
@@ -316,7 +316,7 @@ def test_fewer_rows_than_a_sample_are_refused():
     log = as_log(PLANE, *spoilt(n_rows=50), 0.02)
     with pytest.raises(LogError, match="50 usable rows are fewer than sample_size = 75"):
         dr.identify(MODEL, log, "i-diransac")
-    assert dr.identify(MODEL, log, "ols").fitted_rows == 50
+    assert dr.identify(MODEL, log, "ols").n_fitted == 50
 
 
 def test_log_in_which_nothing_moves_is_refused():

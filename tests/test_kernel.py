@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from diransac.errors import ModelError, SettingsError
-from diransac.kernel import Target, compile_map
-from diransac.kernel.graph import read_graph
-from diransac.kernel.operations import OPERATIONS
+from diransac.simulation.compiler import Target, compile_map
+from diransac.simulation.compiler.graph import read_graph
+from diransac.simulation.compiler.operations import OPERATIONS
 
 x, y, z = (ca.SX.sym(name) for name in "xyz")
 UNARY = [
@@ -332,7 +332,7 @@ def test_map_leaves_its_inputs_alone():
 
 
 def test_importing_the_kernel_does_not_load_llvm():
-    code = "import sys, diransac.kernel, diransac.simulate; sys.exit('llvmlite' in sys.modules)"
+    code = "import sys, diransac.simulation.compiler, diransac.simulation; sys.exit('llvmlite' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import diransac as dr
+from diransac.data.dataset import observe
 from diransac.errors import IdentificationError, LogError
-from diransac.lo_diransac import find
-from diransac.observations import observe
-from diransac.simulate import rollouts
+from diransac.identification.methods.lo_diransac import find
+from diransac.simulation import rollouts
 from simulated import MACHINES, as_log, flight, with_outliers
 from test_nonlinear import log_of, swing
 from user_models import hanging_mass
@@ -104,7 +104,7 @@ def test_noise_and_outliers_are_told_apart():
     hit = rng.random(signals.shape) < 0.2
     spoilt = signals + sigma * rng.normal(size=signals.shape) + hit * rng.uniform(-30.0, 30.0, signals.shape)
     findings = found("planar-rotorcraft", spoilt, inputs)
-    assert findings.noise_scale == pytest.approx(sigma, rel=0.06)
+    assert findings.noise_std == pytest.approx(sigma, rel=0.06)
     assert findings.outlier_fraction == pytest.approx(hit.mean(axis=0), abs=0.02)
     assert (findings.outliers == hit).mean() > 0.98
 
@@ -115,8 +115,8 @@ def test_a_gust_is_an_acceleration_that_the_model_does_not_explain_not_a_sensor_
     pushed, inputs = flight_with(machine, gust)
     findings = found("underwater-vehicle", pushed, inputs)
     inside = (findings.latent_middles >= 1000) & (findings.latent_middles < 1100)
-    assert findings.latent_accelerations[inside] == pytest.approx(0.5, abs=0.1)
-    assert np.abs(findings.latent_accelerations[~inside]).max() < 0.1
+    assert findings.unmodelled_accelerations[inside] == pytest.approx(0.5, abs=0.1)
+    assert np.abs(findings.unmodelled_accelerations[~inside]).max() < 0.1
     assert findings.outliers.mean() < 0.02
 
 
@@ -161,7 +161,7 @@ def climb(moment):
 
 def test_parameters_that_the_motion_does_not_show_are_named():
     findings = found("planar-rotorcraft", *climb(moment=1e-6))
-    assert findings.undetermined.tolist() == [False, True, True]
+    assert findings.unidentifiable.tolist() == [False, True, True]
     assert findings.parameters[0] == pytest.approx(truth("planar-rotorcraft")[0], rel=1e-3)
 
 
@@ -214,7 +214,7 @@ def test_a_delay_of_inputs_that_leap_now_and_then_is_found_where_there_is_no_noi
     log = dr.Log.from_arrays(np.arange(len(signals) - 2) * 0.01, columns)
     result = dr.identify(model, log)
     assert result.diagnosis.input_delay == pytest.approx(0.02, abs=1e-4)
-    assert result.diagnosis.is_late
+    assert result.diagnosis.input_delay_significant
     np.testing.assert_allclose(list(result.parameters.values()), p, rtol=1e-3)
 
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.lo_diransac.arrowhead import Arrowhead
-from diransac.lo_diransac.freed import freed
-from diransac.lo_diransac.gate import mended_inputs, stuck_rows
-from diransac.lo_diransac.hypotheses import robust_scores, weak_form
-from diransac.lo_diransac.mixture import Mixture, lower_scale
-from diransac.lo_diransac.normal_equations import Fit, cost, linearize
-from diransac.lo_diransac.smoothing import choose_half_width, running_median, smooth
-from diransac.lo_diransac.windows import Windows
+from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
+from diransac.identification.methods.lo_diransac.freed import freed
+from diransac.identification.methods.lo_diransac.gate import mended_inputs, stuck_rows
+from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
+from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
+from diransac.identification.methods.lo_diransac.normal_equations import Fit, cost, linearize
+from diransac.identification.methods.lo_diransac.smoothing import choose_half_width, running_median, smooth
+from diransac.identification.methods.lo_diransac.windows import Windows
 from simulated import MACHINES, flight, rollout
 
 ROTORCRAFT = dr.models.planar_rotorcraft()

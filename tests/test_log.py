@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from diransac.data.log import Log
+from diransac.data.readers import read_log
 from diransac.errors import LogError
-from diransac.log import Log
-from diransac.readers import read_log
 
 
 def example(n=100, dt=0.01, **signals):

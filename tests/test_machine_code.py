@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 import pytest
 
 from diransac.errors import SettingsError
-from diransac.simulate import default_threads
+from diransac.simulation import default_threads
 
 
 @pytest.fixture(autouse=True)
@@ -21,7 +21,7 @@ def test_a_process_of_its_own_takes_the_cores_that_it_may_use():
     assert 1 <= default_threads() <= os.cpu_count()
     code = (
         "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
-        "from diransac.simulate import default_threads; assert default_threads() == 1"
+        "from diransac.simulation import default_threads; assert default_threads() == 1"
     )
     if hasattr(os, "sched_setaffinity"):
         assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from diransac.errors import ModelError, ResultError
 from diransac.model import Model, Parameter
-from diransac.models import BUILTIN, builtin
-from diransac.plant import Plant
+from diransac.model.library import BUILTIN, builtin
+from diransac.model.plant import Plant
 from simulated import MACHINES
 from user_models import tumbling
 
@@ -566,7 +566,7 @@ def test_damaged_model_is_refused(data):
     ids=str,
 )
 def test_damaged_model_with_a_right_checksum_is_refused_too(path_and_value, monkeypatch):
-    monkeypatch.setattr("diransac.model._checksum", lambda data: tumbling_checksum)
+    monkeypatch.setattr("diransac.model.model._checksum", lambda data: tumbling_checksum)
     with pytest.raises(ResultError):
         Model.from_dict(damage(*path_and_value))
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from diransac import prepare
+from diransac.data import preprocessing as prepare
+from diransac.data.log import Log
+from diransac.data.readers import read_log
 from diransac.errors import LogError, SettingsError
-from diransac.log import Log
-from diransac.models import planar_rotorcraft
-from diransac.noise import CorruptedLog, Noise, corrupt
-from diransac.readers import read_log
+from diransac.flight.corruption import CorruptedLog, Noise, corrupt
+from diransac.model.library import planar_rotorcraft
 
 N, DT = 4000, 0.01
 T = np.arange(N) * DT

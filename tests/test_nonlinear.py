@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import diransac as dr
+from diransac.data.dataset import observe
 from diransac.errors import IdentificationError, ModelError
 from diransac.model import Parameter
-from diransac.models import builtin
-from diransac.observations import observe
+from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight, with_outliers
 from user_models import hanging_mass
 
@@ -152,7 +152,7 @@ def test_search_gives_the_same_bits_for_every_batch_size(batch_size):
         hanging_mass(), log, settings=dr.Settings.from_dict({**settings.to_dict(), "batch_size": batch_size})
     )
     assert other.parameters == usual.parameters
-    assert (other.fit_error, other.evaluated) == (usual.fit_error, usual.evaluated)
+    assert (other.fit_error, other.n_hypotheses) == (usual.fit_error, usual.n_hypotheses)
 
 
 def test_leaving_rows_out_is_fitting_the_others():

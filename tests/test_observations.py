@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import diransac as dr
+from diransac.data.dataset import observe
 from diransac.errors import LogError, SettingsError
-from diransac.models import builtin
-from diransac.observations import observe
+from diransac.identification.estimators import regression
+from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight
 from user_models import tumbling
 
@@ -124,7 +125,7 @@ def test_signals_that_no_equation_names_may_be_missing():
 def test_log_and_its_arrays_are_left_alone():
     log = plane_log({(3, "thrust"): np.nan})
     before = log.fingerprint
-    observe(MODEL, log).regression()
+    regression(observe(MODEL, log))
     assert log.fingerprint == before
 
 
@@ -165,7 +166,7 @@ def test_angle_that_jumps_by_a_turn_is_unwrapped():
 def test_regression_is_that_of_the_rows_written_by_hand(name):
     machine = MACHINES[name]
     signals, inputs = flight(machine, 60, DT)
-    W, b = observe(builtin(name), as_log(machine, signals, inputs, DT)).regression()
+    W, b = regression(observe(builtin(name), as_log(machine, signals, inputs, DT)))
     by_hand = machine.rows(signals, inputs)
     assert pytest.approx(by_hand[0], rel=1e-12, abs=1e-12) == W
     assert b == pytest.approx(by_hand[1], rel=1e-12, abs=1e-12)
@@ -173,8 +174,8 @@ def test_regression_is_that_of_the_rows_written_by_hand(name):
 
 def test_regression_leaves_skipped_rows_out():
     changes = {(7, "x_ddot"): np.nan, (0, "z_dot"): np.nan}
-    W, b = observe(MODEL, plane_log(changes)).regression()
-    whole_W, whole_b = observe(MODEL, plane_log()).regression()
+    W, b = regression(observe(MODEL, plane_log(changes)))
+    whole_W, whole_b = regression(observe(MODEL, plane_log()))
     kept = np.delete(np.arange(N), [0, 7])
     assert np.array_equal(W, whole_W[kept])
     assert np.array_equal(b, whole_b[kept])

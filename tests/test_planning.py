@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import diransac as dr
-import diransac.planning.solvers
-from diransac.planning.flights import CORNERS, ROTORCRAFT_LIMITS
-from diransac.simulate import rollouts
+import diransac.flight.planning.solvers
+from diransac.flight.planning.flights import CORNERS, ROTORCRAFT_LIMITS
+from diransac.simulation import rollouts
 from planned import LIMITS, ROTORCRAFT, across, defects, mass, rotorcraft
 from rolling import BODY, plain_step
 from simulated import ROTORCRAFT as BY_HAND
@@ -201,8 +201,8 @@ def test_a_nearer_plan_costs_more_effort():
 
 def test_a_problem_is_built_once_for_many_parameters(monkeypatch):
     across(ROTORCRAFT)
-    built, plain = [], diransac.planning.solvers.ca.nlpsol
-    monkeypatch.setattr(diransac.planning.solvers.ca, "nlpsol", lambda *a: built.append(a) or plain(*a))
+    built, plain = [], diransac.flight.planning.solvers.ca.nlpsol
+    monkeypatch.setattr(diransac.flight.planning.solvers.ca, "nlpsol", lambda *a: built.append(a) or plain(*a))
     costs = [across(rotorcraft(mass=m), input_limits=LIMITS, trim={"thrust": 2.4, "moment": 0.0}).cost
              for m in (0.24, 0.25, 0.26)]  # fmt: skip
     assert not built

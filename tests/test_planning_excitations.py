@@ -5,7 +5,7 @@ import pytest
 from casadi import cos
 
 import diransac as dr
-from diransac.planning.flights import ROTORCRAFT_LIMITS
+from diransac.flight.planning.flights import ROTORCRAFT_LIMITS
 from planned import ROTORCRAFT, mass
 from rolling import BODY
 

@@ -10,7 +10,7 @@ import pytest
 
 import diransac as dr
 from diransac.errors import ModelError, PlanningError, SettingsError
-from diransac.planning.transcription import Program
+from diransac.flight.planning.transcription import Program
 from planned import LIMITS, MASS, ROTORCRAFT, across, mass, rotorcraft
 from rolling import BODY
 

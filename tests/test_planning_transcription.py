@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from diransac.planning.stage import Costs, stage_of
-from diransac.planning.transcription import Layout, Numbers, Program
+from diransac.flight.planning.stage import Costs, stage_of
+from diransac.flight.planning.transcription import Layout, Numbers, Program
 from planned import ROTORCRAFT
 from rolling import BODY
 

@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 
 import diransac as dr
 from diransac.errors import ModelError, SettingsError
-from diransac.plant import DisturbedModel, as_plant
-from diransac.simulate import rollouts
+from diransac.model.plant import DisturbedModel, as_plant
+from diransac.simulation import rollouts
 
 
 def mass(sign=1.0, *, definite=True):

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
+from diransac.data.log import Log
 from diransac.errors import LogError, SettingsError
-from diransac.log import Log
+from diransac.flight.trajectory import Trajectory
 from diransac.plots import palette, plot_flight
 from diransac.plots.palette import COLOURS, REFERENCE
-from diransac.trajectory import Trajectory
 
 N, DT = 60, 0.1
 T = np.arange(N) * DT

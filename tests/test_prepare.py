@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from diransac import prepare
+from diransac.data import preprocessing as prepare
+from diransac.data.log import Log
+from diransac.data.preprocessing.bandwidth import choose_bandwidth
+from diransac.data.preprocessing.filters import half_length, kernels
+from diransac.data.readers import read_log
 from diransac.errors import LogError, SettingsError
-from diransac.log import Log
 from diransac.model import Model, Parameter
-from diransac.models.servo_axis import servo_axis
-from diransac.prepare.bandwidth import choose_bandwidth
-from diransac.prepare.filters import half_length, kernels
-from diransac.readers import read_log
+from diransac.model.library.servo_axis import servo_axis
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 N = 400

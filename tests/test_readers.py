@@ -13,9 +13,9 @@ import scipy.io
 from hypothesis import given
 from hypothesis import strategies as st
 
+from diransac.data.log import Log
+from diransac.data.readers import read_log
 from diransac.errors import DiransacError, LogError, SettingsError
-from diransac.log import Log
-from diransac.readers import read_log
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -15,7 +15,7 @@ import diransac as dr
 from diransac.report import figures, markup
 from diransac.report.judgement import findings, verdict, worst
 from diransac.report.runs import bulk, labelled, simulate_on
-from diransac.simulate import rollouts
+from diransac.simulation import rollouts
 
 VOID = {"meta", "input", "link"}
 HOSTILE = '</script><script>alert(1)</script>"><img src=x onerror=alert(1)>'
@@ -324,8 +324,8 @@ def test_noise_outliers_and_what_is_unexplained_stand_in_a_table_with_units(diag
     page = Page(written(diagnosed, hit, tmp_path))
     found = diagnosed.diagnosis
     share = markup.percent(found.outlier_fraction["x_dot"])
-    assert f"x_dot m/s {markup.number(found.noise_scale['x_dot'], 2)} {share}" in page.text
-    left = np.sqrt(np.mean(found.latent_accelerations["x_ddot"] ** 2))
+    assert f"x_dot m/s {markup.number(found.noise_std['x_dot'], 2)} {share}" in page.text
+    left = np.sqrt(np.mean(found.unmodelled_accelerations["x_ddot"] ** 2))
     assert f" {markup.number(left, 2)} What acts on the machine and is not in the model" in page.text
     assert any(a["aria-label"] == "What the model does not explain: force on x in N" for a in page.all("svg"))
     assert page.all("section")[2]["id"] == "diagnosis"
@@ -359,7 +359,10 @@ def test_simulations_begin_anew_where_the_machine_was_and_the_whole_log_stays_to
     n_rows = round(run.period / pushed.dt)
     assert 5 <= len(pushed) / n_rows <= 25
     begin, end = n_rows, 2 * n_rows
-    start = [np.interp(pushed.time[begin], found.diagnosis.motion_time, x) for x in found.diagnosis.motion.values()]
+    start = [
+        np.interp(pushed.time[begin], found.diagnosis.smoothed_time, x)
+        for x in found.diagnosis.smoothed_states.values()
+    ]
     expected = rollouts(model).trajectories(
         [list(found.parameters.values())], np.array(start), pushed["thrust"][begin:end, None], pushed.dt
     )[0]
@@ -400,7 +403,7 @@ def test_a_parameter_that_the_log_cannot_tell_is_no_number(diagnosed, hit, tmp_p
         diagnosed,
         covariance=covariance,
         parameters={**diagnosed.parameters, "bias": 123.456},
-        diagnosis=dataclasses.replace(diagnosed.diagnosis, undetermined=("bias",)),
+        diagnosis=dataclasses.replace(diagnosed.diagnosis, unidentifiable=("bias",)),
     )
     page = Page(written([vague, dr.identify(vague.model, hit, "ols")], hit, tmp_path))
     assert "bias N lo-diransac the log cannot tell ols" in page.text
@@ -429,9 +432,9 @@ def test_positions_alone_are_simulated_from_the_motion_that_was_found(model, log
 
 def test_what_the_model_leaves_out_is_graded(diagnosed, hit):
     assert level_of(diagnosed, hit, "The model leaves out what is worth") == "good"
-    latent = {"x_ddot": diagnosed.diagnosis.latent_accelerations["x_ddot"] + 2.0}
+    latent = {"x_ddot": diagnosed.diagnosis.unmodelled_accelerations["x_ddot"] + 2.0}
     pushed = dataclasses.replace(
-        diagnosed, diagnosis=dataclasses.replace(diagnosed.diagnosis, latent_accelerations=latent)
+        diagnosed, diagnosis=dataclasses.replace(diagnosed.diagnosis, unmodelled_accelerations=latent)
     )
     assert level_of(pushed, hit, "The model leaves out what is worth") == "care"
 
@@ -459,7 +462,7 @@ def test_hostile_names_stay_text(model, log, tmp_path):
         notes=(HOSTILE,),
         stop_reason=HOSTILE,
         preparation=({"step": HOSTILE, HOSTILE: [HOSTILE, {HOSTILE: None}]},),
-        skipped={HOSTILE: 1},
+        rejected={HOSTILE: 1},
         estimator=HOSTILE,
     )
     page = Page(written({HOSTILE: found}, hostile, tmp_path))

@@ -216,9 +216,9 @@ def test_every_key_is_needed(result, tmp_path):
         (["model", "residual"], "AAAA"),
         (["model", "coordinates"], {"y": "m", "z": "m", "theta": "rad"}),
         (["model"], 5),
-        (["sensitivity"], {"mass": [1.0]}),
+        (["bandwidth_sensitivity"], {"mass": [1.0]}),
         (["degrees_of_freedom"], "many"),
-        (["skipped"], 4),
+        (["rejected"], 4),
         (["iterations"], "all"),
         (["method"], None),
         (["notes"], 5),
@@ -275,7 +275,7 @@ def test_printed_result_says_what_is_not_as_it_should_be(results):
 
 
 def test_printed_result_warns_of_a_fit_that_explains_little_of_the_log(result):
-    poor = dataclasses.replace(result, inlier_fraction=0.2, covariance=np.full((3, 3), np.inf), fitted_rows=2)
+    poor = dataclasses.replace(result, inlier_fraction=0.2, covariance=np.full((3, 3), np.inf), n_fitted=2)
     warnings = [line for line in str(poor).splitlines() if line.startswith("!")]
     for part in ("less than half of the log", "short of the 85 % inliers", "2 fitted rows are too few"):
         assert any(part in line for line in warnings), part

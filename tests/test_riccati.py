@@ -8,9 +8,9 @@ from scipy.linalg import solve_discrete_are
 
 import diransac as dr
 from diransac.errors import PlanningError
-from diransac.plant import Plant
-from diransac.simulate import Law, linearized_step, rollouts
-from diransac.trajectory import Trajectory
+from diransac.flight.trajectory import Trajectory
+from diransac.model.plant import Plant
+from diransac.simulation import Law, linearized_step, rollouts
 from rolling import plain_step
 from steering import (
     HOVER,
@@ -69,7 +69,7 @@ def test_many_controllers_have_the_bits_that_each_has_alone():
         arrays = (motion.time, motion.states, motion.inputs, motion.state_names, motion.input_names)
         trajectories.append(Trajectory(*arrays, limits))
     for threads in (1, 2):
-        found = dr.tvlqr_all(plants, trajectories, threads=threads)
+        found = dr.tvlqr_batch(plants, trajectories, threads=threads)
         assert len(found) == 19
         for plant, trajectory, controller in zip(plants, trajectories, found, strict=True):
             alone = dr.tvlqr(plant, trajectory)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from diransac.errors import ModelError, SettingsError
-from diransac.kernel import compile_scan
+from diransac.simulation.compiler import compile_scan
 from rolling import TARGETS
 
 carry, row, constants = ca.SX.sym("c", 2), ca.SX.sym("r", 3), ca.SX.sym("k", 2)

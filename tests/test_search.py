@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from algorithm1 import Choices, Problem, Story, algorithm1
-from diransac.consensus import Diransac, InlierBiasedDiransac, Score
+from diransac.data.dataset import observe
 from diransac.errors import IdentificationError
-from diransac.estimators import OrdinaryLeastSquares
-from diransac.evaluation import Simulation, choose_scoring, judged_signals
-from diransac.models import builtin
-from diransac.observations import observe
-from diransac.search import Outcome, search
-from diransac.settings import Settings
-from diransac.simulate import rollouts
+from diransac.identification.estimators import OrdinaryLeastSquares
+from diransac.identification.evaluation import Simulation, choose_scoring, judged_signals
+from diransac.identification.methods.consensus import Diransac, InlierBiasedDiransac, Score
+from diransac.identification.methods.search import Outcome, search
+from diransac.identification.settings import Settings
+from diransac.model.library import builtin
+from diransac.simulation import rollouts
 from simulated import MACHINES, as_log, flight, rollout, with_outliers
 
 VARIANTS = ("i-diransac", "diransac")
@@ -186,8 +186,8 @@ def assert_agree(outcome: Outcome | str, inlier_sets: list[np.ndarray], story: S
         assert f"no hypothesis was accepted in {story.k} samples ({counts})" in outcome
         return
     assert outcome.iterations == story.k
-    assert outcome.evaluated == len(story.hypotheses)
-    assert outcome.skipped == story.fates
+    assert outcome.n_hypotheses == len(story.hypotheses)
+    assert outcome.rejected == story.fates
     assert np.array_equal(np.sort(outcome.best.rows), np.sort(story.best.rows))
     assert outcome.best.score.inlier_fraction == story.best.fraction
     assert outcome.best.score.error == pytest.approx(story.best.error, rel=1e-9)
@@ -223,7 +223,7 @@ def test_batch_size_and_threads_never_change_a_bit(case, variant, batch_size, th
         return
     assert other.best.parameters.tobytes() == usual.best.parameters.tobytes()
     assert (other.best.rows.tobytes(), other.best.score) == (usual.best.rows.tobytes(), usual.best.score)
-    for name in ("iterations", "evaluated", "skipped", "stop_reason"):
+    for name in ("iterations", "n_hypotheses", "rejected", "stop_reason"):
         assert getattr(other, name) == getattr(usual, name)
 
 
@@ -302,7 +302,7 @@ def test_refit_that_is_pending_at_the_iteration_limit_never_runs():
     script = Script({(0, 1): 1.0, (2, 3, 4): 2.0}, {1.0: (5.0, [2, 3, 4]), 2.0: (1.0, [2, 3, 4])})
     outcome = run_script(script)
     assert outcome.best.parameters == [1.0]
-    assert (outcome.iterations, outcome.evaluated) == (1, 1)
+    assert (outcome.iterations, outcome.n_hypotheses) == (1, 1)
 
 
 def test_refit_runs_before_the_next_sample_and_does_not_count():
@@ -312,21 +312,21 @@ def test_refit_runs_before_the_next_sample_and_does_not_count():
     outcome = run_script(script, max_iterations=2, batch_size=1)
     assert script.fitted == [(0, 1), (2, 3, 4), (1, 2)]
     assert outcome.best.parameters == [2.0]
-    assert (outcome.iterations, outcome.evaluated) == (2, 3)
+    assert (outcome.iterations, outcome.n_hypotheses) == (2, 3)
 
 
 def test_refit_that_is_pending_when_the_inlier_fraction_is_reached_never_runs():
     script = Script({(0, 1): 1.0, (2, 3, 4): 2.0}, {1.0: (5.0, [2, 3, 4]), 2.0: (1.0, [2, 3, 4])})
     outcome = run_script(script, max_iterations=5, batch_size=1, stop_inlier_fraction=0.3)
     assert outcome.best.parameters == [1.0]
-    assert (outcome.iterations, outcome.evaluated, outcome.stop_reason) == (1, 1, "inlier fraction reached")
+    assert (outcome.iterations, outcome.n_hypotheses, outcome.stop_reason) == (1, 1, "inlier fraction reached")
 
 
 def test_refit_that_fails_the_preliminary_test_ends_its_chain():
     script = Script({(0, 1): 1.0, (2, 3, 4): -1.0, (1, 2): 3.0}, {1.0: (5.0, [2, 3, 4]), 3.0: (9.0, [])})
     outcome = run_script(script, max_iterations=2)
     assert outcome.best.parameters == [1.0]
-    assert outcome.skipped == {"out of bounds": 1, "no improvement": 1}
+    assert outcome.rejected == {"out of bounds": 1, "no improvement": 1}
 
 
 def test_chain_that_meets_a_set_again_ends():
@@ -360,7 +360,7 @@ def test_no_inliers_are_never_stored_while_inliers_have_weight():
     script = Script({(0, 1): 1.0, (1, 2): 2.0}, {1.0: (5.0, []), 2.0: (6.0, [1])})
     outcome = run_script(script, max_iterations=2)
     assert outcome.best.parameters == [2.0]
-    assert outcome.skipped["not accepted"] == 1
+    assert outcome.rejected["not accepted"] == 1
 
 
 def test_sample_grows_by_as_few_observations_as_it_needs():

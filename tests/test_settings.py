@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from diransac.errors import SettingsError
-from diransac.settings import Settings
+from diransac.identification.settings import Settings
 
 
 def test_table_iv_holds_the_papers_values():

@@ -9,7 +9,7 @@ import pytest
 
 from diransac.errors import ModelError, SettingsError
 from diransac.model import Model
-from diransac.simulate import rollouts
+from diransac.simulation import rollouts
 from rolling import BODY, PENDULUM, ROTORCRAFT, TARGETS, assert_same, log_of, score_of
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from diransac.errors import SettingsError
-from diransac.simulate import Law, rollouts
+from diransac.simulation import Law, rollouts
 from rolling import (
     BODY,
     EXPLOSIVE,

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from diransac.simulate import inlier_mask, rollouts
+from diransac.simulation import inlier_mask, rollouts
 from rolling import BODY, EXPLOSIVE, PENDULUM, ROTORCRAFT, assert_same, log_of, plain_trajectory, score_of
 
 

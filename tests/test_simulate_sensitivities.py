@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from diransac.errors import SettingsError
-from diransac.models import double_pendulum
-from diransac.simulate import rollouts
+from diransac.model.library import double_pendulum
+from diransac.simulation import rollouts
 from rolling import BODY, EXPLOSIVE, INTEGRATORS, PENDULUM, ROTORCRAFT, TARGETS, assert_same, log_of, machine, score_of
 
 MODELS = [ROTORCRAFT, PENDULUM, BODY, double_pendulum()]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from diransac.simulate import rollouts
+from diransac.simulation import rollouts
 from rolling import BODY, INTEGRATORS, PENDULUM, ROTORCRAFT, log_of, normalised, plain_trajectory
 
 

@@ -203,14 +203,14 @@ def test_a_flight_that_ends_in_an_error_that_nobody_foresaw_takes_no_other_with_
     purpose: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     spec = tiny(plant={"kind": "extended-rotorcraft", "rotor_phase": "any"})
-    fly_all, struck = dr.fly_all, derived_seed(recording.trial_seed(load(spec), "40", 1), purpose)
+    fly_batch, struck = dr.fly_batch, derived_seed(recording.trial_seed(load(spec), "40", 1), purpose)
 
     def breaks(plants: list, controllers: list, **more: object) -> list:
         if struck in more["seeds"]:
             raise ZeroDivisionError("by accident")
-        return fly_all(plants, controllers, **more)
+        return fly_batch(plants, controllers, **more)
 
-    monkeypatch.setattr(recording, "fly_all", breaks)
+    monkeypatch.setattr(recording, "fly_batch", breaks)
     found = run(tmp_path, spec, levels=[40], methods=["ols"], batch_size=2)
     assert found["40", 0, "ols"]["status"] == "done"
     assert found["40", 1, "ols"]["error"] == "internal error: ZeroDivisionError: by accident"
@@ -230,7 +230,7 @@ def test_a_controller_that_cannot_be_takes_no_other_with_it(
         return [alone(*pair) for pair in zip(plants, trajectories, strict=True)]
 
     monkeypatch.setattr(trials, "tvlqr", alone)
-    monkeypatch.setattr(trials, "tvlqr_all", together)
+    monkeypatch.setattr(trials, "tvlqr_batch", together)
     found = run(tmp_path)
     assert found["40", 0, "ols"]["error"] == "no controller"
     assert all(row == whole[key] for key, row in found.items() if key != ("40", 0, "ols"))
@@ -238,12 +238,12 @@ def test_a_controller_that_cannot_be_takes_no_other_with_it(
 
 def test_a_flight_that_diverges_is_a_row_that_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def runaway(plants: list, controllers: list, **more: object) -> list:
-        logs = dr.fly_all(plants, controllers, **more)
+        logs = dr.fly_batch(plants, controllers, **more)
         return [
             dr.Log(log.time, {n: log[n] for n in log.names}, notes=("the flight diverged at t = 1 s",)) for log in logs
         ]
 
-    monkeypatch.setattr(recording, "fly_all", runaway)
+    monkeypatch.setattr(recording, "fly_batch", runaway)
     found = run(tmp_path, trials=1, levels=[40])
     assert {row["error"] for row in found.values()} == {"the flight diverged at t = 1 s"}
 
@@ -256,17 +256,17 @@ def test_an_infeasible_data_flight_fails_every_trial_of_its_level(tmp_path: Path
 
 
 def test_a_data_flight_that_diverges_fails_its_own_trial_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    fly_all, flown = dr.fly_all, []
+    fly_batch, flown = dr.fly_batch, []
 
     def one_runs_away(plants: list, controllers: list, **more: object) -> list:
-        logs = fly_all(plants, controllers, **more)
+        logs = fly_batch(plants, controllers, **more)
         flown.append(len(logs))
         if len(flown) == 1:
             lost = logs[1]
             logs[1] = dr.Log(lost.time, {n: lost[n] for n in lost.names}, notes=("the flight diverged at t = 1 s",))
         return logs
 
-    monkeypatch.setattr(recording, "fly_all", one_runs_away)
+    monkeypatch.setattr(recording, "fly_batch", one_runs_away)
     plant = {"kind": "extended-rotorcraft", "rotor_phase": "any"}
     found = run(tmp_path, tiny(plant=plant), levels=[40], methods=["ols"], batch_size=2)
     assert flown == [2, 1]

@@ -9,9 +9,9 @@ from scipy.stats import binom
 from scipy.stats import t as student
 
 import diransac as dr
-from diransac.models import builtin
-from diransac.observations import observe
-from diransac.uncertainty import N_BLOCKS, jackknife_covariance
+from diransac.data.dataset import observe
+from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance
+from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight
 
 TRIALS = 150

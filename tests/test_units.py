@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from diransac.units import conversion, same_unit, split_unit
+from diransac.data.units import conversion, same_unit, split_unit
 
 SAME = [
     ("m/s^2", "m s^-2"),

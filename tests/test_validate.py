@@ -7,7 +7,7 @@ import pytest
 
 import diransac as dr
 from diransac.errors import LogError, SettingsError
-from diransac.models import builtin
+from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight, rollout
 
 PLANE, VEHICLE = MACHINES["planar-rotorcraft"], MACHINES["underwater-vehicle"]

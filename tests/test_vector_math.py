@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special
 
-from diransac.kernel import Target, compile_map
+from diransac.simulation.compiler import Target, compile_map
 
 UNARY = {  # operation: units in the last place by which it may differ from the C library's
     "NEG": 0, "SQ": 0, "TWICE": 0, "INV": 0, "SQRT": 0, "FABS": 0, "FLOOR": 0, "CEIL": 0, "SIGN": 0, "NOT": 0,

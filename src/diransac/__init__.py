@@ -7,7 +7,6 @@ Models and errors are here at once; everything else is imported when it is first
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from diransac import models
 from diransac.errors import (
     DiransacError,
     IdentificationError,
@@ -18,27 +17,27 @@ from diransac.errors import (
     SettingsError,
     StudyError,
 )
-from diransac.model import Model, Parameter
-from diransac.plant import Disturbance, Plant
+from diransac.model import Disturbance, Model, Parameter, Plant
+from diransac.model import library as models
 
 if TYPE_CHECKING:
-    from diransac.controller import Controller, tvlqr, tvlqr_all
-    from diransac.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
-    from diransac.flight import fly, fly_all, tracking_error
-    from diransac.identification import METHODS, identify
-    from diransac.log import Log
-    from diransac.noise import CorruptedLog, Noise, corrupt
-    from diransac.nonlinear import NonlinearLeastSquares
-    from diransac.planning import places, plan, sine, sines, square, star
+    from diransac.data.log import Log
+    from diransac.data.preprocessing import despike, differentiate, rename, resample, scale, shift
+    from diransac.data.readers import read_log
+    from diransac.flight.closed_loop import fly, fly_batch, tracking_error
+    from diransac.flight.corruption import CorruptedLog, Noise, corrupt
+    from diransac.flight.planning import places, plan, sine, sines, square, star
+    from diransac.flight.trajectory import Trajectory
+    from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
+    from diransac.identification.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
+    from diransac.identification.identify import METHODS, identify
+    from diransac.identification.nonlinear import NonlinearLeastSquares
+    from diransac.identification.result import Result
+    from diransac.identification.settings import Settings
+    from diransac.identification.validation import Validation, validate
     from diransac.plots import plot_flight
-    from diransac.prepare import despike, differentiate, rename, resample, scale, shift
-    from diransac.readers import read_log
     from diransac.report import write_report
-    from diransac.result import Result
-    from diransac.settings import Settings
     from diransac.study import Study, run_study
-    from diransac.trajectory import Trajectory
-    from diransac.validation import Validation, validate
 
 __all__ = [
     "METHODS",
@@ -71,7 +70,7 @@ __all__ = [
     "despike",
     "differentiate",
     "fly",
-    "fly_all",
+    "fly_batch",
     "identify",
     "models",
     "places",
@@ -89,32 +88,32 @@ __all__ = [
     "star",
     "tracking_error",
     "tvlqr",
-    "tvlqr_all",
+    "tvlqr_batch",
     "validate",
     "write_report",
 ]
 
 _FOUND_IN = {
-    "flight": ("fly", "fly_all", "tracking_error"),
-    "controller": ("Controller", "tvlqr", "tvlqr_all"),
-    "estimators": ("OrdinaryLeastSquares", "ScikitLearnEstimator", "TotalLeastSquares"),
-    "identification": ("METHODS", "identify"),
-    "log": ("Log",),
-    "noise": ("CorruptedLog", "Noise", "corrupt"),
-    "nonlinear": ("NonlinearLeastSquares",),
-    "planning": ("places", "plan", "sine", "sines", "square", "star"),
+    "flight.closed_loop": ("fly", "fly_batch", "tracking_error"),
+    "flight.tvlqr": ("Controller", "tvlqr", "tvlqr_batch"),
+    "identification.estimators": ("OrdinaryLeastSquares", "ScikitLearnEstimator", "TotalLeastSquares"),
+    "identification.identify": ("METHODS", "identify"),
+    "data.log": ("Log",),
+    "flight.corruption": ("CorruptedLog", "Noise", "corrupt"),
+    "identification.nonlinear": ("NonlinearLeastSquares",),
+    "flight.planning": ("places", "plan", "sine", "sines", "square", "star"),
     "plots": ("plot_flight",),
-    "prepare": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
-    "readers": ("read_log",),
+    "data.preprocessing": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
+    "data.readers": ("read_log",),
     "report": ("write_report",),
-    "result": ("Result",),
-    "settings": ("Settings",),
+    "identification.result": ("Result",),
+    "identification.settings": ("Settings",),
     "study": ("Study", "run_study"),
-    "trajectory": ("Trajectory",),
-    "validation": ("Validation", "validate"),
+    "flight.trajectory": ("Trajectory",),
+    "identification.validation": ("Validation", "validate"),
 }
 _LATER = {name: module for module, names in _FOUND_IN.items() for name in names}
-_SUBMODULES = ("prepare", "simulate", "study")
+_SUBMODULES = ("simulation", "study")
 
 
 def __getattr__(name: str) -> Any:

@@ -11,8 +11,8 @@ from typing import Any
 import typer
 
 from diransac.errors import ModelError, SettingsError
+from diransac.identification.settings import Settings
 from diransac.model import Model
-from diransac.settings import Settings
 from diransac.user_files import definitions, file_and_name
 
 __all__ = ["load_model", "load_settings", "model_file", "names", "numbers", "pairs", "toml_value"]
@@ -138,7 +138,7 @@ def load_model(text: str) -> Model:
     """
     found = file_and_name(text, "model")
     if found is None:
-        from diransac.models import builtin
+        from diransac.model.library import builtin
 
         return builtin(text)
     file, name = found

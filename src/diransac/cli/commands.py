@@ -35,10 +35,10 @@ from diransac.cli.options import (
 )
 from diransac.cli.outputs import staged
 from diransac.cli.views import Equations, ModelList, compare_methods
-from diransac.identification import METHODS, identify
-from diransac.inspection import inspect
-from diransac.result import Result
-from diransac.validation import validate
+from diransac.identification.identify import METHODS, identify
+from diransac.identification.inspection import inspect
+from diransac.identification.result import Result
+from diransac.identification.validation import validate
 
 __all__ = ["app"]
 

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from diransac.cli.flying import SHAPES, same_equations
-from diransac.controller import Controller, tvlqr
+from diransac.data.log import Log
 from diransac.errors import DiransacError, PlanningError, SettingsError
-from diransac.flight import fly, tracking_error
-from diransac.log import Log
+from diransac.flight.closed_loop import fly, tracking_error
+from diransac.flight.corruption import CorruptedLog, Noise, corrupt
+from diransac.flight.planning import sine, square, star
+from diransac.flight.trajectory import Trajectory
+from diransac.flight.tvlqr import Controller, tvlqr
+from diransac.identification.result import Result
 from diransac.model import Model
-from diransac.noise import CorruptedLog, Noise, corrupt
-from diransac.planning import sine, square, star
-from diransac.plant import ModelWithParameters, Plant
-from diransac.result import Result
+from diransac.model.plant import ModelWithParameters, Plant
 from diransac.text_table import aligned
-from diransac.trajectory import Trajectory
 
 __all__ = ["Flight", "Recording", "Trial", "record", "try_out"]
 

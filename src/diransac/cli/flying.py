@@ -12,12 +12,12 @@ import typer
 
 from diransac.cli.arguments import numbers
 from diransac.cli.options import output_file
+from diransac.data.writing import ENDINGS
 from diransac.errors import ModelError
-from diransac.log.writing import ENDINGS
+from diransac.flight.corruption import Noise
 from diransac.model import Model
-from diransac.models import TABLE_I, extended_rotorcraft, planar_rotorcraft
-from diransac.noise import Noise
-from diransac.plant import Plant
+from diransac.model.library import TABLE_I, extended_rotorcraft, planar_rotorcraft
+from diransac.model.plant import Plant
 
 __all__ = [
     "SHAPES",

@@ -9,13 +9,13 @@ from typing import Annotated, Any
 
 import typer
 
-from diransac import prepare
 from diransac.cli.arguments import load_settings, names, numbers, pairs
+from diransac.data import preprocessing
+from diransac.data.log import Log
+from diransac.data.readers import read_log
 from diransac.errors import LogError, SettingsError
-from diransac.identification import METHODS
-from diransac.log import Log
+from diransac.identification.identify import METHODS
 from diransac.model import Model
-from diransac.readers import read_log
 
 __all__ = [
     "Derivation",
@@ -132,7 +132,7 @@ class Derivation:
     def derive(self, log: Log, model: Model) -> Log:
         """The log with what it lacks, if that is wanted.  Raises LogError: it cannot; SettingsError: as `arguments`."""
         self._check()
-        return prepare.differentiate(log, model, self.bandwidth) if self.differentiate else log
+        return preprocessing.differentiate(log, model, self.bandwidth) if self.differentiate else log
 
     def _check(self) -> None:
         if self.bandwidth is not None and not self.differentiate:
@@ -176,8 +176,8 @@ class Preparation:
         if self.start is not None or self.stop is not None:
             log = log.between(-inf if self.start is None else self.start, inf if self.stop is None else self.stop)
         if self.despike is not None:
-            log = prepare.despike(log, None if self.despike == "all" else names(self.despike))
-        return prepare.shift(log, delays) if delays else log
+            log = preprocessing.despike(log, None if self.despike == "all" else names(self.despike))
+        return preprocessing.shift(log, delays) if delays else log
 
     def read_uneven(self, file: Path) -> Log:
         """As `read`, but a log whose clock is uneven is resampled at its usual rate, and says so."""

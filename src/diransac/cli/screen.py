@@ -12,8 +12,8 @@ from typing import Any, Protocol
 
 import typer
 
-from diransac.consensus import Score
-from diransac.search import Progress
+from diransac.identification.methods.consensus import Score
+from diransac.identification.methods.search import Progress
 
 __all__ = ["bar", "show"]
 

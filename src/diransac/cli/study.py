@@ -19,7 +19,7 @@ from diransac.cli.arguments import names, toml_value
 from diransac.cli.options import JsonFlag
 from diransac.cli.outputs import staged
 from diransac.errors import SettingsError
-from diransac.identification import METHODS
+from diransac.identification.identify import METHODS
 from diransac.study import Status, Study, builtin_names, connected, export, load, run_study, status, template
 from diransac.study.run import Progress
 from diransac.study.specification import TRUE

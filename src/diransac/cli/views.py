@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from diransac.cli.screen import bar
+from diransac.data.log import Log
 from diransac.errors import DiransacError
-from diransac.identification import identify
-from diransac.log import Log
+from diransac.identification.identify import identify
+from diransac.identification.result import Result
 from diransac.model import Model, Parameter
-from diransac.models import BUILTIN
-from diransac.result import Result
+from diransac.model.library import BUILTIN
 from diransac.text_table import aligned
 
 __all__ = ["Comparison", "Equations", "ModelList", "compare_methods"]
@@ -57,15 +57,15 @@ class Comparison:
         for name, result in diagnosed.items():
             found = result.diagnosis
             assert found is not None
-            if found.undetermined:
-                yield f"{name}: the log cannot tell {', '.join(found.undetermined)}"
-            if found.is_late:
+            if found.unidentifiable:
+                yield f"{name}: the log cannot tell {', '.join(found.unidentifiable)}"
+            if found.input_delay_significant:
                 yield f"{name}: inputs act {1e3 * found.input_delay:.3g} ms later than the log says; others miss that"
 
     def _row(self, name: str, result: Result) -> list[str]:
         errors = result.standard_errors
         outside = {n: "!" if n in result.violations else "" for n in result.parameters}
-        untold = () if result.diagnosis is None else result.diagnosis.undetermined
+        untold = () if result.diagnosis is None else result.diagnosis.unidentifiable
         estimates = [
             "?" if n in untold else f"{x:.5g} ± {errors[n]:.2g}{outside[n]}" for n, x in result.parameters.items()
         ]

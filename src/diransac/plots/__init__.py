@@ -10,14 +10,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from diransac.log import Log
+from diransac.data.log import Log
+from diransac.flight.trajectory import Trajectory
 from diransac.plots.flights import Flight, flights_of, last_number, leaves, path_box, shown
 from diransac.plots.heading import Entry, draw_heading, header_height
 from diransac.plots.layout import laid_out
 from diransac.plots.palette import MUTED
 from diransac.plots.panels import LIMIT_LOOK, draw_input, draw_path, draw_state, look, reference_look
 from diransac.plots.writing import checked_ending, write
-from diransac.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
 from diransac.plots.heading import draw_heading, header_height
 from diransac.plots.layout import WIDTH
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = ["LEAST", "judges_parameters", "methods_and_errors", "plot_estimates"]
 
-Floats = npt.NDArray[np.float64]
 
 LEAST = -3
 """Power of ten, %: what is less is shown as nothing."""
@@ -101,7 +101,7 @@ def methods_and_errors(summary: Summary, parameter: str | None = None) -> tuple[
     return [summary.methods[k] for k in kept], rows
 
 
-def _row(name: str, errors: Floats, hidden: npt.NDArray[np.bool_], *, quiet: bool = False) -> Row:
+def _row(name: str, errors: FloatArray, hidden: npt.NDArray[np.bool_], *, quiet: bool = False) -> Row:
     """A row of the errors (n_methods, n_trials) that are not hidden."""
     shown = 100.0 * np.where(hidden[:, None], np.nan, errors)[None]
     return Row(name, Estimates.median(shown)[0], Estimates.largest(shown)[0], quiet)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from diransac.arrays import FloatArray
 from diransac.plots.layout import WIDTH
 from diransac.plots.palette import INK, MUTED, SOFT
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_failures", "failures_height"]
 
-Floats = npt.NDArray[np.float64]
 
 FAILED = "#b42318"
 """The report's colour of what is bad."""
@@ -25,13 +24,13 @@ FAILED = "#b42318"
 _ROW, _NAME, _FREE, _LEFT, _RIGHT = 0.19, 0.21, 0.1, 1.75, 8.83
 
 
-def failures_height(share: Floats) -> float:
+def failures_height(share: FloatArray) -> float:
     """Height of the strip, inches: a row a method that failed anywhere, one line if none did."""
     return _NAME + _FREE + _ROW * len(_failing(share))
 
 
 def draw_failures(
-    figure: Figure, top: float, methods: Sequence[tuple[str, str]], levels: Sequence[str], share: Floats
+    figure: Figure, top: float, methods: Sequence[tuple[str, str]], levels: Sequence[str], share: FloatArray
 ) -> None:
     """Draw the strip.
 
@@ -56,7 +55,7 @@ def draw_failures(
             _draw_cell(figure, _LEFT + i * width, y, width, fraction)
 
 
-def _failing(share: Floats) -> list[int]:
+def _failing(share: FloatArray) -> list[int]:
     """The methods that failed anywhere."""
     return [int(k) for k in np.flatnonzero((np.nan_to_num(share) > 0.0).any(axis=0))]
 

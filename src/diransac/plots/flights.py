@@ -6,16 +6,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from diransac.arrays import FloatArray
+from diransac.data.log import Log
 from diransac.errors import SettingsError
-from diransac.log import Log
+from diransac.flight.trajectory import Trajectory
 from diransac.plots.palette import COLOURS, DASHES
-from diransac.trajectory import Trajectory
 
 __all__ = ["Flight", "Range", "around", "extent", "flights_of", "last_number", "leaves", "near", "path_box", "shown"]
 
-Floats = npt.NDArray[np.float64]
 Range = tuple[float, float]
 
 # Of what an axis shows: the margin, and how far off a line is still drawn.  Of a path: its least breadth.
@@ -92,7 +91,7 @@ def shown(name: str, flights: Sequence[Flight]) -> Range:
     return low - _MARGIN * width, high + _MARGIN * width
 
 
-def _reach(planned: Floats, flown: Sequence[Floats]) -> float:
+def _reach(planned: FloatArray, flown: Sequence[FloatArray]) -> float:
     """How far beyond the references a panel follows the flights: as far as the references themselves extend.
 
     Where these hardly move, the flight that stays nearest tells how far it usually is, before it may diverge.  That
@@ -113,7 +112,7 @@ def path_box(flights: Sequence[Flight]) -> tuple[Range, Range] | None:
     return around(x, max(extent(x), least)), around(z, max(extent(z), least))
 
 
-def near(values: Floats, visible: Range) -> Floats:
+def near(values: FloatArray, visible: Range) -> FloatArray:
     """The values, those far outside brought nearer: a canvas has no room for them."""
     reach = _FARTHEST * extent(visible)
     return np.asarray(np.clip(values, visible[0] - reach, visible[1] + reach))
@@ -130,19 +129,19 @@ def around(visible: Range, width: float) -> Range:
     return middle - width / 2.0, middle + width / 2.0
 
 
-def _finite(values: Iterable[float]) -> Floats:
+def _finite(values: Iterable[float]) -> FloatArray:
     array = np.asarray(values)
     return np.asarray(array[np.isfinite(array)])
 
 
 # Where a flight can no longer be seen --------------------------------------------------------------------------------
-def leaves(values: Floats, visible: Range) -> int | None:
+def leaves(values: FloatArray, visible: Range) -> int | None:
     """The first row that lies outside; None where none does."""
     outside = np.flatnonzero((values < visible[0]) | (values > visible[1]))
     return int(outside[0]) if len(outside) else None
 
 
-def last_number(values: Floats) -> int | None:
+def last_number(values: FloatArray) -> int | None:
     """The last row that is finite, if all that follow are not; None where the last row is, or none is."""
     finite = np.flatnonzero(np.isfinite(values))
     return int(finite[-1]) if len(finite) and finite[-1] < len(values) - 1 else None

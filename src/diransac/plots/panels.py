@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from diransac.arrays import FloatArray
 from diransac.plots.flights import Flight, Range, around, extent, last_number, leaves, near, shown
 from diransac.plots.layout import inches, name_panel
 from diransac.plots.palette import INK, MUTED, PAPER, REFERENCE
@@ -15,11 +15,10 @@ from diransac.plots.palette import INK, MUTED, PAPER, REFERENCE
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from diransac.trajectory import Trajectory
+    from diransac.flight.trajectory import Trajectory
 
 __all__ = ["LIMIT_LOOK", "draw_input", "draw_path", "draw_state", "look", "reference_look"]
 
-Floats = npt.NDArray[np.float64]
 
 LIMIT_LOOK: dict[str, Any] = {"color": MUTED, "linewidth": 0.9, "linestyle": (0.0, (1.0, 2.0))}
 # How many attitudes are drawn; inches: how long each arm of a bar is, and what lies between lines of the path's grid.
@@ -86,7 +85,7 @@ def _frame(axes: Axes, name: str, detail: str, visible: Range, flights: Sequence
     name_panel(axes, name, detail)
 
 
-def _mark_end(axes: Axes, flight: Flight, values: Floats, visible: Range) -> None:
+def _mark_end(axes: Axes, flight: Flight, values: FloatArray, visible: Range) -> None:
     """A triangle where a flight first leaves the panel, else a cross where its numbers end."""
     time = flight.log.time
     if (row := leaves(values, visible)) is not None:

@@ -8,8 +8,8 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from diransac.arrays import FloatArray
 from diransac.plots.layout import WIDTH
 from diransac.plots.palette import INK, MUTED, PAPER, RULE, SOFT
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Row", "Scale", "as_marks", "draw_rows", "name_rows", "names_width", "row_height"]
 
-Floats = npt.NDArray[np.float64]
 Looks = Mapping[str, Mapping[str, Any]]
 
 # Inches: of a row, what each method takes, what is free, and the least in all; decades that have a name each are so far
@@ -48,8 +47,8 @@ class Row:
     """
 
     name: str
-    median: Floats
-    worst: Floats
+    median: FloatArray
+    worst: FloatArray
     quiet: bool = False
 
 
@@ -102,7 +101,7 @@ class Scale:
         last = self.none if self.endless else self.most if self.exceeded else self.high
         return self.nothing - 0.6 * _ROOM, last + 0.6 * _ROOM
 
-    def place(self, values: Floats) -> Floats:
+    def place(self, values: FloatArray) -> FloatArray:
         """Where values stand, in decades; NaN of NaN."""
         with np.errstate(divide="ignore"):
             decades = np.log10(values)

@@ -9,8 +9,8 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
 from diransac.plots.failures import draw_failures, failures_height
 from diransac.plots.flight_rows import draw_flight_rows, flight_rows_height
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["axis_label", "level_labels", "method_looks", "n_trials", "plot_study", "title_of"]
 
-Floats = npt.NDArray[np.float64]
 
 # Inches: a row of panels, what names a trajectory, the axis below the panels, a line of the caption.
 _ROW, _NAME, _AXIS, _LINE = 1.5, 0.24, 0.36, 0.155
@@ -189,7 +188,7 @@ def _spans_decades(flights: Flights) -> bool:
 
 
 # Axes ----------------------------------------------------------------------------------------------------------------
-def _placed(summary: Summary) -> Floats:
+def _placed(summary: Summary) -> FloatArray:
     """Where each point stands, (n_levels, n_methods): methods side by side, so that their bars can be told apart."""
     positions, _ = _positions(summary)
     least = float(np.diff(positions).min()) if len(positions) > 1 else 1.0
@@ -198,7 +197,7 @@ def _placed(summary: Summary) -> Floats:
     return np.asarray(positions[:, None] + _SPREAD * least * np.array([beside.get(m, 0.0) for m in summary.methods]))
 
 
-def _positions(summary: Summary) -> tuple[Floats, int]:
+def _positions(summary: Summary) -> tuple[FloatArray, int]:
     """Positions of the levels, and the power of ten by which they are divided."""
     positions = summary.positions
     largest = float(np.abs(positions).max())
@@ -218,7 +217,7 @@ def _name_levels(axes: Axes, summary: Summary) -> None:
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
 
 
-def _scale(axes: Axes, mean: Floats, highest: Floats, logarithmic: bool) -> None:
+def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool) -> None:
     """Linear from 0, or only up to a first decade and logarithmic from there."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 

@@ -9,8 +9,9 @@ from importlib.resources import files
 from pathlib import Path
 
 from diransac.atomic import write_text
+from diransac.data.log import Log
 from diransac.errors import ResultError
-from diransac.log import Log
+from diransac.identification.result import Result
 from diransac.report import sections
 from diransac.report.diagnosed import diagnoses
 from diransac.report.figures import Timeline
@@ -18,7 +19,6 @@ from diransac.report.markup import Html, tag
 from diransac.report.over_time import inliers_over_time, signals_over_time
 from diransac.report.parameters import parameters
 from diransac.report.runs import Run, diagnosis_of, labelled, simulate_on
-from diransac.result import Result
 
 __all__ = ["write_report"]
 

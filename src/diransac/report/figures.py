@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from diransac.arrays import FloatArray, IntArray
 from diransac.report.markup import Html, tag
 
 __all__ = [
@@ -29,8 +30,6 @@ __all__ = [
     "time_plot",
 ]
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 _HEIGHT = 1000
 _FARTHEST = 10**6

@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from diransac.model import Parameter
+from diransac.arrays import FloatArray, IntArray
+from diransac.model.parameter import Parameter
 from diransac.report.markup import number, percent, plural, share
 from diransac.report.runs import Run
 
 __all__ = ["Finding", "Level", "bounds_text", "findings", "verdict", "windows", "worst"]
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 Level = Literal["note", "good", "care", "bad"]
 _ORDER: tuple[Level, ...] = ("note", "good", "care", "bad")
 
@@ -162,11 +160,11 @@ def _diagnosis(run: Run) -> Iterator[Finding]:
         left = run.unexplained[name]
         text = f"The model leaves out what is worth {percent(left)} of {name}, and less of other accelerations."
         yield Finding("good" if left <= _NEAR else "care", text)
-    if found.is_late:
+    if found.input_delay_significant:
         late = f"Inputs act {number(1e3 * found.input_delay, 3)} ms later than the log says"
         yield Finding("care", f"{late}: the parameters allow for that, simulations of the model need it, too.")
-    if found.undetermined:
-        names = ", ".join(found.undetermined)
+    if found.unidentifiable:
+        names = ", ".join(found.unidentifiable)
         yield Finding("care", f"The log cannot tell {names}: record a motion that depends on it.")
 
 
@@ -176,7 +174,7 @@ def _certainty(run: Run) -> Iterator[Finding]:
     intervals = result.intervals()
     vague = [name for name, (low, high) in intervals.items() if not np.isfinite(high - low)]
     if vague and result.diagnosis is None:
-        rows = plural(result.fitted_rows, "row")
+        rows = plural(result.n_fitted, "row")
         yield Finding("care", f"How certain {', '.join(vague)} is cannot be told: the fit rests on {rows}.")
     for name, (low, high) in intervals.items():
         if name in vague:
@@ -197,7 +195,7 @@ def _certainty(run: Run) -> Iterator[Finding]:
 
 def _bandwidth(run: Run) -> Iterator[Finding]:
     """Whether the filter that derived the rates decided the answer."""
-    changes = run.result.sensitivity
+    changes = run.result.bandwidth_sensitivity
     if not changes:
         return
     if any(np.isnan(pair).any() for pair in changes.values()):

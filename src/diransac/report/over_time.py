@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from diransac.arrays import FloatArray
 from diransac.report.figures import Scale, Timeline, Trace, padded, strip, time_axis, time_plot
 from diransac.report.judgement import windows
 from diransac.report.markup import Html, number, plural, share, tag
@@ -14,7 +15,6 @@ from diransac.report.runs import Run, bulk
 
 __all__ = ["inliers_over_time", "signals_over_time"]
 
-FloatArray = npt.NDArray[np.float64]
 
 _BEYOND_MEASURED = 0.4
 _BEYOND_REFERENCE = 2.0
@@ -194,7 +194,7 @@ def _set_apart(name: str, run: Run, *, is_shown: bool) -> tuple[str, npt.NDArray
 def _level(name: str, run: Run) -> tuple[float, str]:
     """What residuals are to be measured by, 0 if nothing is, and what it is."""
     if run.diagnosis is not None:
-        return _NOISE * run.diagnosis.noise_scale.get(name, 0.0), "three times the noise"
+        return _NOISE * run.diagnosis.noise_std.get(name, 0.0), "three times the noise"
     return float(run.thresholds[run.observations.signals.index(name)]), "the inlier threshold"
 
 

@@ -119,7 +119,7 @@ def _sensitivity(runs: Sequence[Run]) -> Html:
     rows = [
         (name, run.label, percent(half), percent(twice))
         for run in runs
-        for name, (half, twice) in (run.result.sensitivity or {}).items()
+        for name, (half, twice) in (run.result.bandwidth_sensitivity or {}).items()
     ]
     if not rows:
         return join([])

@@ -10,21 +10,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from diransac import prepare
-from diransac.diagnosis import Diagnosis
+from diransac.arrays import BoolArray, FloatArray
+from diransac.data import preprocessing
+from diransac.data.dataset import Observations, observe
+from diransac.data.log import Log
 from diransac.errors import LogError, ResultError, SettingsError
-from diransac.evaluation import as_diagnosed, choose_scoring, judged_signals
-from diransac.log import Log
-from diransac.observations import Observations, observe
-from diransac.result import Result
-from diransac.settings import Settings
-from diransac.simulate import Rollouts, inlier_mask, rollouts
-from diransac.validation import Validation, validate
+from diransac.identification.diagnosis import Diagnosis
+from diransac.identification.evaluation import as_diagnosed, choose_scoring, judged_signals
+from diransac.identification.result import Result
+from diransac.identification.settings import Settings
+from diransac.identification.validation import Validation, validate
+from diransac.simulation import Rollouts, inlier_mask, rollouts
 
 __all__ = ["Run", "bulk", "diagnosis_of", "labelled", "simulate_on"]
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 _MET = 0.5
 _N_RESTARTS = 12
@@ -80,7 +79,7 @@ class Run:
     def tells(self, name: str) -> bool:
         """Whether the result has a parameter, and its log could tell it."""
         diagnosis = self.result.diagnosis
-        return name in self.result.parameters and (diagnosis is None or name not in diagnosis.undetermined)
+        return name in self.result.parameters and (diagnosis is None or name not in diagnosis.unidentifiable)
 
     @property
     def divergence(self) -> float | None:
@@ -124,7 +123,7 @@ class Run:
         """Typical errors of the signals that judge, less what noise makes if it is known, over the signal's range."""
         widths = {n: high - low for n, (low, high) in self.ranges.items()}
         judging = [n for n, x in zip(self.observations.signals, self.thresholds, strict=True) if x > 0.0]
-        noise = {} if self.diagnosis is None else self.diagnosis.noise_scale
+        noise = {} if self.diagnosis is None else self.diagnosis.noise_std
         excess = {n: max(0.0, self.typical_errors[n] - _MEDIAN * noise.get(n, 0.0)) for n in judging}
         return {n: excess[n] / widths[n] for n in judging if widths[n] > 0.0}
 
@@ -133,7 +132,7 @@ class Run:
         """RMS of what the model does not explain of each acceleration, over the RMS of what it does; {} if unknown."""
         if self.result.diagnosis is None or self.held_out:
             return {}
-        latent = {n: _rms(x) for n, x in self.result.diagnosis.latent_accelerations.items()}
+        latent = {n: _rms(x) for n, x in self.result.diagnosis.unmodelled_accelerations.items()}
         explained = {n: _rms(x[np.isfinite(x)]) for n, x in self.accelerations.items()}
         return {n: x / explained[n] for n, x in latent.items() if explained[n] > 0.0}
 
@@ -201,7 +200,7 @@ def _prepared(result: Result, log: Log) -> Log:
     derived = _last_step(result.preparation)
     if derived.get("step") != "differentiate" or _last_step(log.history).get("step") == "differentiate":
         return log
-    return prepare.differentiate(log, result.model, float(derived["bandwidth"]))
+    return preprocessing.differentiate(log, result.model, float(derived["bandwidth"]))
 
 
 def _last_step(history: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
@@ -222,7 +221,7 @@ def _simulate(label: str, result: Result, log: Log, given: Log, diagnosis: Diagn
     apart = np.where(np.isnan(errors), np.inf, errors)
     near = inlier_mask(apart, observations.valid, scoring.thresholds, scoring.min_inlier_signals)
     simulated, period = throughout, np.inf
-    if diagnosis is not None and set(model.state) <= set(diagnosis.motion):
+    if diagnosis is not None and set(model.state) <= set(diagnosis.smoothed_states):
         states, n_rows = _restarts(diagnosis, observations)
         simulated, errors = _simulated(engine, result, observations, states, n_rows)
         period = n_rows * log.dt
@@ -247,12 +246,12 @@ def _simulate(label: str, result: Result, log: Log, given: Log, diagnosis: Diagn
 
 def _restarts(diagnosis: Diagnosis, observations: Observations) -> tuple[FloatArray, int]:
     """States (K, n_x) from which simulations begin anew, and the rows between them."""
-    time, names = diagnosis.motion_time, observations.model.state
+    time, names = diagnosis.smoothed_time, observations.model.state
     every = max(1, round(len(time) / _N_RESTARTS))
     dt, start = observations.log.dt, observations.log.time[observations.offset]
     n_rows = max(1, every * round(float(time[1] - time[0]) / dt)) if len(time) > 1 else len(observations)
     at = start + dt * np.arange(0, len(observations), n_rows)
-    return np.column_stack([np.interp(at, time, diagnosis.motion[n]) for n in names]), n_rows
+    return np.column_stack([np.interp(at, time, diagnosis.smoothed_states[n]) for n in names]), n_rows
 
 
 def _simulated(

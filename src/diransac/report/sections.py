@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from diransac.log import Log
+from diransac.data.log import Log
+from diransac.identification.settings import Settings
+from diransac.identification.validation import Scores, Validation
 from diransac.model import Model
 from diransac.report.judgement import findings, verdict, worst
 from diransac.report.markup import Html, join, number, percent, plural, table, tag
 from diransac.report.runs import Run
-from diransac.settings import Settings
-from diransac.validation import Scores, Validation
 
 __all__ = ["equations", "heading", "making", "scores", "short"]
 
@@ -114,7 +114,7 @@ def _short_term(runs: Sequence[Run]) -> list[Html]:
     if not having:
         return []
     names = dict.fromkeys(name for run in having for name in run.observations.signals)
-    noise = having[0].diagnosis.noise_scale if having[0].diagnosis is not None else {}
+    noise = having[0].diagnosis.noise_std if having[0].diagnosis is not None else {}
     units = having[0].result.model.units
     rows = [
         (name, units[name], number(noise.get(name, np.nan), 3), *(_sound_rms(run, name) for run in having))
@@ -211,7 +211,7 @@ def _provenance(runs: Sequence[Run]) -> Html:
 
 def _facts(run: Run) -> dict[str, str]:
     result, default = run.result, Settings().to_dict()
-    skipped = ", ".join(f"{n:,} {reason}" for reason, n in result.skipped.items()) or "none"
+    skipped = ", ".join(f"{n:,} {reason}" for reason, n in result.rejected.items()) or "none"
     squares = " (sum of squares)" if result.method == "diransac" else ""
     facts = {
         "method": result.method,
@@ -220,7 +220,7 @@ def _facts(run: Run) -> dict[str, str]:
         "fit error": number(result.fit_error, 6) + squares,
         "inliers": f"{percent(result.inlier_fraction)} of the rows that count",
         "samples drawn": f"{result.iterations:,}",
-        "hypotheses evaluated": f"{result.evaluated:,}",
+        "hypotheses evaluated": f"{result.n_hypotheses:,}",
         "went no further": skipped,
         "ended because": result.stop_reason,
     }
@@ -285,7 +285,7 @@ def _call(run: Run) -> str:
         arguments.append(f"settings=dr.Settings({', '.join(f'{name}={value!r}' for name, value in chosen)})")
     if result.iterations and result.diagnosis is None and result.estimator not in _DEFAULT_ESTIMATORS:
         arguments.append(f"estimator={result.estimator}(...)")
-    if result.diagnosis is not None and not set(result.model.required_signals) <= set(result.diagnosis.noise_scale):
+    if result.diagnosis is not None and not set(result.model.required_signals) <= set(result.diagnosis.noise_std):
         arguments.append("differentiate=True")
     elif result.preparation and result.preparation[-1].get("step") == "differentiate":
         arguments.append(f"differentiate=True, bandwidth={result.preparation[-1]['bandwidth']!r}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from diransac.plant import Plant
+from diransac.model.plant import Plant
 from diransac.study.judging import is_disturbed
 
 __all__ = ["PlantFacts"]

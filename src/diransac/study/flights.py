@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from diransac.errors import SettingsError
+from diransac.flight.planning import places, sine, sines, square, star
+from diransac.flight.planning.excitations import LONGEST, check_fully_actuated
+from diransac.flight.planning.flights import check_plane
+from diransac.flight.trajectory import Trajectory
 from diransac.model import Model
-from diransac.planning import places, sine, sines, square, star
-from diransac.planning.excitations import LONGEST, check_fully_actuated
-from diransac.planning.flights import check_plane
-from diransac.plant import ModelWithParameters
+from diransac.model.plant import ModelWithParameters
 from diransac.study.arguments import ANY, given_arguments, takes_options
 from diransac.study.tables import Reader, is_number
-from diransac.trajectory import Trajectory
 
 __all__ = ["MISSIONS", "TRAJECTORIES", "Flight", "check_flown"]
 

@@ -9,18 +9,17 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from diransac.arrays import BoolArray, FloatArray
+from diransac.data.dataset import observe
+from diransac.data.log import Log
 from diransac.errors import IdentificationError
-from diransac.estimators import Estimator, OrdinaryLeastSquares
-from diransac.kernel import compile_map
-from diransac.log import Log
-from diransac.nonlinear import NonlinearLeastSquares
-from diransac.observations import observe
-from diransac.plant import DisturbedModel, Plant
+from diransac.identification.estimators import Estimator, OrdinaryLeastSquares
+from diransac.identification.nonlinear import NonlinearLeastSquares
+from diransac.model.plant import DisturbedModel, Plant
+from diransac.simulation.compiler import compile_map
 
 __all__ = ["best_parameters", "differ", "hold", "is_disturbed", "mean_accelerations", "relative_errors"]
 
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 _ROUNDING = 1e-6
 """Of a parameter: by so little an interval may miss it. Where nothing is wrong, intervals are points."""
@@ -55,7 +54,7 @@ def best_parameters(plant: Plant, log: Log) -> dict[str, float]:
     bound = estimator.bind(observe(model, calm))
     rows = np.arange(bound.n_rows)
     if not bound.well_defined([rows])[0]:
-        loose = ", ".join(list(model.parameters)[i] for i in bound.undetermined())
+        loose = ", ".join(list(model.parameters)[i] for i in bound.unidentifiable())
         raise IdentificationError(
             f"the flight without noise does not determine {loose or 'the parameters'}, so that nothing can be judged "
             "by the best parameters; fly more for data, or leave evaluation.parameters out"
@@ -63,7 +62,7 @@ def best_parameters(plant: Plant, log: Log) -> dict[str, float]:
     return dict(zip(model.parameters, bound.fit([rows])[0].tolist(), strict=True))
 
 
-def mean_accelerations(plant: Plant, log: Log) -> Floats:
+def mean_accelerations(plant: Plant, log: Log) -> FloatArray:
     """Accelerations (N, n_v) at the state and the inputs of each row, averaged over the phases of what vibrates.
 
     A phase is a state of a disturbance whose name begins with ``phase``: an angle in rad, of which the disturbance is
@@ -83,7 +82,7 @@ def mean_accelerations(plant: Plant, log: Log) -> Floats:
     return total / _N_PHASES
 
 
-def relative_errors(found: npt.ArrayLike, reference: npt.ArrayLike) -> Floats:
+def relative_errors(found: npt.ArrayLike, reference: npt.ArrayLike) -> FloatArray:
     """``|found / reference - 1|``: infinite where nothing was found, NaN where the reference is not known, or 0."""
     x, p = np.broadcast_arrays(np.asarray(found, dtype=float), np.asarray(reference, dtype=float))
     judged = ~np.isnan(p) & (p != 0.0)
@@ -91,7 +90,7 @@ def relative_errors(found: npt.ArrayLike, reference: npt.ArrayLike) -> Floats:
     return np.where(judged, np.nan_to_num(np.abs(ratio - 1.0), nan=np.inf, posinf=np.inf), np.nan)
 
 
-def hold(low: npt.ArrayLike, high: npt.ArrayLike, best: npt.ArrayLike) -> Floats:
+def hold(low: npt.ArrayLike, high: npt.ArrayLike, best: npt.ArrayLike) -> FloatArray:
     """1 where intervals hold the best parameter, to a millionth; 0 where not, NaN where one of the three is not known.
 
     An end that is infinite is not known.
@@ -102,7 +101,7 @@ def hold(low: npt.ArrayLike, high: npt.ArrayLike, best: npt.ArrayLike) -> Floats
     return np.where(known, (a - slack <= p) & (p <= b + slack), np.nan)
 
 
-def differ(best: npt.ArrayLike, own: npt.ArrayLike) -> Bools:
+def differ(best: npt.ArrayLike, own: npt.ArrayLike) -> BoolArray:
     """Whether best parameters are others than the plant's own: by more than 0.2 %."""
     return relative_errors(best, own) > _VISIBLE
 

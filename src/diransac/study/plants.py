@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from diransac.errors import DiransacError, ModelError, SettingsError
-from diransac.models import TABLE_I, builtin, extended_rotorcraft
-from diransac.plant import Plant
+from diransac.model.library import TABLE_I, builtin, extended_rotorcraft
+from diransac.model.plant import Plant
 from diransac.study.arguments import ANY, check_signature, given_arguments
 from diransac.study.tables import Reader
 from diransac.study.vehicles import double_pendulum, pendulum, servo_axis

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from diransac.blas import single_threaded
-from diransac.controller import Controller, tvlqr
+from diransac.data.log import Log
 from diransac.errors import PlanningError
-from diransac.flight import fly_all
-from diransac.log import Log
-from diransac.noise import corrupt
-from diransac.plant import Plant
+from diransac.flight.closed_loop import fly_batch
+from diransac.flight.corruption import corrupt
+from diransac.flight.tvlqr import Controller, tvlqr
+from diransac.model.plant import Plant
 from diransac.study.flights import Flight
 from diransac.study.judging import best_parameters
 from diransac.study.library import load
@@ -141,7 +141,7 @@ def _lanes(
 ) -> Sequence[Log | Exception]:
     """Flights of one length: all in one simulation, or each on its own where one of them cannot be."""
     try:
-        return fly_all([plant] * len(controllers), controllers, substeps=substeps, seeds=seeds, threads=1)
+        return fly_batch([plant] * len(controllers), controllers, substeps=substeps, seeds=seeds, threads=1)
     except Exception as error:  # noqa: BLE001  its row says what it was, and it ends no other flight
         if len(controllers) == 1:
             return [error]

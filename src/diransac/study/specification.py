@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from diransac.errors import DiransacError, SettingsError
-from diransac.identification import METHODS
-from diransac.noise import Noise
-from diransac.settings import Settings
+from diransac.flight.corruption import Noise
+from diransac.identification.identify import METHODS
+from diransac.identification.settings import Settings
 from diransac.study.axis import Axis
 from diransac.study.flights import MISSIONS, Flight, check_flown
 from diransac.study.plants import PlantChoice

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import StudyError
 from diransac.study.facts import PlantFacts
 from diransac.study.judging import differ, hold, relative_errors
@@ -29,9 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Estimates", "Flights", "Summary", "summarise"]
 
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
-_Statistic = Callable[[Floats], np.floating]
+_Statistic = Callable[[FloatArray], np.floating]
 
 
 @dataclass(frozen=True)
@@ -49,30 +47,30 @@ class Flights:
     failed : the same, which of these have no flight
     """
 
-    errors: Mapping[str, Floats]
-    ran: Bools
-    failed: Bools
+    errors: Mapping[str, FloatArray]
+    ran: BoolArray
+    failed: BoolArray
 
-    def mean(self, state: str) -> Floats:
+    def mean(self, state: str) -> FloatArray:
         """Mean over the flights there are, (n_levels, n_methods); NaN where there is none."""
         return _over_trials(self.errors[state], ~np.isnan(self.errors[state]), np.mean)
 
-    def deviation(self, state: str) -> Floats:
+    def deviation(self, state: str) -> FloatArray:
         """Standard deviation of the flights there are, with n - 1; NaN where there are fewer than two."""
         there = ~np.isnan(self.errors[state])
         enough = there & (there.sum(axis=2, keepdims=True) > 1)
         return _over_trials(self.errors[state], enough, _sample_deviation)
 
-    def median(self, state: str) -> Floats:
+    def median(self, state: str) -> FloatArray:
         """Median over all trials, of which one that failed counts as an infinite error; NaN where there is none."""
         return _over_trials(np.where(self.failed, np.inf, self.errors[state]), self.ran, _upper_median)
 
-    def largest(self, state: str) -> Floats:
+    def largest(self, state: str) -> FloatArray:
         """Largest error of all trials, infinite where one failed; NaN where there is none."""
         return _over_trials(np.where(self.failed, np.inf, self.errors[state]), self.ran, np.max)
 
     @property
-    def failure_share(self) -> Floats:
+    def failure_share(self) -> FloatArray:
         """Fraction of the trials that failed, (n_levels, n_methods); NaN where there are none."""
         return _over_trials(self.failed.astype(float), self.ran, np.mean)
 
@@ -93,29 +91,29 @@ class Estimates:
     disturbed : (n_levels,) whether the plant has more to it than the model
     """
 
-    errors: Mapping[str, Floats]
-    errors_of_own: Mapping[str, Floats]
-    covered: Mapping[str, Floats]
-    differs: Bools
-    disturbed: Bools
+    errors: Mapping[str, FloatArray]
+    errors_of_own: Mapping[str, FloatArray]
+    covered: Mapping[str, FloatArray]
+    differs: BoolArray
+    disturbed: BoolArray
 
     @cached_property
-    def worst(self) -> Floats:
+    def worst(self) -> FloatArray:
         """Error of the worst parameter against the best ones, (n_levels, n_methods, n_trials)."""
         return _largest(self.errors)
 
     @cached_property
-    def worst_of_own(self) -> Floats:
+    def worst_of_own(self) -> FloatArray:
         """The same against the plant's own parameters."""
         return _largest(self.errors_of_own)
 
     @staticmethod
-    def median(errors: Floats) -> Floats:
+    def median(errors: FloatArray) -> FloatArray:
         """Median over the trials that were judged, (n_levels, n_methods); NaN where there is none."""
         return _over_trials(errors, ~np.isnan(errors), np.median)
 
     @staticmethod
-    def largest(errors: Floats) -> Floats:
+    def largest(errors: FloatArray) -> FloatArray:
         """Largest error of the trials that were judged, (n_levels, n_methods); NaN where there is none."""
         return _over_trials(errors, ~np.isnan(errors), np.max)
 
@@ -157,11 +155,11 @@ class Summary:
     levels: tuple[str, ...]
     methods: tuple[str, ...]
     units: Mapping[str, str]
-    ran: Bools
+    ran: BoolArray
     flights: Mapping[str, Flights]
     estimates: Estimates | None
     failures: Mapping[tuple[str, str], int]
-    seconds: Floats
+    seconds: FloatArray
     stages: tuple[str, ...]
     versions: tuple[str, ...]
     asked: int
@@ -174,7 +172,7 @@ class Summary:
         return f"{self.missing} of {self.asked} rows {verb} missing." if self.missing else ""
 
     @property
-    def positions(self) -> Floats:
+    def positions(self) -> FloatArray:
         """Where the levels stand on an axis, (n_levels,): their values, or 0, 1, 2, ... if they are words."""
         values = [_value(level) for level in self.levels]
         return np.arange(len(values), dtype=float) if None in values else np.array(values, dtype=float)
@@ -239,7 +237,7 @@ class _Table:
         self.ran = np.zeros((len(levels), len(methods), int(self._where[2].max()) + 1), dtype=bool)
         self.ran[self._where] = True
 
-    def column(self, name: str) -> Floats:
+    def column(self, name: str) -> FloatArray:
         """A column of numbers, NaN where there is none."""
         found = np.full(self.ran.shape, np.nan)
         found[self._where] = self._rows[name].to_numpy()
@@ -265,12 +263,12 @@ def _estimates(table: _Table, plants: Sequence[PlantFacts]) -> Estimates:
     return Estimates(errors, errors_of_own, covered, differs, np.array([plant.disturbed for plant in plants]))
 
 
-def _largest(errors: Mapping[str, Floats]) -> Floats:
+def _largest(errors: Mapping[str, FloatArray]) -> FloatArray:
     """The largest of errors by name; NaN where all are."""
     return np.asarray(np.fmax.reduce(list(errors.values())))
 
 
-def _over_trials(values: Floats, counted: Bools, statistic: _Statistic) -> Floats:
+def _over_trials(values: FloatArray, counted: BoolArray, statistic: _Statistic) -> FloatArray:
     """A statistic of those trials that count, (n_levels, n_methods); NaN where none does."""
     found = np.full(values.shape[:2], np.nan)
     for cell in np.argwhere(counted.any(axis=2)):
@@ -297,11 +295,11 @@ def _value(level: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _upper_median(values: Floats) -> np.floating:
+def _upper_median(values: FloatArray) -> np.floating:
     """The median; of an even number the upper one, so that infinities are not averaged with numbers."""
     return np.float64(np.sort(values)[len(values) // 2])
 
 
-def _sample_deviation(values: Floats) -> np.floating:
+def _sample_deviation(values: FloatArray) -> np.floating:
     """The standard deviation with n - 1; exactly 0 of equal values, whose mean rounds."""
     return np.float64(np.std(values - values[0], ddof=1))

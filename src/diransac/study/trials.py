@@ -21,19 +21,19 @@ from typing import Any
 import numpy as np
 
 from diransac.blas import single_threaded
-from diransac.controller import Controller, tvlqr, tvlqr_all
+from diransac.data.log import Log
 from diransac.errors import DiransacError, PlanningError, StudyError
-from diransac.flight import tracking_error
-from diransac.identification import identify
-from diransac.log import Log
-from diransac.plant import Plant
-from diransac.settings import Settings
+from diransac.flight.closed_loop import tracking_error
+from diransac.flight.trajectory import Trajectory
+from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
+from diransac.identification.identify import identify
+from diransac.identification.settings import Settings
+from diransac.model.plant import Plant
 from diransac.study.flights import TRAJECTORIES
 from diransac.study.library import load
 from diransac.study.recording import PATIENCE, Recording, check_ended, flown, record_all, trial_seed
 from diransac.study.seeds import derived_seed
 from diransac.study.specification import TRUE, Study
-from diransac.trajectory import Trajectory
 
 __all__ = ["STAGES", "run_trials"]
 
@@ -245,7 +245,7 @@ def _controllers(cases: Sequence[_Case], plans: dict[int, Trajectory]) -> dict[i
     begin = time.perf_counter()
     plants = [case.found for case in cases if case.found is not None]
     try:
-        steering = tvlqr_all(plants, [plans[id(case)] for case in cases], threads=1)
+        steering = tvlqr_batch(plants, [plans[id(case)] for case in cases], threads=1)
     except Exception:  # noqa: BLE001  it is raised again, and noted, where it belongs
         return _controllers_alone(cases, plans)
     _share(cases, "steer", time.perf_counter() - begin)

@@ -12,10 +12,10 @@ from typing import Any
 
 from casadi import cos, sin
 
-from diransac.derivation import Symbols
 from diransac.model import Model, Parameter
-from diransac.models import builtin
-from diransac.plant import Disturbance, Plant
+from diransac.model.derivation import Symbols
+from diransac.model.library import builtin
+from diransac.model.plant import Disturbance, Plant
 
 __all__ = ["double_pendulum", "pendulum", "servo_axis"]
 

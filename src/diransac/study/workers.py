@@ -16,7 +16,7 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, Protocol
 
 from diransac.errors import SettingsError
-from diransac.simulate import default_threads
+from diransac.simulation import default_threads
 
 __all__ = ["Given", "Processes", "Workers", "workers_of"]
 

@@ -1,0 +1,1 @@
+"""Logs of machines: reading, preparation, and the dataset that a method is given."""

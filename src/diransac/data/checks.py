@@ -1,0 +1,173 @@
+"""What makes columns a log: real numbers under usable names, and a time that increases evenly."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac.arrays import FloatArray
+from diransac.errors import LogError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+__all__ = [
+    "as_column",
+    "as_numbers",
+    "check_clock",
+    "check_even",
+    "check_names",
+    "check_time_order",
+    "numeric_columns",
+    "say_gaps",
+    "say_jitter",
+]
+
+
+# Of a sample: the jitter that is not worth a word, and the one that is an error; of a usual interval: a gap.
+_SILENT_JITTER, _TOLERATED_JITTER, _GAP = 1e-3, 0.2, 1.5
+_ROUNDING = 1e-6
+
+# Seconds from row to row that are likely, and those beyond which there is no log.  Clocks that explain longer ones: a
+# tick in seconds, and the number of ticks from row to row above which it is this clock rather than the next.
+_SHORTEST, _LONGEST, _ABSURD = 1e-7, 1.0, 1e3
+_CLOCKS = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("milliseconds", 1e-3, _LONGEST))
+
+
+# ---------------------------------------------------------------------- columns
+
+
+def as_numbers(values: npt.NDArray[Any]) -> FloatArray | str:
+    """A copy of an array as float64, or why there is none: ``is not numeric: row 3 holds 'takeoff'``."""
+    if values.dtype.kind in "biuf":
+        return values.astype(np.float64)
+    if values.dtype.kind != "O":
+        return f"is not numeric: row 0 holds {values.ravel()[0]!s:.60}" if values.size else "is empty"
+    numbers = np.full(values.shape, np.nan)
+    for row, value in enumerate(values.ravel()):
+        if isinstance(value, (bool, int, float, np.number, np.bool_)) and not isinstance(value, np.complexfloating):
+            numbers.flat[row] = value
+        elif value is not None and str(value) not in ("<NA>", "NaT"):
+            return f"is not numeric: row {row} holds {value!r:.60}"
+    return numbers
+
+
+def numeric_columns(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[dict[str, FloatArray], dict[str, str]]:
+    """The columns that hold numbers, and why each of the others does not."""
+    converted = {name: as_numbers(values) for name, values in columns.items()}
+    numbers = {name: values for name, values in converted.items() if not isinstance(values, str)}
+    return numbers, {name: why for name, why in converted.items() if isinstance(why, str)}
+
+
+def as_column(values: npt.ArrayLike, name: str, source: str) -> FloatArray:
+    """A read-only copy ``(N,)``.  Raises LogError: it is not one column of real numbers."""
+    array = np.asarray(values)
+    numbers = as_numbers(array)
+    if isinstance(numbers, str):
+        raise LogError(f'{source}: signal "{name}" {numbers}')
+    if numbers.ndim != 1:
+        raise LogError(f'{source}: signal "{name}" has shape {numbers.shape}; give one number a row, (N,)')
+    numbers.flags.writeable = False
+    return numbers
+
+
+def check_names(names: Iterable[object], source: str) -> None:
+    """Raise LogError where a name cannot stand for a signal."""
+    for name in names:
+        if not isinstance(name, str) or not name or name != name.strip():
+            raise LogError(f"{source}: {name!r} cannot name a signal; use a text that has no spaces around it")
+        if name == "t":
+            raise LogError(f'{source}: "t" is the time; give the signal another name')
+
+
+def say_gaps(time: FloatArray, signals: Mapping[str, FloatArray]) -> list[str]:
+    """Which signals have missing or infinite samples, how many, and where the first is."""
+    missing = {name: np.isnan(values) for name, values in signals.items()}
+    infinite = {name: np.isinf(values) for name, values in signals.items()}
+    return [*_where("NaN", missing, time), *_where("infinite", infinite, time)]
+
+
+def _where(word: str, flags: Mapping[str, npt.NDArray[np.bool_]], time: FloatArray) -> list[str]:
+    """Sentences such as ``"x", "z" are NaN in 3 of 100 rows``, one for all signals that are so in the same rows."""
+    groups: dict[bytes, list[str]] = {}
+    for name, flag in flags.items():
+        if flag.any():
+            groups.setdefault(flag.tobytes(), []).append(name)
+    sentences = []
+    for names in groups.values():
+        flag = flags[names[0]]
+        subject = ", ".join(f'"{name}"' for name in names) + (" is" if len(names) == 1 else " are")
+        first = time[int(flag.argmax())]
+        sentences.append(f"{subject} {word} in {flag.sum()} of {len(flag)} rows, first at t = {first:.6g} s")
+    return sentences
+
+
+# ---------------------------------------------------------------------- time
+
+
+def check_time_order(time: FloatArray, source: str) -> None:
+    """Raise LogError where time ``(N,)`` has fewer than 2 rows, is not finite, repeats or runs backwards."""
+    if len(time) < 2:
+        raise LogError(f"{source}: a log has at least 2 rows; found {len(time)}")
+    if not np.isfinite(time).all():
+        row = int(np.argmin(np.isfinite(time)))
+        raise LogError(f"{source}: time is {time[row]} at row {row}; give every row a time in seconds")
+    steps = np.diff(time)
+    if steps.min() > 0.0:
+        return
+    row, n = int(np.argmax(steps <= 0.0)), int((steps <= 0.0).sum())
+    more = f" (and {n - 1} more like it)" if n > 1 else ""
+    if steps[row] == 0.0:
+        raise LogError(f"{source}: time {time[row]:.9g} s repeats at row {row + 1}{more}; remove the duplicate rows")
+    raise LogError(
+        f"{source}: time runs backwards at row {row + 1}: {time[row + 1]:.9g} s follows {time[row]:.9g} s{more}; "
+        "sort the rows by time, or split the file there"
+    )
+
+
+def check_even(time: FloatArray, source: str) -> None:
+    """Raise LogError where an interval differs from the mean one by more than a fifth, and say how large a gap is.
+
+    Every row is taken to last ``dt``: what counts is how far one interval is off, not how far the clock drifts.
+    """
+    steps = np.diff(time)
+    dt, usual = float(np.mean(steps)), float(np.median(steps))
+    off = np.abs(steps - dt)
+    if off.max() <= (_TOLERATED_JITTER + _ROUNDING) * dt:
+        return
+    row = int(np.argmax(np.abs(steps - usual)))
+    n_gaps = int((steps > _GAP * usual).sum())
+    what = f"{n_gaps} gap{'s' * (n_gaps > 1)}, the longest" if steps[row] > _GAP * usual else "the most uneven interval"
+    raise LogError(
+        f"{source}: time is not uniform: {what} after t = {time[row]:.6g} s (row {row}) is {steps[row]:.4g} s long, "
+        f"the usual interval {usual:.4g} s; resample it: --resample {1.0 / usual:.4g}, or read_log(..., resample=...)"
+    )
+
+
+def check_clock(time: FloatArray, source: str) -> list[str]:
+    """Whether the usual interval tells of a time that is not in seconds, and the scale that would make it so.
+
+    Raises LogError: the interval is longer than any machine's log has.
+    """
+    dt = float(np.median(np.diff(time)))
+    if _SHORTEST <= dt <= _LONGEST * (1.0 + _ROUNDING):
+        return []
+    apart = f"rows are {dt:.4g} s apart"
+    if dt < _SHORTEST:
+        return [f"{apart}: check the unit of t, and pass --scale t=FACTOR if it is not in seconds"]
+    unit, tick = next((unit, tick) for unit, tick, least in _CLOCKS if dt > least)
+    finding = f"{apart}: if t is in {unit}, pass --scale t={tick:g}"
+    if dt > _ABSURD:
+        raise LogError(f"{source}: {finding}, or read_log(..., scale={{'t': {tick:g}}})")
+    return [finding]
+
+
+def say_jitter(time: FloatArray) -> list[str]:
+    """How uneven the clock is, and where most, if it is worth a word."""
+    steps = np.diff(time)
+    jitter = np.abs(steps / steps.mean() - 1.0)
+    if jitter.max() <= _SILENT_JITTER:
+        return []
+    return [f"time is uneven by up to {jitter.max():.1%} of a sample (at t = {time[int(jitter.argmax())]:.6g} s)"]

@@ -1,0 +1,288 @@
+"""`Log`: named, uniformly sampled signals of one machine, with units and the story of how they came about."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Protocol, overload
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac.arrays import FloatArray
+from diransac.data import checks
+from diransac.data.checks import as_column, numeric_columns
+from diransac.data.units import split_unit
+from diransac.data.writing import write_columns
+from diransac.errors import LogError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+__all__ = ["Log"]
+
+
+_LARGEST = 1e150
+_ROUNDING = 1e-6
+
+
+class Frame(Protocol):
+    """What polars and pandas data frames share."""
+
+    @property
+    def columns(self) -> Iterable[str]:
+        """The columns' names."""
+
+    def __getitem__(self, column: str, /) -> Series:
+        """A column by name."""
+
+
+class Series(Protocol):
+    """What their columns share."""
+
+    def to_numpy(self) -> npt.NDArray[Any]:
+        """The column as an array (N,)."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Log:
+    """Named signals of one machine, sampled at one uniform rate.
+
+    Parameters
+    ----------
+    time : (N,)   seconds, strictly increasing, even to within 20 % of a sample
+    signals : name -> (N,) numbers; NaN is a missing sample
+    units : name -> unit, of those that are known
+    source : how messages name the log, such as ``log "flight.csv"``
+    history : preparation steps in order, each a mapping that JSON can hold
+    notes : what was found when the log was made, a sentence each
+    unusable : name -> why a column of the file is not among the signals
+
+    The arrays are copies and read-only.  Rows count from 0.
+
+    Raises LogError: fewer than 2 rows, unequal lengths, a time that is not finite, increasing and even.
+    """
+
+    time: FloatArray
+    signals: Mapping[str, FloatArray]
+    units: Mapping[str, str] = field(default_factory=dict)
+    source: str = "log"
+    history: tuple[dict[str, Any], ...] = ()
+    notes: tuple[str, ...] = ()
+    unusable: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        checks.check_names(self.signals, self.source)
+        time = as_column(self.time, "t", self.source)
+        signals = {name: as_column(values, name, self.source) for name, values in self.signals.items()}
+        for name, values in signals.items():
+            if len(values) != len(time):
+                raise LogError(f'{self.source}: signal "{name}" has {len(values)} rows, the time has {len(time)}')
+        checks.check_time_order(time, self.source)
+        checks.check_even(time, self.source)
+        units = {name: unit for name, unit in self.units.items() if name in signals}
+        for key, value in (("time", time), ("signals", signals), ("units", units), ("unusable", dict(self.unusable))):
+            object.__setattr__(self, key, MappingProxyType(value) if isinstance(value, dict) else value)
+        object.__setattr__(self, "history", tuple(self.history))
+        object.__setattr__(self, "notes", tuple(self.notes))
+
+    # ------------------------------------------------------------------ making one
+
+    @classmethod
+    def from_arrays(
+        cls,
+        time: npt.ArrayLike,
+        signals: Mapping[str, npt.ArrayLike],
+        units: Mapping[str, str] | None = None,
+        source: str = "log",
+    ) -> Log:
+        """A log of arrays ``(N,)`` in memory; ``time`` in seconds.
+
+        Raises LogError: as `Log`; a column that does not hold real numbers; a unit for a signal that is not there;
+        rows so far apart that the time cannot be in seconds.
+        """
+        columns = {name: np.asarray(values) for name, values in signals.items()}
+        return cls._from_columns(np.asarray(time), columns, units or {}, source)
+
+    @classmethod
+    def from_frame(
+        cls, frame: Frame, units: Mapping[str, str] | None = None, time: str = "t", source: str = "log"
+    ) -> Log:
+        """A log of a polars or pandas data frame: ``time`` names the column of seconds, every other one is a signal.
+
+        A column ``theta [deg]`` is the signal ``theta`` in degrees; one that does not hold numbers is left out, and
+        said in the notes.
+        Raises LogError: as `Log`; it is no data frame; there is no such time column.
+        """
+        if not hasattr(frame, "columns"):
+            raise LogError(f"{source}: frame is a {type(frame).__name__}; give a polars or pandas data frame")
+        headers = [split_unit(str(column)) for column in frame.columns]
+        columns = {name: frame[column].to_numpy() for (name, _), column in zip(headers, frame.columns, strict=True)}
+        if len(columns) < len(headers):
+            raise LogError(f"{source}: two columns have one name; found {', '.join(name for name, _ in headers)}")
+        if time not in columns:
+            raise LogError(
+                f'{source}: there is no time column "{time}"; found {", ".join(columns)}. Name it with time='
+            )
+        numbers, unusable = numeric_columns({name: values for name, values in columns.items() if name != time})
+        known = {name: unit for name, unit in headers if unit is not None} | dict(units or {})
+        known.pop(time, None)
+        return cls._from_columns(columns[time], numbers, known, source, unusable)
+
+    @classmethod
+    def _from_columns(
+        cls,
+        time: npt.NDArray[Any],
+        columns: Mapping[str, npt.NDArray[Any]],
+        units: Mapping[str, str],
+        source: str,
+        unusable: Mapping[str, str] | None = None,
+    ) -> Log:
+        unknown = [name for name in units if name not in columns and name not in (unusable or {})]
+        if unknown:
+            raise LogError(f'{source}: a unit is given for "{unknown[0]}"; found {", ".join(columns)}')
+        log = cls(time, columns, units, source, unusable=unusable or {})
+        return replace(log, notes=(*checks.check_clock(log.time, source), *log.findings()))
+
+    def findings(self) -> tuple[str, ...]:
+        """What is worth saying: columns left out, an uneven clock, missing values, infinities; a sentence each."""
+        left_out = [f'column "{name}" is left out: it {why}' for name, why in self.unusable.items()]
+        return (*left_out, *checks.say_jitter(self.time), *checks.say_gaps(self.time, self.signals))
+
+    # ------------------------------------------------------------------ looking at it
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.signals
+
+    def __repr__(self) -> str:
+        return f"Log({self.source}: {len(self)} rows at {1.0 / self.dt:.6g} Hz, {', '.join(self._found)})"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the signals, without the time ``t``."""
+        return tuple(self.signals)
+
+    @property
+    def _found(self) -> tuple[str, ...]:
+        return ("t", *self.names)
+
+    @property
+    def dt(self) -> float:
+        """Time from one sample to the next, seconds."""
+        return float((self.time[-1] - self.time[0]) / (len(self.time) - 1))
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 over names, time and samples, whatever the columns' order."""
+        digest = hashlib.sha256()
+        for name, values in [("t", self.time), *sorted(self.signals.items())]:
+            digest.update(f"{name}\0{len(values)}\0".encode())
+            digest.update(np.where(np.isnan(values), np.nan, values).astype("<f8").tobytes())
+        return digest.hexdigest()
+
+    def check(self, names: Sequence[str]) -> None:
+        """Raise LogError where a signal is missing, all NaN, infinite, or too large for its square."""
+        for name in names:
+            values = self[name]
+            if np.isnan(values).all():
+                raise LogError(f'{self.source}: signal "{name}" is NaN in every row; leave it out, or give its samples')
+            row = int(np.argmax(np.abs(np.nan_to_num(values, nan=0.0, posinf=np.inf, neginf=-np.inf))))
+            where = f"row {row} (t = {self.time[row]:.6g} s)"
+            if np.isinf(values[row]):
+                raise LogError(f'{self.source}: signal "{name}" is infinite at {where}; give NaN for a missing sample')
+            if np.abs(values[row]) > _LARGEST:
+                raise LogError(f'{self.source}: signal "{name}" is {values[row]:.3g} at {where}: its square overflows')
+
+    # ------------------------------------------------------------------ parts of it
+
+    @overload
+    def __getitem__(self, key: str) -> FloatArray: ...
+    @overload
+    def __getitem__(self, key: slice) -> Log: ...
+    def __getitem__(self, key: str | slice) -> FloatArray | Log:
+        """A signal ``(N,)`` by name (``"t"`` is the time), or the log of a range of rows.
+
+        Raises LogError: there is no such signal; fewer than 2 rows are left.
+        """
+        if isinstance(key, slice):
+            return self._cut(key)
+        if key in self.signals:
+            return self.signals[key]
+        if key == "t":
+            return self.time
+        if key in self.unusable:
+            raise LogError(f'{self.source}: signal "{key}" {self.unusable[key]}')
+        raise LogError(f'{self.source}: signal "{key}" is missing; found {", ".join(self._found)}')
+
+    def _cut(self, rows: slice) -> Log:
+        time = self.time[rows]
+        if len(time) < 2:
+            raise LogError(
+                f"{self.source}: a log has at least 2 rows; rows {rows.start} to {rows.stop} leave {len(time)}"
+            )
+        step = {"step": "cut", "start": float(time[0]), "end": float(time[-1]), "rows": len(time)}
+        signals = {name: values[rows] for name, values in self.signals.items()}
+        return replace(self, time=time, signals=signals, history=(*self.history, step))
+
+    def between(self, start: float, end: float) -> Log:
+        """The rows with ``start <= t <= end``, seconds.
+
+        Raises LogError: fewer than 2 rows lie there.
+        """
+        slack = _ROUNDING * self.dt
+        first, last = np.searchsorted(self.time, [start - slack, end + slack])
+        if last - first < 2:
+            raise LogError(
+                f"{self.source}: fewer than 2 rows lie between {start} and {end} s; "
+                f"the log runs from {self.time[0]:.6g} to {self.time[-1]:.6g} s"
+            )
+        return self[int(first) : int(last)]
+
+    def split(self, fraction: float) -> tuple[Log, Log]:
+        """The log's first ``fraction`` of rows and the rest, such as for identifying and validating.
+
+        Raises LogError: it is no number between 0 and 1, or either part would have fewer than 2 rows.
+        """
+        if not 0.0 < fraction < 1.0:
+            raise LogError(f"{self.source}: fraction is {fraction}; give a number between 0 and 1")
+        row = round(fraction * len(self))
+        return self[:row], self[row:]
+
+    def with_step(
+        self,
+        step: Mapping[str, Any],
+        *,
+        time: FloatArray | None = None,
+        signals: Mapping[str, FloatArray] | None = None,
+        units: Mapping[str, str] | None = None,
+        notes: Sequence[str] = (),
+    ) -> Log:
+        """The log with other contents, where they are given, and one more step in its history."""
+        return replace(
+            self,
+            time=self.time if time is None else time,
+            signals=self.signals if signals is None else signals,
+            units=self.units if units is None else units,
+            history=(*self.history, dict(step)),
+            notes=(*self.notes, *notes),
+        )
+
+    # ------------------------------------------------------------------ files and processes
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = (self.time, dict(self.signals), dict(self.units), self.source, self.history, self.notes)
+        return (Log, (*state, dict(self.unusable)))
+
+    def write(self, path: str | Path) -> None:
+        """Write time and signals to ``.csv``, ``.csv.gz``, ``.parquet`` or ``.npz``; every number reads back exactly.
+
+        The file appears whole or not at all.  Units, history and notes are not written.
+        Raises LogError: another ending, or the file cannot be written.
+        """
+        write_columns(Path(path), {"t": self.time, **self.signals})

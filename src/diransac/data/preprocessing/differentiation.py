@@ -1,0 +1,262 @@
+"""Velocities and accelerations that a log lacks, and regression rows that their noise does not spoil.
+
+Two filters of one kind (see `filters`) share the work.  Signals are derived with four times the bandwidth: what is not
+linear in them, such as the sign of a velocity, then switches in time.  The regression's rows ``W p = b``, which hold at
+every instant, are filtered with the bandwidth itself, both sides alike: a weighted sum of true equations is a true
+equation, whatever ``W`` holds.  So the bandwidth decides which part of the motion is used, not what is made of it.
+
+Inputs are held from a sample to the next one, as in every simulation of this package.  Around a sample there acts, in
+the mean, half of the input before and half of the one after it: `acting_inputs` gives that for the regression.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray
+from diransac.data.preprocessing.bandwidth import Bandwidth, choose_bandwidth
+from diransac.data.preprocessing.filters import REACH, convolve, half_length, kernels
+from diransac.data.preprocessing.steps import unwrap
+from diransac.data.units import same_unit
+from diransac.errors import LogError, SettingsError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from diransac.data.log import Log
+    from diransac.model import Model
+
+__all__ = ["acting_inputs", "differentiate", "filter_rows"]
+
+
+_STEP = "differentiate"
+_DERIVATION = 4.0
+_HIGHEST = 1.0 / 3.0
+_SHORTEST = 2.0 * REACH
+_NOTABLE_NOISE = 0.05
+_LONGEST_BRIDGE = 0.25
+_BESIDE = 2
+# Half a sample later, and the droop of a held input, to fourth order.
+_HOLD = (-1.0 / 24.0, 13.0 / 24.0, 13.0 / 24.0, -1.0 / 24.0)
+
+
+def differentiate(log: Log, model: Model, bandwidth: float | None = None) -> Log:
+    """The log with the velocities and accelerations that the model names and the log lacks, filtered with the rest.
+
+    Parameters
+    ----------
+    bandwidth : Hz; None: chosen from the log, where its motion comes within a factor of ten of its noise (`bandwidth`)
+
+    Accelerations come from measured velocities where there are such, from coordinates otherwise.  All of the model's
+    signals and inputs pass the same zero-phase filter; rows at both ends that it cannot fill are cut.  NaN is bridged
+    by a cubic if it lasts no longer than a quarter of the bandwidth's period; a longer gap stays NaN, with what the
+    filter reaches around it.  Angles in rad are unwrapped.
+
+    Raises LogError: a signal that the equations need is missing and cannot be derived, holds an infinity, or the log
+    is too short.  SettingsError: the bandwidth has no meaning for this log's rate.
+    """
+    sources = _sources(log, model)
+    if model.kinematics is None:
+        log = unwrap(log, [q for q, unit in model.coordinates.items() if q in log and unit == "rad"])
+    names = [n for n in _filtered(model) if n in log]
+    log.check(names)
+    bridged = {name: _bridge(log[name]) for name in names}
+    chosen = None
+    if bandwidth is None:
+        chosen = choose_bandwidth([(bridged[name], order) for name, order in _motions(log, model)], log.dt)
+        bandwidth = chosen.value
+    wide = _derivation_bandwidth(log, bandwidth)
+    L = half_length(wide, log.dt)
+    derived = {**{name: (name, 0) for name in names}, **sources}
+    spoilt = {name: _near_long_gaps(log[name], _LONGEST_BRIDGE / (bandwidth * log.dt), L) for name in names}
+    signals = {**log.signals, **_derived(bridged, derived, spoilt, kernels(wide, log.dt))}
+    return log.with_step(
+        _step(bandwidth, wide, chosen, sources, names, L),
+        time=log.time[L:-L],
+        signals={name: values[L:-L] for name, values in signals.items()},
+        units={**log.units, **_units(log, model, sources)},
+        notes=_notes(bandwidth, chosen, sources, L * log.dt),
+    )
+
+
+def _derived(
+    bridged: Mapping[str, FloatArray],
+    derived: Mapping[str, tuple[str, int]],
+    spoilt: Mapping[str, BoolArray],
+    responses: FloatArray,
+) -> dict[str, FloatArray]:
+    """Derivatives, of order 0 to 2, of what the filter lets through; NaN where a source is spoilt."""
+    signals = {}
+    for name, (source, order) in derived.items():
+        mean = bridged[source].mean()
+        filtered = convolve(bridged[source] - mean, responses[order]) + (mean if order == 0 else 0.0)
+        signals[name] = np.where(spoilt[source], np.nan, filtered)
+    return signals
+
+
+def filter_rows(log: Log, array: FloatArray, valid: BoolArray | None = None) -> FloatArray:
+    """Rows ``(N, ...)`` of a regression over the log, filtered as `differentiate` recorded; as they are without it.
+
+    Parameters
+    ----------
+    array : (N, ...)   W or b; both sides of the equations are to be filtered alike
+    valid : (N,)   rows that hold equations; others have no weight and come out as NaN.  None: those without NaN
+    """
+    step = _recorded(log)
+    if step is None:
+        return array
+    found = np.isfinite(array).all(axis=tuple(range(1, array.ndim))) if valid is None else valid
+    held = np.reshape(found, (-1, *(1,) * (array.ndim - 1)))
+    filtered = convolve(np.where(held, array, 0.0), kernels(step["row_filter"], log.dt)[0])
+    return np.where(held, filtered, np.nan)
+
+
+def acting_inputs(log: Log, inputs: FloatArray) -> FloatArray:
+    """Inputs ``(N, n_u)`` that act around each row of a regression, where `differentiate` derived its accelerations.
+
+    An input is held until the next sample, so that half a sample lies between what is recorded and what acts in the
+    mean.  A log with recorded accelerations, which belong to the input that begins in their row, is left as it is.
+    """
+    if _recorded(log) is None or len(inputs) < 2:
+        return inputs
+    padded = np.concatenate([inputs[:1], inputs[:1], inputs, inputs[-1:]])
+    n = len(inputs)
+    return np.asarray(sum(weight * padded[i : i + n] for i, weight in enumerate(_HOLD)))
+
+
+def _recorded(log: Log) -> Mapping[str, Any] | None:
+    steps = [step for step in log.history if step["step"] == _STEP]
+    return steps[-1] if steps else None
+
+
+# ---------------------------------------------------------------------- what comes from what
+
+
+def _sources(log: Log, model: Model) -> dict[str, tuple[str, int]]:
+    """Missing signal -> the measured signal that it is derived from, and how often."""
+    sources: dict[str, tuple[str, int]] = {}
+    for i, (v, a) in enumerate(zip(model.velocities, model.accelerations, strict=True)):
+        q = list(model.coordinates)[i] if model.kinematics is None else None
+        available = [(name, order) for name, order in ((v, 1), (q, 2)) if name is not None and name in log]
+        if v not in log and q is not None and q in log:
+            sources[v] = (q, 1)
+        if a not in log and available:
+            sources[a] = available[0]
+        for name in (v, a):
+            if name not in log and name not in sources and name in model.required_signals:
+                raise LogError(_underivable(log, model, name, v if name == a and q is None else q))
+    return sources
+
+
+def _underivable(log: Log, model: Model, name: str, source: str | None) -> str:
+    found = ", ".join(("t", *log.names))
+    if source is None:
+        why = f'model "{model.name}" has velocities that are not derivatives of its coordinates'
+        return f'{log.source}: signal "{name}" is missing and cannot be derived: {why}; found {found}. Give it.'
+    return f'{log.source}: signal "{name}" is missing, and so is "{source}", its source; found {found}. Give either.'
+
+
+def _filtered(model: Model) -> Iterable[str]:
+    """Names that pass the filter; quaternions and the like do not, for they are no sums."""
+    coordinates = model.coordinates if model.kinematics is None else ()
+    return (*coordinates, *model.velocities, *model.accelerations, *model.inputs)
+
+
+def _motions(log: Log, model: Model) -> list[tuple[str, int]]:
+    """For every degree of freedom, the signal nearest to the coordinate, and its distance from the acceleration."""
+    coordinates = list(model.coordinates) if model.kinematics is None else [""] * len(model.velocities)
+    chains = zip(coordinates, model.velocities, model.accelerations, strict=True)
+    measured = [[(n, order) for n, order in zip(chain, (2, 1, 0), strict=True) if n in log] for chain in chains]
+    return [chain[0] for chain in measured if chain]
+
+
+def _units(log: Log, model: Model, sources: Mapping[str, tuple[str, int]]) -> dict[str, str]:
+    """Units of what is derived from signals that are known to be in the model's units."""
+    known = {n for n, unit in log.units.items() if n in model.units and same_unit(unit, model.units[n])}
+    return {name: model.units[name] for name, (source, _) in sources.items() if source in known}
+
+
+# ---------------------------------------------------------------------- bandwidth and gaps
+
+
+def _derivation_bandwidth(log: Log, bandwidth: float) -> float:
+    """The bandwidth with which signals are derived.  Raises where the log cannot give the bandwidth that is asked."""
+    highest, duration = _HIGHEST / log.dt, len(log) * log.dt
+    if not 0.0 < bandwidth <= highest * (1.0 + 1e-9):
+        raise SettingsError(
+            f"a bandwidth of {bandwidth:.4g} Hz has no meaning at {1.0 / log.dt:.6g} Hz; give up to {highest:.4g} Hz"
+        )
+    wide = min(_DERIVATION * bandwidth, highest)
+    if bandwidth * duration < _SHORTEST or len(log) < 2 * half_length(wide, log.dt) + 2:
+        raise LogError(
+            f"{log.source}: {duration:.4g} s are too short to be filtered at {bandwidth:.4g} Hz, which takes "
+            f"{_SHORTEST / bandwidth:.4g} s; give a longer log or a higher bandwidth"
+        )
+    return wide
+
+
+def _bridge(values: FloatArray) -> FloatArray:
+    """The samples with each gap filled by the cubic that fits as many samples and two more to either side of it."""
+    missing = np.isnan(values)
+    rows = np.arange(len(values))
+    bridged = np.interp(rows, rows[~missing], values[~missing])
+    for begin, end in _gaps(missing):
+        near = slice(max(0, 2 * begin - end - _BESIDE), 2 * end - begin + _BESIDE)
+        x, known = 2.0 * (rows[near] - begin) / (end - begin) - 1.0, ~missing[near]
+        if begin > 0 and end < len(values) and known.sum() > 2 * _BESIDE:
+            cubic = np.polynomial.polynomial.polyfit(x[known], values[near][known], 3)
+            bridged[begin:end] = np.polynomial.polynomial.polyval(x[(rows[near] >= begin) & (rows[near] < end)], cubic)
+    return bridged
+
+
+def _gaps(missing: BoolArray) -> list[tuple[int, int]]:
+    """Where each run of missing rows begins and ends."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(int), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _near_long_gaps(values: FloatArray, longest: float, reach: int) -> BoolArray:
+    """Rows (N,) within the filter's reach of more than ``longest`` missing samples in a row."""
+    near = np.zeros(len(values), dtype=bool)
+    for begin, end in _gaps(np.isnan(values)):
+        if end - begin > max(longest, 1.0):
+            near[max(0, begin - reach) : end + reach] = True
+    return near
+
+
+# ---------------------------------------------------------------------- what is said
+
+
+def _step(
+    bandwidth: float,
+    wide: float,
+    chosen: Bandwidth | None,
+    sources: Mapping[str, tuple[str, int]],
+    filtered: list[str],
+    n_cut: int,
+) -> dict[str, Any]:
+    return {
+        "step": _STEP,
+        "bandwidth": float(bandwidth),
+        "chosen": chosen is not None,
+        "noise_share": None if chosen is None else chosen.noise_share,
+        "derivation_bandwidth": wide,
+        "row_filter": float(bandwidth),
+        "derived": {name: source for name, (source, _) in sources.items()},
+        "filtered": filtered,
+        "rows_cut": n_cut,
+    }
+
+
+def _notes(bandwidth: float, chosen: Bandwidth | None, sources: Mapping[str, tuple[str, int]], cut: float) -> list[str]:
+    derived = f"derived {', '.join(sources)}; " if sources else "nothing to derive; "
+    origin = "given" if chosen is None else "chosen from the log"
+    notes = [f"{derived}filtered at {bandwidth:.3g} Hz ({origin}), {cut:.3g} s cut at either end"]
+    if chosen is not None and chosen.noise_share > _NOTABLE_NOISE:
+        share = min(1.0, chosen.noise_share)
+        notes.append(
+            f"noise may be {share:.0%} of the accelerations' power up to {bandwidth:.3g} Hz: expect biased masses"
+        )
+    return notes

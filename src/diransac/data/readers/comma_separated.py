@@ -1,0 +1,151 @@
+"""CSV text, plain or packed by gzip: one header line, one line a row."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import zlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.data.readers.table import Table, check_unique
+from diransac.data.units import split_unit
+from diransac.errors import LogError
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["read_csv", "read_csv_gz"]
+
+_SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
+_MISSING = ("", "na", "n/a", "nan", "null", "none")
+
+
+def read_csv_gz(data: bytes, source: str) -> Table:
+    """The table that gzip packed.  Raises LogError: as `read_csv`; it is not gzip, or is cut off."""
+    try:
+        return read_csv(gzip.decompress(data), source)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise LogError(f"{source}: the gzip data are damaged or cut off ({error})") from error
+
+
+def read_csv(data: bytes, source: str) -> Table:
+    """The table that text holds.
+
+    Raises LogError: it is not UTF-8 text with a header line and as many fields in every line.
+    """
+    lines = _text(data, source).split("\n")
+    separator = _separator(lines[0])
+    headers = _header(lines[0], separator, source)
+    _check_ragged(lines, separator, source)
+    if len(lines) == 1:
+        raise LogError(f"{source}: there is a header ({', '.join(headers)[:200]}) but no row")
+    named = [split_unit(header) for header in headers]
+    check_unique([name for name, _ in named if name], source)
+    frame = _frame(lines, separator, source)
+    columns = {n: _numbers(s, separator) for (n, _), s in zip(named, frame.get_columns(), strict=True) if n}
+    units = {name: unit for name, unit in named if unit is not None}
+    return Table(columns, units, tuple(_notes(named, separator)))
+
+
+def _text(data: bytes, source: str) -> str:
+    """The text, every line but the last ended by one line feed."""
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise LogError(
+            f"{source}: it is not UTF-8 text (byte 0x{data[error.start]:02x} at offset {error.start}); save it as UTF-8"
+        ) from error
+    if "\0" in text:
+        raise LogError(f"{source}: it holds binary data, not text")
+    text = text.replace("\r\n", "\n").replace("\r", "\n").strip("\n")
+    if not text.strip():
+        raise LogError(f"{source}: it is empty; give a header line and one line a row")
+    return text
+
+
+def _separator(header: str) -> str:
+    """The comma; a semicolon or a tab where the header has only that."""
+    found = [s for s in _SEPARATORS if s in header]
+    return found[0] if len(found) == 1 else ","
+
+
+def _header(line: str, separator: str, source: str) -> list[str]:
+    try:
+        headers = [header.strip() for header in next(csv.reader([line], delimiter=separator))]
+    except csv.Error as error:
+        raise LogError(f"{source}: the header line cannot be read ({error})") from error
+    if all(_is_number(header) for header in headers):
+        raise LogError(f"{source}: the first line holds numbers ({line:.60}); give it a header line with names")
+    return headers
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _check_ragged(lines: list[str], separator: str, source: str) -> None:
+    """Raise LogError at the first line that has not as many fields as the header."""
+    if any('"' in line for line in lines):
+        counts = _quoted_counts(lines, separator, source)
+    else:
+        counts = [(row + 1, line.count(separator) + 1) for row, line in enumerate(lines)]
+    expected = counts[0][1]
+    for number, count in counts:
+        if count != expected and not lines[number - 1].strip():
+            n = sum(not line.strip() for line in lines)
+            which = f"line {number} is blank, the first of {n}" if n > 1 else f"line {number} is blank"
+            raise LogError(f"{source}: {which}; remove blank lines")
+        if count != expected:
+            raise LogError(f"{source}: line {number} has {count} fields, the header has {expected}")
+
+
+def _quoted_counts(lines: list[str], separator: str, source: str) -> list[tuple[int, int]]:
+    """Line number and number of fields of every record, quotation marks understood."""
+    reader = csv.reader((line + "\n" for line in lines), delimiter=separator, strict=True)
+    try:
+        return [(reader.line_num, len(record)) for record in reader]
+    except csv.Error as error:
+        raise LogError(f"{source}: line {reader.line_num} cannot be read ({error})") from error
+
+
+def _frame(lines: list[str], separator: str, source: str) -> pl.DataFrame:
+    """Every field as text."""
+    import polars as pl
+
+    data = io.BytesIO("\n".join(lines).encode())
+    try:
+        return pl.read_csv(data, separator=separator, infer_schema=False)
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
+        raise LogError(f"{source}: it cannot be read as CSV ({str(error).splitlines()[0]})") from error
+
+
+def _numbers(fields: pl.Series, separator: str) -> FloatArray | str:
+    """A column of text as numbers, empty fields as NaN; or which field is none.  Semicolons allow decimal commas."""
+    import polars as pl
+
+    text = fields.str.strip_chars()
+    readable = text.str.replace(",", ".", literal=True) if separator == ";" else text
+    numbers = readable.cast(pl.Float64, strict=False)
+    bad = (numbers.is_null() & text.is_not_null() & ~text.str.to_lowercase().is_in(_MISSING)).to_numpy()
+    if bad.any():
+        row = int(bad.argmax())
+        return f'is not numeric: line {row + 2} holds "{text[row]:.60}"'
+    return numbers.fill_null(np.nan).to_numpy().astype(np.float64)
+
+
+def _notes(named: list[tuple[str, str | None]], separator: str) -> list[str]:
+    notes = []
+    if separator != ",":
+        notes.append(f"fields are separated by a {_SEPARATORS[separator]}")
+    unnamed = sum(not name for name, _ in named)
+    if unnamed:
+        notes.append(f"{unnamed} column{'s' * (unnamed > 1)} without a name left out")
+    return notes

@@ -1,0 +1,37 @@
+"""NPZ: NumPy arrays by name.  Pickled objects are never loaded."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+
+import numpy as np
+
+from diransac.data.readers.table import Table, check_unique, table_of_arrays
+from diransac.errors import LogError
+
+__all__ = ["read_npz"]
+
+_DAMAGED = (ValueError, EOFError, OSError, KeyError, NotImplementedError, RuntimeError, MemoryError, zlib.error)
+
+
+def read_npz(data: bytes, source: str) -> Table:
+    """The table of an NPZ file.
+
+    Raises LogError: it is none, is cut off, or holds pickled objects.
+    """
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(data))
+    except (zipfile.BadZipFile, NotImplementedError) as error:
+        raise LogError(f"{source}: it is not an NPZ file, or is cut off ({error})") from error
+    check_unique(archive.namelist(), source)
+    arrays = {}
+    for entry in archive.namelist():
+        name = entry.removesuffix(".npy")
+        try:
+            with archive.open(entry) as file:
+                arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
+        except (*_DAMAGED, zipfile.BadZipFile) as error:
+            raise LogError(f'{source}: array "{name}" cannot be read ({error})') from error
+    return table_of_arrays(arrays, source)

@@ -1,0 +1,50 @@
+"""Parquet: one column a signal."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.data.readers.table import Table, check_unique
+from diransac.data.units import split_unit
+from diransac.errors import LogError
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["read_parquet"]
+
+_MAGIC = b"PAR1"
+
+
+def read_parquet(data: bytes, source: str) -> Table:
+    """The table of a Parquet file.
+
+    Raises LogError: it is none, is cut off, or is damaged.
+    """
+    import polars as pl
+
+    if data[:4] != _MAGIC or data[-4:] != _MAGIC or len(data) < 12:
+        what = "is cut off" if data[:4] == _MAGIC else "is not a Parquet file"
+        raise LogError(f"{source}: it {what} (no {_MAGIC.decode()} mark at its {'end' if 'cut' in what else 'start'})")
+    try:
+        frame = pl.read_parquet(io.BytesIO(data))
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, MemoryError) as error:
+        raise LogError(f"{source}: the Parquet data are damaged ({str(error).splitlines()[0]})") from error
+    named = [split_unit(header) for header in frame.columns]
+    check_unique([name for name, _ in named], source)
+    columns = {name: _numbers(series) for (name, _), series in zip(named, frame.get_columns(), strict=True)}
+    return Table(columns, {name: unit for name, unit in named if unit is not None})
+
+
+def _numbers(series: pl.Series) -> FloatArray | str:
+    """A column as numbers, null as NaN; or its first value, which is none."""
+    import polars as pl
+
+    if series.dtype.is_numeric() or series.dtype in (pl.Boolean, pl.Null):
+        return series.cast(pl.Float64).fill_null(np.nan).to_numpy().astype(np.float64)
+    row = series.is_not_null().arg_max() or 0
+    return f"is not numeric: row {row} holds {series[row]!s:.60} ({series.dtype})"

@@ -1,0 +1,1 @@
+"""Flight: planned trajectories, time-varying LQR, closed loops, and logs as recorders corrupt them."""

@@ -1,0 +1,373 @@
+"""The interior-point solvers that come with CasADi, given a `Program`'s own derivatives.
+
+An `nlpsol` object is built once for a layout and solved for many numbers: its functions are looked up in the program
+that is being solved. CasADi's function cache hands them over, so that nothing is differentiated a second time.
+
+References: Waechter and Biegler 2006 (IPOPT); Vanroye et al. 2023, "FATROP" (structure-exploiting interior point).
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import lru_cache
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import casadi as ca
+import numpy as np
+
+from diransac.arrays import FloatArray, IntArray
+from diransac.flight.planning.transcription import Layout, Numbers, Program
+
+if TYPE_CHECKING:
+    pass
+
+
+__all__ = ["TIME_LIMIT", "Manner", "Outcome", "SearchLimits", "interior_point"]
+
+Manner: TypeAlias = Literal["careful", "near", "bold"]
+
+_QUIET: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
+_TOLERANCE = 1e-9
+_FATROP_RELAXES = 1e-8
+"""Times a limit, or one: how much wider fatrop takes every limit, which cannot be switched off."""
+_FATROP_LARGEST = 1e10
+"""Values beyond which fatrop may search for a regularisation for ever, without asking for another value."""
+
+TIME_LIMIT = "time limit reached"
+
+
+@dataclass(frozen=True)
+class SearchLimits:
+    """How long solvers may try, one after the other.
+
+    Parameters
+    ----------
+    iterations : of one solver, at most
+    seconds : of all of them, at most
+    deadline : when these are over, by the monotonic clock; that many seconds from now by default
+    """
+
+    iterations: int
+    seconds: float
+    deadline: float = field(default=0.0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "deadline", self.deadline or time.monotonic() + self.seconds)
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left."""
+        return max(0.0, self.deadline - time.monotonic())
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a solver found.
+
+    Parameters
+    ----------
+    unknowns : (n_unknowns,)   the solution, or where the solver gave up
+    success : whether it is a solution
+    status : the solver's own words
+    iterations : that it took; None where it doesn't tell
+    solver : its name
+    """
+
+    unknowns: FloatArray
+    success: bool
+    status: str
+    iterations: int | None
+    solver: str
+
+    @property
+    def words(self) -> str:
+        """How it ended."""
+        count = "" if self.iterations is None else f" after {self.iterations} iterations"
+        return f"{self.solver} says {self.status}{count}"
+
+
+def interior_point(
+    name: str, program: Program, guess: FloatArray, limits: SearchLimits, manner: Manner = "careful"
+) -> Outcome:
+    """Solve by ``ipopt`` or ``fatrop``.
+
+    Parameters
+    ----------
+    guess : (n_unknowns,)   where to start
+    manner : ``careful``; ``near``, from a guess that is close to the solution: the barrier starts small; ``bold``:
+        every Newton step is taken whole, for problems on which the search along each step creeps (IPOPT alone)
+
+    Raises KeyboardInterrupt: the user stopped it.
+    """
+    return _solver(name, program.layout, limits.iterations, manner).solve(program, guess, limits.deadline)
+
+
+@lru_cache(maxsize=64)
+def _solver(name: str, layout: Layout, iterations: int, manner: Manner) -> _Solver:
+    return _Solver(name, layout, iterations, manner)
+
+
+@contextmanager
+def _interrupts_noted() -> Iterator[list[int]]:
+    """Note Ctrl-C instead of raising it: CasADi keeps to itself what is raised between two evaluations."""
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():  # interrupts come to the main thread alone
+        yield noted
+        return
+    before = signal.getsignal(signal.SIGINT)
+    if before in (None, signal.SIG_IGN):  # not Python's to handle, or ignored, as in a background job of a shell
+        yield noted
+        return
+    signal.signal(signal.SIGINT, lambda number, _frame: noted.append(number))
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class _Stopped(Exception):
+    """The solver is to give up; it says why."""
+
+
+class _Solver:
+    """An `nlpsol` object of one layout; one solve at a time."""
+
+    def __init__(self, name: str, layout: Layout, iterations: int, manner: Manner) -> None:
+        self._name, self._layout = name, layout
+        self._options = {"ipopt": _ipopt_options, "fatrop": _fatrop_options}[name](layout, iterations, manner)
+        self._lock = Lock()
+        self._program: Program | None = None
+        self._nlpsol: ca.Function | None = None
+        self._functions: dict[str, _Evaluation] = {}
+        self._deadline = 0.0
+        self._stopped: BaseException | None = None
+        self._interrupts: list[int] = []
+
+    def solve(self, program: Program, guess: FloatArray, deadline: float) -> Outcome:
+        """Solve one program of this layout."""
+        with self._lock:
+            self._program, self._stopped, self._deadline = program, None, deadline
+            try:
+                return self._run(program, guess)
+            finally:
+                self._program = self._stopped = None
+
+    def _run(self, program: Program, guess: FloatArray) -> Outcome:
+        if self._nlpsol is None:
+            self._build(program)
+        assert self._nlpsol is not None
+        numbers = program.numbers
+        with _interrupts_noted() as self._interrupts:
+            try:
+                lower, upper = self._limits(numbers)
+                found = self._nlpsol(x0=guess, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+            except RuntimeError:
+                if self._stopped is None:
+                    raise
+        if self._interrupts:
+            raise KeyboardInterrupt
+        if isinstance(self._stopped, _Stopped):
+            return Outcome(guess, False, str(self._stopped), None, self._name)
+        if self._stopped is not None:
+            raise self._stopped
+        stats, unknowns = self._nlpsol.stats(), np.array(found["x"]).ravel()
+        success = bool(stats["success"]) and bool(np.isfinite(unknowns).all())
+        return Outcome(unknowns, success, str(stats["return_status"]), int(stats["iter_count"]), self._name)
+
+    def _limits(self, numbers: Numbers) -> tuple[FloatArray, FloatArray]:
+        """Limits of the unknowns, so that those that the solver really keeps to are the ones that were asked for."""
+        lower, upper = numbers.lower, numbers.upper
+        if self._name != "fatrop":
+            return lower, upper
+        finite = [np.where(np.isfinite(limit), np.abs(limit), 0.0) for limit in (lower, upper)]
+        inward = [_FATROP_RELAXES * np.maximum(1.0, size) for size in finite]
+        roomy = upper - lower > inward[0] + inward[1]
+        return np.where(roomy, lower + inward[0], lower), np.where(roomy, upper - inward[1], upper)
+
+    def _build(self, program: Program) -> None:
+        structure = _Structure(program)
+        signatures = _SIGNATURES[self._name]
+        self._functions = {
+            name: _Evaluation(name, results, structure, self._values) for name, results in signatures.items()
+        }
+        nlp = _Evaluation("nlp", ("f", "g"), structure, self._values)
+        self._functions["nlp"] = nlp
+        cache = {name: function for name, function in self._functions.items() if name != "nlp"}
+        self._nlpsol = ca.nlpsol("plan", self._name, nlp, {**_QUIET, **self._options, "cache": cache})
+
+    def _values(self, name: str, x: FloatArray, objective_factor: float, multipliers: FloatArray) -> FloatArray:
+        """One of `_COMPUTE` at a point.
+
+        Raises whatever stopped the solver: from then on no function has a value, which ends the solver's search.
+        """
+        if self._stopped is None and self._interrupts:
+            self._stopped = KeyboardInterrupt()
+        if self._stopped is None and time.monotonic() > self._deadline:
+            self._stopped = _Stopped(TIME_LIMIT)
+        if self._stopped is not None:
+            raise self._stopped
+        assert self._program is not None
+        try:
+            values = np.asarray(_COMPUTE[name](self._program, x, objective_factor, multipliers))
+            if self._name == "fatrop" and not np.abs(values).max(initial=0.0) < _FATROP_LARGEST:
+                raise _Stopped("a number is too large")
+        except BaseException as error:
+            self._stopped = error
+            raise
+        return values
+
+
+class _Structure:
+    """Sparsity of everything that a solver asks for, and how its entries are ordered."""
+
+    def __init__(self, program: Program) -> None:
+        n, m = program.layout.n_unknowns, program.layout.n_constraints
+        self.n_unknowns, self.n_constraints = n, m
+        jacobian, hessian = program.jacobian_entries, program.hessian_entries
+        triangle = hessian[0] <= hessian[1]
+        sorted_jacobian = _sorted(jacobian, (m, n))
+        sorted_hessian = _sorted(hessian, (n, n))
+        sorted_triangle = _sorted((hessian[0][triangle], hessian[1][triangle]), (n, n))
+        every = slice(None)
+        self.parts: dict[str, tuple[ca.Sparsity, Any]] = {
+            "f": (ca.Sparsity.dense(1, 1), every),
+            "g": (ca.Sparsity.dense(m, 1), every),
+            "grad_f_x": (ca.Sparsity.dense(n, 1), every),
+            "grad_gamma_x": (ca.Sparsity.dense(n, 1), every),
+            "grad_gamma_p": (ca.Sparsity.dense(0, 1), every),
+            "jac_g_x": sorted_jacobian,
+            "hess_gamma_x_x": sorted_hessian,
+            "triu_hess_gamma_x_x": (sorted_triangle[0], np.flatnonzero(triangle)[sorted_triangle[1]]),
+        }
+
+
+def _lagrangian_gradient(
+    program: Program, x: FloatArray, objective_factor: float, multipliers: FloatArray
+) -> FloatArray:
+    rows, columns = program.jacobian_entries
+    sums = np.bincount(columns, program.jacobian(x) * multipliers[rows], program.layout.n_unknowns)
+    return np.asarray(objective_factor * program.gradient(x) + sums)
+
+
+_COMPUTE: Mapping[str, Callable[[Program, FloatArray, float, FloatArray], Any]] = {
+    "f": lambda program, x, _factor, _multipliers: [program.objective(x)],
+    "g": lambda program, x, _factor, _multipliers: program.constraints(x),
+    "grad_f_x": lambda program, x, _factor, _multipliers: program.gradient(x),
+    "grad_gamma_x": _lagrangian_gradient,
+    "grad_gamma_p": lambda _program, _x, _factor, _multipliers: np.zeros(0),
+    "jac_g_x": lambda program, x, _factor, _multipliers: program.jacobian(x),
+    "hess_gamma_x_x": Program.hessian,
+    "triu_hess_gamma_x_x": Program.hessian,
+}
+"""What a solver may ask for, by CasADi's names: (program, unknowns, objective's factor, multipliers) -> its entries."""
+
+_SIGNATURES: dict[str, dict[str, tuple[str, ...]]] = {
+    "ipopt": {
+        "nlp_f": ("f",),
+        "nlp_g": ("g",),
+        "nlp_grad_f": ("f", "grad_f_x"),
+        "nlp_jac_g": ("g", "jac_g_x"),
+        "nlp_hess_l": ("triu_hess_gamma_x_x",),
+        "nlp_grad": ("f", "g", "grad_gamma_x", "grad_gamma_p"),
+    },
+    "fatrop": {
+        "nlp_f": ("f",),
+        "nlp_g": ("g",),
+        "nlp_grad_f": ("grad_f_x",),
+        "nlp_jac_g": ("g", "jac_g_x"),
+        "nlp_hess_l": ("grad_gamma_x", "hess_gamma_x_x"),
+        "nlp_grad": ("f", "g", "grad_gamma_x", "grad_gamma_p"),
+    },
+}
+"""What each solver asks for under which name; multipliers go in where their name says that they matter."""
+
+
+class _Evaluation(ca.Callback):
+    """One function of the nonlinear program for CasADi: (x, p, lam_f, lam_g) or (x, p) -> some of `_COMPUTE`."""
+
+    def __init__(
+        self, name: str, results: tuple[str, ...], structure: _Structure, values: Callable[..., FloatArray]
+    ) -> None:
+        ca.Callback.__init__(self)
+        self._results, self._structure, self._values = results, structure, values
+        weighted = name in ("nlp_hess_l", "nlp_grad")
+        sizes = {"x": structure.n_unknowns, "p": 0}
+        if weighted:
+            sizes |= {"lam_f": 1, "lam_g": structure.n_constraints}
+        self._sizes = sizes
+        # CasADi adds multipliers to every solution, even to one that was stopped, and warns if it can't.
+        self._unread = name == "nlp_grad"
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        return len(self._sizes)
+
+    def get_n_out(self) -> int:
+        return len(self._results)
+
+    def get_name_in(self, i: int) -> str:
+        return list(self._sizes)[i]
+
+    def get_name_out(self, i: int) -> str:
+        return self._results[i]
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        return ca.Sparsity.dense(list(self._sizes.values())[i], 1)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        return self._structure.parts[self._results[i]][0]
+
+    def has_eval_buffer(self) -> bool:
+        return True
+
+    def eval_buffer(self, arguments: Any, results: Any) -> int:
+        """Fill the buffers; 1 where there is no value, which CasADi tells the solver."""
+        wanted = [(name, np.frombuffer(b)) for name, b in zip(self._results, results, strict=True) if b is not None]
+        if self._unread:
+            for _, buffer in wanted:
+                buffer[:] = 0.0
+            return 0
+        sizes = self._sizes.values()
+        given = [np.zeros(n) if a is None else np.frombuffer(a) for a, n in zip(arguments, sizes, strict=True)]
+        factor, multipliers = (float(given[2][0]), given[3]) if len(given) > 2 else (0.0, np.zeros(0))
+        try:
+            # Derivatives stand last and are computed first: values are known then.
+            for name, buffer in reversed(wanted):
+                buffer[:] = self._values(name, given[0], factor, multipliers)[self._structure.parts[name][1]]
+        except BaseException:  # noqa: BLE001 - CasADi would print it; it is raised where the solver was called
+            return 1
+        return 0
+
+
+def _sorted(entries: tuple[IntArray, IntArray], shape: tuple[int, int]) -> tuple[ca.Sparsity, IntArray]:
+    """Column-compressed sparsity of entries, and their order in it."""
+    rows, columns = entries
+    order = np.lexsort((rows, columns))
+    starts = np.searchsorted(columns[order], np.arange(shape[1] + 1))
+    return ca.Sparsity(*shape, starts.tolist(), rows[order].tolist()), order
+
+
+def _ipopt_options(_layout: Layout, iterations: int, manner: Manner) -> dict[str, Any]:
+    options = {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, **_interior(iterations, manner)}
+    if manner == "bold":
+        options |= {"accept_every_trial_step": "yes", "mu_init": 1e-3}
+    return {"ipopt": options}
+
+
+def _fatrop_options(layout: Layout, iterations: int, manner: Manner) -> dict[str, Any]:
+    options = {"print_level": 0, **_interior(iterations, manner)}
+    return {"structure_detection": "auto", "equality": [True] * layout.n_constraints, "fatrop": options}
+
+
+def _interior(iterations: int, manner: Manner) -> dict[str, Any]:
+    """What both solvers call by the same name."""
+    options = {"max_iter": iterations, "tol": _TOLERANCE}
+    if manner == "near":
+        options |= {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
+    return options

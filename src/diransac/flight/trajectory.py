@@ -1,0 +1,98 @@
+"""`Trajectory`: where a plant is to be at every moment, and the inputs that take it there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.errors import SettingsError
+
+__all__ = ["Trajectory"]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """States and inputs over time; each input is held from its row to the next.
+
+    Parameters
+    ----------
+    time : (K,)   seconds, evenly spaced, at least 2 rows
+    states : (K, n_x)   coordinates, then velocities, each state's unit
+    inputs : (K, n_u)   each input's unit
+    state_names, input_names : names of the columns
+    input_limits : name -> (lowest, highest) that the inputs keep to; a controller keeps to them as well
+    cost : what the planner minimised; None if it was not planned
+    solver : who planned it; None if nobody did
+
+    The arrays are copies and read-only.
+
+    Raises SettingsError: arrays that do not fit together, a time that is not even, a number that isn't finite.
+    """
+
+    time: FloatArray
+    states: FloatArray
+    inputs: FloatArray
+    state_names: tuple[str, ...] = ()
+    input_names: tuple[str, ...] = ()
+    input_limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    cost: float | None = None
+    solver: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("time", "states", "inputs"):
+            array = np.array(getattr(self, name), np.float64)
+            if array.ndim != (1 if name == "time" else 2) or len(array) != len(self.time) or len(array) < 2:
+                raise SettingsError(
+                    "a trajectory needs time (K,), states (K, n_x) and inputs (K, n_u) with K of at least 2; "
+                    f"found {', '.join(str(np.shape(a)) for a in (self.time, self.states, self.inputs))}"
+                )
+            if not np.isfinite(array).all():
+                raise SettingsError(f"the trajectory's {name} hold a NaN or an infinity")
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        steps = np.diff(self.time)
+        if not (steps > 0).all() or np.ptp(steps) > 1e-6 * steps.mean():
+            raise SettingsError("the trajectory's time must increase evenly; resample it")
+        for name, names, array in (("state", self.state_names, self.states), ("input", self.input_names, self.inputs)):
+            if names and len(names) != array.shape[1]:
+                raise SettingsError(f"the trajectory has {array.shape[1]} {name}s and {len(names)} {name}_names")
+        object.__setattr__(self, "state_names", tuple(self.state_names))
+        object.__setattr__(self, "input_names", tuple(self.input_names))
+        object.__setattr__(self, "input_limits", MappingProxyType(dict(self.input_limits)))
+
+    @property
+    def dt(self) -> float:
+        """Time from row to row, seconds."""
+        return float((self.time[-1] - self.time[0]) / (len(self.time) - 1))
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def columns(self, names: Sequence[str]) -> FloatArray:
+        """States or inputs ``(K, len(names))`` by name.
+
+        Raises SettingsError: there is none of that name.
+        """
+        known = {**dict(zip(self.input_names, self.inputs.T, strict=False))}
+        known |= dict(zip(self.state_names, self.states.T, strict=False))
+        missing = [name for name in names if name not in known]
+        if missing:
+            raise SettingsError(
+                f'the trajectory has no "{missing[0]}"; it has {", ".join(known) or "columns without names"}'
+            )
+        return np.column_stack([known[name] for name in names])
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """A state or input ``(K,)`` by name.
+
+        Raises SettingsError: there is none of that name.
+        """
+        return self.columns([name])[:, 0]
+
+    def __reduce__(self) -> tuple[object, ...]:
+        names = (self.state_names, self.input_names, dict(self.input_limits))
+        return (Trajectory, (self.time, self.states, self.inputs, *names, self.cost, self.solver))

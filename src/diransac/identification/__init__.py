@@ -1,0 +1,1 @@
+"""Identification: dataset -> method -> estimate -> evaluation, and the results that users see."""

@@ -1,0 +1,363 @@
+"""``W p = b -> p``: estimators as small frozen objects, each bound to the rows of a log before it is used.
+
+An estimator says of a set of rows whether it is well-defined, and fits it.  Where a fit needs sums alone, each
+observation's block of ``[W b]^T [W b]`` is formed once, and a sample or a set of inliers is a sum of blocks, taken in
+the order of its rows: no result depends on how many hypotheses are fitted at a time.
+"""
+
+from __future__ import annotations
+
+import operator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, Self, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data import preprocessing
+from diransac.errors import IdentificationError, SettingsError
+from diransac.simulation.compiler import compile_map
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from diransac.data.dataset import Observations
+
+__all__ = [
+    "BoundEstimator",
+    "Estimator",
+    "OrdinaryLeastSquares",
+    "ScikitLearnEstimator",
+    "TotalLeastSquares",
+    "as_estimator",
+    "name_of",
+    "regression",
+]
+
+
+_MIN_EIGENVALUE = 1e-6
+
+
+class BoundEstimator(Protocol):
+    """An estimator over the usable rows of one log, which are numbered from 0."""
+
+    n_rows: int
+
+    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
+        """Whether each set of rows determines the parameters: smallest eigenvalue of the column-scaled ``W^T W``."""
+
+    def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        """Parameters ``(n_sets, n_p)``; not finite where a set determines none."""
+
+    def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
+        """Parameters ``(n_groups, n_p)`` from ``rows`` (ascending) less each group of them."""
+
+    def unidentifiable(self) -> tuple[int, ...]:
+        """Indices of the parameters that the whole log does not determine."""
+
+
+class Estimator(Protocol):
+    """What identifies parameters from rows."""
+
+    def bind(self, observations: Observations) -> BoundEstimator:
+        """The estimator over the usable rows of a log."""
+
+
+@dataclass(frozen=True)
+class _SumsEstimator:
+    """An estimator that needs no more of a set of rows than the sum of ``[W b]^T [W b]``.
+
+    Parameters
+    ----------
+    min_eigenvalue : the smallest eigenvalue of ``W^T W`` must exceed it, with the columns of ``W`` divided by their RMS
+        over the whole log, so that it has no unit
+    """
+
+    min_eigenvalue: float = _MIN_EIGENVALUE
+
+    def fit(self, W: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:
+        """Parameters ``(n_p,)`` from ``W (..., n_p)`` and ``b (...)``."""
+        bound = self._bind(*_flat(W, b))
+        return np.asarray(bound.fit([np.arange(bound.n_rows)])[0])
+
+    def well_defined(self, W: npt.ArrayLike, b: npt.ArrayLike) -> bool:
+        """Whether ``W (..., n_p)``, ``b (...)`` determine the parameters, with the columns scaled by their own RMS."""
+        bound = self._bind(*_flat(W, b))
+        return bool(bound.well_defined([np.arange(bound.n_rows)])[0])
+
+    def bind(self, observations: Observations) -> BoundEstimator:
+        """The estimator over the usable rows of a log."""
+        return self._bind(*regression(observations))
+
+    def _bind(self, W: FloatArray, b: FloatArray) -> _BoundSums:
+        return _BoundSums(self, W, b)
+
+    def solve(self, gram: FloatArray) -> FloatArray:
+        """Parameters ``(..., n_p)`` from sums ``(..., n_p + 1, n_p + 1)`` with columns of unit RMS."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class OrdinaryLeastSquares(_SumsEstimator):
+    """``p = (W^T W)^-1 W^T b``: least squares of the equation error.
+
+    References: Dimmig et al. 2023, section III.C (whose printed formula lacks the transpose).
+    """
+
+    def solve(self, gram: FloatArray) -> FloatArray:
+        """Normal equations by LDL^T."""
+        return solve_definite(gram[..., :-1, :-1], gram[..., :-1, -1])
+
+
+@dataclass(frozen=True)
+class TotalLeastSquares(_SumsEstimator):
+    """The ``p`` of the smallest change of ``W`` and ``b`` that makes ``W p = b`` exact, in columns of unit RMS.
+
+    Every column is taken to be as noisy as any other, relative to its RMS.
+
+    References: Golub and Van Loan 1980, "An analysis of the total least squares problem".
+    """
+
+    def solve(self, gram: FloatArray) -> FloatArray:
+        """Eigenvector of the smallest eigenvalue of ``[W b]^T [W b]``."""
+        finite = np.all(np.isfinite(gram), axis=(-2, -1), keepdims=True)
+        _, vectors = np.linalg.eigh(np.where(finite, gram, np.eye(gram.shape[-1])))
+        smallest = np.where(finite[..., 0], vectors[..., :, 0], np.nan)
+        last = smallest[..., -1:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(np.abs(last) > np.finfo(float).eps, -smallest[..., :-1] / last, np.nan)
+
+
+class _BoundSums:
+    """Blocks of ``[W b]^T [W b]`` in columns of unit RMS, the upper triangle of each observation's in a row."""
+
+    def __init__(self, estimator: _SumsEstimator, W: FloatArray, b: FloatArray) -> None:
+        self._estimator = estimator
+        self.n_rows, _, self._n_p = W.shape
+        columns = np.concatenate([W, b[:, :, None]], axis=2)
+        self._scale = column_scale(columns)
+        columns = columns / np.where(self._scale > 0.0, self._scale, 1.0)
+        self._upper = np.triu_indices(self._n_p + 1)
+        i, j = self._upper
+        self._blocks = np.zeros((self.n_rows, len(i)))
+        for row in range(W.shape[1]):
+            self._blocks += columns[:, row, i] * columns[:, row, j]
+        self._latest: tuple[Sequence[IntArray], FloatArray] = ([], np.empty((0, self._n_p + 1, self._n_p + 1)))
+
+    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
+        gram = self._gram(row_sets)[:, :-1, :-1]
+        return np.asarray(smallest_eigenvalue(gram) > self._estimator.min_eigenvalue)
+
+    def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        return self._unscale(self._estimator.solve(self._gram(row_sets)))
+
+    def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
+        return self._unscale(self._estimator.solve(self._gram([rows]) - self._gram(groups)))
+
+    def unidentifiable(self) -> tuple[int, ...]:
+        gram = self._gram([np.arange(self.n_rows)])[0, :-1, :-1]
+        return loose_parameters(gram, self._estimator.min_eigenvalue)
+
+    def _unscale(self, scaled: FloatArray) -> FloatArray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(scaled * self._scale[-1] / self._scale[:-1])
+
+    def _gram(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        """Sums ``(n_sets, n_p + 1, n_p + 1)``, each in the order of its rows; kept for who asks for the same again.
+
+        Whether a set is well-defined is asked right before it is fitted.
+        """
+        before, gram = self._latest
+        if len(before) == len(row_sets) and all(map(operator.is_, before, row_sets)):
+            return gram
+        sums = np.empty((len(row_sets), self._blocks.shape[1]))
+        lengths = np.array([len(rows) for rows in row_sets])
+        for length in np.unique(lengths):
+            alike = np.flatnonzero(lengths == length).tolist()
+            rows = np.stack([row_sets[i] for i in alike], axis=1)
+            sums[alike] = np.add.reduce(np.take(self._blocks, rows, axis=0), axis=0)
+        gram = np.empty((len(row_sets), self._n_p + 1, self._n_p + 1))
+        i, j = self._upper
+        gram[:, i, j] = gram[:, j, i] = sums
+        self._latest = list(row_sets), gram
+        return gram
+
+
+class LinearRegressor(Protocol):
+    """What scikit-learn's linear regressors share."""
+
+    def fit(self, X: FloatArray, y: FloatArray) -> Self:
+        """Fit coefficients."""
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
+        """Settings by name."""
+
+    def set_params(self, **params: object) -> Self:
+        """Change settings."""
+
+
+@dataclass(frozen=True)
+class ScikitLearnEstimator:
+    """Any scikit-learn linear regressor: fitted without intercept, to columns and right-hand side of unit RMS.
+
+    Parameters
+    ----------
+    regressor : an estimator with ``fit`` and ``coef_`` (or an ``estimator_`` that has it), such as ``HuberRegressor()``
+    min_eigenvalue : as in `OrdinaryLeastSquares`
+
+    Raises SettingsError: the regressor cannot be fitted without an intercept.
+    """
+
+    regressor: LinearRegressor
+    min_eigenvalue: float = _MIN_EIGENVALUE
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "regressor", _without_intercept(self.regressor))
+
+    def bind(self, observations: Observations) -> BoundEstimator:
+        """The estimator over the usable rows of a log."""
+        return _BoundScikitLearn(self, *regression(observations))
+
+
+class _BoundScikitLearn:
+    """Rows of ``W`` and ``b`` for a scikit-learn regressor; whether they are enough is judged by their sums."""
+
+    def __init__(self, estimator: ScikitLearnEstimator, W: FloatArray, b: FloatArray) -> None:
+        self._regressor = estimator.regressor
+        self._sums = _BoundSums(OrdinaryLeastSquares(estimator.min_eigenvalue), W, b)
+        self.n_rows = len(W)
+        scale = column_scale(np.concatenate([W, b[:, :, None]], axis=2))
+        self._scale = np.where(scale > 0.0, scale, 1.0)
+        self._W, self._b = W / self._scale[:-1], b / self._scale[-1]
+
+    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
+        return self._sums.well_defined(row_sets)
+
+    def unidentifiable(self) -> tuple[int, ...]:
+        return self._sums.unidentifiable()
+
+    def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
+        return self.fit([np.setdiff1d(rows, group) for group in groups])
+
+    def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        fits = np.array([self._fit_one(rows) for rows in row_sets]).reshape(len(row_sets), -1)
+        return np.asarray(fits * self._scale[-1] / self._scale[:-1])
+
+    def _fit_one(self, rows: IntArray) -> FloatArray:
+        from sklearn.base import clone
+
+        n_p = self._W.shape[2]
+        try:
+            fitted = clone(self._regressor).fit(self._W[rows].reshape(-1, n_p), self._b[rows].reshape(-1))
+        except ValueError:
+            return np.full(n_p, np.nan)
+        holder = getattr(fitted, "estimator_", fitted)
+        return np.asarray(holder.coef_, dtype=float).reshape(n_p)
+
+
+def _without_intercept(regressor: LinearRegressor) -> LinearRegressor:
+    """A clone that fits no intercept and draws the same random numbers each time."""
+    from sklearn.base import clone
+    from sklearn.linear_model import LinearRegression
+
+    fresh = clone(regressor)
+    known = fresh.get_params(deep=True)
+    changes: dict[str, Any] = {}
+    if "fit_intercept" in known:
+        changes["fit_intercept"] = False
+    elif "estimator__fit_intercept" in known:
+        changes["estimator__fit_intercept"] = False
+    elif "estimator" in known and known["estimator"] is None:
+        changes["estimator"] = LinearRegression(fit_intercept=False)
+    else:
+        raise SettingsError(
+            f"{type(regressor).__name__} cannot be fitted without an intercept; give a linear regressor"
+        )
+    if "random_state" in known and known["random_state"] is None:
+        changes["random_state"] = 0
+    return cast("LinearRegressor", fresh.set_params(**changes))
+
+
+def as_estimator(candidate: object) -> Estimator:
+    """The estimator itself, or a scikit-learn regressor wrapped as one.
+
+    Raises SettingsError: it is neither.
+    """
+    if hasattr(candidate, "bind") and not isinstance(candidate, type):
+        return cast("Estimator", candidate)
+    if hasattr(candidate, "fit") and hasattr(candidate, "get_params") and not isinstance(candidate, type):
+        return ScikitLearnEstimator(cast("LinearRegressor", candidate))
+    raise SettingsError(
+        f"estimator is {candidate!r}; give dr.OrdinaryLeastSquares(), dr.TotalLeastSquares(), "
+        "dr.NonlinearLeastSquares() or a scikit-learn linear regressor"
+    )
+
+
+def name_of(estimator: Estimator) -> str:
+    """What users call it: its class, or the scikit-learn class that it wraps."""
+    named = estimator.regressor if isinstance(estimator, ScikitLearnEstimator) else estimator
+    return type(named).__name__
+
+
+def regression(observations: Observations) -> tuple[FloatArray, FloatArray]:
+    """``W (N, r, n_p)`` and ``b (N, r)`` of the rows that count, eqs. (1) and (5).
+
+    Where the log's signals were derived by a filter, the same filter acts on both sides of the equation.
+    """
+    model, log = observations.model, observations.log
+    W, b = compile_map(model.regressor)(*observations.state_arrays(), observations.acting_inputs())
+    W = W.reshape(len(observations), model.n_p, model.n_v).transpose(0, 2, 1)
+    W, b = (preprocessing.filter_rows(log, rows, observations.valid) for rows in (W, b))
+    return np.ascontiguousarray(W[observations.valid]), np.ascontiguousarray(b[observations.valid])
+
+
+def column_scale(columns: FloatArray) -> FloatArray:
+    """RMS ``(n,)`` of the columns of ``(N, r, n)``."""
+    flat = columns.reshape(-1, columns.shape[-1])
+    return np.asarray(np.sqrt(np.square(flat).mean(axis=0)))
+
+
+def smallest_eigenvalue(gram: FloatArray) -> FloatArray:
+    """Smallest eigenvalue of each ``(..., n, n)``; -inf where it is not finite."""
+    finite = np.all(np.isfinite(gram), axis=(-2, -1))
+    values = np.linalg.eigvalsh(np.where(finite[..., None, None], gram, 0.0))[..., 0]
+    return np.where(finite, values, -np.inf)
+
+
+def loose_parameters(gram: FloatArray, min_eigenvalue: float) -> tuple[int, ...]:
+    """Indices of the parameters that take part in a direction whose eigenvalue is too small."""
+    values, vectors = np.linalg.eigh(gram)
+    weak = values <= min_eigenvalue
+    return tuple(int(i) for i in np.flatnonzero((np.abs(vectors[:, weak]) > 0.1).any(axis=1)))
+
+
+def solve_definite(A: FloatArray, g: FloatArray) -> FloatArray:
+    """``A^-1 g`` for symmetric positive definite ``A (..., n, n)``, by LDL^T; NaN where it breaks down.
+
+    Written out over the leading axes: the same bits for every batch and on every machine, as LAPACK does not promise.
+    """
+    A, x = A.copy(), g.copy()
+    n = A.shape[-1]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for j in range(n):
+            pivot = np.where(A[..., j, j] > 0.0, A[..., j, j], np.nan)
+            for i in range(j + 1, n):
+                factor = A[..., i, j] / pivot
+                A[..., i, j:] -= factor[..., None] * A[..., j, j:]
+                x[..., i] -= factor * x[..., j]
+        for j in reversed(range(n)):
+            for i in range(j + 1, n):
+                x[..., j] -= A[..., j, i] * x[..., i]
+            x[..., j] /= np.where(A[..., j, j] > 0.0, A[..., j, j], np.nan)
+    return x
+
+
+def _flat(W: npt.ArrayLike, b: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """``(n, 1, n_p)`` and ``(n, 1)``.  Raises IdentificationError: shapes do not match, or a value is not finite."""
+    W, b = np.asarray(W, dtype=float), np.asarray(b, dtype=float)
+    if W.ndim < 2 or W.shape[:-1] != b.shape:
+        raise IdentificationError(f"W {W.shape} and b {b.shape} do not match; give W (..., n_p) and b (...)")
+    if not (np.isfinite(W).all() and np.isfinite(b).all()):
+        raise IdentificationError("W or b holds NaN or infinity; leave those rows out")
+    return W.reshape(-1, 1, W.shape[-1]), b.reshape(-1, 1)

@@ -1,0 +1,1 @@
+"""Identification methods, each a frozen object with its own settings."""

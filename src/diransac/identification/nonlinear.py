@@ -1,0 +1,230 @@
+"""Nonlinear least squares of the accelerations, for models that are not affine in their parameters.
+
+The error is that of the predicted acceleration, not that of the equation: equations can be multiplied by any function
+of the parameters, and their error vanishes wherever that function does; an acceleration's cannot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.identification.estimators import (
+    BoundEstimator,
+    OrdinaryLeastSquares,
+    loose_parameters,
+    smallest_eigenvalue,
+    solve_definite,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from diransac.data.dataset import Observations
+    from diransac.model import Model, Parameter
+    from diransac.simulation.compiler import Map
+
+__all__ = ["NonlinearLeastSquares"]
+
+
+_START_DECADES = 3.0
+_ROWS_FOR_STARTS = 100
+_ROWS_FOR_WHOLE = 2000
+# Evaluated together: bounds the memory, whatever the number of sets.
+_ROWS_AT_A_TIME = 300_000
+_CONVERGED = 1e-14
+# Errors whose squares could not be summed: a lane that has one is nowhere to go.
+_HUGE = 1e140
+# Marquardt's damping at the start, and its bounds.
+_DAMPING = (1e-3, 1e-12, 1e12)
+# Bounds of the logarithm of a positive parameter that has none of its own: 1e-12 to 1e12.
+_LOG_BOUND = 27.6
+
+
+@dataclass(frozen=True)
+class NonlinearLeastSquares:
+    """Least squares of ``(a - a_model(q, v, u, p)) / rms(a)`` within the parameters' bounds.
+
+    No starting value is asked for: ``n_starts`` points spread over six decades, or over the bounds, are evaluated on
+    the rows to be fitted, and the best few are followed by Levenberg and Marquardt's method; where the model is affine
+    in its parameters, the solution of the linear regression is followed, too.
+
+    Parameters
+    ----------
+    n_starts : starting points evaluated
+    n_followed : of them, those that are followed
+    max_steps : steps of each
+    min_eigenvalue : as in `OrdinaryLeastSquares`, for the Jacobian at the fit of the whole log
+
+    References: Levenberg 1944; Marquardt 1963; Transtrum and Sethna 2012 for the damping.
+    """
+
+    n_starts: int = 200
+    n_followed: int = 3
+    max_steps: int = 60
+    min_eigenvalue: float = 1e-6
+
+    def bind(self, observations: Observations) -> BoundEstimator:
+        """The estimator over the usable rows of a log."""
+        return _BoundNonlinear(self, observations)
+
+
+class _BoundNonlinear:
+    """Accelerations of the usable rows, and the model that predicts them."""
+
+    def __init__(self, settings: NonlinearLeastSquares, observations: Observations) -> None:
+        self._settings = settings
+        model = observations.model
+        q, v, a = (x[observations.valid] for x in observations.state_arrays())
+        known = [i for i, n in enumerate(model.accelerations) if n in observations.signals]
+        self._state, self._inputs = np.hstack([q, v]), observations.acting_inputs()[observations.valid]
+        self._accelerations = a[:, known]
+        self._scale = np.sqrt(np.square(self._accelerations).mean(axis=0))
+        self._scale[self._scale == 0.0] = 1.0
+        self._chart = _Chart(tuple(model.parameters.values()))
+        self._evaluate = _compiled(model, known)
+        self.n_rows = len(self._state)
+        self._n_p = model.n_p
+        self._starts = self._chart.starts(settings.n_starts)
+        self._linear = None if model.nonlinear_parameters else OrdinaryLeastSquares().bind(observations)
+        everything = np.arange(self.n_rows)[None]
+        whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // _ROWS_FOR_WHOLE)]))
+        self._starts = np.vstack([whole, self._starts])
+        J = self._errors(everything, whole)[1].reshape(self.n_rows, len(known), -1)
+        scale = np.sqrt(np.square(J).mean(axis=(0, 1)))
+        J = J / np.where(scale > 0.0, scale, 1.0)
+        self._blocks = np.einsum("nri,nrj->nij", J, J)
+
+    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
+        gram = np.array([self._blocks[rows].sum(axis=0) for rows in row_sets])
+        return np.asarray(smallest_eigenvalue(gram) > self._settings.min_eigenvalue)
+
+    def unidentifiable(self) -> tuple[int, ...]:
+        return loose_parameters(self._blocks.sum(axis=0), self._settings.min_eigenvalue)
+
+    def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        fits = np.empty((len(row_sets), self._n_p))
+        for length in {len(rows) for rows in row_sets}:
+            places = [i for i, rows in enumerate(row_sets) if len(rows) == length]
+            at_a_time = max(1, _ROWS_AT_A_TIME // (len(self._starts) * max(1, length)))
+            for first in range(0, len(places), at_a_time):
+                some = places[first : first + at_a_time]
+                fits[some] = self._fit_equal(np.array([row_sets[i] for i in some]))
+        return fits
+
+    def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
+        start = self._chart.to_free(self._fit_equal(rows[None]))
+        kept = [np.setdiff1d(rows, group)[None] for group in groups]
+        return np.array([self._chart.to_parameters(self._descend(x, start)[0][0]) for x in kept])
+
+    def _fit_equal(self, rows: IntArray) -> FloatArray:
+        """Parameters ``(B, n_p)`` from row sets ``(B, n)``: each from the best of its followed starts."""
+        starts, (n_sets, n) = self._starts, rows.shape
+        few = rows[:, :: max(1, n // _ROWS_FOR_STARTS)]
+        every = np.tile(np.arange(len(starts)), n_sets)
+        costs = self._costs(np.repeat(few, len(starts), axis=0), starts[every]).reshape(n_sets, -1)
+        best = np.argsort(costs, axis=1, kind="stable")[:, : self._settings.n_followed]
+        followed = starts[best]
+        if self._linear is not None:
+            solved = self._chart.clip(self._chart.to_free(self._linear.fit(list(rows))))
+            followed = np.concatenate([solved[:, None], followed], axis=1)
+        free, costs = self._descend(np.repeat(rows, followed.shape[1], axis=0), followed.reshape(-1, self._n_p))
+        winner = np.argmin(costs.reshape(n_sets, -1), axis=1)
+        return self._chart.to_parameters(free.reshape(n_sets, -1, self._n_p)[np.arange(n_sets), winner])
+
+    def _descend(self, rows: IntArray, free: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Levenberg-Marquardt on every lane, each until it gains nothing more: free coordinates and sums of squares."""
+        free, damping, active = free.copy(), np.full(len(free), _DAMPING[0]), np.arange(len(free))
+        errors, J = self._errors(rows, free)
+        costs = np.square(errors).sum(axis=1)
+        for _ in range(self._settings.max_steps):
+            H = np.einsum("bni,bnj->bij", J[active], J[active])
+            slope = np.einsum("bni,bn->bi", J[active], errors[active])
+            diagonal = np.einsum("bii->bi", H)
+            H = H + (damping[active, None] * (diagonal + 1e-12))[:, :, None] * np.eye(self._n_p)
+            trial = self._chart.clip(free[active] - np.nan_to_num(solve_definite(H, slope)))
+            trial_errors, trial_J = self._errors(rows[active], trial)
+            trial_costs = np.square(trial_errors).sum(axis=1)
+            with np.errstate(invalid="ignore"):
+                gain = costs[active] - trial_costs
+            better = gain > 0.0
+            going = np.where(better, gain > _CONVERGED * costs[active], damping[active] < _DAMPING[2])
+            damping[active] = np.clip(damping[active] * np.where(better, 0.1, 4.0), *_DAMPING[1:])
+            to = active[better]
+            free[to], errors[to], J[to], costs[to] = (x[better] for x in (trial, trial_errors, trial_J, trial_costs))
+            active = active[going]
+            if not len(active):
+                break
+        return free, costs
+
+    def _costs(self, rows: IntArray, free: FloatArray) -> FloatArray:
+        """Sum of squares ``(B,)``, infinite where it is not finite."""
+        return np.asarray(np.square(self._errors(rows, free)[0]).sum(axis=1))
+
+    def _errors(self, rows: IntArray, free: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scaled errors ``(B, n r)`` and their Jacobian ``(B, n r, n_p)`` in the free coordinates."""
+        n_lanes, n = rows.shape
+        p, slope = self._chart.to_parameters(free), self._chart.slope(free)
+        flat = rows.reshape(-1)
+        a, da = self._evaluate(self._state[flat], self._inputs[flat], np.repeat(p, n, axis=0))
+        da = da.reshape(len(flat), self._n_p, len(self._scale)).transpose(0, 2, 1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            errors = ((a - self._accelerations[flat]) / self._scale).reshape(n_lanes, -1)
+            J = (da / self._scale[:, None]).reshape(n_lanes, -1, self._n_p) * slope[:, None, :]
+        bad = ~(np.all(np.abs(errors) < _HUGE, axis=1) & np.all(np.abs(J) < _HUGE, axis=(1, 2)))
+        errors[bad], J[bad] = np.inf, 0.0
+        return errors, J
+
+
+class _Chart:
+    """Free coordinates of bounded parameters: the logarithm where a parameter is positive, itself elsewhere."""
+
+    def __init__(self, parameters: Sequence[Parameter]) -> None:
+        self._log = np.array([x.positive for x in parameters])
+        lower = np.array([x.lower for x in parameters])
+        upper = np.array([x.upper for x in parameters])
+        with np.errstate(divide="ignore"):
+            self._lower = np.where(self._log, np.maximum(np.log(np.maximum(lower, 0.0)), -_LOG_BOUND), lower)
+            self._upper = np.where(self._log, np.minimum(np.log(np.maximum(upper, 0.0)), _LOG_BOUND), upper)
+
+    def to_parameters(self, free: FloatArray) -> FloatArray:
+        return np.where(self._log, np.exp(np.where(self._log, free, 0.0)), free)
+
+    def to_free(self, parameters: FloatArray) -> FloatArray:
+        return np.where(self._log, np.log(np.where(self._log, np.maximum(parameters, 1e-300), 1.0)), parameters)
+
+    def slope(self, free: FloatArray) -> FloatArray:
+        """``dp / d free``."""
+        return np.where(self._log, self.to_parameters(free), 1.0)
+
+    def clip(self, free: FloatArray) -> FloatArray:
+        return np.clip(free, self._lower, self._upper)
+
+    def starts(self, n: int) -> FloatArray:
+        """Points ``(n, n_p)``: over the bounds where both are given, else over six decades about 1 on the open side."""
+        rng = np.random.default_rng(20231003)
+        shape = (n, len(self._log))
+        spread = _START_DECADES * np.log(10.0)
+        sizes, signs = np.exp(rng.uniform(-spread, spread, shape)), rng.choice([-1.0, 1.0], shape)
+        lower, upper = np.isfinite(self._lower), np.isfinite(self._upper)
+        points = np.where(lower, self._lower + sizes, np.where(upper, self._upper - sizes, signs * sizes))
+        low = np.where(self._log, np.maximum(self._lower, -spread), self._lower)
+        high = np.where(self._log, np.minimum(self._upper, spread), self._upper)
+        low, high = (np.where(low < high, x, bound) for x, bound in ((low, self._lower), (high, self._upper)))
+        both = lower & upper
+        low, high = np.where(both, low, 0.0), np.where(both, high, 1.0)
+        return self.clip(np.where(both, low + rng.uniform(0.0, 1.0, shape) * (high - low), points))
+
+
+def _compiled(model: Model, known: Sequence[int]) -> Map:
+    """Accelerations ``(N, r)`` and ``da/dp (N, n_p r)``, column by column, of rows of (x, u, p)."""
+    from diransac.simulation.compiler import compile_map
+
+    x, u, p = (ca.SX.sym(n, model.dynamics.size1_in(i)) for i, n in enumerate("xup"))
+    a = model.dynamics(x, u, p)[1][list(known)]
+    function = ca.Function("accelerations", [x, u, p], ca.cse([a, ca.densify(ca.jacobian(a, p))]))
+    return compile_map(function)

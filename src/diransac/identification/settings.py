@@ -1,0 +1,156 @@
+"""What can be chosen about an identification, with the paper's symbols."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from diransac.errors import SettingsError
+from diransac.simulation import INTEGRATORS
+
+__all__ = ["Settings"]
+
+REFITS = ("inliers", "none")
+INITIAL_STATES = ("first", "robust")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the RANSAC methods; ``Settings()`` works for any model, ``Settings.table_iv()`` is the paper's.
+
+    Parameters
+    ----------
+    sample_size : s, observations in a sample at least
+    max_iterations : k_m, samples drawn at most
+    stop_inlier_fraction : f_I,t, stop once the stored model has this fraction of inliers; None forces all iterations
+    inlier_thresholds : epsilon by signal, in its unit; an error is an inlier's if strictly below.  A signal that is not
+        named has 0, which switches it off.  None: a fifth of each signal's spread in the log
+    min_inlier_signals : xi, signals of an observation that must be inliers; None: half of those with a threshold
+    error_weights : w by signal in eq. (2), one over its unit; a signal that is not named has 0.  None: 1 over the
+        spread for velocities, 0.1 over it for accelerations (Table IV's ratio), coordinates only where the log has no
+        velocity of theirs
+    acceptance_weights : nu = (nu_e, nu_f) of eq. (3)
+    refit : "inliers" (Algorithm 1, lines 25-31) or "none"
+    integrator : "rk4", "euler" or "semi-implicit-euler"
+    substeps : integration steps per sample
+    initial_state : Y_0; "first" (the paper's: the first row), "robust" (the same, but a first sample far from the line
+        through the first seven gives way to it), or values by name, which replace those of the first row
+    threads : threads of the simulation; None: one a core, one in a worker process (`simulate.default_threads`).  Never
+        changes an answer
+    batch_size : hypotheses simulated at once.  Never changes an answer
+
+    Raises SettingsError: a value has no meaning.
+    References: Dimmig et al. 2023, Algorithm 1 and Table IV.
+    """
+
+    sample_size: int = 75
+    max_iterations: int = 1000
+    stop_inlier_fraction: float | None = 0.85
+    inlier_thresholds: Mapping[str, float] | None = None
+    min_inlier_signals: int | None = None
+    error_weights: Mapping[str, float] | None = None
+    acceptance_weights: tuple[float, float] = (1.0, 0.06)
+    refit: str = "inliers"
+    integrator: str = "rk4"
+    substeps: int = 1
+    initial_state: str | Mapping[str, float] = "first"
+    threads: int | None = None
+    batch_size: int = 256
+
+    def __post_init__(self) -> None:
+        for name in ("sample_size", "max_iterations", "substeps", "batch_size"):
+            object.__setattr__(self, name, _positive_integer(name, getattr(self, name)))
+        for name in ("min_inlier_signals", "threads"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _positive_integer(name, getattr(self, name)))
+        if self.stop_inlier_fraction is not None:
+            fraction = _fraction("stop_inlier_fraction", self.stop_inlier_fraction)
+            object.__setattr__(self, "stop_inlier_fraction", fraction)
+        for name in ("inlier_thresholds", "error_weights"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _by_name(name, getattr(self, name), 0.0))
+        self._check_acceptance()
+        _one_of("refit", self.refit, REFITS)
+        _one_of("integrator", self.integrator, tuple(INTEGRATORS))
+        if isinstance(self.initial_state, Mapping):
+            object.__setattr__(self, "initial_state", _by_name("initial_state", self.initial_state, -np.inf))
+        else:
+            _one_of("initial_state", self.initial_state, INITIAL_STATES)
+
+    def _check_acceptance(self) -> None:
+        try:
+            weights = tuple(float(x) for x in self.acceptance_weights)
+        except (TypeError, ValueError) as error:
+            raise SettingsError(f"acceptance_weights is {self.acceptance_weights!r}; give (nu_e, nu_f)") from error
+        if len(weights) != 2 or not all(0.0 <= x < np.inf for x in weights) or not any(weights):
+            raise SettingsError(
+                f"acceptance_weights is {self.acceptance_weights!r}; give (nu_e, nu_f), none negative, not both zero"
+            )
+        object.__setattr__(self, "acceptance_weights", weights)
+
+    @classmethod
+    def table_iv(cls) -> Settings:
+        """Table IV of the paper, for the planar rotorcraft."""
+        rates, accelerations = ("x_dot", "z_dot", "theta_dot"), ("x_ddot", "z_ddot", "theta_ddot")
+        return cls(
+            sample_size=75,
+            max_iterations=1000,
+            stop_inlier_fraction=0.85,
+            inlier_thresholds=dict.fromkeys((*rates, *accelerations), 0.5),
+            min_inlier_signals=3,
+            error_weights={**dict.fromkeys(rates, 1.0), **dict.fromkeys(accelerations, 0.1)},
+            acceptance_weights=(1.0, 0.06),
+        )
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Settings:
+        """Settings from a mapping, such as a TOML table or `to_dict`'s.
+
+        Raises SettingsError: an unknown name; it lists those there are.
+        """
+        known = [f.name for f in dataclasses.fields(cls)]
+        unknown = [name for name in data if name not in known]
+        if unknown:
+            raise SettingsError(f'there is no setting "{unknown[0]}"; there are {", ".join(known)}')
+        return cls(**data)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Every setting by name, ready for JSON."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
+
+
+def _positive_integer(name: str, value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise SettingsError(f"{name} is {value!r}; give a whole number of at least 1")
+    return int(value)
+
+
+def _fraction(name: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0.0 < value <= 1.0:
+        raise SettingsError(f"{name} is {value!r}; give a number above 0 and up to 1, or None")
+    return float(value)
+
+
+def _one_of(name: str, value: object, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise SettingsError(f"{name} is {value!r}; choose {', '.join(choices)}")
+
+
+def _by_name(name: str, values: object, lower: float) -> dict[str, float]:
+    """A plain dict of finite numbers, none below ``lower``."""
+    if not isinstance(values, Mapping):
+        raise SettingsError(f"{name} is {values!r}; give a mapping from signal to number")
+    try:
+        numbers = {str(k): float(v) for k, v in values.items()}
+    except (TypeError, ValueError) as error:
+        raise SettingsError(f"{name} is {dict(values)!r}; give a number for each signal") from error
+    for signal, x in numbers.items():
+        if not np.isfinite(x) or x < lower:
+            raise SettingsError(
+                f"{name}: {signal} is {x}; give a finite number" + (" of at least 0" if lower == 0.0 else "")
+            )
+    return numbers

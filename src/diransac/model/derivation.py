@@ -1,0 +1,339 @@
+"""From a user's residual function to checked symbolic parts: ``r = W p - b`` and ``r = M a + c``.
+
+Affinity is decided by evaluation at random points.  The expression graph alone is not enough on either side:
+``sign(p.k)`` has a vanishing second derivative without being affine, and ``m * (a + k / m * v)`` is affine without
+looking so.
+"""
+
+from __future__ import annotations
+
+import keyword
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.errors import ModelError, ResultError
+
+if TYPE_CHECKING:
+    from diransac.model.parameter import Parameter
+
+__all__ = ["Probe", "Symbols"]
+
+
+_N_POINTS = 40
+_SINGULAR = 1e-10
+_TOLERANCE = 1e-8
+_ARGUMENTS = "qvaup"
+# What a user's function raises when it meets a symbol where it expects a number, or the wrong count of arguments.
+_USER_ERRORS = (RuntimeError, TypeError, ValueError, ArithmeticError, LookupError, NameError, AttributeError)
+
+
+class Symbols:
+    """Named scalars: ``q.theta`` or ``q["theta"]``, iterable in order.
+
+    Raises ModelError: a name that the model does not declare.
+    """
+
+    def __init__(self, label: str, kind: str, named: Mapping[str, ca.SX]) -> None:
+        self._label, self._kind, self._named = label, kind, dict(named)
+
+    def __getattr__(self, name: str) -> ca.SX:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return self[name]
+
+    def __getitem__(self, name: str) -> ca.SX:
+        if name not in self._named:
+            raise ModelError(f"{self._label}: {self._kind} have no {name!r}; found {', '.join(self._named) or 'none'}")
+        return self._named[name]
+
+    def __iter__(self) -> Iterator[ca.SX]:
+        return iter(self._named.values())
+
+    def __len__(self) -> int:
+        return len(self._named)
+
+
+def call_user(label: str, what: str, function: Callable[..., Any], *arguments: Symbols) -> ca.SX:
+    """What the user's function returns, as one column of SX.
+
+    Raises ModelError: it branches on a symbol, fails, or returns something else than numbers and expressions of the
+    model's own symbols.
+    """
+    try:
+        returned = function(*arguments)
+    except _USER_ERRORS as error:
+        if "truth value" in str(error):
+            raise ModelError(
+                f"{label}: {what} branch on a symbol (if, and, or, min, max); use casadi.if_else, fmin or fmax"
+            ) from error
+        reason = str(error).partition("\n")[0]
+        raise ModelError(f"{label}: {what} failed: {type(error).__name__}: {reason}") from error
+    values = list(returned.values()) if isinstance(returned, Mapping) else returned
+    try:
+        column = ca.vertcat(*(values if isinstance(values, list | tuple) else [values]), ca.SX(0, 1))
+    except (TypeError, NotImplementedError) as error:
+        raise ModelError(f"{label}: {what} return {returned!r:.80}; return a list of expressions") from error
+    own = {symbol.element_hash() for symbols in arguments for symbol in symbols}
+    foreign = [str(symbol) for symbol in ca.symvar(column) if symbol.element_hash() not in own]
+    if foreign:
+        raise ModelError(f"{label}: {what} hold a symbol {foreign[0]} of their own; declare it, or give its value")
+    return column
+
+
+def check_groups(label: str, units: Mapping[str, object], parameters: object) -> None:
+    """Raises ModelError: a group of signals does not map names to units, or the parameters are none."""
+    for kind, group in units.items():
+        if not isinstance(group, Mapping):
+            raise ModelError(f'{label}: {kind} = {group!r}; give a mapping from name to unit, such as {{"x": "m"}}')
+        for name, unit in group.items():
+            if not isinstance(unit, str):
+                raise ModelError(f'{label}: the unit of {name!r} is {unit!r}; give a text, such as "m"')
+    if not isinstance(parameters, Mapping):
+        raise ModelError(f"{label}: parameters = {parameters!r}; give a mapping from name to dr.Parameter")
+    for name, parameter in parameters.items():
+        if not hasattr(parameter, "admits"):
+            raise ModelError(f'{label}: parameter {name!r} is {parameter!r}; give dr.Parameter("kg") or the like')
+
+
+def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
+    """Check names of coordinates, velocities, accelerations, inputs and parameters, in that order.
+
+    Raises ModelError: a name is no identifier, is taken twice, or a group that is needed is empty.
+    """
+    names = [n for group in groups for n in group]
+    for name in names:
+        if str(name) != name or not name.isidentifier() or keyword.iskeyword(name) or name.startswith("__"):
+            raise ModelError(
+                f"{label}: {name!r} cannot name a signal or parameter; use letters, digits and underscores"
+            )
+        if name == "t":
+            raise ModelError(f'{label}: the name "t" is kept for time; choose another')
+        if names.count(name) > 1:
+            raise ModelError(f"{label}: the name {name!r} is used twice; signals and parameters need different names")
+    for kind, group in (("coordinates", groups[0]), ("parameters", groups[4])):
+        if not group:
+            raise ModelError(f"{label}: there are no {kind}; give at least one")
+
+
+def check_residual(label: str, residual: ca.Function, accelerations: Sequence[str]) -> None:
+    """Raises ModelError: not one residual per acceleration, or a NaN constant in one."""
+    if residual.size1_out(0) != len(accelerations) or residual.size2_out(0) != 1:
+        raise ModelError(
+            f"{label}: equations return {residual.numel_out(0)} residuals, but there are {len(accelerations)} "
+            f"accelerations ({', '.join(accelerations)}); return one residual for each"
+        )
+    for i, name in _nan_outputs(residual):
+        raise ModelError(
+            f"{label}: {name} {i + 1} of {len(accelerations)} contains NaN; a function of Python's math module gives "
+            "NaN for a symbol: use casadi's"
+        )
+
+
+def check_kinematics(label: str, kinematics: ca.Function) -> None:
+    """Raises ModelError: not one rate per coordinate, or a NaN constant in one."""
+    n = kinematics.size1_in(0)
+    if kinematics.size1_out(0) != n:
+        raise ModelError(
+            f"{label}: kinematics return {kinematics.numel_out(0)} rates; return one for each of {n} coordinates"
+        )
+    check_constants(label, "kinematics", kinematics)
+
+
+def check_constants(label: str, what: str, function: ca.Function) -> None:
+    """Raises ModelError: a NaN constant in one of the function's results."""
+    for i, _ in _nan_outputs(function):
+        raise ModelError(
+            f"{label}: {what} {i + 1} of {function.numel_out(0)} contains NaN; use casadi's functions, not "
+            "Python's math"
+        )
+
+
+def _nan_outputs(function: ca.Function) -> Iterator[tuple[int, str]]:
+    """Indices of the outputs whose expression holds a NaN constant."""
+    arguments = [ca.SX.sym(n, *function.size_in(i)) for i, n in enumerate(function.name_in())]
+    for i, expression in enumerate(ca.vertsplit(function(*arguments))):
+        one = ca.Function("one", arguments, [expression])
+        constants = (k for k in range(one.n_instructions()) if one.instruction_id(k) == ca.OP_CONST)
+        if any(np.isnan(one.instruction_constant(k)) for k in constants):
+            yield i, "equation"
+
+
+class Probe:
+    """A residual function evaluated at fixed random points, to decide what expression graphs cannot.
+
+    Parameters
+    ----------
+    residual : ``(q, v, a, u, p) -> r (r)``
+    parameters : their bounds, which the points respect
+
+    Points are ``(n, n_points)`` for each argument; ``everywhere`` holds parameters of both signs and many magnitudes.
+    """
+
+    def __init__(self, residual: ca.Function, parameters: Sequence[Parameter]) -> None:
+        rng = np.random.default_rng(20231001)
+        self.residual = residual
+        sizes = [residual.size1_in(i) for i in range(5)]
+        self.points = [rng.uniform(-2.0, 2.0, (n, _N_POINTS)) for n in sizes[:4]]
+        self.points[3][:, ::2] = np.abs(self.points[3][:, ::2])
+        self.points.append(np.array([_within(x, rng) for x in parameters]).reshape(sizes[4], _N_POINTS))
+        signs = rng.choice([-1.0, 1.0], (sizes[4], _N_POINTS))
+        self.everywhere = signs * 10.0 ** rng.uniform(-1.5, 1.5, (sizes[4], _N_POINTS))
+
+    def affine_parts(self, argument: str, symbols: Sequence[ca.SX]) -> tuple[ca.SX, ca.SX]:
+        """``(J, c)`` with ``r = J z + c`` for the argument ``z``, if ``r`` is affine in it.
+
+        Where the graph shows it, they are taken at ``z = 0``; elsewhere at a point within the bounds.
+        """
+        k = _ARGUMENTS.index(argument)
+        z, r = symbols[k], self.residual(*symbols)
+        J = ca.jacobian(r, z)
+        if not ca.depends_on(J, z):
+            return J, ca.substitute(r, z, ca.DM.zeros(z.shape))
+        z0 = ca.DM(self.points[k][:, 0])
+        J0, r0 = ca.simplify(ca.substitute(J, z, z0)), ca.substitute(r, z, z0)
+        return J0, r0 - J0 @ z0
+
+    def is_affine(self, argument: str, values: FloatArray) -> bool:
+        """Whether ``r = J z + c`` wherever ``r`` is finite, with ``values (n, n_points)`` of the argument ``z``."""
+        symbols = [ca.SX.sym(n, self.residual.size1_in(i)) for i, n in enumerate(_ARGUMENTS)]
+        k = _ARGUMENTS.index(argument)
+        J, c = self.affine_parts(argument, symbols)
+        z = symbols[k]
+        size = ca.fabs(J) @ ca.fabs(z) + ca.fabs(c) + 1.0
+        error = ca.Function("error", symbols, [(self.residual(*symbols) - J @ z - c) / size])
+        points = [*self.points[:k], values, *self.points[k + 1 :]]
+        found = np.abs(np.array(error(*points)))
+        finite = np.isfinite(np.array(self.residual(*points)))
+        return bool((found[finite] < _TOLERANCE).all())
+
+
+def _within(parameter: Parameter, rng: np.random.Generator) -> FloatArray:
+    """Random values ``(n_points,)`` within a parameter's bounds, away from a strict zero."""
+    lower = max(parameter.lower, 0.0) if parameter.positive else parameter.lower
+    draw = rng.uniform(0.1, 0.9, _N_POINTS)
+    if np.isfinite(lower) and np.isfinite(parameter.upper):
+        return lower + draw * (parameter.upper - lower)
+    if np.isfinite(lower):
+        return lower + 2.5 * draw
+    if np.isfinite(parameter.upper):
+        return parameter.upper - 2.5 * draw
+    return rng.choice([-1.0, 1.0], _N_POINTS) * 2.5 * draw
+
+
+def affine_in_acceleration(
+    label: str, probe: Probe, accelerations: Mapping[str, str]
+) -> tuple[ca.Function, ca.Function]:
+    """Functions ``M(q, v, u, p)`` and ``c(q, v, u, p)`` with ``r = M a + c``.
+
+    Raises ModelError: the residuals are not affine in ``a``, or cannot be evaluated.
+    """
+    if not np.isfinite(np.array(probe.residual(*probe.points))).all(axis=0).any():
+        raise ModelError(
+            f"{label}: the equations are not finite at any of {_N_POINTS} random points; check roots and logarithms"
+        )
+    if not probe.is_affine("a", probe.points[2]):
+        raise ModelError(
+            f"{label}: the equations are not affine in the accelerations {', '.join(accelerations)}; "
+            "write them as M a + c = 0, with a to the first power only"
+        )
+    q, v, a, u, p = (ca.SX.sym(n, probe.residual.size1_in(i)) for i, n in enumerate(_ARGUMENTS))
+    M, c = probe.affine_parts("a", (q, v, a, u, p))
+    return ca.Function("M", [q, v, u, p], [M]), ca.Function("c", [q, v, u, p], [c])
+
+
+def mass_matrix_sign(label: str, probe: Probe, mass_matrix: ca.Function, accelerations: Mapping[str, str]) -> int:
+    """1 or -1 where ``M`` is symmetric and positive or negative definite at every point, else 0.
+
+    Raises ModelError: ``M`` is singular at every point; it names the accelerations that are left unidentifiable.
+    """
+    q, v, _, u, p = probe.points
+    stacked = np.array(ca.densify(mass_matrix(q, v, u, p)))
+    n = len(accelerations)
+    M = stacked.reshape(n, _N_POINTS, n).transpose(1, 0, 2)
+    M = M[np.isfinite(M).all(axis=(1, 2))]
+    rows = np.abs(M).max(axis=2, keepdims=True, initial=0.0)
+    scaled = M / np.where(rows > 0.0, rows, 1.0)
+    columns = np.abs(scaled).max(axis=1, keepdims=True, initial=0.0)
+    _, values, vectors = np.linalg.svd(scaled / np.where(columns > 0.0, columns, 1.0))
+    if len(M) == 0 or (values[:, -1] <= _SINGULAR * values[:, 0]).all():
+        loose = np.abs(vectors[:, -1]).max(axis=0, initial=0.0) > 1e-6
+        names = [x for x, l in zip(accelerations, loose, strict=True) if l] or list(accelerations)
+        raise ModelError(
+            f"{label}: the mass matrix dr/da is singular; the equations do not determine {', '.join(names)}"
+        )
+    if not np.allclose(M, M.transpose(0, 2, 1), rtol=1e-9, atol=1e-12 * np.abs(M).max()):
+        return 0
+    eigenvalues = np.linalg.eigvalsh(M)
+    return int((eigenvalues > 0.0).all()) - int((eigenvalues < 0.0).all())
+
+
+def nonlinear_parameters(probe: Probe, names: Sequence[str]) -> tuple[str, ...]:
+    """Names of the parameters in which the residual is not affine, by evaluation within the bounds and everywhere."""
+    if probe.is_affine("p", probe.points[4]) and probe.is_affine("p", probe.everywhere):
+        return ()
+    symbols = [ca.SX.sym(n, probe.residual.size1_in(i)) for i, n in enumerate(_ARGUMENTS)]
+    r = probe.residual(*symbols)
+    both = ca.Function("both", symbols, [r, ca.densify(ca.jacobian(r, symbols[4]))])
+    start = np.hstack([probe.points[4][:, ::2], probe.everywhere[:, ::2]])
+    found = [name for i, name in enumerate(names) if _is_curved(both, probe.points[:4], start, i)]
+    return tuple(found) or tuple(names)
+
+
+def _is_curved(both: ca.Function, others: Sequence[FloatArray], start: FloatArray, i: int) -> bool:
+    """Whether a step in ``p_i`` alone leaves its tangent, or a step in the others turns it."""
+    n_p = len(start)
+
+    def evaluate(p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        r, J = (np.array(x) for x in both(*others, p))
+        return r, J.reshape(len(r), _N_POINTS, n_p)[:, :, i]
+
+    along, across = start.copy(), start[:, ::-1].copy()
+    along[i] = start[i, ::-1]
+    across[i] = start[i]
+    r, slope = evaluate(start)
+    r_along, _ = evaluate(along)
+    _, slope_across = evaluate(across)
+    step = along[i] - start[i]
+    leaves = np.abs(r_along - r - slope * step) > _TOLERANCE * (
+        np.abs(r_along) + np.abs(r) + np.abs(slope * step) + 1.0
+    )
+    turns = np.abs(slope_across - slope) > _TOLERANCE * (np.abs(slope_across) + np.abs(slope) + 1.0)
+    return bool(leaves.any() or turns.any())
+
+
+def find_quaternions(kinematics: ca.Function) -> tuple[tuple[int, int, int, int], ...]:
+    """Runs of four coordinates whose norm the kinematics conserve, but that of no fewer of them."""
+    rng = np.random.default_rng(20231002)
+    q = rng.normal(size=(kinematics.size1_in(0), _N_POINTS))
+    rates = np.array(kinematics(q, rng.normal(size=(kinematics.size1_in(1), _N_POINTS))))
+    found: list[tuple[int, int, int, int]] = []
+    start = 0
+    while start + 4 <= len(q):
+        four = slice(start, start + 4)
+        work = q[four] * rates[four]
+        small = _TOLERANCE * max(1.0, np.abs(rates[four]).max())
+        fewer = [*work, *(work[0] + work[i] for i in (1, 2, 3))]
+        if np.abs(work.sum(axis=0)).max() < small <= min(np.abs(x).max() for x in fewer):
+            found.append((start, start + 1, start + 2, start + 3))
+            start += 4
+        else:
+            start += 1
+    return tuple(found)
+
+
+def deserialize(text: str) -> ca.Function:
+    """The SX function that ``Function.serialize`` wrote.
+
+    Raises ResultError: it is damaged, or no SX function.
+    """
+    try:
+        function = ca.Function.deserialize(text)
+    except (RuntimeError, UnicodeDecodeError, MemoryError, TypeError, NotImplementedError) as error:
+        raise ResultError("the stored equations cannot be read; identify again") from error
+    if function.is_null() or not function.is_a("SXFunction"):
+        raise ResultError("the stored equations are no SX function; identify again")
+    return function

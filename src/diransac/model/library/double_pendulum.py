@@ -1,0 +1,65 @@
+"""A double pendulum with a motor at each joint."""
+
+from casadi import atan, cos, sin
+
+from diransac.model.derivation import Symbols
+from diransac.model.model import Model
+from diransac.model.parameter import Parameter
+
+__all__ = ["double_pendulum"]
+
+
+def double_pendulum(
+    upper_length: float = 0.3, gravity: float = 9.81, gear_ratio: float = 6.0, friction_steepness: float = 100.0
+) -> Model:
+    """``M(q) q'' + c(q, q') + g(q) + f(q') = tau`` in the nine parameters that motion shows.
+
+    Parameters
+    ----------
+    upper_length : l1, length of the upper link, m
+    gravity : g, m/s^2
+    gear_ratio : n; the rotors' inertia Ir acts n^2-fold at its own joint and, through the belt, across both
+    friction_steepness : k, s/rad: dry friction is ``cf atan(k q')``
+
+    Coordinates q1 (0 hanging) and q2 (relative to the upper link), rad; inputs torque1, torque2 at the joints, N m.
+    Parameters: inertia1 = I1 + m2 l1^2, moment1 = m1 r1 + m2 l1, inertia2 = I2, moment2 = m2 r2, rotor_inertia = Ir,
+    viscous friction b1, b2 (N m s/rad) and dry friction cf1, cf2 (N m).  Masses and I1 alone never show in the motion.
+
+    References: Wiebe et al. 2022, "Torque-limited simple/double pendulum: an open source reference platform" (DFKI),
+    equations of motion; Gautier and Khalil 1990 for base parameters.
+    """
+
+    def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
+        coupling = upper_length * p.moment2 * cos(q.q2)
+        centrifugal = upper_length * p.moment2 * sin(q.q2)
+        M11 = p.inertia1 + p.inertia2 + 2 * coupling + (gear_ratio**2 + 1) * p.rotor_inertia
+        M12 = p.inertia2 + coupling - gear_ratio * p.rotor_inertia
+        M22 = p.inertia2 + gear_ratio**2 * p.rotor_inertia
+        g2 = gravity * p.moment2 * sin(q.q1 + q.q2)
+        g1 = gravity * p.moment1 * sin(q.q1) + g2
+        c1 = -centrifugal * (2 * v.q1 + v.q2) * v.q2
+        f1 = p.viscous_friction1 * v.q1 + p.dry_friction1 * atan(friction_steepness * v.q1)
+        f2 = p.viscous_friction2 * v.q2 + p.dry_friction2 * atan(friction_steepness * v.q2)
+        return [
+            M11 * a.q1 + M12 * a.q2 + c1 + g1 + f1 - u.torque1,
+            M12 * a.q1 + M22 * a.q2 + centrifugal * v.q1**2 + g2 + f2 - u.torque2,
+        ]
+
+    return Model(
+        name="double-pendulum",
+        description="two links with a motor at each joint, viscous and dry friction",
+        coordinates={"q1": "rad", "q2": "rad"},
+        inputs={"torque1": "N m", "torque2": "N m"},
+        parameters={
+            "inertia1": Parameter("kg m^2", positive=True),
+            "moment1": Parameter("kg m", positive=True),
+            "inertia2": Parameter("kg m^2", positive=True),
+            "moment2": Parameter("kg m", positive=True),
+            "rotor_inertia": Parameter("kg m^2", lower=0.0),
+            "viscous_friction1": Parameter("N m s/rad", lower=0.0),
+            "dry_friction1": Parameter("N m", lower=0.0),
+            "viscous_friction2": Parameter("N m s/rad", lower=0.0),
+            "dry_friction2": Parameter("N m", lower=0.0),
+        },
+        equations=equations,
+    )

@@ -1,0 +1,390 @@
+"""Equations of motion, written once; everything else is derived from them.
+
+A second-order plant has coordinates ``q``, velocities ``v``, accelerations ``a``, inputs ``u`` and constant parameters
+``p``.  The user writes residuals ``r(q, v, a, u, p) = 0``, one per acceleration.  From them come
+
+* the regressor ``W p = b`` with ``W = dr/dp`` and ``b = W p - r`` (Dimmig et al. 2023, eqs. (1) and (5)),
+* the forward dynamics ``a = -M^-1 r(a=0)`` with ``M = dr/da``,
+* the linearisation of the state equation, with ``M da = -dr``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.errors import ModelError, ResultError
+from diransac.model import derivation
+from diransac.model.derivation import Probe, Symbols
+from diransac.model.parameter import Parameter
+
+__all__ = ["Model"]
+
+Equations = Callable[[Symbols, Symbols, Symbols, Symbols, Symbols], Sequence[Any]]
+Kinematics = Callable[[Symbols, Symbols], Sequence[Any]]
+
+
+class Model:
+    """A second-order dynamical model with named, unit-carrying signals and parameters.
+
+    Parameters
+    ----------
+    name : how messages and files call it
+    coordinates : name -> unit; a coordinate ``x`` has velocity ``x_dot`` and acceleration ``x_ddot``
+    inputs : name -> unit
+    parameters : name -> `Parameter`
+    equations : ``equations(q, v, a, u, p)`` returns the residuals, one per acceleration; each argument gives its
+        components by name (``q.theta``, ``v.theta``, ``a.theta``, ``u.thrust``, ``p.mass``), mathematics is CasADi's
+    velocities : name -> unit, where velocities are not the derivatives of the coordinates (``wx`` with acceleration
+        ``wx_dot``); then ``kinematics`` is needed
+    kinematics : ``kinematics(q, v)`` returns the derivative of every coordinate.  Four consecutive coordinates whose
+        norm it conserves are a unit quaternion: normalised after every integration step, its sign is ignored in errors
+
+    Raises ModelError: an unknown or repeated name, a wrong number of residuals, a NaN constant (``math.sin`` of a
+    symbol makes one silently), Python branching on a symbol, residuals that are not affine in the accelerations, a
+    singular mass matrix.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        coordinates: Mapping[str, str],
+        inputs: Mapping[str, str],
+        parameters: Mapping[str, Parameter],
+        equations: Equations,
+        *,
+        velocities: Mapping[str, str] | None = None,
+        kinematics: Kinematics | None = None,
+        description: str = "",
+    ) -> None:
+        self._name_signals(name, coordinates, inputs, parameters, velocities, description)
+        if (velocities is None) != (kinematics is None):
+            given, missing = ("velocities", "kinematics") if kinematics is None else ("kinematics", "velocities")
+            raise ModelError(f'model "{name}": {given} without {missing}; give both, or neither')
+        q, v, a, u, p = self._symbols()
+        residual = derivation.call_user(self._label, "equations", equations, *self.named(q, v, a, u, p))
+        self.residual = ca.Function("residual", [q, v, a, u, p], [residual], list("qvaup"), ["r"])
+        self.kinematics: ca.Function | None = None
+        if kinematics is not None:
+            rates = derivation.call_user(self._label, "kinematics", kinematics, *self.named(q, v))
+            self.kinematics = ca.Function("kinematics", [q, v], [rates], list("qv"), ["q_dot"])
+        self._check()
+
+    # ------------------------------------------------------------------ names and sizes
+
+    def _name_signals(
+        self,
+        name: str,
+        coordinates: Mapping[str, str],
+        inputs: Mapping[str, str],
+        parameters: Mapping[str, Parameter],
+        velocities: Mapping[str, str] | None,
+        description: str,
+    ) -> None:
+        self.name, self.description = name, description
+        units = {"coordinates": coordinates, "inputs": inputs, "velocities": velocities or {}}
+        derivation.check_groups(self._label, units, parameters)
+        self.coordinates, self.inputs, self.parameters = dict(coordinates), dict(inputs), dict(parameters)
+        if velocities is None:
+            self.velocities = {f"{q}_dot": _per_second(unit) for q, unit in coordinates.items()}
+            self.accelerations = {f"{q}_ddot": _per_second(unit, 2) for q, unit in coordinates.items()}
+        else:
+            self.velocities = dict(velocities)
+            self.accelerations = {f"{v}_dot": _per_second(unit) for v, unit in velocities.items()}
+        groups = (self.coordinates, self.velocities, self.accelerations, self.inputs, self.parameters)
+        derivation.check_names(self._label, groups)
+
+    @property
+    def _label(self) -> str:
+        return f'model "{self.name}"'
+
+    @property
+    def n_q(self) -> int:
+        """Number of coordinates."""
+        return len(self.coordinates)
+
+    @property
+    def n_v(self) -> int:
+        """Number of velocities, and of accelerations."""
+        return len(self.velocities)
+
+    @property
+    def n_u(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def n_p(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    @property
+    def state(self) -> tuple[str, ...]:
+        """Names of the state ``x = [q; v]``."""
+        return (*self.coordinates, *self.velocities)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of everything a simulation predicts: coordinates, velocities, accelerations."""
+        return (*self.state, *self.accelerations)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of every signal and input by name."""
+        return {**self.coordinates, **self.velocities, **self.accelerations, **self.inputs}
+
+    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
+        groups = (self.coordinates, self.velocities, self.accelerations, self.inputs, self.parameters)
+        q, v, a, u, p = (ca.vertcat(*(ca.SX.sym(n) for n in names)) for names in groups)
+        return q, v, a, u, p
+
+    @property
+    def rate_names(self) -> tuple[str, ...]:
+        """Names that equations use for velocities and accelerations: ``theta``, not ``theta_dot``."""
+        return tuple(self.coordinates if self._velocities_are_derivatives else self.velocities)
+
+    def named(self, *vectors: ca.SX) -> tuple[Symbols, ...]:
+        """The vectors q, v, a, u and p, or the first few of them, with components by name: as equations see them."""
+        names = {
+            "coordinates": self.coordinates,
+            "velocities": self.rate_names,
+            "accelerations": self.rate_names,
+            "inputs": self.inputs,
+            "parameters": self.parameters,
+        }
+        return tuple(
+            Symbols(self._label, kind, dict(zip(names[kind], ca.vertsplit(x), strict=True)))
+            for kind, x in zip(names, vectors, strict=False)
+        )
+
+    @property
+    def _velocities_are_derivatives(self) -> bool:
+        return list(self.velocities) == [f"{q}_dot" for q in self.coordinates]
+
+    # ------------------------------------------------------------------ checks
+
+    def _check(self) -> None:
+        derivation.check_residual(self._label, self.residual, tuple(self.accelerations))
+        if self.kinematics is not None:
+            derivation.check_kinematics(self._label, self.kinematics)
+        self._probe = Probe(self.residual, tuple(self.parameters.values()))
+        self._mass_matrix, self._bias = derivation.affine_in_acceleration(self._label, self._probe, self.accelerations)
+        self._definite = derivation.mass_matrix_sign(self._label, self._probe, self._mass_matrix, self.accelerations)
+
+    @cached_property
+    def nonlinear_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters in which the residuals are not affine; empty where ``W p = b`` holds."""
+        return derivation.nonlinear_parameters(self._probe, tuple(self.parameters))
+
+    @cached_property
+    def required_signals(self) -> tuple[str, ...]:
+        """Names of the signals and inputs that the residuals depend on: what a pointwise estimator must be given."""
+        names = (*self.signals, *self.inputs)
+        q, v, a, u, p = self._symbols()
+        depends = ca.which_depends(self.residual(q, v, a, u, p), ca.vertcat(q, v, a, u), 1, False)
+        return tuple(n for n, d in zip(names, depends, strict=True) if d)
+
+    def states_behind(self, signals: Iterable[str]) -> tuple[str, ...]:
+        """Names of the states whose initial value changes the simulation of any of these signals."""
+        x = ca.vertcat(*(ca.SX.sym(n) for n in self.state))
+        u, p = ca.SX.sym("u", self.n_u), ca.SX.sym("p", self.n_p)
+        rates, accelerations = self.dynamics(x, u, p)
+        feeds = np.array(ca.DM(ca.jacobian_sparsity(ca.vertcat(x, accelerations), x), 1), dtype=bool)
+        wanted = set(signals)
+        matter = np.any(feeds[[n in wanted for n in self.signals]], axis=0)
+        flows = np.array(ca.DM(ca.jacobian_sparsity(rates, x), 1), dtype=bool)
+        for _ in self.state:
+            matter = matter | np.any(flows[matter], axis=0)
+        return tuple(n for n, m in zip(self.state, matter, strict=True) if m)
+
+    @cached_property
+    def quaternions(self) -> tuple[tuple[int, int, int, int], ...]:
+        """Indices of the coordinates that form unit quaternions, found by the norm that ``kinematics`` conserves."""
+        return () if self.kinematics is None else derivation.find_quaternions(self.kinematics)
+
+    # ------------------------------------------------------------------ what is derived
+
+    @cached_property
+    def regressor(self) -> ca.Function:
+        """Function ``(q, v, a, u) -> (W (r, n_p), b (r))`` with ``W p = b`` for every solution, eqs. (1) and (5).
+
+        Raises ModelError: the residuals are not affine in the parameters; it names them.
+        """
+        if self.nonlinear_parameters:
+            raise ModelError(
+                f"{self._label}: the equations are not affine in {', '.join(self.nonlinear_parameters)}: there is no "
+                'regression W p = b; use method="nls" or a RANSAC method, which fit by nonlinear least squares'
+            )
+        q, v, a, u, p = self._symbols()
+        W, r0 = self._probe.affine_parts("p", (q, v, a, u, p))
+        return ca.Function("regressor", [q, v, a, u], [ca.densify(W), ca.densify(-r0)], list("qvau"), ["W", "b"])
+
+    @cached_property
+    def dynamics(self) -> ca.Function:
+        """Function ``(x, u, p) -> (x_dot (n_x), a (n_v))`` with ``x = [q; v]``."""
+        q, v, _, u, p = self._symbols()
+        a = -self._solve_mass(q, v, u, p, self._bias(q, v, u, p))
+        q_dot = v if self.kinematics is None else self.kinematics(q, v)
+        x = ca.vertcat(q, v)
+        outputs = [ca.densify(ca.vertcat(q_dot, a)), ca.densify(a)]
+        return ca.Function("dynamics", [x, u, p], ca.cse(outputs), ["x", "u", "p"], ["x_dot", "a"])
+
+    @cached_property
+    def linearization(self) -> ca.Function:
+        """Function ``(x, u, p) -> (A (n_x, n_x), B (n_x, n_u))`` of ``d x_dot = A dx + B du``."""
+        x, u, p = (ca.SX.sym(n, size) for n, size in (("x", len(self.state)), ("u", self.n_u), ("p", self.n_p)))
+        outputs = [ca.densify(J) for J in self.rate_jacobians(x, u, p)[:2]]
+        return ca.Function("linearization", [x, u, p], outputs, ["x", "u", "p"], ["A", "B"])
+
+    @cached_property
+    def rate_jacobians(self) -> ca.Function:
+        """Function ``(x, u, p) -> d x_dot / d(x, u, p)``, three sparse matrices, by ``M da = -dr``."""
+        q, v, a, u, p = self._symbols()
+        x = ca.vertcat(q, v)
+        r = self.residual(q, v, a, u, p)
+        q_dot = v if self.kinematics is None else self.kinematics(q, v)
+        solved = -self._solve_mass(q, v, u, p, ca.jacobian(r, ca.vertcat(x, u, p)))
+        solved = ca.sparsify(ca.substitute(solved, a, self.dynamics(x, u, p)[1]))
+        both = ca.vertcat(ca.jacobian(q_dot, ca.vertcat(x, u, p)), solved)
+        edges = [0, x.numel(), x.numel() + u.numel(), both.size2()]
+        names = ["dx", "du", "dp"]
+        return ca.Function("rate_jacobians", [x, u, p], ca.cse(ca.horzsplit(both, edges)), ["x", "u", "p"], names)
+
+    @cached_property
+    def force_response(self) -> ca.Function:
+        """Function ``(q, v, u, p, f) -> M^-1 f (n_v)``: what generalised forces add, ``M a + c = f``.
+
+        Raises ModelError: ``M`` is not symmetric and definite, so that residuals are no balance of forces.
+        """
+        if self._definite == 0:
+            raise ModelError(
+                f"{self._label}: the mass matrix dr/da is not symmetric and definite, so the equations are no "
+                "balance of forces that others could join; write them as such, or give accelerations"
+            )
+        q, v, _, u, p = self._symbols()
+        f = ca.SX.sym("f", self.n_v)
+        a = self._definite * self._solve_mass(q, v, u, p, f)
+        return ca.Function("force_response", [q, v, u, p, f], [ca.densify(a)], list("qvupf"), ["a"])
+
+    def _solve_mass(self, q: ca.SX, v: ca.SX, u: ca.SX, p: ca.SX, rhs: ca.SX) -> ca.SX:
+        """``M^-1 rhs``: LDL^T where the probe found ``M`` symmetric and definite, CasADi's solve elsewhere."""
+        M = self._mass_matrix(q, v, u, p)
+        if self._definite == 0:
+            return ca.solve(ca.densify(M), ca.densify(rhs))
+        D, LT, order = ca.ldl(ca.sparsify(self._definite * M))
+        return self._definite * ca.ldl_solve(ca.densify(rhs), D, LT, order)
+
+    def equations_text(self) -> tuple[str, ...]:
+        """Every residual as readable text, ``0 = ...``, in the signals' names."""
+        return tuple(f"0 = {r}" for r in ca.vertsplit(self.residual(*self._symbols())))
+
+    def parameter_vector(self, parameters: Mapping[str, float]) -> FloatArray:
+        """Values ``(n_p,)`` in the model's order.
+
+        Raises ModelError: a name is missing, unknown, or its value is not finite.
+        """
+        if set(parameters) != set(self.parameters):
+            raise ModelError(
+                f"{self._label}: parameters are {', '.join(self.parameters)}; found {', '.join(parameters)}"
+            )
+        values = np.array([parameters[n] for n in self.parameters], dtype=float)
+        if not np.isfinite(values).all():
+            bad = [n for n, x in zip(self.parameters, values, strict=True) if not np.isfinite(x)]
+            raise ModelError(f"{self._label}: parameter {bad[0]} is {parameters[bad[0]]}; give a finite number")
+        return values
+
+    # ------------------------------------------------------------------ identity and storage
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of the names, units, bounds and equations."""
+        return str(self.to_dict()["checksum"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Names, units, bounds and serialised equations, ready for JSON; `from_dict` reads it back."""
+        data = {
+            "name": self.name,
+            "description": self.description,
+            "coordinates": self.coordinates,
+            "velocities": None if self.kinematics is None else self.velocities,
+            "inputs": self.inputs,
+            "parameters": {n: _parameter_to_dict(x) for n, x in self.parameters.items()},
+            "residual": self.residual.serialize(),
+            "kinematics": None if self.kinematics is None else self.kinematics.serialize(),
+        }
+        return {**data, "checksum": _checksum(data)}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Model:
+        """The model that `to_dict` wrote.
+
+        Raises ResultError: the data are damaged.
+        """
+        try:
+            return cls._from_checked(data)
+        except (KeyError, TypeError, AttributeError, ValueError, ModelError) as error:
+            raise ResultError(
+                f"the stored model is damaged: {type(error).__name__}: {error}; identify again"
+            ) from error
+
+    @classmethod
+    def _from_checked(cls, data: Mapping[str, Any]) -> Model:
+        model = cls.__new__(cls)
+        if data["checksum"] != _checksum({k: x for k, x in data.items() if k != "checksum"}):
+            raise ResultError("the stored model is damaged: its checksum does not match; identify again")
+        parameters = {n: _parameter_from_dict(x) for n, x in data["parameters"].items()}
+        model._name_signals(
+            data["name"], data["coordinates"], data["inputs"], parameters, data["velocities"], data["description"]
+        )
+        model.residual = derivation.deserialize(data["residual"])
+        stored = data["kinematics"]
+        model.kinematics = None if stored is None else derivation.deserialize(stored)
+        sizes = [model.residual.size1_in(i) for i in range(model.residual.n_in())]
+        if sizes != [model.n_q, model.n_v, model.n_v, model.n_u, model.n_p]:
+            raise ResultError("the stored model is damaged: its names do not fit its equations; identify again")
+        model._check()
+        return model
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Model.from_dict, (self.to_dict(),))
+
+    def __repr__(self) -> str:
+        return f"Model({self.name!r}, coordinates={list(self.coordinates)}, parameters={list(self.parameters)})"
+
+
+def _per_second(unit: str, order: int = 1) -> str:
+    """``m -> m/s``, ``m -> m/s^2``; a unit that has a divisor already gets it multiplied."""
+    power = "s" if order == 1 else f"s^{order}"
+    if unit in ("", "1"):
+        return f"1/{power}"
+    head, slash, tail = unit.partition("/")
+    if not slash:
+        return f"{unit}/{power}"
+    if tail == "s":
+        return f"{head}/s^{order + 1}"
+    return f"{head}/({tail} {power})"
+
+
+def _parameter_to_dict(parameter: Parameter) -> dict[str, Any]:
+    def finite(x: float) -> float | None:
+        return float(x) if np.isfinite(x) else None
+
+    lower, upper = finite(parameter.lower), finite(parameter.upper)
+    return {"unit": parameter.unit, "lower": lower, "upper": upper, "positive": parameter.positive}
+
+
+def _parameter_from_dict(data: Mapping[str, Any]) -> Parameter:
+    lower = -np.inf if data["lower"] is None else data["lower"]
+    upper = np.inf if data["upper"] is None else data["upper"]
+    return Parameter(data["unit"], lower, upper, data["positive"])
+
+
+def _checksum(data: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()

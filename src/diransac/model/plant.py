@@ -1,0 +1,337 @@
+"""`Plant`: a model with its parameters, and `Disturbance`: what acts on it without the model's knowing.
+
+A disturbed plant obeys ``M a + c = f`` where its model has ``M a + c = 0``, or has ``a + e`` for the model's ``a``. The
+equations of motion stay the model's own: planning, control and identification know them alone, and only a simulation
+knows the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from diransac.arrays import FloatArray
+from diransac.errors import ModelError, SettingsError
+from diransac.model import derivation
+from diransac.model.derivation import Symbols
+from diransac.model.model import Model
+
+__all__ = ["Disturbance", "DisturbedModel", "ModelWithParameters", "Plant", "as_plant"]
+
+Effect = Callable[[Symbols, Symbols, Symbols, Symbols, Symbols], Mapping[str, Any]]
+"""``effect(q, v, u, p, d)`` gives expressions by name."""
+
+_STEPS_PER_PERIOD = 8
+"""Integration steps in a period of the fastest disturbance: docs/flying.md shows what more of them change."""
+
+
+class ModelWithParameters(Protocol):
+    """A `Plant` or a `Result`."""
+
+    @property
+    def model(self) -> Model:
+        """Equations of motion."""
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """Their parameters."""
+
+
+class Disturbance:
+    """Forces on a plant, or accelerations of it, that its model doesn't know.
+
+    Parameters
+    ----------
+    model : whose plant is disturbed
+    name : how messages call it; what belongs to it is named after it
+    forces : ``forces(q, v, u, p, d)`` returns generalised forces by acceleration, under the name that the equations
+        use (``{"z": ..., "theta": ...}``): ``M a + c = f``, in N for m, N m for rad; what is not named is zero
+    accelerations : the same of what is added to the accelerations themselves
+    constants : name -> value, read as ``d.name``; another value needs no new compilation
+    states : name -> unit, of states of its own (the phase of a rotor), read as ``d.name``
+    rates : ``rates(q, v, u, p, d)`` returns the derivative of each state by name
+    start : name -> initial value of a state, or two, low and high, to draw it from with a flight's seed; 0 where not
+        named
+    highest_frequency : Hz, of the fastest thing in it; a flight takes at least 8 integration steps in its period
+
+    ``d.t`` is the time since the simulation's start, s. Mathematics is CasADi's.
+
+    Raises ModelError: an unknown name, a NaN constant, Python branching on a symbol, states without rates, a force
+    where the model's equations are no balance of forces (``M`` is not symmetric and definite).
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        name: str,
+        *,
+        forces: Effect | None = None,
+        accelerations: Effect | None = None,
+        constants: Mapping[str, float] | None = None,
+        states: Mapping[str, str] | None = None,
+        rates: Effect | None = None,
+        start: Mapping[str, float | Sequence[float]] | None = None,
+        highest_frequency: float = 0.0,
+    ) -> None:
+        self.model, self.name = model, name
+        self.constants, self.states = dict(constants or {}), dict(states or {})
+        self.start = {**dict.fromkeys(self.states, 0.0), **{n: _as_start(value) for n, value in (start or {}).items()}}
+        self.highest_frequency = float(highest_frequency)
+        self._check(rates is not None)
+        sizes = {"q": model.n_q, "v": model.n_v, "u": model.n_u, "p": model.n_p, "d": len(self._own)}
+        q, v, u, p, own = (ca.SX.sym(name, size) for name, size in sizes.items())
+        known = model.named(q, v, v, u, p)
+        d = Symbols(self._label, "constants and states", dict(zip(self._own, ca.vertsplit(own), strict=True)))
+        arguments = (*known[:2], *known[3:], d)
+        wanted = {
+            "forces": (forces, model.rate_names),
+            "accelerations": (accelerations, model.rate_names),
+            "rates": (rates, tuple(self.states)),
+        }
+        results = [self._expressions(what, *wanted[what], arguments) for what in wanted]
+        self.effect = ca.Function("effect", [q, v, u, p, own], results, list("qvupd"), list(wanted))
+        if forces is not None:
+            model.force_response  # noqa: B018  refuses a model that is no balance of forces
+
+    @property
+    def _label(self) -> str:
+        return f'disturbance "{self.name}"'
+
+    @property
+    def _own(self) -> tuple[str, ...]:
+        """Names of what the user's functions find in ``d``."""
+        return (*self.constants, *self.states, "t")
+
+    def _check(self, has_rates: bool) -> None:
+        if not self.name.replace("-", "_").isidentifier():
+            raise ModelError(f"{self._label}: the name is used in others; give letters, digits and hyphens")
+        if len(set(self._own)) < len(self._own):
+            raise ModelError(f"{self._label}: a name is used twice; found {', '.join(self._own)}, and t is the time")
+        if bool(self.states) != has_rates:
+            raise ModelError(f"{self._label}: states and rates need each other; give both, or neither")
+        unknown = [name for name in self.start if name not in self.states]
+        if unknown:
+            raise ModelError(
+                f'{self._label}: start names "{unknown[0]}"; states are {", ".join(self.states) or "none"}'
+            )
+        numbers = {**self.constants, **self.start, "highest_frequency": self.highest_frequency}
+        for name, value in numbers.items():
+            is_range = name in self.start and isinstance(value, tuple)
+            if np.size(value) != (2 if is_range else 1) or not np.isfinite(value).all():
+                raise ModelError(f"{self._label}: {name} is {value!r}; give a finite number")
+            if is_range and value[0] > value[1]:
+                raise ModelError(f"{self._label}: {name} is {value!r}; give the low end of a range first")
+        if self.highest_frequency < 0:
+            raise ModelError(f"{self._label}: highest_frequency is {self.highest_frequency}; give Hz, 0 or more")
+
+    def _expressions(
+        self, what: str, effect: Effect | None, names: Sequence[str], arguments: Sequence[Symbols]
+    ) -> ca.SX:
+        """What a function of the user returns, in order; zero where it names nothing."""
+        if effect is None:
+            return ca.SX(len(names), 1)
+
+        def ordered(*symbols: Symbols) -> list[Any]:
+            returned = effect(*symbols)
+            unknown = [name for name in returned if name not in names]
+            if unknown:
+                raise ModelError(f'{self._label}: {what} name "{unknown[0]}"; there are {", ".join(names) or "none"}')
+            return [returned.get(name, 0.0) for name in names]
+
+        column = derivation.call_user(self._label, what, ordered, *arguments)
+        derivation.check_constants(self._label, what, ca.Function(what, [ca.vertcat(*ca.symvar(column))], [column]))
+        return column
+
+    def drawn_start(self, rng: np.random.Generator) -> list[float]:
+        """Initial states, in order; those given as a range are drawn uniformly."""
+        return [float(rng.uniform(*value) if isinstance(value, tuple) else value) for value in self.start.values()]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        kept = {name: value for name, value in vars(self).items() if name != "effect"}
+        return (_restored, (kept, self.effect.serialize()))
+
+    def __repr__(self) -> str:
+        return f"Disturbance({self.name!r} of {self.model.name!r}, constants={self.constants})"
+
+
+def _as_start(value: Any) -> Any:
+    """A number itself, a range of whatever sequence as a pair."""
+    return tuple(value) if isinstance(value, Sequence | np.ndarray) else value
+
+
+def _restored(kept: Mapping[str, Any], effect: str) -> Disturbance:
+    """A disturbance out of its pickle."""
+    disturbance = Disturbance.__new__(Disturbance)
+    vars(disturbance).update(kept, effect=derivation.deserialize(effect))
+    return disturbance
+
+
+class DisturbedModel:
+    """A model and disturbances as one set of equations; simulated as a `Model` is, by `diransac.simulation.rollouts`.
+
+    The state is ``[q; v; own states of the disturbances; t]``, t only where it is used; the parameters are the model's,
+    then the disturbances' constants.
+
+    Parameters
+    ----------
+    model : what is known
+    disturbances : what is not; each of them made for this model
+    """
+
+    def __init__(self, model: Model, disturbances: Sequence[Disturbance]) -> None:
+        self.model, self.disturbances = model, tuple(disturbances)
+        self.name = " with ".join((model.name, " and ".join(one.name for one in self.disturbances)))
+        own = [f"{one.name}.{state}" for one in self.disturbances for state in one.states]
+        self.own_states = (*own, "t") if any(_uses_time(one) for one in self.disturbances) else tuple(own)
+        self.parameters = (*model.parameters, *(f"{one.name}.{n}" for one in self.disturbances for n in one.constants))
+        self.state = (*model.state, *self.own_states)
+        self.signals = (*self.state, *model.accelerations)
+        self.quaternions = model.quaternions
+
+    @property
+    def n_q(self) -> int:
+        """Number of coordinates."""
+        return self.model.n_q
+
+    @property
+    def n_v(self) -> int:
+        """Number of states that follow the coordinates: velocities, and the disturbances' own."""
+        return self.model.n_v + len(self.own_states)
+
+    @property
+    def n_u(self) -> int:
+        """Number of inputs."""
+        return self.model.n_u
+
+    @property
+    def n_p(self) -> int:
+        """Number of parameters and constants."""
+        return len(self.parameters)
+
+    @cached_property
+    def dynamics(self) -> ca.Function:
+        """Function ``(x, u, p) -> (x_dot, a (n_v of the model))``."""
+        x, u, p = (ca.SX.sym(n, size) for n, size in (("x", len(self.state)), ("u", self.n_u), ("p", self.n_p)))
+        model, n_x = self.model, len(self.model.state)
+        q, v = x[: model.n_q], x[model.n_q : n_x]
+        known, acceleration = model.dynamics(x[:n_x], u, p[: model.n_p])
+        forces, rates = ca.SX(model.n_v, 1), []
+        for effect in self._effects(q, v, x[n_x:], u, p):
+            forces += effect[0]
+            acceleration += effect[1]
+            rates.append(effect[2])
+        if forces.nnz():
+            acceleration += model.force_response(q, v, u, p[: model.n_p], forces)
+        clock = ca.SX.ones(int("t" in self.own_states))
+        x_dot = ca.vertcat(known[: model.n_q], acceleration, *rates, clock)
+        outputs = ca.cse([ca.densify(x_dot), ca.densify(acceleration)])
+        return ca.Function("dynamics", [x, u, p], outputs, ["x", "u", "p"], ["x_dot", "a"])
+
+    def _effects(self, q: ca.SX, v: ca.SX, own: ca.SX, u: ca.SX, p: ca.SX) -> list[tuple[ca.SX, ca.SX, ca.SX]]:
+        """Forces, accelerations and rates of every disturbance."""
+        constants, states = iter(ca.vertsplit(p)[self.model.n_p :]), iter(ca.vertsplit(own))
+        own_of = [
+            ([next(constants) for _ in one.constants], [next(states) for _ in one.states]) for one in self.disturbances
+        ]
+        time = next(states, ca.SX(0))
+        effects = list[tuple[ca.SX, ca.SX, ca.SX]]()
+        for one, (values, state) in zip(self.disturbances, own_of, strict=True):
+            forces, accelerations, rates = one.effect(q, v, u, p[: self.model.n_p], ca.vertcat(*values, *state, time))
+            effects.append((forces, accelerations, rates))
+        return effects
+
+    @cached_property
+    def rate_jacobians(self) -> ca.Function:
+        """Function ``(x, u, p) -> d x_dot / d(x, u, p)``, three sparse matrices."""
+        x, u, p = (ca.SX.sym(n, size) for n, size in (("x", len(self.state)), ("u", self.n_u), ("p", self.n_p)))
+        x_dot = self.dynamics(x, u, p)[0]
+        jacobians = ca.cse([ca.jacobian(x_dot, z) for z in (x, u, p)])
+        return ca.Function("rate_jacobians", [x, u, p], jacobians, ["x", "u", "p"], ["dx", "du", "dp"])
+
+
+def _uses_time(disturbance: Disturbance) -> bool:
+    """Whether ``d.t`` matters."""
+    arguments = disturbance.effect.sx_in()
+    results = ca.vertcat(*disturbance.effect(*arguments))
+    return bool(ca.which_depends(results, arguments[-1][-1], 1, False)[0])
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A model with its parameters: what can be simulated, planned for and flown.  A `Result` serves as one, too.
+
+    Parameters
+    ----------
+    model : the equations that are known
+    parameters : name -> value
+    disturbances : what acts on the plant without the model's knowing; simulations alone know it
+
+    Raises ModelError: a parameter is missing, unknown or not finite; a disturbance of another model, or two of a name.
+    """
+
+    model: Model
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    disturbances: tuple[Disturbance, ...] = ()
+
+    def __post_init__(self) -> None:
+        values = self.model.parameter_vector(self.parameters)
+        ordered = {n: float(x) for n, x in zip(self.model.parameters, values, strict=True)}
+        object.__setattr__(self, "parameters", ordered)
+        object.__setattr__(self, "disturbances", tuple(self.disturbances))
+        names = [one.name for one in self.disturbances]
+        for one in self.disturbances:
+            if one.model.fingerprint != self.model.fingerprint:
+                raise ModelError(
+                    f'disturbance "{one.name}" was made for model "{one.model.name}", not for "{self.model.name}"; '
+                    "make it for the plant's own"
+                )
+            if names.count(one.name) > 1:
+                raise ModelError(f'two disturbances are called "{one.name}"; give each a name of its own')
+
+    @cached_property
+    def simulated(self) -> Model | DisturbedModel:
+        """What moves: the model, with its disturbances if there are any."""
+        return DisturbedModel(self.model, self.disturbances) if self.disturbances else self.model
+
+    @property
+    def constants(self) -> FloatArray:
+        """Parameters, then the disturbances' constants: what `simulated` takes as ``p``."""
+        values = [*self.parameters.values(), *(x for one in self.disturbances for x in one.constants.values())]
+        return np.array(values)
+
+    def initial_state(self, state: npt.ArrayLike, seed: int = 0) -> FloatArray:
+        """Initial state of what is simulated, from the model's own ``(n_x,)``.
+
+        Parameters
+        ----------
+        seed : of those states of disturbances that start anywhere in a range
+        """
+        x = np.asarray(state, np.float64)
+        if isinstance(self.simulated, Model):
+            return x
+        rng = np.random.default_rng(seed)
+        own = [value for one in self.disturbances for value in one.drawn_start(rng)]
+        return np.concatenate([x, own, np.zeros(int("t" in self.simulated.own_states))])
+
+    def substeps(self, dt: float) -> int:
+        """Integration steps from row to row, dt seconds apart, that resolve every disturbance."""
+        fastest = max((one.highest_frequency for one in self.disturbances), default=0.0)
+        return max(1, int(np.ceil(_STEPS_PER_PERIOD * fastest * dt)))
+
+
+def as_plant(plant: ModelWithParameters) -> Plant:
+    """The plant itself, or a result as a plant.
+
+    Raises SettingsError: it is something else.
+    """
+    if isinstance(plant, Plant):
+        return plant
+    if not isinstance(getattr(plant, "model", None), Model) or not hasattr(plant, "parameters"):
+        raise SettingsError(f"plant is {plant!r:.60}; give a dr.Plant or a dr.Result, such as dr.Result.load(path)")
+    return Plant(plant.model, plant.parameters)

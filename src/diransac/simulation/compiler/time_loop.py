@@ -1,0 +1,284 @@
+"""The time loop of a simulation, as machine code: eight rollouts to a vector.
+
+A lane is one rollout: its parameters, its initial state, its window of rows. What a lane computes is the same in every
+variant of the loop; variants differ in what they keep (`kept.py`) and in where the inputs come from (`inputs.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain
+from typing import TYPE_CHECKING, Protocol, TypeAlias
+
+from llvmlite import ir
+
+from diransac.simulation.compiler.machine_code import LANES
+from diransac.simulation.compiler.operations import evaluate, numbers
+from diransac.simulation.compiler.vectors import (
+    DOUBLE,
+    INTEGER,
+    INTEGERS,
+    NUMBERS,
+    POINTER,
+    Cell,
+    Loop,
+    Value,
+    Vectors,
+    integer,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from diransac.simulation.compiler.graph import Graph
+
+__all__ = ["ARGUMENTS", "Block", "Inputs", "Kept", "Plan", "Row", "TimeLoop", "emit_time_loop"]
+
+ARGUMENTS = {
+    "parameters": "pointer",  # (n_p, n_padded) float64
+    "initial_states": "pointer",  # (n_states, n_padded) float64
+    "inputs": "pointer",  # (n_log, n_u) float64, read where inputs are held
+    "laws": "pointer",  # (n_laws, n_log, width) float64, read where inputs are fed back
+    "law_starts": "pointer",  # (n_padded,) int64, row of all laws' rows at which each lane's law starts
+    "limits": "pointer",  # (2, n_u) float64, smallest and largest inputs of the laws
+    "measured": "pointer",  # (n_log, n_s) float64
+    "valid": "pointer",  # (n_log,) bytes, 0 or 1
+    "weights": "pointer",  # (n_log, n_s) float64
+    "squared_thresholds": "pointer",  # (n_s,) float64
+    "start_rows": "pointer",  # (n_padded,) int64, read where lanes have windows of their own
+    "sums": "pointer",  # float64, written by what is kept; so are the next four
+    "counts": "pointer",  # (2, n_padded) int64
+    "inlier_bits": "pointer",  # (n_blocks, n_rows) bytes, a bit a lane
+    "series": "pointer",  # (n_lanes, n_rows, width) float64
+    "final": "pointer",  # (n_blocks, n_states, 8) float64
+    "step": "number",  # seconds, of one sub-step
+    "min_inlier_signals": "integer",
+    "n_lanes": "integer",
+    "n_padded": "integer",  # n_lanes rounded up to whole vectors; the last lane is repeated
+    "n_rows": "integer",
+    "first_block": "integer",  # vectors of lanes to run: first_block .. end_block - 1
+    "end_block": "integer",
+}
+"""Arguments of the compiled time loop, in order, and their kinds."""
+
+STATE, INPUT, PARAMETER, STEP = range(4)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a time loop computes.
+
+    Attributes
+    ----------
+    step : graph of (x, u, p, h) -> (x after one sub-step, signals before it, Jacobian (n_s, n_z) of the scored ones)
+    further_step : graph of (x, u, p, h) -> (x after one sub-step,), for the sub-steps after the first
+    substeps : sub-steps a row
+    n_states, n_inputs, n_signals, n_unknowns : sizes of x, u, all signals, and what the Jacobian is with respect to;
+        x holds the model's state, and after it those sensitivities of it that are not constant
+    scored : positions among all signals of those that are compared with measurements
+    quaternions : positions among the scored ones; four that have an arbitrary common sign
+    state_quaternions : positions in x of all such fours
+    """
+
+    step: Graph
+    further_step: Graph
+    substeps: int
+    n_states: int
+    n_inputs: int
+    n_signals: int
+    n_unknowns: int
+    scored: tuple[int, ...]
+    quaternions: tuple[tuple[int, ...], ...]
+    state_quaternions: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
+class Block:
+    """What belongs to the eight lanes of a block.
+
+    Attributes
+    ----------
+    first : position of the first lane among the padded ones
+    starts : per lane, row of the log at which it starts; empty if all start at the first
+    step, further_step : results of the graphs that hold for the whole rollout
+    """
+
+    first: Value
+    starts: list[Value]
+    step: dict[int, Value]
+    further_step: dict[int, Value]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a block's rollouts.
+
+    Attributes
+    ----------
+    index : row of the rollout
+    inputs : those that act from this row to the next
+    signals : states and accelerations at this row
+    slopes : Jacobian of the scored signals, by signal and unknown; None where it is always zero
+    alive : whether every signal has been finite in all rows so far
+    """
+
+    index: Value
+    inputs: list[Value]
+    signals: list[Value]
+    slopes: list[list[Value | None]]
+    alive: Value
+
+
+class Kept(Protocol):
+    """What a variant of the loop keeps; it emits its own code into the loop that it is made with."""
+
+    ends_early: bool
+    """Whether a block can be left once all its lanes have diverged."""
+
+    def __init__(self, loop: TimeLoop) -> None: ...
+
+    def start(self, block: Block) -> None:
+        """Emit what happens before a block's first row."""
+
+    def row(self, block: Block, row: Row) -> None:
+        """Emit what is kept of a row."""
+
+    def end(self, block: Block) -> None:
+        """Emit what happens after a block's last row."""
+
+
+Inputs: TypeAlias = "Callable[[TimeLoop, Block, Value], list[Value]]"
+"""Emits the inputs of a block's lanes at a row."""
+
+
+def emit_time_loop(plan: Plan, kept: type[Kept], inputs: Inputs, *, windows: bool) -> Value:
+    """LLVM module with one function, `time_loop`, that takes `ARGUMENTS`.
+
+    Parameters
+    ----------
+    plan : what to compute
+    kept : what to keep of it
+    inputs : emits the inputs of a row
+    windows : every lane starts at its own row of the log, not all at its first
+    """
+    module = ir.Module("diransac")
+    kinds = {"pointer": POINTER, "integer": INTEGER, "number": DOUBLE}
+    signature = ir.FunctionType(ir.VoidType(), [kinds[kind] for kind in ARGUMENTS.values()])
+    function = ir.Function(module, signature, "time_loop")
+    for argument, (name, kind) in zip(function.args, ARGUMENTS.items(), strict=True):
+        argument.name = name
+        if kind == "pointer":
+            argument.add_attribute("noalias")
+    TimeLoop(plan, windows, function).emit(kept, inputs)
+    return module
+
+
+class TimeLoop:
+    """Emits the function: blocks of lanes, and in them rows; gives what is kept access to what is logged."""
+
+    def __init__(self, plan: Plan, windows: bool, function: Value) -> None:
+        self.plan, self.windows = plan, windows
+        self.arguments = {argument.name: argument for argument in function.args}
+        self.v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
+        self.builder = self.v.builder
+        self.state: list[Cell] = [self.v.cell(self.v.number(0.0)) for _ in range(plan.n_states)]
+        self.guard = self.v.cell(self.v.number(0.0))
+        """Zero as long as every signal has been finite."""
+
+    def emit(self, variant: type[Kept], inputs: Inputs) -> None:
+        """Emit the whole function."""
+        kept, v = variant(self), self.v
+        with v.repeat(self.arguments["first_block"], self.arguments["end_block"]) as blocks:
+            block = self._start(blocks.index)
+            kept.start(block)
+            with v.repeat(integer(0), self.arguments["n_rows"]) as rows:
+                u = inputs(self, block, rows.index)
+                self._row(kept, block, rows, u)
+            kept.end(block)
+        self.builder.ret_void()
+
+    def _start(self, index: Value) -> Block:
+        """Load what a block of lanes starts from, and compute what holds for all its rows."""
+        v, plan = self.v, self.plan
+        first = self.builder.mul(index, integer(LANES))
+        for k, cell in enumerate(self.state):
+            v.set(cell, self._lane_vector("initial_states", k, first))
+        v.set(self.guard, v.number(0.0))
+
+        def load(argument: int, element: int) -> Value:
+            if argument == PARAMETER:
+                return self._lane_vector("parameters", element, first)
+            return v.splat(self.arguments["step"])
+
+        constant = [
+            evaluate(v, graph, [k for k in graph.needed(chain(*graph.outputs)) if graph.invariant[k]], load)
+            for graph in (plan.step, plan.further_step)
+        ]
+        return Block(first, self.whole_numbers("start_rows", first) if self.windows else [], *constant)
+
+    def whole_numbers(self, name: str, first: Value) -> list[Value]:
+        """Return the eight integers of a block's lanes in an array that holds one for every lane."""
+        vector = self.v.load(self.arguments[name], first, INTEGERS)
+        return [self.v.lane(vector, lane) for lane in range(LANES)]
+
+    def _row(self, kept: Kept, block: Block, rows: Loop, u: list[Value]) -> None:
+        """Keep what is wanted of one row, then step to the next."""
+        v, graph = self.v, self.plan.step
+        results = self._evaluate(graph, chain(*graph.outputs), u, block.step)
+        after, signals, slopes = (numbers(v, results, positions) for positions in graph.outputs)
+        alive = self._still_finite(signals)
+        kept.row(block, Row(rows.index, u, signals, self._by_signal(slopes), alive))
+        if kept.ends_early:
+            with self.builder.if_then(self.builder.not_(v.any_lane(alive))):
+                self.builder.branch(rows.leave)
+        self._set_state(after)
+        if self.plan.substeps > 1:
+            self._further_steps(u, block)
+
+    def _by_signal(self, slopes: list[Value]) -> list[list[Value | None]]:
+        """Jacobian by signal and unknown, from its elements column by column."""
+        graph, n_scored = self.plan.step, len(self.plan.scored)
+        zeros = [graph.instructions[k].is_zero for k in graph.outputs[2]]
+        entries = [None if zero else slope for slope, zero in zip(slopes, zeros, strict=True)]
+        return [entries[k::n_scored] for k in range(n_scored)]
+
+    def _further_steps(self, u: list[Value], block: Block) -> None:
+        """Take the sub-steps after the first."""
+        plan = self.plan
+        (after,) = plan.further_step.outputs
+        with self.v.repeat(integer(1), integer(plan.substeps)):
+            results = self._evaluate(plan.further_step, after, u, block.further_step)
+            self._set_state(numbers(self.v, results, after))
+
+    def _set_state(self, after: list[Value]) -> None:
+        """Let the state be another one."""
+        for cell, value in zip(self.state, after, strict=True):
+            self.v.set(cell, value)
+
+    def _evaluate(
+        self, graph: Graph, wanted: Iterable[int], u: list[Value], known: dict[int, Value]
+    ) -> dict[int, Value]:
+        """Evaluate a graph at the current state."""
+        x = [self.v.get(cell) for cell in self.state]
+        return evaluate(self.v, graph, list(wanted), lambda argument, k: (x if argument == STATE else u)[k], known)
+
+    def _still_finite(self, signals: list[Value]) -> Value:
+        """Whether every signal has been finite in all rows so far: zero times it stays zero."""
+        v = self.v
+        guard = v.get(self.guard)
+        for signal in signals:
+            guard = v.fma(signal, v.number(0.0), guard)
+        v.set(self.guard, guard)
+        return v.compare("==", guard, v.number(0.0))
+
+    def logged(self, name: str, width: int, block: Block, row: Value, kind: Value = DOUBLE) -> list[Value]:
+        """Return the columns of a logged array at a row; one load for all lanes if they share their row."""
+        v, builder = self.v, self.builder
+        at = [builder.add(start, row) for start in block.starts] or [row]
+        columns = [[v.element(self.arguments[name], place, width, k, kind) for place in at] for k in range(width)]
+        return [v.join(column) if self.windows else v.splat(*column) for column in columns]
+
+    def _lane_vector(self, name: str, element: int, first: Value) -> Value:
+        """One element of an array that holds a value for every lane."""
+        index = self.builder.add(self.builder.mul(self.arguments["n_padded"], integer(element)), first)
+        return self.v.load(self.arguments[name], index, NUMBERS)

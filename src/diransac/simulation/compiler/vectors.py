@@ -1,0 +1,331 @@
+"""Eight float64 lanes at a time: llvmlite's IR builder with vector types.
+
+Nothing here knows about models. Every method emits instructions whose lanes are independent and correctly rounded (no
+fast-math flags), so a lane's bits depend neither on its neighbours nor on the width of the machine's registers.
+"""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from llvmlite import ir
+
+from diransac.simulation.compiler.machine_code import LANES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+__all__ = ["Cell", "Loop", "Value", "Vectors", "integer"]
+
+Value: TypeAlias = Any
+"""An LLVM value: a vector of numbers, of 64-bit integers or of conditions, or a scalar (llvmlite has no types)."""
+
+DOUBLE = ir.DoubleType()
+INTEGER = ir.IntType(64)
+BIT = ir.IntType(1)
+BYTE = ir.IntType(8)
+BITS = ir.IntType(LANES)
+POINTER = ir.PointerType()
+NUMBERS = ir.VectorType(DOUBLE, LANES)
+INTEGERS = ir.VectorType(INTEGER, LANES)
+CONDITIONS = ir.VectorType(BIT, LANES)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A mutable variable of the emitted code; LLVM keeps it in a register."""
+
+    address: Value
+    type: Value
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A loop being emitted: its counter, and the block to branch to in order to leave it."""
+
+    index: Value
+    leave: Value
+
+
+def integer(value: int) -> Value:
+    """64-bit integer constant, a scalar."""
+    return ir.Constant(INTEGER, value)
+
+
+class Vectors:
+    """Emits arithmetic on vectors of eight lanes at the end of a builder's block."""
+
+    def __init__(self, builder: Value) -> None:
+        self.builder = builder
+        self._memory: dict[tuple[str, Value], Value] = {}
+
+    def once(self, name: str, operand: Value, emit: Callable[[], Value]) -> Value:
+        """`emit()`, or what it gave before for the same name and operand: sin and cos share their work."""
+        key = (name, operand)
+        if key not in self._memory:
+            self._memory[key] = emit()
+        return self._memory[key]
+
+    # Constants -----------------------------------------------------------------------------------------------------
+    def number(self, value: float) -> Value:
+        """Return the constant in every lane."""
+        return ir.Constant(NUMBERS, [ir.Constant(DOUBLE, float(value))] * LANES)
+
+    def integer(self, value: int) -> Value:
+        """Return the 64-bit integer constant in every lane."""
+        return ir.Constant(INTEGERS, [ir.Constant(INTEGER, value)] * LANES)
+
+    # Arithmetic ----------------------------------------------------------------------------------------------------
+    def add(self, x: Value, y: Value) -> Value:
+        """Return x + y."""
+        return self.builder.fadd(x, y)
+
+    def sub(self, x: Value, y: Value) -> Value:
+        """Return x - y."""
+        return self.builder.fsub(x, y)
+
+    def mul(self, x: Value, y: Value) -> Value:
+        """Return x y."""
+        return self.builder.fmul(x, y)
+
+    def div(self, x: Value, y: Value) -> Value:
+        """Return x / y."""
+        return self.builder.fdiv(x, y)
+
+    def neg(self, x: Value) -> Value:
+        """Return -x."""
+        return self.builder.fneg(x)
+
+    def fma(self, x: Value, y: Value, z: Value) -> Value:
+        """Return x y + z, rounded once."""
+        return self.intrinsic("fma", x, y, z)
+
+    def absolute(self, x: Value) -> Value:
+        """Return |x|."""
+        return self.intrinsic("fabs", x)
+
+    def polynomial(self, x: Value, coefficients: Sequence[float]) -> Value:
+        """Return a polynomial by Horner's rule, its highest power first."""
+        result = self.number(coefficients[0])
+        for coefficient in coefficients[1:]:
+            result = self.fma(result, x, self.number(coefficient))
+        return result
+
+    def sign(self, x: Value) -> Value:
+        """Return -1, 1, or x where that is zero or NaN."""
+        zero = self.number(0.0)
+        negative = self.select(self.compare("<", x, zero), self.number(-1.0), x)
+        return self.select(self.compare(">", x, zero), self.number(1.0), negative)
+
+    def smaller(self, x: Value, y: Value) -> Value:
+        """Return the smaller operand; the other one where one is NaN."""
+        return self.select(self.either(self.compare("<", x, y), self.is_nan(y)), x, y)
+
+    def larger(self, x: Value, y: Value) -> Value:
+        """Return the larger operand; the other one where one is NaN."""
+        return self.select(self.either(self.compare(">", x, y), self.is_nan(y)), x, y)
+
+    def clamped(self, x: Value, lowest: float, highest: float) -> Value:
+        """Return x within bounds; NaN stays."""
+        x = self.select(self.compare("<", x, self.number(lowest)), self.number(lowest), x)
+        return self.select(self.compare(">", x, self.number(highest)), self.number(highest), x)
+
+    def intrinsic(self, name: str, *operands: Value) -> Value:
+        """Return LLVM's `llvm.<name>` of vectors."""
+        return self.builder.call(self._declared(f"llvm.{name}.v{LANES}f64", NUMBERS, len(operands)), operands)
+
+    def libm(self, name: str, *operands: Value) -> Value:
+        """Return the C library's function of every lane, one lane after the other."""
+        function = self._declared(name, DOUBLE, len(operands))
+        result = ir.Constant(NUMBERS, ir.Undefined)
+        for lane in range(LANES):
+            scalars = [self.lane(operand, lane) for operand in operands]
+            result = self.with_lane(result, self.builder.call(function, scalars), lane)
+        return result
+
+    def _declared(self, name: str, kind: Value, n_operands: int) -> Value:
+        """Return a function from elsewhere, declared once in the module."""
+        module = self.builder.module
+        known = module.globals.get(name)
+        return known or ir.Function(module, ir.FunctionType(kind, [kind] * n_operands), name)
+
+    # Conditions ----------------------------------------------------------------------------------------------------
+    def compare(self, relation: str, x: Value, y: Value) -> Value:
+        """Return `x relation y`, false where either is NaN, except that NaN differs from everything."""
+        emit = self.builder.fcmp_unordered if relation == "!=" else self.builder.fcmp_ordered
+        return emit(relation, x, y)
+
+    def is_condition(self, x: Value) -> bool:
+        """Whether a value holds conditions rather than numbers."""
+        return bool(x.type == CONDITIONS)
+
+    def is_nan(self, x: Value) -> Value:
+        """Return where x is NaN."""
+        return self.builder.fcmp_unordered("uno", x, x)
+
+    def select(self, condition: Value, x: Value, y: Value) -> Value:
+        """Return x where the condition holds, else y."""
+        return self.builder.select(condition, x, y)
+
+    def both(self, x: Value, y: Value) -> Value:
+        """Return the logical and of conditions, or the bitwise one of integers."""
+        return self.builder.and_(x, y)
+
+    def either(self, x: Value, y: Value) -> Value:
+        """Return the logical or of conditions, or the bitwise one of integers."""
+        return self.builder.or_(x, y)
+
+    def negate(self, condition: Value) -> Value:
+        """Return the logical not."""
+        return self.builder.not_(condition)
+
+    def count(self, total: Value, condition: Value) -> Value:
+        """Return integers that grow by one where the condition holds."""
+        return self.builder.sub(total, self.builder.sext(condition, INTEGERS))
+
+    def any_lane(self, condition: Value) -> Value:
+        """Return one bit: whether the condition holds in some lane."""
+        return self.builder.icmp_unsigned("!=", self.builder.bitcast(condition, BITS), ir.Constant(BITS, 0))
+
+    def turned_towards(
+        self, values: Sequence[Value], targets: Sequence[Value], places: Sequence[int]
+    ) -> tuple[list[Value], Value]:
+        """Return the values, those at `places` with the common sign that is nearer to the targets; where it changed."""
+        dot, turned = self.number(0.0), list(values)
+        for k in places:
+            dot = self.fma(values[k], targets[k], dot)
+        opposite = self.compare("<", dot, self.number(0.0))
+        for k in places:
+            turned[k] = self.select(opposite, self.neg(values[k]), values[k])
+        return turned, opposite
+
+    # Bits ----------------------------------------------------------------------------------------------------------
+    def bits(self, x: Value) -> Value:
+        """Return the 64 bits of each number as an integer."""
+        return self.builder.bitcast(x, INTEGERS)
+
+    def from_bits(self, x: Value) -> Value:
+        """Return the numbers whose bits these integers are."""
+        return self.builder.bitcast(x, NUMBERS)
+
+    def lowest_bit(self, x: Value) -> Value:
+        """Return the condition that an integer is odd."""
+        return self.builder.trunc(x, CONDITIONS)
+
+    def has_bits(self, x: Value, mask: int) -> Value:
+        """Return where an integer shares a bit with the mask."""
+        return self.builder.icmp_unsigned("!=", self.both(x, self.integer(mask)), self.integer(0))
+
+    def sign_bit(self, x: Value) -> Value:
+        """Return where the sign of x is minus, zeros included."""
+        return self.builder.icmp_signed("<", self.bits(x), self.integer(0))
+
+    def add_integers(self, x: Value, y: Value) -> Value:
+        """Return x + y, modulo 2**64."""
+        return self.builder.add(x, y)
+
+    def exclusive_or(self, x: Value, y: Value) -> Value:
+        """Return the bits that differ."""
+        return self.builder.xor(x, y)
+
+    def shift_left(self, x: Value, places: int) -> Value:
+        """Return x 2**places, modulo 2**64."""
+        return self.builder.shl(x, self.integer(places))
+
+    def shift_right(self, x: Value, places: int) -> Value:
+        """Return x / 2**places of integers without sign, rounded down."""
+        return self.builder.lshr(x, self.integer(places))
+
+    # Lanes and memory ----------------------------------------------------------------------------------------------
+    def lane(self, x: Value, lane: int) -> Value:
+        """Return one lane as a scalar."""
+        return self.builder.extract_element(x, ir.Constant(INTEGER, lane))
+
+    def with_lane(self, x: Value, scalar: Value, lane: int) -> Value:
+        """Return the vector with one lane replaced."""
+        return self.builder.insert_element(x, scalar, ir.Constant(INTEGER, lane))
+
+    def join(self, scalars: list[Value]) -> Value:
+        """Return the vector of these eight scalars."""
+        result = ir.Constant(ir.VectorType(scalars[0].type, LANES), ir.Undefined)
+        for lane, scalar in enumerate(scalars):
+            result = self.with_lane(result, scalar, lane)
+        return result
+
+    def splat(self, scalar: Value) -> Value:
+        """Return the scalar in every lane."""
+        kind = ir.VectorType(scalar.type, LANES)
+        undefined = ir.Constant(kind, ir.Undefined)
+        first = self.with_lane(undefined, scalar, 0)
+        zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+        return self.builder.shuffle_vector(first, undefined, zeros)
+
+    def load(self, base: Value, index: Value, kind: Value) -> Value:
+        """Load a scalar, or a vector that starts, at element `index` of an array."""
+        element = kind.element if isinstance(kind, ir.VectorType) else kind
+        address = self.builder.gep(base, [index], source_etype=element)
+        return self.builder.load(address, typ=kind, align=1 if element == BYTE else 8)
+
+    def element(self, base: Value, row: Value, width: int, column: int, kind: Value) -> Value:
+        """Load a scalar from a row of a matrix."""
+        return self.load(base, self.builder.add(self.builder.mul(row, integer(width)), integer(column)), kind)
+
+    def store(self, value: Value, base: Value, index: Value) -> None:
+        """Store a scalar or a vector at element `index` of an array of float64 or int64."""
+        address = self.builder.gep(base, [index], source_etype=INTEGER)
+        self.builder.store(value, address, align=8)
+
+    def store_bits(self, condition: Value, base: Value, index: Value) -> None:
+        """Store a condition at element `index` of an array of bytes, the first lane in the lowest bit."""
+        self.builder.store(self.builder.bitcast(condition, BITS), self.builder.gep(base, [index], source_etype=BITS))
+
+    # Control -------------------------------------------------------------------------------------------------------
+    def cell(self, value: Value) -> Cell:
+        """Return a new variable that holds the value."""
+        with self.builder.goto_entry_block():
+            address = self.builder.alloca(value.type)
+        self.builder.store(value, address)
+        return Cell(address, value.type)
+
+    def get(self, cell: Cell) -> Value:
+        """Return what a variable holds."""
+        return self.builder.load(cell.address, typ=cell.type)
+
+    def set(self, cell: Cell, value: Value) -> None:
+        """Let a variable hold another value."""
+        self.builder.store(value, cell.address)
+
+    def call_aside(self, name: str, emit: Callable[..., Value], *operands: Value) -> Value:
+        """Return `emit(vectors, *operands)`, run as a function of its own that the module holds once: for what is rare.
+
+        Parameters
+        ----------
+        name : of the function; the same name means the same `emit`
+        """
+        function = self.builder.module.globals.get(name)
+        if function is None:
+            function = ir.Function(self.builder.module, ir.FunctionType(NUMBERS, [NUMBERS] * len(operands)), name)
+            function.linkage = "internal"
+            for attribute in ("noinline", "cold"):
+                function.attributes.add(attribute)
+            aside = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
+            aside.builder.ret(emit(aside, *function.args))
+        return self.builder.call(function, operands)
+
+    @contextmanager
+    def repeat(self, first: Value, end: Value) -> Iterator[Loop]:
+        """Emit what is inside once, to run with every index from `first` to before `end`."""
+        builder = self.builder
+        index = self.cell(first)
+        test, body, leave = (builder.append_basic_block(name) for name in ("test", "body", "leave"))
+        builder.branch(test)
+        builder.position_at_end(test)
+        counter = self.get(index)
+        builder.cbranch(builder.icmp_signed("<", counter, end), body, leave)
+        builder.position_at_end(body)
+        yield Loop(counter, leave)
+        self.set(index, builder.add(counter, ir.Constant(INTEGER, 1)))
+        builder.branch(test)
+        builder.position_at_end(leave)
