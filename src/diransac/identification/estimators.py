@@ -7,7 +7,6 @@ the order of its rows: no result depends on how many hypotheses are fitted at a 
 
 from __future__ import annotations
 
-import operator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
@@ -22,13 +21,14 @@ from diransac.simulation.compiler import compile_map
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from diransac.data.dataset import Observations
+    from diransac.data.dataset import Dataset, Segment
 
 __all__ = [
     "BoundEstimator",
     "Estimator",
     "OrdinaryLeastSquares",
     "ScikitLearnEstimator",
+    "Selection",
     "TotalLeastSquares",
     "as_estimator",
     "name_of",
@@ -39,29 +39,36 @@ __all__ = [
 _MIN_EIGENVALUE = 1e-6
 
 
+class Selection(Protocol):
+    """Sets of rows, gathered once: whether each determines the parameters, and the parameters."""
+
+    def well_defined(self) -> BoolArray:
+        """Whether each set of rows determines the parameters: smallest eigenvalue of the column-scaled ``W^T W``."""
+
+    def fit(self) -> FloatArray:
+        """Parameters ``(n_sets, n)``; not finite where a set determines none."""
+
+
 class BoundEstimator(Protocol):
-    """An estimator over the usable rows of one log, which are numbered from 0."""
+    """An estimator over the usable rows of a dataset, which are numbered from 0, log after log."""
 
     n_rows: int
 
-    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
-        """Whether each set of rows determines the parameters: smallest eigenvalue of the column-scaled ``W^T W``."""
-
-    def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
-        """Parameters ``(n_sets, n_p)``; not finite where a set determines none."""
+    def select(self, row_sets: Sequence[IntArray]) -> Selection:
+        """Sets of rows, to be checked and fitted."""
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        """Parameters ``(n_groups, n_p)`` from ``rows`` (ascending) less each group of them."""
+        """Parameters ``(n_groups, n)`` from ``rows`` (ascending) less each group of them."""
 
     def unidentifiable(self) -> tuple[int, ...]:
-        """Indices of the parameters that the whole log does not determine."""
+        """Indices of the parameters that the whole dataset does not determine."""
 
 
 class Estimator(Protocol):
     """What identifies parameters from rows."""
 
-    def bind(self, observations: Observations) -> BoundEstimator:
-        """The estimator over the usable rows of a log."""
+    def bind(self, dataset: Dataset) -> BoundEstimator:
+        """The estimator over the usable rows of a dataset."""
 
 
 @dataclass(frozen=True)
@@ -79,16 +86,16 @@ class _SumsEstimator:
     def fit(self, W: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:
         """Parameters ``(n_p,)`` from ``W (..., n_p)`` and ``b (...)``."""
         bound = self._bind(*_flat(W, b))
-        return np.asarray(bound.fit([np.arange(bound.n_rows)])[0])
+        return np.asarray(bound.select([np.arange(bound.n_rows)]).fit()[0])
 
     def well_defined(self, W: npt.ArrayLike, b: npt.ArrayLike) -> bool:
         """Whether ``W (..., n_p)``, ``b (...)`` determine the parameters, with the columns scaled by their own RMS."""
         bound = self._bind(*_flat(W, b))
-        return bool(bound.well_defined([np.arange(bound.n_rows)])[0])
+        return bool(bound.select([np.arange(bound.n_rows)]).well_defined()[0])
 
-    def bind(self, observations: Observations) -> BoundEstimator:
-        """The estimator over the usable rows of a log."""
-        return self._bind(*regression(observations))
+    def bind(self, dataset: Dataset) -> BoundEstimator:
+        """The estimator over the usable rows of a dataset."""
+        return self._bind(*regression(dataset))
 
     def _bind(self, W: FloatArray, b: FloatArray) -> _BoundSums:
         return _BoundSums(self, W, b)
@@ -143,34 +150,29 @@ class _BoundSums:
         self._blocks = np.zeros((self.n_rows, len(i)))
         for row in range(W.shape[1]):
             self._blocks += columns[:, row, i] * columns[:, row, j]
-        self._latest: tuple[Sequence[IntArray], FloatArray] = ([], np.empty((0, self._n_p + 1, self._n_p + 1)))
 
-    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
-        gram = self._gram(row_sets)[:, :-1, :-1]
-        return np.asarray(smallest_eigenvalue(gram) > self._estimator.min_eigenvalue)
-
-    def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
-        return self._unscale(self._estimator.solve(self._gram(row_sets)))
+    def select(self, row_sets: Sequence[IntArray]) -> _SelectedSums:
+        return _SelectedSums(self, self._gram(row_sets))
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        return self._unscale(self._estimator.solve(self._gram([rows]) - self._gram(groups)))
+        return self.solve(self._gram([rows]) - self._gram(groups))
 
     def unidentifiable(self) -> tuple[int, ...]:
         gram = self._gram([np.arange(self.n_rows)])[0, :-1, :-1]
-        return loose_parameters(gram, self._estimator.min_eigenvalue)
+        return loose_parameters(gram, self.min_eigenvalue)
 
-    def _unscale(self, scaled: FloatArray) -> FloatArray:
+    @property
+    def min_eigenvalue(self) -> float:
+        """Of the estimator."""
+        return self._estimator.min_eigenvalue
+
+    def solve(self, gram: FloatArray) -> FloatArray:
+        """Parameters in their units from sums in columns of unit RMS."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(scaled * self._scale[-1] / self._scale[:-1])
+            return np.asarray(self._estimator.solve(gram) * self._scale[-1] / self._scale[:-1])
 
     def _gram(self, row_sets: Sequence[IntArray]) -> FloatArray:
-        """Sums ``(n_sets, n_p + 1, n_p + 1)``, each in the order of its rows; kept for who asks for the same again.
-
-        Whether a set is well-defined is asked right before it is fitted.
-        """
-        before, gram = self._latest
-        if len(before) == len(row_sets) and all(map(operator.is_, before, row_sets)):
-            return gram
+        """Sums ``(n_sets, n + 1, n + 1)``, each in the order of its rows."""
         sums = np.empty((len(row_sets), self._blocks.shape[1]))
         lengths = np.array([len(rows) for rows in row_sets])
         for length in np.unique(lengths):
@@ -180,8 +182,21 @@ class _BoundSums:
         gram = np.empty((len(row_sets), self._n_p + 1, self._n_p + 1))
         i, j = self._upper
         gram[:, i, j] = gram[:, j, i] = sums
-        self._latest = list(row_sets), gram
         return gram
+
+
+@dataclass(frozen=True)
+class _SelectedSums:
+    """Sums of ``[W b]^T [W b]`` over each set of rows, ``(n_sets, n + 1, n + 1)``."""
+
+    bound: _BoundSums
+    gram: FloatArray
+
+    def well_defined(self) -> BoolArray:
+        return np.asarray(smallest_eigenvalue(self.gram[:, :-1, :-1]) > self.bound.min_eigenvalue)
+
+    def fit(self) -> FloatArray:
+        return self.bound.solve(self.gram)
 
 
 class LinearRegressor(Protocol):
@@ -215,9 +230,9 @@ class ScikitLearnEstimator:
     def __post_init__(self) -> None:
         object.__setattr__(self, "regressor", _without_intercept(self.regressor))
 
-    def bind(self, observations: Observations) -> BoundEstimator:
-        """The estimator over the usable rows of a log."""
-        return _BoundScikitLearn(self, *regression(observations))
+    def bind(self, dataset: Dataset) -> BoundEstimator:
+        """The estimator over the usable rows of a dataset."""
+        return _BoundScikitLearn(self, *regression(dataset))
 
 
 class _BoundScikitLearn:
@@ -231,8 +246,8 @@ class _BoundScikitLearn:
         self._scale = np.where(scale > 0.0, scale, 1.0)
         self._W, self._b = W / self._scale[:-1], b / self._scale[-1]
 
-    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
-        return self._sums.well_defined(row_sets)
+    def select(self, row_sets: Sequence[IntArray]) -> _SelectedRows:
+        return _SelectedRows(self._sums.select(row_sets), self, row_sets)
 
     def unidentifiable(self) -> tuple[int, ...]:
         return self._sums.unidentifiable()
@@ -241,6 +256,7 @@ class _BoundScikitLearn:
         return self.fit([np.setdiff1d(rows, group) for group in groups])
 
     def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        """Parameters ``(n_sets, n)`` in their units."""
         fits = np.array([self._fit_one(rows) for rows in row_sets]).reshape(len(row_sets), -1)
         return np.asarray(fits * self._scale[-1] / self._scale[:-1])
 
@@ -254,6 +270,21 @@ class _BoundScikitLearn:
             return np.full(n_p, np.nan)
         holder = getattr(fitted, "estimator_", fitted)
         return np.asarray(holder.coef_, dtype=float).reshape(n_p)
+
+
+@dataclass(frozen=True)
+class _SelectedRows:
+    """Sets of rows for a scikit-learn regressor."""
+
+    sums: _SelectedSums
+    bound: _BoundScikitLearn
+    row_sets: Sequence[IntArray]
+
+    def well_defined(self) -> BoolArray:
+        return self.sums.well_defined()
+
+    def fit(self) -> FloatArray:
+        return self.bound.fit(self.row_sets)
 
 
 def _without_intercept(regressor: LinearRegressor) -> LinearRegressor:
@@ -300,16 +331,26 @@ def name_of(estimator: Estimator) -> str:
     return type(named).__name__
 
 
-def regression(observations: Observations) -> tuple[FloatArray, FloatArray]:
-    """``W (N, r, n_p)`` and ``b (N, r)`` of the rows that count, eqs. (1) and (5).
+def regression(dataset: Dataset) -> tuple[FloatArray, FloatArray]:
+    """``W (N, r, n)`` and ``b (N, r)`` of the rows that count, eqs. (1) and (5), log after log.
 
-    Where the log's signals were derived by a filter, the same filter acts on both sides of the equation.
+    Where a log's signals were derived by a filter, the same filter acts on both sides of the equation.  A per-log
+    parameter has a column per log, which is zero in the rows of the others.
     """
-    model, log = observations.model, observations.log
-    W, b = compile_map(model.regressor)(*observations.state_arrays(), observations.acting_inputs())
-    W = W.reshape(len(observations), model.n_p, model.n_v).transpose(0, 2, 1)
-    W, b = (preprocessing.filter_rows(log, rows, observations.valid) for rows in (W, b))
-    return np.ascontiguousarray(W[observations.valid]), np.ascontiguousarray(b[observations.valid])
+    parts = [_segment_regression(one) for one in dataset.segments]
+    W = [dataset.layout.scattered(W, i) for i, (W, _) in enumerate(parts)]
+    if len(parts) == 1:
+        return W[0], parts[0][1]
+    return np.concatenate(W), np.concatenate([b for _, b in parts])
+
+
+def _segment_regression(one: Segment) -> tuple[FloatArray, FloatArray]:
+    """Rows of one log in its own parameters."""
+    model, log = one.model, one.log
+    W, b = compile_map(model.regressor)(*one.state_arrays(), one.acting_inputs())
+    W = W.reshape(len(one), model.n_p, model.n_v).transpose(0, 2, 1)
+    W, b = (preprocessing.filter_rows(log.filter, log.dt, rows, one.valid) for rows in (W, b))
+    return np.ascontiguousarray(W[one.valid]), np.ascontiguousarray(b[one.valid])
 
 
 def column_scale(columns: FloatArray) -> FloatArray:

@@ -1,82 +1,109 @@
-"""Hypotheses over one log: bounds, simulation, error and inliers, as a search asks for them."""
+"""Evaluation: the one place that simulates a dataset with parameters and judges the simulation."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import LogError, SettingsError
-from diransac.identification.methods.consensus import Score, Variant
-from diransac.simulation import Scores, default_threads, rollouts
+from diransac.identification.estimate import Evaluation, Resolution
+from diransac.simulation import Measurements, RolloutBatch, default_threads, rollouts
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from diransac.data.dataset import Observations
+    from diransac.data.dataset import Dataset, Segment
     from diransac.data.log import Log
-    from diransac.identification.diagnosis import Diagnosis
+    from diransac.identification.estimate import Diagnosis, Estimate
     from diransac.identification.settings import Settings
     from diransac.model import Model
+    from diransac.simulation import ScoreBatch, Simulator
 
-__all__ = ["Scoring", "Simulation", "as_diagnosed", "choose_scoring", "judged_signals"]
-
+__all__ = [
+    "Scores",
+    "Scoring",
+    "Simulation",
+    "as_estimated",
+    "choose_scoring",
+    "evaluate",
+    "judged_signals",
+    "mean_squared_error",
+    "rms_error",
+]
 
 _THRESHOLD_IN_SPREADS = 0.2
 _ACCELERATION_WEIGHT = 0.1
+_DEFAULT_RESOLUTION = Resolution()
+
+
+# ---------------------------------------------------------------------- what judges
 
 
 @dataclass(frozen=True)
 class Scoring:
-    """Which signals judge a simulation: error weights and inlier thresholds ``(n_s,)``, and how many make an inlier."""
+    """Error weights and inlier thresholds ``(n_s,)`` of a dataset's signals, and how many signals make an inlier."""
 
     weights: FloatArray
     thresholds: FloatArray
     min_inlier_signals: int
     notes: tuple[str, ...] = ()
 
+    @property
+    def judged(self) -> BoolArray:
+        """Signals ``(n_s,)`` that have a weight or a threshold."""
+        return np.asarray((self.weights > 0.0) | (self.thresholds > 0.0))
 
-def judged_signals(model: Model, log: Log, settings: Settings) -> tuple[str, ...]:
-    """Names of the signals that the settings let judge a simulation; by default rates, and coordinates without one."""
+
+def judged_signals(model: Model, logs: Sequence[Log], settings: Settings) -> tuple[str, ...]:
+    """Names of the signals whose simulation is judged: those that the settings name, or the default ones.
+
+    By default velocities and accelerations, and coordinates of which no velocity is measured, as far as every log has
+    them.
+    """
     named = {**(settings.error_weights or {}), **(settings.inlier_thresholds or {})}
     chosen = {n for n, x in named.items() if x > 0.0}
     if settings.error_weights is None or settings.inlier_thresholds is None:
-        chosen.update(_judged_by_default(model, log))
+        chosen.update(_judged_by_default(model, [n for n in model.signals if all(n in log for log in logs)]))
     return tuple(n for n in model.signals if n in chosen)
 
 
-def _judged_by_default(model: Model, log: Log) -> tuple[str, ...]:
-    rates = [n for n in (*model.velocities, *model.accelerations) if n in log]
+def _judged_by_default(model: Model, measured: Sequence[str]) -> tuple[str, ...]:
+    rates = [n for n in (*model.velocities, *model.accelerations) if n in measured]
     if model.kinematics is not None:
-        bare = [] if any(n in log for n in model.velocities) else [q for q in model.coordinates if q in log]
+        bare = [] if any(n in measured for n in model.velocities) else [q for q in model.coordinates if q in measured]
     else:
         pairs = zip(model.coordinates, model.velocities, strict=True)
-        bare = [q for q, v in pairs if q in log and v not in log]
+        bare = [q for q, v in pairs if q in measured and v not in measured]
     return (*bare, *rates)
 
 
-def choose_scoring(observations: Observations, settings: Settings) -> Scoring:
-    """Weights and thresholds from the settings, or from each signal's spread in the log where they are None.
+def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
+    """Weights and thresholds from the settings, or from each signal's spread in the dataset where they are None.
 
-    Raises SettingsError: they name a signal that is not there, or leave nothing to judge by; LogError: every signal is
-    constant.
+    Raises
+    ------
+    SettingsError
+        The settings name a signal that is not there, or leave nothing to judge by.
+    LogError
+        Every signal is constant.
     """
-    by_default = _judged_by_default(observations.model, observations.log)
-    scales = {n: observations.scales[n] for n in by_default}
+    by_default = _judged_by_default(dataset.model, dataset.common_signals)
+    scales = {n: dataset.scales[n] for n in by_default}
     constant = [n for n, scale in scales.items() if scale == 0.0]
     weights, thresholds = settings.error_weights, settings.inlier_thresholds
     if weights is None or thresholds is None:
         if len(constant) == len(scales):
-            raise LogError(f"{observations.log.source}: {', '.join(scales)} are constant; nothing moves in this log")
+            raise LogError(f"{dataset.source}: {', '.join(scales)} are constant; nothing moves in this log")
         moving = {n: scale for n, scale in scales.items() if scale > 0.0}
-        slow = observations.model.accelerations
+        slow = dataset.model.accelerations
         if weights is None:
             weights = {n: (_ACCELERATION_WEIGHT if n in slow else 1.0) / x for n, x in moving.items()}
         if thresholds is None:
             thresholds = {n: _THRESHOLD_IN_SPREADS * x for n, x in moving.items()}
-    w, eps = observations.by_signal(weights), observations.by_signal(thresholds)
+    w, eps = dataset.by_signal(weights), dataset.by_signal(thresholds)
     if not (w > 0.0).any():
         raise SettingsError("every error weight is zero; give one signal a positive weight")
     n_signals = int((eps > 0.0).sum())
@@ -85,83 +112,220 @@ def choose_scoring(observations: Observations, settings: Settings) -> Scoring:
         raise SettingsError(
             f"min_inlier_signals = {needed}, but {n_signals} signals have an inlier threshold: nothing can be an inlier"
         )
-    judging = ", ".join(n for n, x in zip(observations.signals, eps, strict=True) if x > 0.0)
+    judging = ", ".join(n for n, x in zip(dataset.signals, eps, strict=True) if x > 0.0)
     notes = [f"{n} is constant and judges nothing" for n in constant]
     notes.append(f"a row is an inlier if {needed} of its {n_signals} judging signals are near: {judging}")
     return Scoring(w, eps, needed, tuple(notes))
 
 
-def as_diagnosed(observations: Observations, settings: Settings, diagnosis: Diagnosis) -> tuple[Observations, Settings]:
-    """The log with its inputs acting as late as they do, and settings that start where the machine was.
+# ---------------------------------------------------------------------- simulation
 
-    That is the first sample, as by default, but for samples that are missing or outliers.
+
+@dataclass(frozen=True)
+class Scores:
+    """Agreement of hypotheses with a dataset; a hypothesis is a lane.
+
+    Parameters
+    ----------
+    sum_squares : (n_lanes, n_s)   sum over the rows that count of squared errors, infinite where a rollout diverged
+    inlier_count : (n_lanes,)   rows that are inliers
+    batches : one per log
     """
-    if diagnosis.input_delay_significant:
-        time = observations.log.dt * np.arange(len(observations))
-        columns = [np.interp(time - diagnosis.input_delay, time, column) for column in observations.inputs.T]
-        observations = replace(observations, inputs=np.column_stack(columns))
-    return observations, replace(settings, initial_state=_start(observations, settings, diagnosis))
+
+    sum_squares: FloatArray
+    inlier_count: IntArray
+    batches: tuple[ScoreBatch, ...]
+
+    def inlier_masks(self, lane: int) -> list[BoolArray]:
+        """Inliers ``(N,)`` of one hypothesis over all rows of each log; a row that does not count is none."""
+        return [batch.inliers(lane) for batch in self.batches]
 
 
-def _start(observations: Observations, settings: Settings, diagnosis: Diagnosis) -> str | Mapping[str, float]:
-    if settings.initial_state != "first":
-        return settings.initial_state
-    start = {name: float(motion[0]) for name, motion in diagnosis.smoothed_states.items()}
+class Simulation:
+    """Simulations of a dataset; in `score`, each log from an initial state of its own.
+
+    Parameters
+    ----------
+    dataset : logs, whose inputs drive the simulation
+    signals : (n_s,)   Boolean: signals of the dataset that are compared with the measured ones; None: all
+    resolution : integrator and steps
+    rules : rule of each log's initial state, as ``Settings.initial_state``
+    threads : None: one per core
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        signals: BoolArray | None = None,
+        resolution: Resolution = _DEFAULT_RESOLUTION,
+        rules: Sequence[str | Mapping[str, float]] | None = None,
+        threads: int | None = None,
+    ) -> None:
+        compared = np.ones(len(dataset.signals), bool) if signals is None else signals
+        names = [n for n, j in zip(dataset.signals, compared, strict=True) if j]
+        self._dataset, self._compared = dataset, compared
+        self._rules = ["first"] * len(dataset.segments) if rules is None else list(rules)
+        self._threads = threads or default_threads()
+        self._simulator: Simulator = rollouts(
+            dataset.model, names, integrator=resolution.integrator, substeps=resolution.substeps
+        )
+        self._measured = [
+            Measurements(np.ascontiguousarray(one.measured[:, compared]), one.valid) for one in dataset.segments
+        ]
+
+    @cached_property
+    def starts(self) -> list[FloatArray]:
+        """Initial state ``(n_x,)`` of each log.
+
+        Raises
+        ------
+        LogError
+            A log lacks its initial state.
+        """
+        return [one.initial_state(rule) for one, rule in zip(self._dataset.segments, self._rules, strict=True)]
+
+    def score(self, parameters: FloatArray, thresholds: FloatArray, min_inlier_signals: int) -> Scores:
+        """Sums of squared errors and inliers of every hypothesis ``(n_lanes, n)`` over all logs."""
+        batches = []
+        for i, one in enumerate(self._dataset.segments):
+            lanes = RolloutBatch(self._dataset.layout.of_log(parameters, i), self.starts[i], one.inputs, one.log.dt)
+            found = self._simulator.score(
+                lanes, self._measured[i], thresholds, min_inlier_signals, threads=self._threads
+            )
+            batches.append(found)
+        sums, counts = batches[0].sum_squares, batches[0].inlier_count
+        for batch in batches[1:]:
+            sums, counts = sums + batch.sum_squares, counts + batch.inlier_count
+        return Scores(sums, counts, tuple(batches))
+
+    def restarted(
+        self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Simulations of one log that restart from given states.
+
+        Parameters
+        ----------
+        parameters : (n_p,)   of the model
+        states : (K, n_x)   initial state of each
+        start_rows : (K,)   first row of each; rows past the end of the log repeat the last input
+
+        Returns
+        -------
+        All signals of the model ``(K, n_rows, n_signals)``, and simulated less measured ``(K, n_rows, n_s)`` of the
+        compared ones, NaN from a divergence on; a missing sample counts as measured 0.
+        """
+        one, measured = self._dataset.segments[log], self._measured[log].values
+        more = ((0, max(0, int(start_rows.max()) + n_rows - len(one))), (0, 0))
+        inputs, measured = (np.pad(x, more, mode="edge") for x in (one.inputs, np.nan_to_num(measured)))
+        batch = RolloutBatch(
+            np.tile(parameters, (len(states), 1)), states, inputs, one.log.dt, start_rows=start_rows, n_rows=n_rows
+        )
+        compared = Measurements(measured, np.ones(len(measured), bool))
+        return self._simulator.trajectories(batch), self._simulator.errors(batch, compared)
+
+
+def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: Settings) -> Evaluation:
+    """Evaluation of an estimate on the logs that it was made from.
+
+    The simulation is as fine as the one that fitted; inputs act as late, and first states are, as the estimate has
+    them.  Nothing is simulated, and the fit error is NaN, where a log lacks its initial state.
+
+    Parameters
+    ----------
+    scoring : weights and thresholds
+    settings : initial states and threads
+    """
+    acting, rules = as_estimated(dataset, estimate.diagnosis, settings)
+    judged, weights = scoring.judged, scoring.weights[scoring.judged]
+    simulation = Simulation(acting, judged, estimate.resolution, rules, settings.threads)
+    try:
+        simulation.starts  # noqa: B018  refuses a log without an initial state
+    except LogError:
+        nothing = acting.on_given_logs([np.zeros(len(one), dtype=bool) for one in acting.segments])
+        unknown = np.full(len(acting.segments), np.nan)
+        return Evaluation(np.nan, np.nan, nothing, unknown, unknown)
+    scores = simulation.score(estimate.values[None], scoring.thresholds[judged], scoring.min_inlier_signals)
+    error_of = mean_squared_error if estimate.squared_error else rms_error
+    counts = [one.n_rows for one in acting.segments]
+    parts = list(zip(scores.batches, counts, strict=True))
+    return Evaluation(
+        fit_error=float(error_of(scores.sum_squares, acting.n_rows, weights)[0]),
+        inlier_fraction=float(scores.inlier_count[0] / acting.n_rows),
+        inliers=acting.on_given_logs(scores.inlier_masks(0)),
+        fit_errors=np.array([error_of(batch.sum_squares, n, weights)[0] for batch, n in parts]),
+        inlier_fractions=np.array([batch.inlier_count[0] / n for batch, n in parts]),
+    )
+
+
+def as_estimated(
+    dataset: Dataset, found: Diagnosis | None, settings: Settings
+) -> tuple[Dataset, list[str | Mapping[str, float]]]:
+    """The dataset with inputs that act as late as a diagnosis has them, and the rule of each log's initial state.
+
+    That is the first sample, as by default, but the smoothed state where the sample is missing or an outlier.
+    """
+    rule = settings.initial_state
+    if found is None:
+        return dataset, [rule] * len(dataset.segments)
+    delay = found.input_delay if found.input_delay_significant else 0.0
+    segments = tuple(_delayed(one, delay) for one in dataset.segments)
+    if rule != "first":
+        return replace(dataset, segments=segments), [rule] * len(segments)
+    begins = np.cumsum([0, *(len(log) for log in dataset.given)])
+    rules = [_first_state(one, i, int(begins[i]) + one.offset, found) for i, one in enumerate(segments)]
+    return replace(dataset, segments=segments), [*rules]
+
+
+def _delayed(one: Segment, delay: float) -> Segment:
+    """The segment with its inputs acting ``delay`` seconds later, interpolated linearly."""
+    if not delay:
+        return one
+    time = one.log.dt * np.arange(len(one))
+    columns = [np.interp(time - delay, time, column) for column in one.inputs.T]
+    return replace(one, inputs=np.column_stack(columns))
+
+
+def _first_state(one: Segment, log: int, row: int, found: Diagnosis) -> dict[str, float]:
+    """Values of the first row, which is ``row`` of all logs; smoothed ones for what is missing or an outlier."""
+    start = found.first_states(log)
     for name in start:
-        if name in diagnosis.outliers and not diagnosis.outliers[name][observations.offset]:
-            first = float(observations.column(name)[0])
+        if name in found.outliers and name in one.present and not found.outliers[name][row]:
+            first = float(one.column(name)[0])
             start[name] = first if np.isfinite(first) else start[name]
     return start
 
 
-class Simulation:
-    """Simulates hypotheses of one model over one log and judges them.
+# ---------------------------------------------------------------------- errors
 
-    Raises LogError: the initial state is missing.
+
+def rms_error(sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
+    """``e = sum_i w_i sqrt(sum_j err_ij^2 / N)``, the weighted RMS model-fit error of every hypothesis, eq. (2).
+
+    Parameters
+    ----------
+    sum_squares : (n_hypotheses, n_signals)   sum over time of squared errors, infinite where a rollout diverged
+    n_rows : N, observations in that sum
+    weights : (n_signals,)   w
+
+    Returns
+    -------
+    (n_hypotheses,).  Signals of zero weight are left out, so they add no 0 times infinity.
+
+    References
+    ----------
+    Dimmig et al. 2023, eq. (2).
     """
+    return _weighted_sum(np.sqrt(sum_squares / n_rows), weights)
 
-    def __init__(self, observations: Observations, scoring: Scoring, settings: Settings, variant: Variant) -> None:
-        judged = (scoring.weights > 0.0) | (scoring.thresholds > 0.0)
-        names = [n for n, j in zip(observations.signals, judged, strict=True) if j]
-        self._observations, self._variant, self._scoring = observations, variant, scoring
-        self._weights, self._thresholds = scoring.weights[judged], scoring.thresholds[judged]
-        self._rollouts = rollouts(observations.model, names, integrator=settings.integrator, substeps=settings.substeps)
-        self._log_arrays = (
-            observations.initial_state(settings.initial_state),
-            observations.inputs,
-            np.ascontiguousarray(observations.measured[:, judged]),
-            observations.valid,
-            observations.log.dt,
-        )
-        self._threads = settings.threads or default_threads()
-        self._latest: dict[bytes, tuple[Scores, int]] = {}
 
-    def admits(self, parameters: FloatArray) -> BoolArray:
-        """Preliminary test of ``(n, n_p)`` parameters: every one within its bounds."""
-        bounds = self._observations.model.parameters.values()
-        return np.asarray(np.all([x.admits(parameters[:, i]) for i, x in enumerate(bounds)], axis=0))
+def mean_squared_error(sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
+    """``e = sum_i w_i sum_j err_ij^2 / N``: DIRANSAC's error, eq. (2) without the root; shapes as in `rms_error`."""
+    return _weighted_sum(sum_squares / n_rows, weights)
 
-    def scores(self, parameters: FloatArray) -> list[Score]:
-        """Error and inlier fraction of every hypothesis ``(n, n_p)``."""
-        found = self._rollouts.score(
-            parameters, *self._log_arrays, self._thresholds, self._scoring.min_inlier_signals, threads=self._threads
-        )
-        self._latest = {p.tobytes(): (found, lane) for lane, p in enumerate(parameters)}
-        n_rows = self._observations.n_rows
-        errors = self._variant.errors(found.sum_squares, n_rows, self._weights)
-        fractions = found.inlier_count / n_rows
-        return [Score(e, f) for e, f in zip(errors.tolist(), fractions.tolist(), strict=True)]
 
-    def inlier_mask(self, parameters: FloatArray) -> BoolArray:
-        """Inliers ``(N,)`` of one hypothesis over all rows; a row that does not count is none (section III.D).
-
-        The latest `scores` found those of its hypotheses on the way; any other is simulated.
-        """
-        if parameters.tobytes() not in self._latest:
-            self.scores(parameters[None])
-        found, lane = self._latest[parameters.tobytes()]
-        return found.inliers(lane)
-
-    def inliers(self, parameters: FloatArray) -> IntArray:
-        """Usable rows that are inliers of one hypothesis ``(n_p,)``, ascending."""
-        return np.flatnonzero(self.inlier_mask(parameters)[self._observations.valid])
+def _weighted_sum(errors: FloatArray, weights: FloatArray) -> FloatArray:
+    """A sum over signals in their order: its rounding depends on no shape."""
+    total = np.zeros(len(errors))
+    for i in np.flatnonzero(weights > 0.0):
+        total += weights[i] * errors[:, i]
+    return total

@@ -1,310 +1,198 @@
-"""The one entry: a model and a log in, a `Result` out, whatever the method."""
+"""The one entry: a model and logs in, a `Result` out: dataset, method, estimate, evaluation."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
-from diransac.blas import single_threaded
 from diransac.data import preprocessing
-from diransac.data.dataset import Observations, observe
+from diransac.data.dataset import Dataset, as_logs
 from diransac.data.log import Log
-from diransac.errors import DiransacError, IdentificationError, LogError, SettingsError
-from diransac.identification.diagnosis import Diagnosis
-from diransac.identification.estimators import (
-    BoundEstimator,
-    Estimator,
-    OrdinaryLeastSquares,
-    TotalLeastSquares,
-    as_estimator,
-    name_of,
-)
-from diransac.identification.evaluation import Scoring, Simulation, as_diagnosed, choose_scoring, judged_signals
-from diransac.identification.methods.consensus import Diransac, InlierBiasedDiransac, Score, Variant
-from diransac.identification.methods.search import Hypothesis, Outcome, Progress, search
-from diransac.identification.nonlinear import NonlinearLeastSquares
-from diransac.identification.result import LogSummary, Result
-from diransac.identification.sampling import sample_rows
+from diransac.errors import DiransacError, SettingsError
+from diransac.identification.agreement import disagreements
+from diransac.identification.estimate import Evaluation, LogSummary
+from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
+from diransac.identification.method import Callback, Method, report, within
+from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, factory
+from diransac.identification.result import Result
 from diransac.identification.settings import Settings
-from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance
 from diransac.model import Model
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from diransac.identification.methods.lo_diransac import Findings
 
 __all__ = ["METHODS", "identify"]
 
 
-_ESTIMATORS: dict[str, Callable[[], Estimator]] = {
-    "ols": OrdinaryLeastSquares,
-    "tls": TotalLeastSquares,
-    "nls": NonlinearLeastSquares,
-}
-_VARIANTS: dict[str, Callable[[Settings], Variant]] = {
-    "diransac": lambda _: Diransac(),
-    "i-diransac": lambda settings: InlierBiasedDiransac(settings.acceptance_weights),
-}
-_LOCALLY_OPTIMISED = "lo-diransac"
-_GAUSSIAN = 10_000
-"""Degrees of freedom of an interval whose covariance is not itself an estimate from few numbers."""
-METHODS = (*_ESTIMATORS, *_VARIANTS, _LOCALLY_OPTIMISED)
-
-
 def identify(
     model: Model,
-    log: Log,
-    method: str = _LOCALLY_OPTIMISED,
+    logs: Log | Iterable[Log],
+    method: str | Method = DEFAULT,
     *,
     seed: int = 0,
     settings: Settings | None = None,
     estimator: object = None,
     differentiate: bool = False,
     bandwidth: float | None = None,
-    progress: Progress | None = None,
+    progress: Callback | None = None,
 ) -> Result:
-    """Parameters of ``model`` from ``log``.
+    """Parameters of a model from one log, or from several logs of one machine.
 
     Parameters
     ----------
-    method : "lo-diransac", which asks for nothing and says most; "ols", "tls", "nls" (least squares of the whole log:
-        ordinary, total, nonlinear); "diransac", "i-diransac", the paper's
-    seed : sample k of a RANSAC method depends on (seed, k) alone
-    settings : `Settings`; those of a search serve the paper's methods alone, those of the simulation serve the fit
-        error and the inliers of every method
-    estimator : inside a RANSAC method, `OrdinaryLeastSquares()` (default; `NonlinearLeastSquares()` where the model is
+    model : equations with the parameters to be estimated
+    logs : one log, or a sequence of logs.  Several share their parameters, but for those that are `Parameter.per_log`;
+        each has an initial state of its own, and nothing is continued from one to the next
+    method : name or object.  "lo-diransac" (default) needs no tuning and returns full diagnostics; "ols", "tls", "nls"
+        are least squares of all rows (ordinary, total, nonlinear); "diransac" and "i-diransac" are the paper's.  An
+        object, such as ``dr.LoDiransac(substeps=10)``, has settings of its own
+    seed : of all that is random; sample k of a search depends on (seed, k) alone
+    settings : of a method that is given by name.  A setting that the method has no use for is refused
+    estimator : inside the paper's methods: `OrdinaryLeastSquares` (default; `NonlinearLeastSquares` where the model is
         not affine in its parameters), another of ours, or any scikit-learn linear regressor
-    differentiate : derive the velocities and accelerations that the log lacks, and filter both sides of the
-        equations alike; the identification is then repeated at half and twice the bandwidth, for
-        ``result.bandwidth_sensitivity``.  lo-diransac leaves unmeasured what the log lacks, and has no such filter
-    bandwidth : of that filter, Hz; None: chosen from the log
-    progress : called with (samples drawn, max_iterations, score of the stored hypothesis)
+    differentiate : derive the velocities and accelerations that a log lacks, and filter both sides of the equations
+        alike; the identification is then repeated at half and twice the bandwidth, for
+        ``result.bandwidth_sensitivity``.  lo-diransac estimates what a log lacks, and has no such filter
+    bandwidth : of that filter, Hz; None: chosen from the logs
+    progress : called with a `Progress` now and then
 
-    Raises LogError: the log cannot serve; SettingsError: an argument has no meaning; ModelError: a linear method meets
-    a model that is not affine in its parameters; IdentificationError: the log does not determine the parameters, or
-    no hypothesis was accepted.
-    References: Dimmig et al. 2023, Algorithm 1.
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    LogError
+        A log lacks a signal, or cannot be used.
+    SettingsError
+        An argument has no meaning, or a setting no use.
+    ModelError
+        A linear method meets a model that is not affine in its parameters.
+    IdentificationError
+        The logs do not determine the parameters, or no hypothesis was accepted.
+
+    References
+    ----------
+    Dimmig et al. 2023, Algorithm 1.
     """
-    settings = Settings() if settings is None else settings
-    _check_arguments(model, log, method, estimator, seed, settings)
-    task = _Task(model, log, method, seed, settings, _estimator(model, method, estimator))
-    if bandwidth is not None and (not differentiate or method == _LOCALLY_OPTIMISED):
+    chosen = _method(method, settings, estimator)
+    given = as_logs(logs)
+    _check_arguments(model, seed)
+    filtered = differentiate and chosen.needs_all_signals
+    if bandwidth is not None and not filtered:
         raise SettingsError(
             "bandwidth is given without differentiate=True, which alone uses it (and lo-diransac does not)"
         )
-    if method == _LOCALLY_OPTIMISED:
-        return task.optimise(derivable=differentiate)
-    if not differentiate:
-        return task.run(log, progress)
-    derived = preprocessing.differentiate(log, model, bandwidth)
-    result = task.run(derived, progress)
-    return task.with_sensitivity(result, derived)
+    task = _Task(model, given, chosen, int(seed), pointwise=chosen.needs_all_signals or not differentiate)
+    if not filtered:
+        return task.run(given, progress)
+    derived = _derived(model, given, bandwidth)
+    result = task.run(derived, within(progress, 0.0, 0.4))
+    return task.with_sensitivity(result, derived, progress)
 
 
-def _check_arguments(
-    model: object, log: object, method: object, estimator: object, seed: object, settings: object
-) -> None:
+def _method(method: object, settings: object, estimator: object) -> Method:
+    """The method object, with the settings that are given beside its name."""
+    if settings is not None and not isinstance(settings, Settings):
+        raise SettingsError(f"settings is {settings!r}; give a dr.Settings, such as dr.Settings(sample_size=75)")
+    if not isinstance(method, str):
+        if not hasattr(method, "fit") or isinstance(method, type):
+            raise SettingsError(f"method is {method!r}; give a name ({', '.join(METHODS)}) or an object")
+        if settings is not None or estimator is not None:
+            raise SettingsError("settings and estimator belong to a method's name; a method object has its own")
+        return method  # type: ignore[return-value]
+    make, of_search = factory(method), {}
+    if estimator is not None:
+        if method not in WITH_ESTIMATOR:
+            raise SettingsError(f'estimator serves the RANSAC methods; method "{method}" is an estimator itself')
+        of_search["estimator"] = estimator
+    return make(settings or Settings(), **of_search)
+
+
+def _check_arguments(model: object, seed: object) -> None:
     if not isinstance(model, Model):
         raise SettingsError(f"model is {model!r}; give a dr.Model, such as dr.models.planar_rotorcraft()")
-    if not isinstance(log, Log):
-        raise SettingsError(f"log is a {type(log).__name__}; give a dr.Log, such as dr.read_log(path)")
-    if method not in METHODS:
-        raise SettingsError(f'there is no method "{method}"; there are {", ".join(METHODS)}')
-    if estimator is not None and method not in _VARIANTS:
-        raise SettingsError(f'estimator serves the RANSAC methods; method "{method}" is an estimator itself')
-    if not isinstance(settings, Settings):
-        raise SettingsError(f"settings is {settings!r}; give a dr.Settings, such as dr.Settings(sample_size=75)")
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
         raise SettingsError(f"seed is {seed!r}; give a whole number")
 
 
-def _estimator(model: Model, method: str, candidate: object) -> Estimator:
-    if candidate is not None:
-        return as_estimator(candidate)
-    if method in _ESTIMATORS:
-        return _ESTIMATORS[method]()
-    return NonlinearLeastSquares() if model.nonlinear_parameters else OrdinaryLeastSquares()
+def _derived(model: Model, logs: Sequence[Log], bandwidth: float | None) -> tuple[Log, ...]:
+    """The logs with what they lack, all filtered with one bandwidth: the lowest that any of them calls for."""
+    found = [preprocessing.differentiate(log, model, bandwidth) for log in logs]
+    chosen = [log.filter.bandwidth for log in found if log.filter is not None]
+    lowest = min(chosen)
+    again = [x if used == lowest else preprocessing.differentiate(log, model, lowest) for x, used, log in zip(found, chosen, logs, strict=True)]
+    return tuple(again)
 
 
 @dataclass(frozen=True)
 class _Task:
-    """One identification, apart from how its log is prepared."""
+    """One identification, apart from how its logs are prepared."""
 
     model: Model
-    given: Log
-    method: str
+    given: tuple[Log, ...]
+    method: Method
     seed: int
-    settings: Settings
-    estimator: Estimator
+    pointwise: bool
 
-    def run(self, log: Log, progress: Progress | None = None) -> Result:
-        """Identify from a prepared log."""
-        observations = observe(self.model, log, judged_signals(self.model, log, self.settings))
-        bound = self.estimator.bind(observations)
-        if not bound.well_defined([np.arange(bound.n_rows)])[0]:
-            raise IdentificationError(self._undetermined(log, bound.unidentifiable()))
-        scoring = choose_scoring(observations, self.settings)
-        simulation = self._simulation(observations, scoring)
-        outcome = self._estimate(bound, simulation, progress)
-        best = outcome.best
-        assert best is not None
-        rows = np.sort(best.rows)
+    def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
+        """Identify from prepared logs."""
+        criteria = self.method.criteria
+        judged = judged_signals(self.model, logs, criteria)
+        dataset = Dataset.of(self.model, logs, judged, pointwise=self.pointwise, given=self.given)
+        scoring = choose_scoring(dataset, criteria)
+        several = len(logs) > 1
+        estimate = self.method.fit(dataset, self.seed, within(progress, 0.0, 0.5 if several else 0.95))
+        report(progress, "evaluating", 0.5 if several else 0.95)
+        evaluation = evaluate(estimate, dataset, scoring, criteria)
+        remarks = disagreements(self.method, dataset, self.seed, within(progress, 0.5, 1.0))
+        report(progress, "done", 1.0)
         return Result(
-            **self._judged(log, observations, simulation, best.parameters),
-            covariance=jackknife_covariance(bound, rows),
-            degrees_of_freedom=max(1, min(N_BLOCKS, len(rows)) - 1),
-            n_fitted=len(rows),
-            estimator=name_of(self.estimator),
-            iterations=outcome.iterations,
-            n_hypotheses=outcome.n_hypotheses,
-            stop_reason=outcome.stop_reason,
-            rejected=dict(outcome.rejected),
-            notes=(*observations.notes, *scoring.notes),
+            model=self.model,
+            method=self.method.name,
+            seed=self.seed,
+            settings=criteria,
+            options=dict(self.method.options()),
+            estimate=estimate,
+            evaluation=evaluation,
+            logs=_summaries(dataset, evaluation, remarks),
+            notes=(*dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x)),
         )
 
-    def optimise(self, *, derivable: bool) -> Result:
-        """Identify by lo-diransac; velocities and accelerations may be missing where they are derivable."""
-        from diransac.identification.methods.lo_diransac import find
-
-        judged = judged_signals(self.model, self.given, self.settings)
-        observations = observe(self.model, self.given, judged, pointwise=not derivable)
-        with single_threaded():  # its matrices are small: other cores would only wait
-            findings = find(observations, int(self.seed))
-        scoring = choose_scoring(observations, self.settings)
-        diagnosis = self._diagnosis(observations, findings)
-        acting, settings = as_diagnosed(observations, self.settings, diagnosis)
-        simulation = Simulation(acting, scoring, settings, self._variant())
-        covariance = findings.covariance.copy()
-        covariance[findings.unidentifiable] = covariance[:, findings.unidentifiable] = np.inf
-        return Result(
-            **self._judged(self.given, observations, simulation, findings.parameters),
-            covariance=covariance,
-            degrees_of_freedom=_GAUSSIAN,
-            n_fitted=int(np.isfinite(observations.measured).any(axis=1).sum()),
-            estimator="multiple shooting",
-            iterations=findings.samples,
-            n_hypotheses=findings.hypotheses,
-            stop_reason="settled" if findings.settled else "limit of steps",
-            rejected={},
-            notes=(*observations.notes, *findings.notes, *scoring.notes),
-            diagnosis=diagnosis,
-        )
-
-    def _judged(
-        self, log: Log, observations: Observations, simulation: Simulation | None, parameters: FloatArray
-    ) -> dict[str, Any]:
-        """What a result says of how it was made, and of the parameters that it returns."""
-        score, inliers = Score(np.nan, np.nan), np.zeros(len(observations), dtype=bool)
-        if simulation is not None:
-            score, inliers = simulation.scores(parameters[None])[0], simulation.inlier_mask(parameters)
-        given = self.given
-        return {
-            "model": self.model,
-            "parameters": dict(zip(self.model.parameters, parameters.tolist(), strict=True)),
-            "inliers": self._on_given_log(observations, inliers),
-            "inlier_fraction": score.inlier_fraction,
-            "fit_error": score.error,
-            "method": self.method,
-            "seed": int(self.seed),
-            "settings": self.settings,
-            "violations": self._violations(parameters),
-            "log": LogSummary(given.source, given.fingerprint, float(given.time[0]), given.dt, len(given)),
-            "preparation": tuple(log.history),
-        }
-
-    def _diagnosis(self, observations: Observations, findings: Findings) -> Diagnosis:
-        """What lo-diransac found beside the parameters, by name and over the rows of the log that the user gave."""
-        model, dt = self.model, observations.log.dt
-        columns = {name: model.signals.index(name) for name in observations.signals}
-        begin = observations.log.time[observations.offset]
-        forces = (
-            ()
-            if findings.unmodelled_forces is None
-            else zip(model.accelerations, findings.unmodelled_forces.T, strict=True)
-        )
-        return Diagnosis(
-            noise_std={name: float(findings.noise_std[k]) for name, k in columns.items()},
-            outlier_fraction={name: float(findings.outlier_fraction[k]) for name, k in columns.items()},
-            outliers={name: self._on_given_log(observations, findings.outliers[:, k]) for name, k in columns.items()},
-            unmodelled_time=begin + dt * findings.latent_middles,
-            unmodelled_accelerations=dict(
-                zip(model.accelerations, findings.unmodelled_accelerations.T.copy(), strict=True)
-            ),
-            unmodelled_forces={name: force.copy() for name, force in forces},
-            smoothed_time=begin + dt * (findings.latent_middles - findings.latent_middles[0]),
-            smoothed_states=dict(zip(model.state, findings.states.T.copy(), strict=True)),
-            input_delay=findings.input_delay,
-            input_delay_error=findings.input_delay_error,
-            input_delay_significant=findings.input_delay_significant,
-            unidentifiable=tuple(np.array(list(model.parameters))[findings.unidentifiable].tolist()),
-        )
-
-    def _variant(self) -> Variant:
-        """The variant that searches; least squares is judged by I-DIRANSAC's error, eq. (2)."""
-        return _VARIANTS.get(self.method, _VARIANTS["i-diransac"])(self.settings)
-
-    def _simulation(self, observations: Observations, scoring: Scoring) -> Simulation | None:
-        """What judges hypotheses; None where a least-squares method meets a log that nothing can be simulated from."""
-        try:
-            return Simulation(observations, scoring, self.settings, self._variant())
-        except LogError:
-            if self.method in _VARIANTS:
-                raise
-            return None
-
-    def _estimate(self, bound: BoundEstimator, simulation: Simulation | None, progress: Progress | None) -> Outcome:
-        if simulation is None or self.method not in _VARIANTS:
-            rows = np.arange(bound.n_rows)
-            parameters = bound.fit([rows])[0]
-            if not np.isfinite(parameters).all():
-                raise IdentificationError(
-                    f"{self.given.source}: {self.method} finds no finite parameters; try another method"
-                )
-            best = Hypothesis(parameters, rows, Score(np.nan, np.nan))
-            return Outcome(best, n_hypotheses=1, stop_reason="whole log fitted")
-        if bound.n_rows < self.settings.sample_size:
-            raise LogError(
-                f"{self.given.source}: {bound.n_rows} usable rows are fewer than sample_size = "
-                f"{self.settings.sample_size}; give a longer log or a smaller sample_size"
-            )
-        return search(self._variant(), self.settings, bound, simulation, sample_rows, self.seed, progress)
-
-    def _violations(self, parameters: FloatArray) -> tuple[str, ...]:
-        pairs = zip(self.model.parameters.items(), parameters, strict=True)
-        return tuple(name for (name, bounds), x in pairs if not bounds.admits(x))
-
-    def _undetermined(self, log: Log, indices: tuple[int, ...]) -> str:
-        names = [list(self.model.parameters)[i] for i in indices] or list(self.model.parameters)
-        return (
-            f"{log.source}: the log does not determine {', '.join(names)}: the motion that would show "
-            f"{'it' if len(names) == 1 else 'them'} is missing or moves with another; record a livelier motion, or fix "
-            "parameters in the model"
-        )
-
-    def _on_given_log(self, observations: Observations, inliers: BoolArray) -> BoolArray:
-        """Inliers ``(N,)`` over the rows of the log that the user gave."""
-        begin = observations.log.time[observations.offset]
-        first = round(float(begin - self.given.time[0]) / self.given.dt)
-        mask = np.zeros(len(self.given), dtype=bool)
-        mask[first : first + len(inliers)] = inliers
-        return mask
-
-    def with_sensitivity(self, result: Result, derived: Log) -> Result:
+    def with_sensitivity(self, result: Result, derived: Sequence[Log], progress: Callback | None) -> Result:
         """The result with each parameter's relative change at half and twice the differentiating bandwidth."""
-        bandwidth = float(derived.history[-1]["bandwidth"])
-        changes = [self._change(result, bandwidth * factor) for factor in (0.5, 2.0)]
+        chosen = derived[0].filter
+        assert chosen is not None
+        changes = []
+        for k, factor in enumerate((0.5, 2.0)):
+            part = within(progress, 0.4 + 0.3 * k, 0.7 + 0.3 * k, f"{factor:g} x bandwidth: ")
+            changes.append(self._change(result, chosen.bandwidth * factor, part))
         pairs = {n: (changes[0][n], changes[1][n]) for n in result.parameters}
         return dataclasses.replace(result, bandwidth_sensitivity=pairs)
 
-    def _change(self, result: Result, bandwidth: float) -> dict[str, float]:
+    def _change(self, result: Result, bandwidth: float, progress: Callback | None) -> dict[str, float]:
         """Relative change of each parameter at another bandwidth; NaN where nothing was identified there."""
         try:
-            other = self.run(preprocessing.differentiate(self.given, self.model, bandwidth)).parameters
+            other = self.run(_derived(self.model, self.given, bandwidth), progress).parameters
         except DiransacError:
             return dict.fromkeys(result.parameters, np.nan)
         return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}
+
+
+def _summaries(dataset: Dataset, evaluation: Evaluation, remarks: Sequence[str]) -> tuple[LogSummary, ...]:
+    scores = zip(evaluation.fit_errors.tolist(), evaluation.inlier_fractions.tolist(), strict=True)
+    parts = zip(dataset.given, dataset.segments, scores, remarks, strict=True)
+    return tuple(
+        LogSummary(
+            log.source,
+            log.fingerprint,
+            float(log.time[0]),
+            log.dt,
+            len(log),
+            tuple(dict(step) for step in one.log.history),
+            error,
+            fraction,
+            remark,
+        )
+        for log, one, (error, fraction), remark in parts
+    )

@@ -24,7 +24,7 @@ from diransac.identification.estimators import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from diransac.data.dataset import Observations
+    from diransac.data.dataset import Dataset, Segment
     from diransac.model import Model, Parameter
     from diransac.simulation.compiler import Map
 
@@ -68,29 +68,29 @@ class NonlinearLeastSquares:
     max_steps: int = 60
     min_eigenvalue: float = 1e-6
 
-    def bind(self, observations: Observations) -> BoundEstimator:
-        """The estimator over the usable rows of a log."""
-        return _BoundNonlinear(self, observations)
+    def bind(self, dataset: Dataset) -> BoundEstimator:
+        """The estimator over the usable rows of a dataset."""
+        return _BoundNonlinear(self, dataset)
 
 
 class _BoundNonlinear:
     """Accelerations of the usable rows, and the model that predicts them."""
 
-    def __init__(self, settings: NonlinearLeastSquares, observations: Observations) -> None:
-        self._settings = settings
-        model = observations.model
-        q, v, a = (x[observations.valid] for x in observations.state_arrays())
-        known = [i for i, n in enumerate(model.accelerations) if n in observations.signals]
-        self._state, self._inputs = np.hstack([q, v]), observations.acting_inputs()[observations.valid]
-        self._accelerations = a[:, known]
+    def __init__(self, settings: NonlinearLeastSquares, dataset: Dataset) -> None:
+        self._settings, self._layout = settings, dataset.layout
+        model = dataset.model
+        known = [i for i, n in enumerate(model.accelerations) if n in dataset.common_signals]
+        parts = [_usable(one, known) for one in dataset.segments]
+        self._state, self._inputs, self._accelerations = (np.concatenate(x) for x in zip(*parts, strict=True))
+        self._log_of_row = np.repeat(np.arange(len(parts)), [len(x) for x, _, _ in parts])
         self._scale = np.sqrt(np.square(self._accelerations).mean(axis=0))
         self._scale[self._scale == 0.0] = 1.0
-        self._chart = _Chart(tuple(model.parameters.values()))
+        self._chart = _Chart(self._layout.bounds)
         self._evaluate = _compiled(model, known)
         self.n_rows = len(self._state)
-        self._n_p = model.n_p
+        self._n_p = len(self._layout)
         self._starts = self._chart.starts(settings.n_starts)
-        self._linear = None if model.nonlinear_parameters else OrdinaryLeastSquares().bind(observations)
+        self._linear = None if model.nonlinear_parameters else OrdinaryLeastSquares().bind(dataset)
         everything = np.arange(self.n_rows)[None]
         whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // _ROWS_FOR_WHOLE)]))
         self._starts = np.vstack([whole, self._starts])
@@ -99,7 +99,11 @@ class _BoundNonlinear:
         J = J / np.where(scale > 0.0, scale, 1.0)
         self._blocks = np.einsum("nri,nrj->nij", J, J)
 
+    def select(self, row_sets: Sequence[IntArray]) -> _SelectedRows:
+        return _SelectedRows(self, row_sets)
+
     def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
+        """Whether the Jacobian at the fit of all rows has full rank in each set of rows."""
         gram = np.array([self._blocks[rows].sum(axis=0) for rows in row_sets])
         return np.asarray(smallest_eigenvalue(gram) > self._settings.min_eigenvalue)
 
@@ -107,6 +111,7 @@ class _BoundNonlinear:
         return loose_parameters(self._blocks.sum(axis=0), self._settings.min_eigenvalue)
 
     def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        """Parameters ``(n_sets, n)``."""
         fits = np.empty((len(row_sets), self._n_p))
         for length in {len(rows) for rows in row_sets}:
             places = [i for i, rows in enumerate(row_sets) if len(rows) == length]
@@ -130,7 +135,7 @@ class _BoundNonlinear:
         best = np.argsort(costs, axis=1, kind="stable")[:, : self._settings.n_followed]
         followed = starts[best]
         if self._linear is not None:
-            solved = self._chart.clip(self._chart.to_free(self._linear.fit(list(rows))))
+            solved = self._chart.clip(self._chart.to_free(self._linear.select(list(rows)).fit()))
             followed = np.concatenate([solved[:, None], followed], axis=1)
         free, costs = self._descend(np.repeat(rows, followed.shape[1], axis=0), followed.reshape(-1, self._n_p))
         winner = np.argmin(costs.reshape(n_sets, -1), axis=1)
@@ -170,14 +175,52 @@ class _BoundNonlinear:
         n_lanes, n = rows.shape
         p, slope = self._chart.to_parameters(free), self._chart.slope(free)
         flat = rows.reshape(-1)
-        a, da = self._evaluate(self._state[flat], self._inputs[flat], np.repeat(p, n, axis=0))
-        da = da.reshape(len(flat), self._n_p, len(self._scale)).transpose(0, 2, 1)
+        own = self._own(p, rows)
+        a, da = self._evaluate(self._state[flat], self._inputs[flat], own)
+        da = self._scattered(da.reshape(len(flat), own.shape[1], len(self._scale)).transpose(0, 2, 1), flat)
         with np.errstate(over="ignore", invalid="ignore"):
             errors = ((a - self._accelerations[flat]) / self._scale).reshape(n_lanes, -1)
             J = (da / self._scale[:, None]).reshape(n_lanes, -1, self._n_p) * slope[:, None, :]
         bad = ~(np.all(np.abs(errors) < _HUGE, axis=1) & np.all(np.abs(J) < _HUGE, axis=(1, 2)))
         errors[bad], J[bad] = np.inf, 0.0
         return errors, J
+
+
+    def _own(self, p: FloatArray, rows: IntArray) -> FloatArray:
+        """Parameters of the model ``(B n, n_p)`` at each row of ``(B, n)``, from vectors ``(B, n_all)``."""
+        if self._layout.is_shared:
+            return np.repeat(p, rows.shape[1], axis=0)
+        index = self._layout.index[self._log_of_row[rows]]
+        return np.take_along_axis(p[:, None, :], index, axis=2).reshape(rows.size, -1)
+
+    def _scattered(self, J: FloatArray, rows: IntArray) -> FloatArray:
+        """Jacobian ``(B n, r, n_all)`` from that of each row's own parameters ``(B n, r, n_p)``."""
+        if self._layout.is_shared:
+            return J
+        full = np.zeros((*J.shape[:2], self._n_p))
+        index = np.broadcast_to(self._layout.index[self._log_of_row[rows]][:, None, :], J.shape)
+        np.put_along_axis(full, index, J, axis=2)
+        return full
+
+
+@dataclass(frozen=True)
+class _SelectedRows:
+    """Sets of rows for nonlinear least squares."""
+
+    bound: _BoundNonlinear
+    row_sets: Sequence[IntArray]
+
+    def well_defined(self) -> BoolArray:
+        return self.bound.well_defined(self.row_sets)
+
+    def fit(self) -> FloatArray:
+        return self.bound.fit(self.row_sets)
+
+
+def _usable(one: Segment, known: Sequence[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """States, inputs and known accelerations of one log's usable rows."""
+    q, v, a = (x[one.valid] for x in one.state_arrays())
+    return np.hstack([q, v]), one.acting_inputs()[one.valid], a[:, known]
 
 
 class _Chart:

@@ -1,11 +1,11 @@
-"""What an identification found, and how: printed as a table, saved as JSON."""
+"""`Result`: an estimate with its evaluation and provenance; printed as a table, saved as JSON."""
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,105 +13,115 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.atomic import write_text
+from diransac.data.dataset import ParameterLayout
 from diransac.errors import DiransacError, ResultError, SettingsError
-from diransac.identification.diagnosis import Diagnosis
+from diransac.identification.estimate import Diagnosis, Estimate, Evaluation, LogSummary
+from diransac.identification.serialization import NumberPairs, Values, dump, load
 from diransac.identification.settings import Settings
 from diransac.model import Model
 from diransac.text_table import aligned, telling_digits
 
-__all__ = ["LogSummary", "Result"]
+__all__ = ["Result"]
 
-
-_FORMAT = 3
+_FORMAT = 4
 _FEW_INLIERS = 0.5
-_PLAIN = {
-    "method": str,
-    "estimator": str,
-    "seed": int,
-    "n_fitted": int,
-    "iterations": int,
-    "n_hypotheses": int,
-    "stop_reason": str,
-    "rejected": dict,
-}
 
 
 @dataclass(frozen=True)
-class LogSummary:
-    """Which log it was: how messages name it, SHA-256, first time (s), sampling time (s), rows."""
+class _Provenance:
+    """The plain part of a result's JSON."""
 
-    source: str
-    fingerprint: str
-    start: float
-    dt: float
-    n_rows: int
+    method: str
+    seed: int
+    logs: tuple[LogSummary, ...]
+    notes: tuple[str, ...]
+    options: Mapping[str, Any]
+    bandwidth_sensitivity: NumberPairs | None
+
+
+@dataclass(frozen=True)
+class _Derived:
+    """Figures of a result's JSON that follow from the rest, for programs that read it."""
+
+    units: Mapping[str, str]
+    standard_errors: Values
+    intervals_95: NumberPairs
+    violations: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
     """Parameters of a model with everything that is needed to judge and repeat them.
 
+    Two results are equal if all of it is.  A result serves as a plant: it has a ``model`` and its ``parameters``.
+
     Parameters
     ----------
     model : the model, equations included
-    parameters : name -> estimate, in the parameter's unit
-    covariance : (n_p, n_p)   lo-diransac's own, else by a jackknife over stretches of time; infinite where the log
-        cannot tell
-    degrees_of_freedom : of that covariance, for intervals
-    inliers : (N,)   over the rows of the log that was given
-    n_fitted : observations that the parameters were fitted to: a sample, or a set of inliers
-    inlier_fraction : of the rows that count
-    fit_error : eq. (2) of the returned parameters (its square sibling for DIRANSAC); NaN where nothing could be
-        simulated, infinite where the simulation diverged
-    method, estimator, seed, settings : how it was made
-    iterations : k, samples drawn; n_hypotheses : hypotheses looked at, refits included
-    stop_reason : why the search ended; rejected : hypotheses that went no further, by reason
-    violations : names of the parameters outside their bounds (never with a RANSAC method)
-    log : which log it was; preparation : what was done to it, in order; notes : what was found on the way
+    method, seed, settings, options : how it was made; ``options`` are the method's own settings
+    estimate : parameters, covariance, and what the method found beside them
+    evaluation : agreement of a simulation of every log with the measured signals
+    logs : the logs that it was made from
+    notes : findings on the way, a sentence each
     bandwidth_sensitivity : name -> relative change at half and at twice the differentiating filter's bandwidth
-    diagnosis : lo-diransac's: noise, faults, and what the model leaves out
-
-    Two results are equal if all of this is.
     """
 
     model: Model
-    parameters: Mapping[str, float]
-    covariance: FloatArray
-    degrees_of_freedom: int
-    n_fitted: int
-    inliers: BoolArray
-    inlier_fraction: float
-    fit_error: float
     method: str
-    estimator: str
     seed: int
     settings: Settings
-    iterations: int
-    n_hypotheses: int
-    stop_reason: str
-    rejected: Mapping[str, int]
-    violations: tuple[str, ...]
-    log: LogSummary
-    preparation: tuple[Mapping[str, Any], ...] = ()
+    estimate: Estimate
+    evaluation: Evaluation
+    logs: tuple[LogSummary, ...]
     notes: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
     bandwidth_sensitivity: Mapping[str, tuple[float, float]] | None = None
-    diagnosis: Diagnosis | None = None
 
-    def __post_init__(self) -> None:
-        for name in ("covariance", "inliers"):
-            array = np.array(getattr(self, name))
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+    # ------------------------------------------------------------------ parameters
+
+    @cached_property
+    def layout(self) -> ParameterLayout:
+        """Places of each log's parameters in the estimate."""
+        return ParameterLayout(self.model.parameters, len(self.logs))
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Estimate of each parameter in its unit; of a per-log parameter, the mean over the logs."""
+        if self.layout.is_shared:
+            return dict(self.estimate.parameters)
+        return dict(zip(self.model.parameters, (self.layout.mean_map @ self.estimate.values).tolist(), strict=True))
+
+    @property
+    def per_log(self) -> dict[str, tuple[float, ...]]:
+        """Values of each per-log parameter, one per log."""
+        values = self.estimate.values
+        pairs = zip(self.model.parameters.items(), self.layout.index.T, strict=True)
+        return {name: tuple(values[own].tolist()) for (name, x), own in pairs if x.per_log}
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance ``(n_p, n_p)`` of `parameters`; infinite variances where the logs do not determine one."""
+        if self.layout.is_shared:
+            return self.estimate.covariance
+        known = np.isfinite(np.diag(self.estimate.covariance))
+        finite = np.where(np.outer(known, known), self.estimate.covariance, 0.0)
+        mapped = self.layout.mean_map @ finite @ self.layout.mean_map.T
+        lost = (self.layout.mean_map[:, ~known] != 0.0).any(axis=1)
+        mapped[lost] = mapped[:, lost] = np.inf
+        return np.asarray(mapped)
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Standard error of each parameter in its unit; see `uncertainty.jackknife_covariance` for what it covers."""
-        return dict(zip(self.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+        """Standard error of each parameter in its unit."""
+        return dict(zip(self.model.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """``(low, high)`` of each parameter, by Student's t.
 
-        Raises SettingsError: the level is not between 0 and 1.
+        Raises
+        ------
+        SettingsError
+            The level is not between 0 and 1.
         """
         if not 0.0 < level < 1.0:
             raise SettingsError(f"level is {level}; give a number between 0 and 1, such as 0.95")
@@ -122,43 +132,98 @@ class Result:
         return {n: (x - width * errors[n], x + width * errors[n]) for n, x in self.parameters.items()}
 
     @property
+    def violations(self) -> tuple[str, ...]:
+        """Names of the parameters outside their bounds (never with a RANSAC method)."""
+        return self.layout.violations(self.estimate.values)
+
+    @property
     def units(self) -> dict[str, str]:
         """Unit of each parameter."""
         return {n: x.unit for n, x in self.model.parameters.items()}
 
+    # ------------------------------------------------------------------ estimate and evaluation by their names
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Degrees of freedom of the covariance."""
+        return self.estimate.degrees_of_freedom
+
+    @property
+    def n_fitted(self) -> int:
+        """Observations that the parameters were fitted to: a sample, or a set of inliers."""
+        return self.estimate.n_fitted
+
+    @property
+    def estimator(self) -> str:
+        """Name of the estimator."""
+        return self.estimate.estimator
+
+    @property
+    def iterations(self) -> int:
+        """Samples drawn, the paper's k."""
+        return self.estimate.iterations
+
+    @property
+    def n_hypotheses(self) -> int:
+        """Hypotheses judged, refits included."""
+        return self.estimate.n_hypotheses
+
+    @property
+    def rejected(self) -> Mapping[str, int]:
+        """Hypotheses that went no further, by reason."""
+        return self.estimate.rejected
+
+    @property
+    def stop_reason(self) -> str:
+        """Reason why the search ended."""
+        return self.estimate.stop_reason
+
+    @property
+    def diagnosis(self) -> Diagnosis | None:
+        """Noise, faults and unmodelled forces, from lo-diransac."""
+        return self.estimate.diagnosis
+
+    @property
+    def fit_error(self) -> float:
+        """Eq. (2) of the parameters (its square sibling for DIRANSAC); NaN if nothing could be simulated."""
+        return self.evaluation.fit_error
+
+    @property
+    def inlier_fraction(self) -> float:
+        """Inliers over the rows that count."""
+        return self.evaluation.inlier_fraction
+
+    @property
+    def inliers(self) -> BoolArray:
+        """Inliers ``(N,)`` over the rows of the logs that were given, log after log."""
+        return self.evaluation.inliers
+
+    # ------------------------------------------------------------------ logs
+
+    def log_rows(self, i: int) -> slice:
+        """Rows of log ``i`` among the rows of all logs."""
+        begin = sum(log.n_rows for log in self.logs[:i])
+        return slice(begin, begin + self.logs[i].n_rows)
+
     @property
     def inlier_times(self) -> FloatArray:
-        """Log time of every inlier, s."""
-        return np.asarray(self.log.start + self.log.dt * np.flatnonzero(self.inliers))
+        """Time of every inlier in its own log, s."""
+        parts = [
+            log.start + log.dt * np.flatnonzero(self.inliers[self.log_rows(i)]) for i, log in enumerate(self.logs)
+        ]
+        return np.concatenate(parts)
+
+    # ------------------------------------------------------------------ files
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON; `from_dict` reads it back."""
         return {
             "format": _FORMAT,
-            "method": self.method,
-            "estimator": self.estimator,
-            "seed": self.seed,
-            "parameters": dict(self.parameters),
-            "units": self.units,
-            "standard_errors": {n: _encode(x) for n, x in self.standard_errors.items()},
-            "intervals_95": {n: [_encode(x) for x in pair] for n, pair in self.intervals().items()},
-            "covariance": [[_encode(x) for x in row] for row in self.covariance],
-            "degrees_of_freedom": self.degrees_of_freedom,
-            "n_fitted": self.n_fitted,
-            "inlier_fraction": _encode(self.inlier_fraction),
-            "fit_error": _encode(self.fit_error),
-            "iterations": self.iterations,
-            "n_hypotheses": self.n_hypotheses,
-            "stop_reason": self.stop_reason,
-            "rejected": dict(self.rejected),
-            "violations": list(self.violations),
-            "notes": list(self.notes),
-            "bandwidth_sensitivity": _encode_pairs(self.bandwidth_sensitivity),
-            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
-            "preparation": [dict(step) for step in self.preparation],
-            "log": vars(self.log).copy(),
+            **dump(_Provenance(**{n: getattr(self, n) for n in _Provenance.__dataclass_fields__})),
+            **dump(self.estimate),
+            **dump(self.evaluation),
+            **dump(_Derived(self.units, self.standard_errors, self.intervals(), self.violations)),
             "settings": self.settings.to_dict(),
-            "inliers": base64.b64encode(np.packbits(self.inliers).tobytes()).decode(),
             "model": self.model.to_dict(),
         }
 
@@ -166,7 +231,10 @@ class Result:
     def from_dict(cls, data: object) -> Result:
         """The result that `to_dict` wrote.
 
-        Raises ResultError: the data are of another format, or damaged.
+        Raises
+        ------
+        ResultError
+            The data are of another format, or damaged.
         """
         if not isinstance(data, Mapping) or data.get("format") != _FORMAT:
             raise ResultError(f"this is no diransac result of format {_FORMAT}; identify again")
@@ -177,34 +245,17 @@ class Result:
 
     @classmethod
     def _from_checked(cls, data: Mapping[str, Any]) -> Result:
-        model = Model.from_dict(data["model"])
-        log = LogSummary(**data["log"])
-        packed = np.frombuffer(base64.b64decode(data["inliers"], validate=True), dtype=np.uint8)
-        if len(packed) != (log.n_rows + 7) // 8:
-            raise ValueError(f"inliers of {log.n_rows} rows")
-        values = model.parameter_vector(data["parameters"])
-        pairs, diagnosis = data["bandwidth_sensitivity"], data["diagnosis"]
-        return cls(
-            model=model,
-            parameters=dict(zip(model.parameters, values.tolist(), strict=True)),
-            covariance=np.array([[_decode(x) for x in row] for row in data["covariance"]]).reshape(
-                model.n_p, model.n_p
-            ),
-            degrees_of_freedom=int(data["degrees_of_freedom"]),
-            inliers=np.unpackbits(packed, count=log.n_rows).astype(bool),
-            inlier_fraction=_decode(data["inlier_fraction"]),
-            fit_error=_decode(data["fit_error"]),
-            settings=Settings.from_dict(data["settings"]),
-            violations=tuple(data["violations"]),
-            notes=tuple(data["notes"]),
-            preparation=tuple(data["preparation"]),
-            bandwidth_sensitivity=None
-            if pairs is None
-            else {n: (_decode(a), _decode(b)) for n, (a, b) in pairs.items()},
-            diagnosis=None if diagnosis is None else Diagnosis.from_dict(diagnosis, log.n_rows),
-            log=log,
-            **{key: _of_kind(kind, data[key], key) for key, kind in _PLAIN.items()},
-        )
+        model, plain = Model.from_dict(data["model"]), load(_Provenance, data)
+        estimate, evaluation = load(Estimate, data), load(Evaluation, data)
+        layout = ParameterLayout(model.parameters, len(plain.logs))
+        if tuple(estimate.parameters) != layout.names:
+            raise ValueError(f"parameters {', '.join(estimate.parameters)}")
+        n_rows = sum(log.n_rows for log in plain.logs)
+        masks = [] if estimate.diagnosis is None else estimate.diagnosis.outliers.values()
+        if any(len(mask) != n_rows for mask in (evaluation.inliers, *masks)):
+            raise ValueError(f"a mask of other than {n_rows} rows")
+        settings = Settings.from_dict(data["settings"])
+        return cls(model, estimate=estimate, evaluation=evaluation, settings=settings, **vars(plain))
 
     def save(self, path: str | Path) -> None:
         """Write JSON, whole or not at all.
@@ -235,7 +286,7 @@ class Result:
         return isinstance(other, Result) and self._text() == other._text()
 
     def __hash__(self) -> int:
-        return hash(self._text())
+        return hash((self.model, self.method, self.seed, self.fit_error))
 
     def _text(self) -> str:
         return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
@@ -244,9 +295,10 @@ class Result:
         return "\n".join([self._headline(), *self._table(), self._summary(), *self._diagnosed(), *self._warnings()])
 
     def _headline(self) -> str:
-        seconds = self.log.dt * (self.log.n_rows - 1)
-        rate = 1.0 / self.log.dt
-        return f"{self.model.name} by {self.method} from {self.log.source} ({seconds:.4g} s at {rate:.4g} Hz)"
+        many = len(self.logs) > 1
+        seconds = sum(log.dt * (log.n_rows - 1) for log in self.logs)
+        source = f"{len(self.logs)} logs" if many else self.logs[0].source
+        return f"{self.model.name} by {self.method} from {source} ({seconds:.4g} s at {1.0 / self.logs[0].dt:.4g} Hz)"
 
     def _table(self) -> list[str]:
         rows = [("parameter", "estimate", "95 % interval", "unit")]
@@ -272,12 +324,21 @@ class Result:
 
     def _diagnosed(self) -> list[str]:
         """What is wrong with the log and with the model, where it is known."""
-        if self.diagnosis is None:
-            return []
-        return ["", *aligned(self.diagnosis.lines(self.model.units)), ""]
+        lines = [] if len(self.logs) == 1 else ["", *aligned(self._log_lines())]
+        return lines if self.diagnosis is None else [*lines, "", *aligned(self.diagnosis.lines(self.model.units)), ""]
+
+    def _log_lines(self) -> list[list[str]]:
+        """Rows of a table: log, duration, fit error, inliers, per-log parameters."""
+        own = self.per_log
+        rows = [["log", "s", "fit error", "inliers", *(f"{name} [{self.units[name]}]" for name in own)]]
+        for i, log in enumerate(self.logs):
+            inliers = f"{100.0 * log.inlier_fraction:.1f} %"
+            values = [f"{x[i]:.5g}" for x in own.values()]
+            rows.append([log.source, f"{log.dt * (log.n_rows - 1):.4g}", f"{log.fit_error:.4g}", inliers, *values])
+        return rows
 
     def _warnings(self) -> list[str]:
-        lines = [f"! {n} = {self.parameters[n]:.6g} is outside its bounds" for n in self.violations]
+        lines = [f"! {n} = {self.estimate.parameters[n]:.6g} is outside its bounds" for n in self.violations]
         lines += self._warnings_of_search() if self.diagnosis is None else self._warnings_of_diagnosis(self.diagnosis)
         for name, (half, double) in (self.bandwidth_sensitivity or {}).items():
             lines.append(
@@ -297,26 +358,7 @@ class Result:
         return lines
 
     def _warnings_of_diagnosis(self, found: Diagnosis) -> list[str]:
-        lines = [f"! the log cannot tell {name}: record a motion that depends on it" for name in found.unidentifiable]
+        lines = [f"! {name} is not identifiable from this log; excite it" for name in found.unidentifiable]
         if found.input_delay_significant:
-            lines.append(f"! inputs act {1e3 * found.input_delay:.3g} ms later than the log says")
+            lines.append(f"! inputs act {1e3 * found.input_delay:.3g} ms later than recorded")
         return lines
-
-
-def _encode(x: float) -> float | str:
-    """JSON has no infinity and no NaN."""
-    return float(x) if np.isfinite(x) else str(float(x))
-
-
-def _decode(x: float | str) -> float:
-    return float(x)
-
-
-def _of_kind(kind: type, value: Any, key: str) -> Any:
-    if not isinstance(value, kind):
-        raise TypeError(f"{key} {value!r}")
-    return value
-
-
-def _encode_pairs(pairs: Mapping[str, tuple[float, float]] | None) -> dict[str, list[float | str]] | None:
-    return None if pairs is None else {n: [_encode(x) for x in pair] for n, pair in pairs.items()}

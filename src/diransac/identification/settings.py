@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,10 +12,19 @@ import numpy as np
 from diransac.errors import SettingsError
 from diransac.simulation import INTEGRATORS
 
-__all__ = ["Settings"]
+__all__ = ["EXECUTION", "JUDGING", "SIMULATION", "Settings", "check_used"]
 
 REFITS = ("inliers", "none")
 INITIAL_STATES = ("first", "robust")
+
+JUDGING = ("inlier_thresholds", "min_inlier_signals", "error_weights")
+"""Settings of the fit error and the inliers, which every method's evaluation has."""
+
+SIMULATION = ("integrator", "substeps", "initial_state")
+"""Settings of the simulation that is judged."""
+
+EXECUTION = ("threads", "batch_size")
+"""Settings that change no answer; every method accepts them."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +115,11 @@ class Settings:
             acceptance_weights=(1.0, 0.06),
         )
 
+    def changed(self) -> tuple[str, ...]:
+        """Names of the settings that differ from their defaults."""
+        default = Settings()
+        return tuple(f.name for f in dataclasses.fields(self) if getattr(self, f.name) != getattr(default, f.name))
+
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Settings:
         """Settings from a mapping, such as a TOML table or `to_dict`'s.
@@ -121,6 +135,22 @@ class Settings:
     def to_dict(self) -> dict[str, Any]:
         """Every setting by name, ready for JSON."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
+
+
+def check_used(settings: Settings, used: Collection[str], method: str) -> None:
+    """Refuse settings that a method has no use for.
+
+    Raises
+    ------
+    SettingsError
+        A setting that is not in ``used`` differs from its default; it is named.
+    """
+    unused = [name for name in settings.changed() if name not in (*used, *EXECUTION)]
+    if unused:
+        raise SettingsError(
+            f'method "{method}" has no use for the setting {unused[0]} = {getattr(settings, unused[0])!r}; leave it out'
+            f" (it uses {', '.join(used)})"
+        )
 
 
 def _positive_integer(name: str, value: object) -> int:

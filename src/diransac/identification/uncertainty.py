@@ -37,7 +37,7 @@ def jackknife_covariance(estimator: BoundEstimator, rows: IntArray) -> FloatArra
     groups = [g for g in np.array_split(rows, min(N_BLOCKS, len(rows))) if len(g)]
     fits = estimator.fit_without(groups, rows)
     n = len(fits)
-    determined = estimator.well_defined([np.setdiff1d(rows, group) for group in groups])
+    determined = estimator.select([np.setdiff1d(rows, group) for group in groups]).well_defined()
     if n < 2 or not determined.all() or not np.isfinite(fits).all():
         return np.full((fits.shape[1], fits.shape[1]), np.inf)
     deviations = fits - fits.mean(axis=0)

@@ -377,13 +377,14 @@ def _parameter_to_dict(parameter: Parameter) -> dict[str, Any]:
         return float(x) if np.isfinite(x) else None
 
     lower, upper = finite(parameter.lower), finite(parameter.upper)
-    return {"unit": parameter.unit, "lower": lower, "upper": upper, "positive": parameter.positive}
+    stored = {"unit": parameter.unit, "lower": lower, "upper": upper, "positive": parameter.positive}
+    return {**stored, "per_log": True} if parameter.per_log else stored
 
 
 def _parameter_from_dict(data: Mapping[str, Any]) -> Parameter:
     lower = -np.inf if data["lower"] is None else data["lower"]
     upper = np.inf if data["upper"] is None else data["upper"]
-    return Parameter(data["unit"], lower, upper, data["positive"])
+    return Parameter(data["unit"], lower, upper, data["positive"], bool(data.get("per_log", False)))
 
 
 def _checksum(data: Mapping[str, Any]) -> str:

@@ -21,6 +21,7 @@ class Parameter:
     unit : its unit, such as ``"kg m^2"``
     lower, upper : inclusive bounds in that unit
     positive : a strict lower bound of zero, for what cannot vanish (a mass)
+    per_log : one value per log (the bias of a sensor, a payload) where several logs are identified together
 
     Raises ModelError: the bounds leave no room, or are NaN.
     """
@@ -29,6 +30,7 @@ class Parameter:
     lower: float = -np.inf
     upper: float = np.inf
     positive: bool = False
+    per_log: bool = False
 
     def __post_init__(self) -> None:
         if not self.lower <= self.upper or (self.positive and self.upper <= 0.0):

@@ -1,1 +1,48 @@
-"""Identification methods, each a frozen object with its own settings."""
+"""Identification methods, each a frozen object with its own settings; `METHODS` names them.
+
+A new method is a file here and a line in the registry: its name, and the function that makes it from `Settings`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from diransac.errors import SettingsError
+
+if TYPE_CHECKING:
+    from diransac.identification.method import Method
+    from diransac.identification.settings import Settings
+
+__all__ = ["DEFAULT", "METHODS", "WITH_ESTIMATOR", "factory"]
+
+_REGISTRY = {
+    "ols": "least_squares:ordinary",
+    "tls": "least_squares:total",
+    "nls": "least_squares:nonlinear",
+    "diransac": "ransac:Diransac",
+    "i-diransac": "ransac:IDiransac",
+    "lo-diransac": "lo_diransac:configured",
+}
+METHODS = tuple(_REGISTRY)
+"""Names of all methods."""
+
+DEFAULT = "lo-diransac"
+WITH_ESTIMATOR = ("diransac", "i-diransac")
+"""Methods that take an estimator inside."""
+
+
+def factory(name: str) -> Callable[..., Method]:
+    """The function that makes a method from `Settings`.
+
+    Raises
+    ------
+    SettingsError
+        There is no method of that name; it lists those there are.
+    """
+    if name not in _REGISTRY:
+        raise SettingsError(f'there is no method "{name}"; there are {", ".join(METHODS)}')
+    module, _, attribute = _REGISTRY[name].partition(":")
+    found: Any = getattr(importlib.import_module(f"diransac.identification.methods.{module}"), attribute)
+    return found  # type: ignore[no-any-return]

@@ -1,19 +1,19 @@
 """The method lo-diransac: random minimal samples, consensus by simulation, local optimisation.
 
-| file | what it holds |
+| file | content |
 |---|---|
-| `method.py` | the steps in their order, and what they find |
-| `gate.py` | what is not to be used at all |
-| `smoothing.py` | the motion without a model |
+| `settings.py` | `LoDiransac`: settings, and `fit` |
+| `method.py` | the steps in their order |
+| `smoothing.py` | screening of samples, and the motion without a model |
 | `hypotheses.py` | samples in weak form, consensus |
-| `freed.py` | the model with what it may lack |
-| `windows.py` | the log as rollouts of that |
+| `augmented_model.py` | the model with discrepancies |
+| `shooting.py` | logs as intervals, each a rollout of the augmented model |
 | `mixture.py` | noise: a Gaussian and outliers |
-| `normal_equations.py`, `arrowhead.py` | all windows as one quadratic, and its solution in O(N) |
+| `normal_equations.py`, `arrowhead.py` | all intervals as one quadratic, and its solution in O(N) |
 | `refinement.py` | local optimisation, from easy to exact |
-| `readout.py` | parameters and covariance |
+| `instrumental_variables.py` | parameters and covariance |
 """
 
-from diransac.identification.methods.lo_diransac.method import Findings, find
+from diransac.identification.methods.lo_diransac.settings import LoDiransac, configured
 
-__all__ = ["Findings", "find"]
+__all__ = ["LoDiransac", "configured"]

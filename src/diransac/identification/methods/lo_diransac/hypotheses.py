@@ -3,7 +3,7 @@
 An equation that holds at every moment holds under any average, too.  Rows ``W p = b`` of the smoothed motion are
 averaged under a bump of a window's length: vibration and noise average out, and since the bump ends in zero, as if by
 parts, little depends on the accelerations.  A sample of few averages of each equation gives a first guess, and every
-guess is judged by simulation.
+guess is scored by simulation.
 
 References: Fischler, Bolles 1981 (RANSAC); Messenger, Bortz 2021 (weak form); Nister 2005 (judging many on little, few
 on all); Torr, Zisserman 2000.
@@ -20,72 +20,68 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.nonlinear import NonlinearLeastSquares
 from diransac.identification.sampling import sample_rows
-from diransac.simulation import rollouts
+from diransac.simulation import Measurements, RolloutBatch, rollouts
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import Observations
+    from diransac.data.dataset import Dataset
+    from diransac.identification.methods.lo_diransac.settings import LoDiransac
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
-    from diransac.identification.methods.lo_diransac.windows import Windows
-    from diransac.model import Model
 
-__all__ = ["WeakForm", "find_hypotheses", "n_samples", "robust_scores", "weak_form"]
+__all__ = ["WeakForm", "find_hypotheses", "robust_scores", "weak_form"]
 
-
-_COUNT = 200
-_NONLINEAR_COUNT = 100
-# Rows of a sample at most, in parameters: the fewer, the likelier that none of them is wrong.
-_MOST = 4
 _OVERLAP = 5
-_FIRST_WINDOWS, _FINALISTS = 12, 12
-
-
-def n_samples(model: Model) -> int:
-    """Samples that are drawn for a model."""
-    return _NONLINEAR_COUNT if model.nonlinear_parameters else _COUNT
 
 
 def find_hypotheses(
-    windows: Windows, motion: Motion, seed: int, observations: Observations
-) -> tuple[FloatArray, FloatArray]:
-    """Hypotheses ``(n, n_p)`` within their bounds, and their scores ``(n,)``, best first.
+    settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
+) -> FloatArray:
+    """Hypotheses ``(n_hypotheses, n)`` within their bounds, best first.
 
-    Samples are judged on a few windows, the best on all.
+    Samples are scored on a few intervals, the best on all.
     """
-    if windows.model.nonlinear_parameters:
-        finalists = _nonlinear(motion, seed, observations)
+    if intervals.model.nonlinear_parameters:
+        finalists = _nonlinear(settings, intervals, motion, seed, dataset)
     else:
-        finalists = _linear(windows, motion, seed)
+        finalists = _linear(settings, intervals, motion, seed)
     if not len(finalists):
-        return finalists, np.zeros(0)
-    scores = robust_scores(windows, motion, finalists, np.arange(len(windows)))
-    order = np.argsort(scores, kind="stable")[: np.isfinite(scores).sum()]
-    return finalists[order], scores[order]
+        return finalists
+    scores = robust_scores(intervals, motion, finalists, np.arange(len(intervals)))
+    return finalists[np.argsort(scores, kind="stable")[: np.isfinite(scores).sum()]]
 
 
-def _linear(windows: Windows, motion: Motion, seed: int) -> FloatArray:
+def _linear(settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, seed: int) -> FloatArray:
     """Finalists of a model that is affine in its parameters: the best of least squares of random averages."""
-    weak = weak_form(windows, motion)
-    few = np.unique(np.linspace(0, len(windows) - 1, min(_FIRST_WINDOWS, len(windows))).astype(int))
-    samples = _admitted(windows, weak.solve(_samples(weak, seed)))
+    weak = weak_form(intervals, motion)
+    n = len(intervals)
+    few = np.unique(np.linspace(0, n - 1, min(settings.n_screening_intervals, n)).astype(int))
+    samples = _admitted(intervals, weak.solve(_samples(settings, weak, seed)))
     if not len(samples):
         return samples
-    return samples[np.argsort(robust_scores(windows, motion, samples, few), kind="stable")[:_FINALISTS]]
+    order = np.argsort(robust_scores(intervals, motion, samples, few), kind="stable")
+    return samples[order[: settings.n_finalists]]
 
 
-def _nonlinear(motion: Motion, seed: int, observations: Observations) -> FloatArray:
+def _nonlinear(
+    settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
+) -> FloatArray:
     """Finalists of any model: nonlinear least squares of all and of random rows of the smoothed motion."""
-    smoothed = replace(
-        observations,
-        signals=tuple(observations.model.signals),
-        measured=motion.signals,
-        valid=np.ones(len(motion.signals), bool),
+    segments = tuple(
+        replace(
+            one,
+            signals=tuple(dataset.model.signals),
+            measured=motion.signals[rows][: len(one)],
+            valid=np.ones(len(one), bool),
+        )
+        for one, rows in zip(dataset.segments, intervals.rows_of_logs, strict=True)
     )
-    n, n_p = len(smoothed), observations.model.n_p
-    rows = sample_rows(seed, np.arange(_NONLINEAR_COUNT), n, 0, min(n, _MOST * n_p))
+    n, n_p = sum(map(len, segments)), intervals.n_p
+    rows = sample_rows(seed, np.arange(settings.n_nonlinear_samples), n, 0, min(n, settings.largest_sample * n_p))
     sizes = _generator(seed).integers(n_p, rows.shape[1] + 1, len(rows))
     samples = [np.sort(some[:size]) for some, size in zip(rows, sizes, strict=True)]
-    return NonlinearLeastSquares().bind(smoothed).fit([np.arange(n), *samples])
+    bound = NonlinearLeastSquares().bind(replace(dataset, segments=segments))
+    return bound.select([np.arange(n), *samples]).fit()
 
 
 @dataclass(frozen=True)
@@ -106,11 +102,11 @@ class WeakForm:
         return np.asarray(np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d)
 
 
-def _samples(weak: WeakForm, seed: int) -> BoolArray:
-    """All rows, and random sets of n_p to `_MOST` n_p rows of each equation."""
+def _samples(settings: LoDiransac, weak: WeakForm, seed: int) -> BoolArray:
+    """All rows, and random sets of n to ``largest_sample`` n rows of each equation, with n parameters."""
     rng = _generator(seed)
     n, r, n_p = weak.W.shape
-    sizes = np.r_[n, np.minimum(rng.integers(n_p, _MOST * n_p + 1, _COUNT), n)]
+    sizes = np.r_[n, np.minimum(rng.integers(n_p, settings.largest_sample * n_p + 1, settings.n_samples), n)]
     ranks = rng.random((len(sizes), n, r)).argsort(axis=1).argsort(axis=1)
     return np.asarray(ranks < sizes[:, None, None])
 
@@ -119,47 +115,59 @@ def _generator(seed: int) -> np.random.Generator:
     return np.random.default_rng([int(seed < 0), abs(seed)])
 
 
-def weak_form(windows: Windows, motion: Motion) -> WeakForm:
-    """Rows of the smoothed motion under overlapping bumps."""
-    model, H = windows.model, windows.length
-    n_q, n_v, n_p = model.n_q, model.n_v, model.n_p
-    N = len(motion.signals)
-    q, v, a = np.split(motion.signals, [n_q, n_q + n_v], axis=1)
-    W, b = compile_map(model.regressor)(q, v, a, windows.inputs[:N])
-    rows = np.concatenate([W, b], axis=1)
+def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
+    """Rows of the smoothed motion, averaged under overlapping bumps that lie within one log each."""
+    model, H, layout = intervals.model, intervals.length, intervals.layout
+    n_p, n_v = model.n_p, model.n_v
     bump = np.sin(np.pi * (np.arange(H) + 0.5) / H) ** 2
     bump /= bump.sum()
-    firsts = np.arange(0, N - H + 1, max(1, H // _OVERLAP))
-    means = np.lib.stride_tricks.sliding_window_view(rows, H, axis=0)[firsts] @ bump
-    W, b = means[:, : n_p * n_v].reshape(-1, n_p, n_v).swapaxes(1, 2), means[:, n_p * n_v :]
+    Ws, bs = [], []
+    for i, rows in enumerate(intervals.rows_of_logs):
+        logged = intervals.is_logged[rows]
+        q, v, a = np.split(motion.signals[rows][logged], [model.n_q, model.n_q + n_v], axis=1)
+        W, b = compile_map(model.regressor)(q, v, a, intervals.inputs[rows][logged])
+        firsts = np.arange(0, len(b) - H + 1, max(1, H // _OVERLAP))
+        if not len(firsts):
+            continue
+        both = np.concatenate([W, b], axis=1)
+        means = np.lib.stride_tricks.sliding_window_view(both, H, axis=0)[firsts] @ bump
+        Ws.append(layout.scattered(means[:, : n_p * n_v].reshape(-1, n_p, n_v).swapaxes(1, 2), i))
+        bs.append(means[:, n_p * n_v :])
+    W, b = np.concatenate(Ws), np.concatenate(bs)
     scale = np.maximum(np.median(np.abs(b - np.median(b, axis=0)), axis=0), 1e-9)
     return WeakForm(np.ascontiguousarray(W / scale[:, None]), b / scale)
 
 
-def _admitted(windows: Windows, p: FloatArray) -> FloatArray:
+def _admitted(intervals: ShootingIntervals, p: FloatArray) -> FloatArray:
     """Moved to a bound that may be touched; without those outside one that may not."""
-    bounds = list(windows.model.parameters.values())
+    bounds = intervals.layout.bounds
     lower = np.array([-np.inf if x.positive else x.lower for x in bounds])
     p = np.clip(p, lower, np.array([x.upper for x in bounds]))
-    inside = np.all([x.admits(p[:, i]) for i, x in enumerate(bounds)], axis=0)
-    return p[inside]
+    return p[intervals.layout.admits(p)]
 
 
-def robust_scores(windows: Windows, motion: Motion, parameters: FloatArray, places: IntArray) -> FloatArray:
-    """Each hypothesis simulated over windows from the smoothed states, judged by its residuals' robust scale.
+def robust_scores(
+    intervals: ShootingIntervals, motion: Motion, parameters: FloatArray, chosen: IntArray
+) -> FloatArray:
+    """Score ``(n_hypotheses,)`` of each hypothesis, simulated over chosen intervals from the smoothed states.
 
-    The score is the sum over signals of the log of the 35 % quantile of the residuals' size: no threshold is asked
-    for, and units do not matter.
+    The score is the sum over signals of the log of the 35 % quantile of the residuals' size: it needs no threshold,
+    and units do not matter.
     """
-    n, n_x = len(parameters), windows.model.n_q + windows.model.n_v
-    starts = windows.starts[places]
-    seen: BoolArray = np.asarray(windows.known.any(axis=0))
-    names = [s for s, k in zip(windows.model.signals, seen, strict=True) if k]
-    errors = rollouts(windows.model, names).errors(
-        np.repeat(parameters, len(starts), axis=0), np.tile(motion.signals[starts, :n_x], (n, 1)), windows.inputs,
-        windows.measured[:, seen], windows.every, windows.dt, start_rows=np.tile(starts, n), n_rows=windows.length,
-    ).reshape(n, -1, len(names))  # fmt: skip
-    rows = (starts[:, None] + np.arange(windows.length)).ravel()
-    known = np.broadcast_to(windows.known[rows][:, seen], errors.shape)
+    n, n_x = len(parameters), intervals.model.n_q + intervals.model.n_v
+    starts, logs = intervals.starts[chosen], np.tile(intervals.log_of[chosen], n)
+    seen: BoolArray = np.asarray(intervals.known.any(axis=0))
+    names = [s for s, k in zip(intervals.model.signals, seen, strict=True) if k]
+    own = np.repeat(parameters, len(starts), axis=0)
+    if not intervals.layout.is_shared:
+        own = np.take_along_axis(own, intervals.layout.index[logs], axis=1)
+    batch = RolloutBatch(
+        own, np.tile(motion.signals[starts, :n_x], (n, 1)), intervals.inputs, intervals.dt, np.tile(starts, n),
+        intervals.length,
+    )  # fmt: skip
+    compared = Measurements(intervals.measured[:, seen], intervals.measurements.valid)
+    errors = rollouts(intervals.model, names).errors(batch, compared).reshape(n, -1, len(names))
+    rows = (starts[:, None] + np.arange(intervals.length)).ravel()
+    known = np.broadcast_to(intervals.known[rows][:, seen], errors.shape)
     scale = lower_scale(np.nan_to_num(errors, nan=np.inf), known)
     return np.asarray(np.log(np.maximum(scale, 1e-4 * motion.spread[seen])).sum(axis=1))

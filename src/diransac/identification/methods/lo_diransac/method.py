@@ -1,14 +1,14 @@
-"""lo-diransac: random minimal samples, consensus by simulation, local optimisation.
+"""The steps of lo-diransac in their order.
 
-1. `gate`: what is not to be used at all.
-2. `smoothing`: the motion without a model.
-3. `hypotheses`: parameters from random samples of the equations in weak form, judged by simulation.
-4. `refinement`: the most probable motion and parameters, noise and deviations from the model, from the best of them.
-5. `readout`: parameters that hold for the whole motion, and their covariance.
+1. `smoothing`: screening of samples; the motion without a model.
+2. `hypotheses`: parameters from random samples of the equations in weak form, judged by simulation.
+3. `refinement`: the most probable motion and parameters, noise and discrepancies, from the best of them.
+4. `instrumental_variables`: parameters that hold for the whole motion, and their covariance.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,256 +16,331 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import IdentificationError, LogError, ModelError
-from diransac.identification.methods.lo_diransac.gate import mended_inputs, stuck_rows
-from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, n_samples, robust_scores
+from diransac.identification.estimate import Diagnosis, Estimate, Resolution
+from diransac.identification.method import report
+from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, robust_scores
+from diransac.identification.methods.lo_diransac.instrumental_variables import (
+    InstrumentalEstimate,
+    discrepancy_units,
+    estimate_parameters,
+    parameter_units,
+    unexplained,
+)
 from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
-from diransac.identification.methods.lo_diransac.readout import deviation_units, parameter_units, read_out, unexplained
-from diransac.identification.methods.lo_diransac.refinement import believe, refine, start
-from diransac.identification.methods.lo_diransac.smoothing import choose_half_width, running_median, smooth
-from diransac.identification.methods.lo_diransac.windows import Windows
+from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
+from diransac.identification.methods.lo_diransac.refinement import make_prior, refine, start
+from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+from diransac.identification.methods.lo_diransac.smoothing import (
+    Motion,
+    Samples,
+    choose_half_width,
+    odd_window,
+    running_median,
+    screened_inputs,
+    smooth,
+    stuck_rows,
+)
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import Observations
+    from diransac.data.dataset import Dataset, Segment
+    from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.readout import Readout
-    from diransac.identification.methods.lo_diransac.refinement import Belief, Refinement
-    from diransac.identification.methods.lo_diransac.smoothing import Motion
+    from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
+    from diransac.identification.methods.lo_diransac.settings import LoDiransac
 
-__all__ = ["Findings", "find"]
+__all__ = ["estimate"]
 
-
-_FEWEST_WINDOWS = 4
-# Half a row of delay or more is taken up by shifting the inputs, as often as needed.
-_WHOLE_ROW, _MAX_SHIFTS = 0.5, 3
-# Local optimisations at most, and the difference in their losses, nats, that shows nothing.
-_MAX_STARTS, _MAX_FITS, _AS_LIKELY = 5, 8, 5.0
+_FEWEST_INTERVALS = 4
+# Half a sample of delay or more is taken up by shifting the inputs.
+_WHOLE_SAMPLE = 0.5
+# Difference of two fits' losses, nats, below which both are as likely.
+_AS_LIKELY = 5.0
 _OUTLIER = 0.5
-# Rows that inputs may be late by, to begin with.
-_SHIFTS = range(-3, 9)
-# A share of a signal's spread that is no noise any more.
+# Delays that are tried at a time, before they are refined to a sample.
+_DELAYS_AT_A_TIME = 12
+# Fraction of a signal's spread from which on its noise leaves nothing to explain.
 _ALL_OF_IT = 0.8
-# A delay that is worth a word: so many standard errors, and so many rows.
-_SURE, _SMALL_DELAY = 3.0, 0.25
+# A significant delay: so many standard errors, and so many samples.
+_SIGNIFICANT, _SMALL_DELAY = 3.0, 0.25
+_GAUSSIAN = 10_000
+"""Degrees of freedom of an interval whose covariance is not itself an estimate from few numbers."""
 
 
-@dataclass(frozen=True)
-class Findings:
-    """What lo-diransac found in a log.
-
-    Parameters
-    ----------
-    parameters, covariance : (n_p,), (n_p, n_p)
-    states : (W, n_x)   of the most probable motion, at the first row of each window
-    unidentifiable : (n_p,)   parameters whose 95 % interval spans more than all of an equation's inertial force
-    noise_std, outlier_fraction : (n_s,)   of each signal of the model; NaN where it is not measured
-    outliers : (N, n_s)   samples that are more likely outliers than not
-    latent_middles, unmodelled_accelerations : (W,), (W, n_v)   middle row of each window, and its unmodelled part
-    unmodelled_forces : (W, n_v)   the same as generalised forces; None where the equations are no balance of forces
-    input_delay, input_delay_error : s; input_delay_significant : whether that is more than errors of estimation
-    samples, hypotheses, steps : samples drawn, hypotheses judged on the whole log, Gauss-Newton steps
-    settled : whether local optimisation ended before its limit
-    notes : what was found and done, a sentence each
-    """
-
-    parameters: FloatArray
-    covariance: FloatArray
-    states: FloatArray
-    unidentifiable: BoolArray
-    noise_std: FloatArray
-    outlier_fraction: FloatArray
-    outliers: BoolArray
-    latent_middles: FloatArray
-    unmodelled_accelerations: FloatArray
-    unmodelled_forces: FloatArray | None
-    input_delay: float
-    input_delay_error: float
-    input_delay_significant: bool
-    samples: int
-    hypotheses: int
-    steps: int
-    settled: bool
-    notes: tuple[str, ...]
-
-
-def find(observations: Observations, seed: int) -> Findings:
-    """Parameters of the model from the log, without starting values or thresholds.
-
-    Raises LogError: the log is too short; IdentificationError: no sample of it gives parameters within their bounds.
-    """
-    windows, motion, notes = _prepare(observations)
-    hypotheses, _ = find_hypotheses(windows, motion, seed, observations)
+def estimate(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
+    """Parameters of the dataset's model; raises as `LoDiransac.fit`."""
+    report(callback, "smoothing", 0.0)
+    intervals, motion, notes = _prepared(settings, dataset)
+    report(callback, "drawing hypotheses", 0.1)
+    hypotheses = find_hypotheses(settings, intervals, motion, seed, dataset)
     if not len(hypotheses):
         raise IdentificationError(
-            f"{observations.log.source}: no sample of the log gives parameters within their bounds; check the model, "
+            f"{dataset.source}: no sample of the log gives parameters within their bounds; check the model, "
             "the signs and units of inputs, and the bounds"
         )
-    belief = believe(windows, motion, deviation_units(windows, motion, hypotheses[0]))
-    late, refined = _best_when_late(windows, motion, hypotheses, belief)
-    windows, refined, later = _shifted(windows.delayed(late), refined, belief)
-    result = read_out(windows, refined.fit)
-    if not _admits(windows, result.parameters):
+    unit = discrepancy_units(intervals, motion, hypotheses[0])
+    search = _LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
+    delay, refined = search.best_delayed(intervals)
+    intervals, refined, later = search.shifted(intervals.delayed(delay), refined)
+    report(callback, "estimating parameters", 0.9)
+    result = estimate_parameters(intervals, refined.fit, settings.prior_inflation)
+    kept = refined.fit.shared[: intervals.n_p]
+    if not settings.instrumental_variables:
+        result = replace(result, parameters=kept, unexplained=unexplained(intervals, refined.fit, kept))
+    elif not intervals.layout.admits(result.parameters[None])[0]:
         # The fit keeps to the bounds, least squares on its motion need not.
-        kept = refined.fit.shared[: windows.model.n_p]
-        result = replace(result, parameters=kept, unexplained=unexplained(windows, refined.fit, kept))
+        result = replace(result, parameters=kept, unexplained=unexplained(intervals, refined.fit, kept))
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
-    if _explains_nothing(windows, motion, refined):
-        notes = (*notes, "the model explains hardly anything of this log: do not rely on these parameters")
-    if not refined.settled:
-        notes = (*notes, "local optimisation had not settled when it reached its limit of steps")
-    return _findings(observations, windows, motion, refined, result, late + later, len(hypotheses), notes)
+    if _explains_nothing(intervals, motion, refined):
+        notes = (*notes, "the model explains almost nothing of this log: do not rely on these parameters")
+    if not refined.converged and settings.max_steps:
+        notes = (*notes, "local optimisation did not converge within its limit of steps")
+    found = _Found(dataset, intervals, motion, refined.fit, result, float(delay + later + refined.fit.shared[-1]))
+    return _estimate(settings, found, len(hypotheses), refined.converged, notes)
 
 
-def _admits(windows: Windows, parameters: FloatArray) -> bool:
-    return all(bounds.admits(x) for bounds, x in zip(windows.model.parameters.values(), parameters, strict=True))
-
-
-def _explains_nothing(windows: Windows, motion: Motion, refined: Refinement) -> bool:
+def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
     """Whether the noise of every signal is as large as the signal."""
-    seen = windows.known.any(axis=0)
+    seen = intervals.known.any(axis=0)
     return bool((refined.fit.noise.sigma > _ALL_OF_IT * motion.spread)[seen].all())
 
 
-def _prepare(observations: Observations) -> tuple[Windows, Motion, tuple[str, ...]]:
-    """The log in windows of the motion's own time scale, and the motion."""
-    model, dt = observations.model, observations.log.dt
-    measured = np.full((len(observations), len(model.signals)), np.nan)
-    measured[:, [model.signals.index(n) for n in observations.signals]] = observations.measured
-    stuck = stuck_rows(observations.measured)
+# ---------------------------------------------------------------------- preparation
+
+
+def _prepared(settings: LoDiransac, dataset: Dataset) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
+    """The logs in intervals of the motion's own time scale, and the motion, row by row of the intervals."""
+    model, dt = dataset.model, dataset.dt
+    screened = [_screened(settings, one, dt) for one in dataset.segments]
+    samples, inputs = [x for x, _, _ in screened], [u for _, u, _ in screened]
+    several = len(samples) > 1
+    notes = [
+        f"{one.log.source}: {note}" if several else note
+        for one, (_, _, said) in zip(dataset.segments, screened, strict=True)
+        for note in said
+    ]
+    half = choose_half_width(model, samples, dt, settings.smoothing_half_width)
+    n_rows = sum(len(one) for one in dataset.segments)
+    if n_rows < _FEWEST_INTERVALS * half:
+        raise LogError(
+            f"{dataset.source}: {n_rows} rows are too few; lo-diransac needs at least "
+            f"{_FEWEST_INTERVALS * half}. Give a longer log"
+        )
+    motions = smooth(model, samples, dt, half)
+    logs = [(x.measured, x.known, u) for x, u in zip(samples, inputs, strict=True)]
+    intervals = ShootingIntervals.of(model, dataset.layout, logs, dt, half, settings.substeps)
+    rows = zip(motions, intervals.rows_of_logs, strict=True)
+    signals = np.concatenate([_to_length(x.signals, r.stop - r.start) for x, r in rows])
+    return intervals, Motion(signals, motions[0].spread), tuple(notes)
+
+
+def _to_length(values: FloatArray, n_rows: int) -> FloatArray:
+    return np.pad(values, ((0, n_rows - len(values)), (0, 0)), mode="edge")
+
+
+def _screened(settings: LoDiransac, one: Segment, dt: float) -> tuple[Samples, FloatArray, list[str]]:
+    """Samples and inputs of one log, and what was found."""
+    model, notes = one.model, []
+    measured = np.full((len(one), len(model.signals)), np.nan)
+    measured[:, [model.signals.index(n) for n in one.signals]] = one.measured
+    present = [one.signals.index(n) for n in one.present]
+    stuck = stuck_rows(one.measured[:, present]) if settings.stuck_rows else np.zeros(len(one), bool)
     known = np.isfinite(measured) & ~stuck[:, None]
     measured = np.where(known, measured, 0.0)
-    inputs, n_leaps = mended_inputs(observations.inputs)
-    notes = []
+    inputs, n_leaps = screened_inputs(one.inputs, odd_window(settings.input_window, dt), settings.input_threshold)
     if stuck.any():
         notes.append(f"{stuck.sum()} rows repeat the row before in every signal, and were taken as missing")
     if n_leaps:
-        notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median stands in for them")
-    centre = running_median(measured, known)
-    half = choose_half_width(model, measured, known, centre, dt)
-    if len(observations) < _FEWEST_WINDOWS * half:
-        raise LogError(
-            f"{observations.log.source}: {len(observations)} rows are too few; lo-diransac needs at least "
-            f"{_FEWEST_WINDOWS * half}. Give a longer log"
-        )
-    motion = smooth(model, measured, known, centre, dt, half)
-    return Windows(model, measured, known, inputs, dt, half), motion, tuple(notes)
+        notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median replaces them")
+    centre = running_median(measured, known, odd_window(settings.median_window, dt))
+    return Samples(measured, known, centre), inputs, notes
 
 
-def _best(windows: Windows, motion: Motion, hypotheses: FloatArray, belief: Belief) -> Refinement:
-    """Local optimisation from the best hypothesis; where it leaves a doubt, from others; the likeliest of these.
-
-    Doubtful is what takes most of a window for outliers: sensors may have failed there, or the fit.  What was found
-    then becomes a hypothesis itself if it is the likeliest so far, or else the next one has its turn; doubt ends with a
-    second fit that is as likely.
-    """
-    waiting = list(hypotheses[:_MAX_STARTS])
-    found: list[Refinement] = []
-    while waiting and len(found) < _MAX_FITS:
-        found.append(refine(windows, start(windows, motion, waiting.pop(0), belief), belief))
-        again = any(abs(found[-1].loss - x.loss) < _AS_LIKELY for x in found[:-1])
-        if again or not _is_doubtful(windows, found[-1]):
-            break
-        if all(found[-1].loss < x.loss for x in found[:-1]):
-            waiting.insert(0, found[-1].fit.shared[: windows.model.n_p])
-    return replace(min(found, key=lambda x: x.loss), steps=sum(x.steps for x in found))
+# ---------------------------------------------------------------------- local search
 
 
-def _is_doubtful(windows: Windows, refined: Refinement) -> bool:
-    """Whether some window has too few inlying samples for a robust scale to stand on."""
-    fit = refined.fit
-    inlying = (fit.noise.inlying(fit.residuals, windows.known) > _OUTLIER).reshape(len(windows), -1).sum(axis=1)
-    return bool((inlying < BREAKDOWN * windows.known.reshape(len(windows), -1).sum(axis=1)).any())
+@dataclass(frozen=True)
+class _LocalSearch:
+    """Local optimisations from the best hypotheses, and delays of the inputs."""
 
+    settings: LoDiransac
+    motion: Motion
+    hypotheses: FloatArray
+    prior: Prior
+    callback: Callback | None
 
-def _best_when_late(windows: Windows, motion: Motion, hypotheses: FloatArray, belief: Belief) -> tuple[int, Refinement]:
-    """How many rows inputs are late by, and the best fit then.
+    def best(self, intervals: ShootingIntervals) -> Refinement:
+        """Local optimisation from the best hypothesis; where it is doubtful, from others; the likeliest of these.
 
-    Where the hypotheses say that they are late at all, the neighbouring rows are tried, too, and theirs, as long as the
-    fit becomes likelier: hypotheses come from inputs that were taken to be in time.
-    """
-    late = _likeliest_shift(windows, motion, hypotheses[0])
-    fits = {late: _best(windows.delayed(late), motion, hypotheses, belief)}
-    for step in (-1, 1) if late else ():
-        while abs(late + step) < windows.length:
-            other = _best(windows.delayed(late + step), motion, hypotheses, belief)
-            fits[late + step] = other
-            if other.loss >= fits[late].loss:
+        Doubtful is a fit that takes most of an interval for outliers: sensors may have failed there, or the fit.  It
+        becomes a hypothesis itself if it is the likeliest so far, or else the next one has its turn; doubt ends with a
+        second fit that is as likely.
+        """
+        waiting = list(self.hypotheses[: self.settings.max_starts])
+        found: list[Refinement] = []
+        while waiting and len(found) < self.settings.max_fits:
+            share = len(found) / self.settings.max_fits
+            report(self.callback, "local optimisation", 0.3 + 0.5 * share, f"fit {len(found) + 1}")
+            begin = start(self.settings, intervals, self.motion, waiting.pop(0), self.prior)
+            found.append(refine(self.settings, intervals, begin, self.prior))
+            again = any(abs(found[-1].loss - x.loss) < _AS_LIKELY for x in found[:-1])
+            if again or not _is_doubtful(intervals, found[-1]):
                 break
-            late += step
-    return late, replace(fits[late], steps=sum(fit.steps for fit in fits.values()))
+            if all(found[-1].loss < x.loss for x in found[:-1]):
+                waiting.insert(0, found[-1].fit.shared[: intervals.n_p])
+        return min(found, key=lambda x: x.loss)
+
+    def best_delayed(self, intervals: ShootingIntervals) -> tuple[int, Refinement]:
+        """Delay of the inputs in samples, and the best fit then.
+
+        Where the hypotheses favour a delay at all, the neighbouring samples are tried, too, and theirs, as long as the
+        fit becomes likelier: hypotheses come from inputs without a delay.
+        """
+        report(self.callback, "searching for a delay", 0.25)
+        delay = self._likeliest_delay(intervals)
+        fits = {delay: self.best(intervals.delayed(delay))}
+        for step in (-1, 1) if delay else ():
+            while abs(delay + step) < intervals.length:
+                other = self.best(intervals.delayed(delay + step))
+                fits[delay + step] = other
+                if other.loss >= fits[delay].loss:
+                    break
+                delay += step
+        return delay, fits[delay]
+
+    def _likeliest_delay(self, intervals: ShootingIntervals) -> int:
+        """Delay in samples with which simulations by the best hypothesis agree best with the log.
+
+        Inputs that are held for many samples and then step make few outliers under a wrong delay, and local
+        optimisation would rest there; so whole samples are settled before it begins.
+        """
+        every, scores = np.arange(len(intervals)), dict[int, float]()
+        low, high = (round(x / intervals.dt) for x in self.settings.delay_range)
+
+        def score(rows: int) -> float:
+            if rows not in scores:
+                delayed = intervals.delayed(rows)
+                scores[rows] = float(robust_scores(delayed, self.motion, self.hypotheses[:1], every)[0])
+            return scores[rows]
+
+        step = max(1, (high - low) // (_DELAYS_AT_A_TIME - 1))
+        tried: list[int] = [x for x in range(-(-low // step) * step, high + 1, step)]
+        best = min(tried, key=lambda rows: (score(rows), abs(rows)))
+        while step > 1:
+            step = max(1, step // 2)
+            near = [x for x in (best - step, best, best + step) if low <= x <= high]
+            best = min(near, key=lambda rows: (score(rows), abs(rows)))
+        return best
+
+    def shifted(self, intervals: ShootingIntervals, refined: Refinement) -> tuple[ShootingIntervals, Refinement, int]:
+        """Local optimisation again with the inputs shifted by whole samples, while it finds them delayed."""
+        shift = 0
+        for k in range(self.settings.max_delay_shifts):
+            delay = refined.fit.shared[-1]
+            if not _WHOLE_SAMPLE <= abs(delay) < intervals.length:
+                break
+            report(self.callback, "local optimisation with delayed inputs", 0.8 + 0.03 * k)
+            shift += round(delay)
+            intervals = intervals.delayed(round(delay))
+            shared = np.append(refined.fit.shared[:-1], delay - round(delay))
+            sizes = np.append(refined.fit.prior[:-1], self.prior.delay)
+            begin = with_residuals(intervals, replace(refined.fit, shared=shared, prior=sizes))
+            refined = refine(self.settings, intervals, begin, self.prior)
+        return intervals, refined, shift
 
 
-def _likeliest_shift(windows: Windows, motion: Motion, p: FloatArray) -> int:
-    """Rows that inputs are late by if simulations with the best hypothesis are to agree best with the log.
-
-    Inputs that are held for many rows and then leap make few outliers when they are taken to be early or late, and
-    local optimisation would rest there; so whole rows are settled before it begins.
-    """
-    every = np.arange(len(windows))
-    scores = {rows: float(robust_scores(windows.delayed(rows), motion, p[None], every)[0]) for rows in _SHIFTS}
-    return min(scores, key=lambda rows: (scores[rows], abs(rows)))
+def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:
+    """Whether some interval has too few inlying samples for a robust scale to stand on."""
+    fit, n = refined.fit, len(intervals)
+    inlying = (fit.noise.inlying(fit.residuals, intervals.known) > _OUTLIER).reshape(n, -1).sum(axis=1)
+    return bool((inlying < BREAKDOWN * intervals.known.reshape(n, -1).sum(axis=1)).any())
 
 
-def _shifted(windows: Windows, refined: Refinement, belief: Belief) -> tuple[Windows, Refinement, int]:
-    """Local optimisation again with the inputs shifted by whole rows, while it finds them late."""
-    shift, steps = 0, refined.steps
-    for _ in range(_MAX_SHIFTS):
-        delay = refined.fit.shared[-1]
-        if not _WHOLE_ROW <= abs(delay) < windows.length:
-            break
-        shift += round(delay)
-        windows = windows.delayed(round(delay))
-        shared = np.append(refined.fit.shared[:-1], delay - round(delay))
-        prior = np.append(refined.fit.prior[:-1], belief.delay)
-        refined = refine(windows, windows.judged(replace(refined.fit, shared=shared, prior=prior)), belief)
-        steps += refined.steps
-    return windows, replace(refined, steps=steps), shift
+# ---------------------------------------------------------------------- the estimate
 
 
-def _findings(
-    observations: Observations,
-    windows: Windows,
-    motion: Motion,
-    refined: Refinement,
-    result: Readout,
-    shift: int,
-    n_hypotheses: int,
-    notes: tuple[str, ...],
-) -> Findings:
-    fit, N, dt = refined.fit, len(observations), windows.dt
-    delay = float(shift + fit.shared[-1])
-    seen = windows.known.any(axis=0)
-    inlying = fit.noise.inlying(fit.residuals, windows.known)[:N]
+@dataclass(frozen=True)
+class _Found:
+    """Everything that an estimate is made of; the delay is in samples."""
+
+    dataset: Dataset
+    intervals: ShootingIntervals
+    motion: Motion
+    fit: Fit
+    result: InstrumentalEstimate
+    delay: float
+
+
+def _estimate(
+    settings: LoDiransac, found: _Found, n_hypotheses: int, converged: bool, notes: tuple[str, ...]
+) -> Estimate:
+    dataset, intervals, result = found.dataset, found.intervals, found.result
+    names = dataset.layout.names
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
-    units = parameter_units(windows, motion, result.parameters)
-    return Findings(
-        parameters=result.parameters,
-        covariance=result.covariance,
-        states=fit.x.copy(),
-        unidentifiable=~(spans < units),
-        noise_std=np.where(seen, fit.noise.sigma, np.nan),
-        outlier_fraction=np.where(seen, fit.noise.pi, np.nan),
-        outliers=windows.known[:N] & (inlying < _OUTLIER),
-        latent_middles=np.asarray(windows.starts + 0.5 * (windows.length - 1), np.float64),
-        unmodelled_accelerations=result.unexplained,
-        unmodelled_forces=_latent_forces(windows, fit, result),
-        input_delay=float(delay * dt),
-        input_delay_error=result.delay_error * dt,
-        input_delay_significant=abs(delay) > max(_SURE * result.delay_error, _SMALL_DELAY),
-        samples=n_samples(windows.model),
-        hypotheses=n_hypotheses,
-        steps=refined.steps,
-        settled=refined.settled,
+    lost = ~(spans < parameter_units(intervals, found.motion, result.parameters))
+    covariance = result.covariance.copy()
+    covariance[lost] = covariance[:, lost] = np.inf
+    nonlinear = bool(dataset.model.nonlinear_parameters)
+    return Estimate(
+        parameters=dict(zip(names, result.parameters.tolist(), strict=True)),
+        covariance=covariance,
+        degrees_of_freedom=_GAUSSIAN,
+        n_fitted=sum(int(np.isfinite(one.measured).any(axis=1).sum()) for one in dataset.segments),
+        estimator="multiple shooting",
+        iterations=settings.n_nonlinear_samples if nonlinear else settings.n_samples,
+        n_hypotheses=n_hypotheses,
+        stop_reason="converged" if converged else "limit of steps",
+        resolution=Resolution("rk4", settings.substeps),
         notes=notes,
+        diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x)),
     )
 
 
-def _latent_forces(windows: Windows, fit: Fit, result: Readout) -> FloatArray | None:
-    """Generalised forces (W, n_v) that make the latent accelerations, at the windows' starts."""
-    model = windows.model
+def _diagnosis(found: _Found, unidentifiable: tuple[str, ...]) -> Diagnosis:
+    """Noise, faults and unmodelled forces, by name and over the rows of the logs as they were given."""
+    dataset, intervals, fit, result = found.dataset, found.intervals, found.fit, found.result
+    model, dt = dataset.model, intervals.dt
+    columns = {name: model.signals.index(name) for name in dataset.signals}
+    seen = intervals.known.any(axis=0)
+    sigma, fraction = (np.where(seen, x, np.nan) for x in (fit.noise.sigma, fit.noise.pi))
+    inlying = fit.noise.inlying(fit.residuals, intervals.known)
+    outliers = intervals.known & (inlying < _OUTLIER)
+    begins = np.array([one.log.time[one.offset] for one in dataset.segments])[intervals.log_of]
+    place = intervals.starts - intervals.first_of_log[intervals.log_of]
+    forces = _unmodelled_forces(intervals, fit, result)
+    per_equation: Callable[[FloatArray], dict[str, FloatArray]] = lambda x: dict(  # noqa: E731
+        zip(model.accelerations, x.T.copy(), strict=True)
+    )
+    return Diagnosis(
+        noise_std={name: float(sigma[k]) for name, k in columns.items()},
+        outlier_fraction={name: float(fraction[k]) for name, k in columns.items()},
+        outliers={name: _on_given_logs(dataset, intervals, outliers[:, k]) for name, k in columns.items()},
+        window_log=intervals.log_of.copy(),
+        unmodelled_time=begins + dt * (place + 0.5 * (intervals.length - 1)),
+        unmodelled_accelerations=per_equation(result.unexplained),
+        unmodelled_forces={} if forces is None else per_equation(forces),
+        smoothed_time=begins + dt * place.astype(float),
+        smoothed_states=dict(zip(model.state, fit.x.T.copy(), strict=True)),
+        input_delay=float(found.delay * dt),
+        input_delay_error=result.delay_error * dt,
+        input_delay_significant=abs(found.delay) > max(_SIGNIFICANT * result.delay_error, _SMALL_DELAY),
+        unidentifiable=unidentifiable,
+    )
+
+
+def _on_given_logs(dataset: Dataset, intervals: ShootingIntervals, mask: BoolArray) -> BoolArray:
+    """A mask over the intervals' rows as one over the rows of the logs."""
+    parts = [mask[rows][: len(one)] for rows, one in zip(intervals.rows_of_logs, dataset.segments, strict=True)]
+    return dataset.on_given_logs(parts)
+
+
+def _unmodelled_forces(intervals: ShootingIntervals, fit: Fit, result: InstrumentalEstimate) -> FloatArray | None:
+    """Generalised forces (W, n_v) that make the unmodelled accelerations, at the intervals' starts; None if no forces do."""
+    model = intervals.model
     try:
         response = model.force_response
     except ModelError:
         return None
-    motion = (fit.x[:, : model.n_q].T, fit.x[:, model.n_q :].T, windows.inputs[windows.starts].T, result.parameters)
+    p = np.broadcast_to(intervals.parameters_of(result.parameters, intervals.log_of), (len(fit.x), model.n_p))
+    motion = (fit.x[:, : model.n_q].T, fit.x[:, model.n_q :].T, intervals.inputs[intervals.starts].T, p.T)
     columns = [np.array(response(*motion, np.repeat(f[:, None], len(fit.x), axis=1))).T for f in np.eye(model.n_v)]
     return np.asarray(np.linalg.solve(np.stack(columns, axis=-1), result.unexplained[:, :, None])[:, :, 0])

@@ -47,8 +47,15 @@ class Mixture:
         distance = np.minimum(np.abs(residuals) / self.sigma, _FAR)
         return np.asarray(np.exp(-0.5 * np.square(distance)) * (1.0 - self.pi) / (self.sigma * np.sqrt(2.0 * np.pi)))
 
-    def updated(self, residuals: FloatArray, known: BoolArray, inlying: FloatArray) -> Mixture:
-        """The M step; a scale shrinks by at most 0.4, which keeps the far in sight of the near at first."""
+    def updated(
+        self, residuals: FloatArray, known: BoolArray, inlying: FloatArray, *, outliers: bool = True
+    ) -> Mixture:
+        """The M step; a scale shrinks to 0.4 of itself at most, so that large residuals keep some weight at first.
+
+        Parameters
+        ----------
+        outliers : whether the fraction of outliers is estimated; it stays as it is without
+        """
         weight = inlying.sum(axis=0)
         squares = (inlying * np.square(residuals)).sum(axis=0)
         sigma = np.sqrt(squares / np.maximum(weight, 1e-9))
@@ -56,7 +63,8 @@ class Mixture:
         count = known.sum(axis=0)
         pi = np.clip(1.0 - weight / np.maximum(count, 1), *_FRACTION)
         seen = count >= _FEWEST
-        return Mixture(np.where(seen, sigma, self.sigma), np.where(seen, pi, self.pi), self.span, self.floor)
+        pi = np.where(seen & outliers, pi, self.pi)
+        return Mixture(np.where(seen, sigma, self.sigma), pi, self.span, self.floor)
 
 
 def lower_scale(residuals: FloatArray, known: BoolArray) -> FloatArray:

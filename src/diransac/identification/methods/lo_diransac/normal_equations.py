@@ -1,44 +1,47 @@
-"""The quadratic model of all windows together: measurements, continuity, and what is believed beforehand.
+"""The quadratic model of all intervals together: measurements, continuity, and priors.
 
-Unknowns are what all windows share (parameters, pushes, delay), and at the start of each window w the state x_w and
-a latent acceleration d_w that acts over the window.  With ``F`` the rollout of a window, twice the cost is
+Unknowns are those that all intervals share (parameters, discrepancies, delay), and at the start of each interval w the
+state x_w and an unmodelled acceleration d_w that acts over the interval.  With ``F`` the rollout of an interval and
+``kappa`` the standard deviation of continuity, twice the cost is
 
-    sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / slack^2 + sum |d_w|^2 / tau^2 + |s|^2 / prior^2
+    sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / kappa^2 + sum |d_w|^2 / tau^2 + |s|^2 / prior^2
+
+The second sum is over neighbours within one log.
 
 References: Bock 1987 (multiple shooting); Tremolet 2006 (weak-constraint 4D-Var).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.mixture import Mixture
-    from diransac.identification.methods.lo_diransac.windows import Windows
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["Fit", "NormalEquations", "cost", "linearize"]
+__all__ = ["Fit", "NormalEquations", "cost", "linearize", "with_residuals"]
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A motion with its parameters, and the scales that say how far each part is believed.
+    """A motion with its parameters, and the scales of every term of the cost.
 
     Parameters
     ----------
-    shared : (n_s,)   parameters, pushes, input delay in rows
-    x, d : (W, n_x), (W, n_v)   states at the windows' starts, latent accelerations
+    shared : (n_s,)   parameters, discrepancies, input delay in samples
+    x, d : (W, n_x), (W, n_v)   states at the intervals' starts, unmodelled accelerations
     residuals : (N, n_signals)   simulated less measured
     noise : of each signal
-    tau : (n_v,)   size of the latent accelerations
-    slack : (n_x,)   size of the jumps from window to window
-    prior : (n_s,)   size of the pushes and of the delay; infinite for the parameters
+    tau : (n_v,)   size of the unmodelled accelerations
+    continuity_std : (n_x,)   size of the jumps from interval to interval
+    prior : (n_s,)   size of the discrepancies and of the delay; infinite for the parameters
     """
 
     shared: FloatArray
@@ -47,7 +50,7 @@ class Fit:
     residuals: FloatArray
     noise: Mixture
     tau: FloatArray
-    slack: FloatArray
+    continuity_std: FloatArray
     prior: FloatArray
 
 
@@ -60,47 +63,70 @@ class NormalEquations:
     right_s: FloatArray
 
 
-def linearize(windows: Windows, fit: Fit, weights: FloatArray) -> NormalEquations:
-    """Gauss and Newton's normal equations; ``weights (N, n_signals)`` are those of the measurements."""
+def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
+    """The fit with its residuals over these intervals."""
+    return replace(fit, residuals=intervals.residuals(fit.shared, fit.x, fit.d))
+
+
+def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> NormalEquations:
+    """Gauss-Newton normal equations; ``weights (N, n_signals)`` are those of the measurements."""
     n_x, k = fit.x.shape[1], fit.x.shape[1] + fit.d.shape[1]
-    sums = windows.rollouts.gauss_newton(
-        *windows.lanes(fit.shared, fit.x, fit.d), windows.measured, windows.every, windows.dt, weights,
-        start_rows=windows.starts, n_rows=windows.length,
-    )  # fmt: skip
-    order = _order(len(fit.shared), n_x, k)
+    sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights)
+    order = _order(sums.gradient.shape[1] - k, n_x, k)
     H, g = sums.normal_matrix[:, order][:, :, order], -sums.gradient[:, order]
     F = sums.final_slopes[:-1][:, :, order]
-    jumps = fit.x[1:] - sums.final_states[:-1]
-    precision = 1.0 / np.square(fit.slack)
-    FP = F.swapaxes(1, 2) * precision
+    linked = intervals.linked
+    jumps = np.where(linked[:, None], fit.x[1:] - sums.final_states[:-1], 0.0)
+    F = F if linked.all() else np.where(linked[:, None, None], F, 0.0)
+    precision = linked[:, None] / np.square(fit.continuity_std)
+    FP = F.swapaxes(1, 2) * precision[:, None, :]
     H[:-1] += FP @ F
     g[:-1] += np.einsum("wij,wj->wi", FP, jumps)
     state, latent, own = np.arange(n_x), np.arange(n_x, k), 1.0 / np.square(fit.tau)
     H[1:, state, state] += precision
-    H[1:, :n_x, k:] -= precision[:, None] * F[:, :, k:]
+    H[1:, :n_x, k:] -= precision[:, :, None] * F[:, :, k:]
     g[1:, :n_x] -= precision * jumps
     H[:, latent, latent] += own
     g[:, n_x:k] -= own * fit.d
     E = np.zeros((len(H) - 1, k, k))
-    E[:, :n_x] = -precision[:, None] * F[:, :, :k]
+    E[:, :n_x] = -precision[:, :, None] * F[:, :, :k]
     beforehand = 1.0 / np.square(fit.prior)
-    corner = H[:, k:, k:].sum(axis=0) + np.diag(beforehand)
-    system = Arrowhead(H[:, :k, :k], E, H[:, :k, k:], corner)
-    return NormalEquations(system, g[:, :k], g[:, k:].sum(axis=0) - beforehand * fit.shared)
+    border, corner, right = _shared_blocks(intervals, H[:, :k, k:], H[:, k:, k:], g[:, k:])
+    system = Arrowhead(H[:, :k, :k], E, border, corner + np.diag(beforehand))
+    return NormalEquations(system, g[:, :k], right - beforehand * fit.shared)
 
 
-def _order(n_s: int, n_x: int, k: int) -> npt.NDArray[np.int64]:
+def _shared_blocks(
+    intervals: ShootingIntervals, border: FloatArray, corner: FloatArray, right: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Border ``(W, k, n_s)``, sums of corner ``(n_s, n_s)`` and right side ``(n_s,)`` in the places of each log."""
+    if intervals.layout.is_shared:
+        return border, corner.sum(axis=0), right.sum(axis=0)
+    n_own, n_s = intervals.model.n_p, intervals.n_shared
+    rest = np.arange(intervals.n_p, n_s)
+    place = np.hstack([intervals.layout.index, np.broadcast_to(rest, (intervals.layout.n_logs, len(rest)))])
+    assert place.shape[1] == n_own + len(rest)
+    wide, whole, total = np.zeros((*border.shape[:2], n_s)), np.zeros((n_s, n_s)), np.zeros(n_s)
+    for i, at in enumerate(place):
+        own = np.flatnonzero(intervals.log_of == i)
+        wide[own[:, None, None], np.arange(border.shape[1])[None, :, None], at] = border[own]
+        whole[np.ix_(at, at)] += corner[own].sum(axis=0)
+        total[at] += right[own].sum(axis=0)
+    return wide, whole, total
+
+
+def _order(n_s: int, n_x: int, k: int) -> IntArray:
     """Places of (x, d, s) among the rollouts' unknowns, which are (s, d, x)."""
     n_v = k - n_x
     return np.concatenate([np.arange(n_s + n_v, n_s + k), np.arange(n_s, n_s + n_v), np.arange(n_s)])
 
 
-def cost(windows: Windows, fit: Fit, weights: FloatArray) -> float:
+def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
     """Twice the cost with the weights held; infinite where a rollout diverges."""
-    ends = windows.ends(fit.shared, fit.x, fit.d)
+    ends = intervals.ends(fit.shared, fit.x, fit.d)
     terms = (
         (weights * np.square(fit.residuals)).sum(),
-        np.square((fit.x[1:] - ends) / fit.slack).sum(),
+        np.square((fit.x[1:] - ends) / fit.continuity_std).sum(),
         np.square(fit.d / fit.tau).sum(),
         np.square(fit.shared / fit.prior).sum(),
     )

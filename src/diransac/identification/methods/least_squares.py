@@ -1,0 +1,137 @@
+"""Least squares of the whole dataset: ordinary, total, nonlinear, or any other estimator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from diransac.errors import IdentificationError
+from diransac.identification.estimate import Estimate, Resolution
+from diransac.identification.estimators import (
+    BoundEstimator,
+    Estimator,
+    OrdinaryLeastSquares,
+    TotalLeastSquares,
+    as_estimator,
+    name_of,
+)
+from diransac.identification.method import report
+from diransac.identification.nonlinear import NonlinearLeastSquares
+from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
+from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from diransac.data.dataset import Dataset
+    from diransac.identification.method import Callback
+
+__all__ = ["LeastSquares", "bound_to", "fitted"]
+
+_NAMES = {"OrdinaryLeastSquares": "ols", "TotalLeastSquares": "tls", "NonlinearLeastSquares": "nls"}
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """Least squares of every row: methods "ols", "tls" and "nls", by their estimator.
+
+    Parameters
+    ----------
+    estimator : `OrdinaryLeastSquares` (default), `TotalLeastSquares`, `NonlinearLeastSquares`, or any scikit-learn
+        linear regressor
+    criteria : settings of the evaluation: `Settings` of which those of a search are refused
+
+    Raises
+    ------
+    SettingsError
+        A setting has no use here, or the estimator is none.
+    """
+
+    estimator: object = field(default_factory=OrdinaryLeastSquares)
+    criteria: Settings = field(default_factory=Settings)
+    needs_all_signals = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "estimator", as_estimator(self.estimator))
+        check_used(self.criteria, (*JUDGING, *SIMULATION), self.name)
+
+    @property
+    def name(self) -> str:
+        """``"ols"``, ``"tls"``, ``"nls"``, or the name of the estimator's class."""
+        known = name_of(self._estimator)
+        return _NAMES.get(known, known)
+
+    @property
+    def _estimator(self) -> Estimator:
+        return self.estimator  # type: ignore[return-value]  # as_estimator made it one
+
+    def options(self) -> Mapping[str, Any]:
+        """None beside the estimator."""
+        return {}
+
+    def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:  # noqa: ARG002  nothing is random
+        """Parameters by least squares of all rows.
+
+        Raises
+        ------
+        IdentificationError
+            The dataset does not determine the parameters, or no finite ones are found.
+        """
+        report(callback, "fitting", 0.0)
+        bound = bound_to(self._estimator, dataset)
+        rows = np.arange(bound.n_rows)
+        parameters = bound.select([rows]).fit()[0]
+        if not np.isfinite(parameters).all():
+            raise IdentificationError(
+                f"{dataset.source}: {self.name} finds no finite parameters; try another method"
+            )
+        report(callback, "uncertainty", 0.5)
+        resolution = Resolution(self.criteria.integrator, self.criteria.substeps)
+        return fitted(bound, dataset, parameters, rows, estimator=name_of(self._estimator), resolution=resolution)
+
+
+def ordinary(settings: Settings) -> LeastSquares:
+    """Method "ols"."""
+    return LeastSquares(OrdinaryLeastSquares(), settings)
+
+
+def total(settings: Settings) -> LeastSquares:
+    """Method "tls"."""
+    return LeastSquares(TotalLeastSquares(), settings)
+
+
+def nonlinear(settings: Settings) -> LeastSquares:
+    """Method "nls"."""
+    return LeastSquares(NonlinearLeastSquares(), settings)
+
+
+def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
+    """The estimator over the dataset.
+
+    Raises
+    ------
+    IdentificationError
+        The dataset as a whole does not determine the parameters; they are named.
+    """
+    bound = estimator.bind(dataset)
+    if bound.select([np.arange(bound.n_rows)]).well_defined()[0]:
+        return bound
+    names = [dataset.layout.names[i] for i in bound.unidentifiable()] or list(dataset.layout.names)
+    raise IdentificationError(
+        f"{dataset.source}: the log does not determine {', '.join(names)}: the motion that would show "
+        f"{'it' if len(names) == 1 else 'them'} is missing or moves with another; record a livelier motion, or fix "
+        "parameters in the model"
+    )
+
+
+def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows: np.ndarray, **about: Any) -> Estimate:
+    """The estimate of parameters ``(n,)`` that were fitted to rows, with its jackknife covariance."""
+    return Estimate(
+        parameters=dict(zip(dataset.layout.names, parameters.tolist(), strict=True)),
+        covariance=jackknife_covariance(bound, rows),
+        degrees_of_freedom=max(1, min(N_BLOCKS, len(rows)) - 1),
+        n_fitted=len(rows),
+        **about,
+    )

@@ -1,0 +1,86 @@
+"""A model augmented by discrepancies, all of them parameters, so that compiled rollouts and derivatives serve unchanged.
+
+- Unmodelled accelerations, one for each of the model's: ``a = f(q, v, u, p) + d``.
+- Input gain and bias discrepancies: in every equation a constant force, and one in proportion to each input.  An
+  actuator that is stronger or points elsewhere than the model has it deviates alike for as long as the motion lasts;
+  unmodelled accelerations, free in every interval, would attribute that to the parameters.
+- A delay of the inputs, ``u(t - tau) = u - tau du/dt``.
+
+References
+----------
+Kennedy, O'Hagan 2001 (models with a discrepancy); Tremolet 2006 (weak-constraint 4D-Var).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import casadi as ca
+
+from diransac.model import Model, Parameter
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from diransac.model.derivation import Symbols
+
+__all__ = ["AugmentedModel", "augmented_model"]
+
+
+@dataclass(frozen=True)
+class AugmentedModel:
+    """The augmented form of a model.
+
+    Parameters
+    ----------
+    model : its parameters are the model's ``p``; the discrepancies, equation by equation the bias and one gain per
+        input; the delay in samples; the unmodelled accelerations.  Its inputs are u, and the change of u per sample of
+        delay
+    n_p, n_v, n_u : of the model
+    """
+
+    model: Model
+    n_p: int
+    n_v: int
+    n_u: int
+
+    @property
+    def n_discrepancies(self) -> int:
+        """Input gain and bias discrepancies."""
+        return self.n_v * (self.n_u + 1)
+
+
+@lru_cache(maxsize=16)
+def augmented_model(model: Model) -> AugmentedModel:
+    """The model with unmodelled accelerations, input gain and bias discrepancies, and an input delay."""
+    derived = model.kinematics is None
+    own = list(model.coordinates if derived else model.velocities)
+    later, latent = [f"{n}_later" for n in model.inputs], [f"unmodelled_{n}" for n in own]
+    discrepancies = [f"discrepancy_{i}_{k}" for i in range(model.n_v) for k in range(model.n_u + 1)]
+
+    def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
+        motion = [_stacked(q, model.coordinates), _stacked(v, own), _stacked(a, own) - _stacked(p, latent)]
+        applied = _stacked(u, model.inputs) + p.input_delay * _stacked(u, later)
+        forces = ca.reshape(_stacked(p, discrepancies), model.n_u + 1, model.n_v).T @ ca.vertcat(1, applied)
+        return list(ca.vertsplit(model.residual(*motion, applied, _stacked(p, model.parameters)) - forces))
+
+    def kinematics(q: Symbols, v: Symbols) -> list[object]:
+        assert model.kinematics is not None
+        return list(ca.vertsplit(model.kinematics(_stacked(q, model.coordinates), _stacked(v, own))))
+
+    augmented = Model(
+        f"{model.name}, augmented",
+        model.coordinates,
+        {**model.inputs, **dict(zip(later, model.inputs.values(), strict=True))},
+        {**model.parameters, **{n: Parameter("") for n in (*discrepancies, "input_delay", *latent)}},
+        equations,
+        velocities=None if derived else model.velocities,
+        kinematics=None if derived else kinematics,
+    )
+    return AugmentedModel(augmented, model.n_p, model.n_v, model.n_u)
+
+
+def _stacked(symbols: Symbols, names: Iterable[str]) -> ca.SX:
+    return ca.SX(ca.vertcat(*(getattr(symbols, n) for n in names)))

@@ -1,0 +1,228 @@
+"""Parameters from the most probable motion by instrumental variables, and their covariance.
+
+Where the model is right, the parameters of the fit are the parameters.  Where it is not, the log is explained by
+parameters and discrepancies together, in proportions that depend on the noise.  The parameters that are wanted are
+those of least squares on noise-free data, for which the equations hold best.  ``W p = b`` is solved again, on the fitted
+motion, with instruments that leave the unmodelled accelerations out: accelerations with noise would pull inertias
+towards zero.
+
+The covariance has three parts: the fit's, carried through that solution; that of the unmodelled forces that no
+parameters make, as a sample of the forces on the machine, for another log would hold others; and the change under a
+tenfold wider prior on model error, because a deviation from the model that is the same all along is more than chance.
+
+References
+----------
+Plumlee 2017 (discrepancies orthogonal to the model); Janot, Vandanjon, Gautier 2014 (instruments from a simulated
+model); White 1982 (inference under a wrong model); Hausman 1978 (specification tests).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from diransac.arrays import FloatArray, IntArray
+from diransac.identification.methods.lo_diransac.normal_equations import linearize
+from diransac.identification.methods.lo_diransac.refinement import weights_of
+from diransac.simulation.compiler import compile_map
+
+if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.methods.lo_diransac.smoothing import Motion
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.model import Model
+    from diransac.simulation.compiler import Map
+
+__all__ = ["InstrumentalEstimate", "discrepancy_units", "estimate_parameters", "inertial_forces", "parameter_units", "unexplained"]
+
+
+_TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class InstrumentalEstimate:
+    """Parameters that hold for the whole motion.
+
+    Parameters
+    ----------
+    parameters, covariance : (n,), (n, n)   per-log parameters of every log included
+    unexplained : (W, n_v)   mean of each interval's accelerations that the model with these parameters does not make
+    delay_error : standard error of the delay, samples
+    """
+
+    parameters: FloatArray
+    covariance: FloatArray
+    unexplained: FloatArray
+    delay_error: float
+
+
+def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation: float) -> InstrumentalEstimate:
+    """The parameters for which the equations hold best on the fitted motion, and their covariance."""
+    found = _solution(intervals, fit)
+    change = _solution(intervals, _inflated_prior(intervals, fit, prior_inflation)).parameters - found.parameters
+    return replace(found, covariance=found.covariance + np.outer(change, change))
+
+
+def _inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fit:
+    """The fit, by one step, with unmodelled accelerations so many times as large as the evidence has them."""
+    inflated, n_x = replace(fit, tau=factor * fit.tau), fit.x.shape[1]
+    at = linearize(intervals, inflated, weights_of(intervals, fit))
+    step = at.system.solve(at.right_z, at.right_s)
+    x, d = fit.x + step.step_z[:, :n_x], fit.d + step.step_z[:, n_x:]
+    return replace(inflated, shared=fit.shared + step.step_p, x=x, d=d)
+
+
+def _solution(intervals: ShootingIntervals, fit: Fit) -> InstrumentalEstimate:
+    """Parameters, and the first two parts of their covariance.
+
+    In the fit they hold exactly, with the discrepancies and the unmodelled accelerations besides:
+    ``r(p) = g + M d``.  The component of either in the regressor's column space is attributed to the parameters: of the
+    discrepancies row by row; of the unmodelled accelerations, which are constant over an interval, by interval means.
+    """
+    n_p, n_s, n_x, n_v = intervals.n_p, len(fit.shared), fit.x.shape[1], intervals.model.n_v
+    by_rows, by_means, push, M = _gains(intervals, fit)
+    latent = np.einsum("wij,wj->wi", M, fit.d)
+    p = fit.shared[:n_p] - np.einsum("pni,ni->p", by_rows, push) - np.einsum("pwi,wi->p", by_means, latent)
+    of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + n_v, n_p))
+    level = np.hstack([np.ones((len(push), 1)), intervals.inputs])
+    of_s[:n_p] = np.eye(n_p)
+    of_s[n_p:-1] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
+    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means, M)
+    at = linearize(intervals, fit, weights_of(intervals, fit))
+    z, s = at.system.functional(of_z, of_s)
+    covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s
+    sampled = _sampled(intervals, fit, by_rows, by_means, push, latent)
+    delay = at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
+    return InstrumentalEstimate(p, covariance + sampled, unexplained(intervals, fit, p), float(np.sqrt(delay)))
+
+
+def _gains(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Effect of rows (n, N, n_v) and interval means (n, W, n_v) on the parameters; discrepancies (N, n_v); mean M.
+
+    The instruments are the regressors of the motion without its unmodelled accelerations; M is (W, n_v, n_v).
+    """
+    evaluate, (q, v, a, u) = _residual_map(intervals.model), _motion(intervals, fit)
+    quiet, p = a - np.repeat(fit.d, intervals.length, axis=0), _row_parameters(intervals, fit.shared)
+    push, Z, M = evaluate(q, v, quiet, u, p)
+    W = evaluate(q, v, a, u, p)[1]
+    logged = intervals.is_logged[:, None]
+    W, Z = _regressors(intervals, W * logged), _regressors(intervals, Z * logged)
+    by_means = _instrumented(_means(intervals, W), _means(intervals, Z))
+    return _instrumented(W, Z), by_means, push * logged, _means(intervals, _matrices(M, intervals.model.n_v))
+
+
+def _sampled(
+    intervals: ShootingIntervals, fit: Fit, by_rows: FloatArray, by_means: FloatArray, push: FloatArray, latent: FloatArray
+) -> FloatArray:
+    """Covariance of the parameters over logs with other unmodelled forces than these, which it estimates."""
+    q, v, a, u = _motion(intervals, fit)
+    p = _row_parameters(intervals, fit.shared)
+    W = _regressors(intervals, _residual_map(intervals.model)(q, v, a, u, p)[1] * intervals.is_logged[:, None])
+    unmade = latent - _means(intervals, W) @ np.einsum("pwi,wi->p", by_means, latent)
+    unpushed = push - W @ np.einsum("pni,ni->p", by_rows, push)
+    of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)
+    sums = _batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
+    return np.asarray(sums.T @ sums)
+
+
+def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:
+    """Mean accelerations (W, n_v) of the fitted motion that the model does not make: ``M^-1 r`` of the residuals."""
+    p = _row_parameters(intervals, parameters)
+    residuals, _, M = _residual_map(intervals.model)(*_motion(intervals, fit), p)
+    left = np.linalg.solve(_matrices(M, intervals.model.n_v), residuals[:, :, None])[:, :, 0]
+    logged = intervals.is_logged[:, None].astype(float)
+    return _means(intervals, left * logged) / _means(intervals, logged)
+
+
+def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
+    """The discrepancy that would make all of its equation's inertial force; infinite for parameters."""
+    force = inertial_forces(intervals, motion, p)
+    level = np.append(1.0, np.sqrt(np.square(intervals.inputs).mean(axis=0)) + _TINY)
+    return np.concatenate([np.full(intervals.n_p, np.inf), (force[:, None] / level).ravel(), [1.0]])
+
+
+def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
+    """The change of each parameter ``(n,)`` that would make all of some equation's inertial force."""
+    W = _residual_map(intervals.model)(*_smoothed(intervals, motion), _row_parameters(intervals, p, logged=True))[1]
+    logs = intervals.log_of_row[intervals.is_logged]
+    sizes = np.sqrt(np.square(_by_log(intervals, _matrices(W, intervals.model.n_p), logs)).mean(axis=0)).T
+    return np.asarray((inertial_forces(intervals, motion, p) / np.maximum(sizes, _TINY)).min(axis=1))
+
+
+def inertial_forces(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
+    """RMS of ``M a`` of each equation, (n_v,)."""
+    q, v, a, u = _smoothed(intervals, motion)
+    n_v = intervals.model.n_v
+    own = _row_parameters(intervals, p, logged=True)
+    M = _residual_map(intervals.model)(q, v, a, u, own)[2].reshape(len(a), n_v, n_v)
+    return np.asarray(np.sqrt(np.square(np.einsum("nji,nj->ni", M, a)).mean(axis=0)))
+
+
+def _smoothed(intervals: ShootingIntervals, motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Smoothed coordinates, velocities, accelerations and the inputs of all logged rows."""
+    model, logged = intervals.model, intervals.is_logged
+    q, v, a = np.split(motion.signals[logged], [model.n_q, model.n_q + model.n_v], axis=1)
+    return q, v, a, intervals.inputs[logged]
+
+
+def _motion(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Fitted coordinates, velocities and accelerations, and the inputs as they act, each (N, n)."""
+    model = intervals.model
+    series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
+    q, v, a = np.split(series.reshape(len(intervals.measured), -1), [model.n_q, model.n_q + model.n_v], axis=1)
+    return q, v, a, intervals.inputs + fit.shared[-1] * intervals.moving_inputs[:, model.n_u :]
+
+
+def _row_parameters(intervals: ShootingIntervals, values: FloatArray, *, logged: bool = False) -> FloatArray:
+    """Parameters of the model: one vector for all rows, or (N, n_p) where logs differ; of logged rows, or all."""
+    logs = intervals.log_of_row[intervals.is_logged] if logged else intervals.log_of_row
+    return intervals.parameters_of(values[: intervals.n_p], logs)
+
+
+def _regressors(intervals: ShootingIntervals, columns: FloatArray) -> FloatArray:
+    """Regressors (N, r, n) from matrices that were stored column by column; zero in other logs' parameters."""
+    return _by_log(intervals, _matrices(columns, intervals.model.n_p), intervals.log_of_row)
+
+
+def _by_log(intervals: ShootingIntervals, W: FloatArray, logs: IntArray) -> FloatArray:
+    """Regressors (N, r, n_p) of rows with their columns in the places of their logs (N, r, n)."""
+    if intervals.layout.is_shared:
+        return W
+    full = np.zeros((*W.shape[:2], intervals.n_p))
+    np.put_along_axis(full, np.broadcast_to(intervals.layout.index[logs][:, None, :], W.shape), W, axis=2)
+    return full
+
+
+def _residual_map(model: Model) -> Map:
+    """Residuals, and their derivatives with respect to parameters and accelerations, column by column."""
+    q, v, a, u, p = (ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup"))
+    r = model.residual(q, v, a, u, p)
+    slopes = [ca.densify(ca.jacobian(r, x)) for x in (p, a)]
+    return compile_map(ca.Function("residuals", [q, v, a, u, p], [ca.densify(r), *slopes]))
+
+
+def _batch_sums(values: FloatArray) -> FloatArray:
+    """Sums over about sqrt(W) neighbouring intervals each: their squares count what neighbours have in common."""
+    return np.add.reduceat(values, np.arange(0, len(values), round(np.sqrt(len(values)))), axis=0)
+
+
+def _means(intervals: ShootingIntervals, rows: FloatArray) -> FloatArray:
+    """Mean of each interval, (W, ...)."""
+    return np.asarray(rows.reshape(len(intervals), intervals.length, *rows.shape[1:]).mean(axis=1))
+
+
+def _matrices(columns: FloatArray, n_columns: int) -> FloatArray:
+    """Matrices (N, r, n_columns) that were stored column by column."""
+    return columns.reshape(len(columns), n_columns, -1).swapaxes(1, 2)
+
+
+def _instrumented(A: FloatArray, Z: FloatArray) -> FloatArray:
+    """``(Z'A)^-1 Z'`` of stacked matrices (N, r, n), as (n, N, r); columns scaled to one."""
+    rows, instruments = A.reshape(-1, A.shape[2]), Z.reshape(-1, A.shape[2])
+    scale = np.linalg.norm(instruments, axis=0) + _TINY
+    instruments = instruments / scale
+    solved = np.linalg.lstsq(instruments.T @ (rows / scale), instruments.T, rcond=None)[0] / scale[:, None]
+    return np.asarray(solved).reshape(-1, *A.shape[:2])

@@ -1,0 +1,156 @@
+"""`LoDiransac`: the settings of the default method."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from diransac.blas import single_threaded
+from diransac.errors import SettingsError
+from diransac.identification.settings import JUDGING, Settings, check_used
+
+if TYPE_CHECKING:
+    from diransac.data.dataset import Dataset
+    from diransac.identification.estimate import Estimate
+    from diransac.identification.method import Callback
+
+__all__ = ["LoDiransac", "configured"]
+
+
+@dataclass(frozen=True)
+class LoDiransac:
+    """Locally optimised DIRANSAC: random samples, consensus by simulation, one weak-constraint fit of all logs.
+
+    Every default works for any model and any subset of signals.  Times are in seconds; a window of less than a few
+    samples is widened to them.
+
+    Parameters
+    ----------
+    criteria : settings of the evaluation: weights, thresholds and initial state, threads
+    stuck_rows : whether rows that repeat the row before in every signal are taken as missing
+    input_window : s, window of the Hampel filter that replaces momentary leaps of inputs
+    input_threshold : of that filter, in local standard deviations
+    median_window : s, window of the running median that residuals of the smoothing start from
+    smoothing_half_width : s, narrowest half width of the smoothing polynomials, and of the shooting intervals; the
+        shorter of it and 25 samples.  Three times, nine times, ... as wide ones are chosen by cross-validation
+    n_samples, n_nonlinear_samples : random samples of a model that is affine in its parameters, and of others
+    largest_sample : rows of each equation in a sample at most, over the number of parameters
+    n_screening_intervals, n_finalists : intervals on which all hypotheses are scored, and the best that are scored on all
+    delay_range : s, delays of the inputs that are tried before local optimisation, in whole samples
+    max_delay_shifts : how often inputs are shifted by whole samples after it
+    substeps : integration steps per sample: one is off by a percent where dry friction changes sign between samples or
+        links are light
+    max_starts, max_fits : hypotheses that may be optimised, and local optimisations at most
+    max_steps : Gauss-Newton steps of each at most; 0: the best hypothesis is the estimate
+    outliers : whether the noise of each signal has outliers; it is Gaussian without
+    neighbouring_starts : whether intervals may begin where their neighbours end, where that explains them better
+    gradual_continuity : whether the motion is made continuous gradually rather than from the start
+    robust_model_error : whether the size of unmodelled accelerations follows the median interval at first
+    model_error : whether unmodelled accelerations follow the evidence; they vanish without
+    prior_model_error : their size before the log is seen, over the spread of the accelerations
+    prior_discrepancy, initial_discrepancy : size of input gain and bias discrepancies, over that which makes all of an
+        equation's inertial force, before the log is seen and on the way down
+    prior_delay : s, standard deviation of the input delay before the log is seen
+    instrumental_variables : whether parameters are read from the fitted motion by instrumental variables, rather than
+        from the fit
+    prior_inflation : factor of the prior on model error whose effect on the parameters is added to their covariance
+
+    Raises
+    ------
+    SettingsError
+        A value has no meaning.
+    """
+
+    criteria: Settings = field(default_factory=Settings)
+    stuck_rows: bool = True
+    input_window: float = 0.15
+    input_threshold: float = 8.0
+    median_window: float = 0.31
+    smoothing_half_width: float = 0.25
+    n_samples: int = 200
+    n_nonlinear_samples: int = 100
+    largest_sample: int = 4
+    n_screening_intervals: int = 12
+    n_finalists: int = 12
+    delay_range: tuple[float, float] = (-0.03, 0.08)
+    max_delay_shifts: int = 3
+    substeps: int = 5
+    max_starts: int = 5
+    max_fits: int = 8
+    max_steps: int = 60
+    outliers: bool = True
+    neighbouring_starts: bool = True
+    gradual_continuity: bool = True
+    robust_model_error: bool = True
+    model_error: bool = True
+    prior_model_error: float = 1e-3
+    prior_discrepancy: float = 0.1
+    initial_discrepancy: float = 0.01
+    prior_delay: float = 3e-4
+    instrumental_variables: bool = True
+    prior_inflation: float = 10.0
+
+    name = "lo-diransac"
+    needs_all_signals = False
+
+    def __post_init__(self) -> None:
+        check_used(self.criteria, (*JUDGING, "initial_state"), self.name)
+        for f in dataclasses.fields(self):
+            value = getattr(self, f.name)
+            if f.name != "criteria":
+                object.__setattr__(self, f.name, _checked(f.name, value, f.default))
+        if not self.delay_range[0] <= 0.0 <= self.delay_range[1]:
+            raise SettingsError(f"delay_range is {self.delay_range}; give (earliest, latest) in s, with 0 between them")
+
+    def options(self) -> Mapping[str, Any]:
+        """All settings but the criteria."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "criteria"}
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+
+    def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
+        """Parameters of the model from the logs, without starting values or thresholds.
+
+        Raises
+        ------
+        LogError
+            The logs are too short, or sampled at different rates.
+        IdentificationError
+            No sample gives parameters within their bounds.
+        """
+        from diransac.identification.methods.lo_diransac.method import estimate
+
+        with single_threaded():  # matrices are small: other cores would only wait
+            return estimate(self, dataset, int(seed), callback)
+
+
+def configured(settings: Settings) -> LoDiransac:
+    """The method with its defaults, evaluated by the given settings."""
+    return LoDiransac(settings)
+
+
+_MAY_BE_ZERO = ("n_samples", "max_delay_shifts", "max_steps", "prior_model_error", "prior_discrepancy", "prior_delay")
+
+
+def _checked(name: str, value: Any, default: Any) -> Any:
+    """The value as the kind of its default.  Raises SettingsError: it is none, or out of range."""
+    least = "at least 0" if name in _MAY_BE_ZERO else "above 0"
+    if isinstance(default, bool):
+        if not isinstance(value, bool):
+            raise SettingsError(f"{name} is {value!r}; give True or False")
+        return value
+    if isinstance(default, tuple):
+        try:
+            low, high = (float(x) for x in value)
+        except (TypeError, ValueError) as error:
+            raise SettingsError(f"{name} is {value!r}; give two numbers") from error
+        return low, high
+    kinds = (int, np.integer) if isinstance(default, int) else (int, float, np.number)
+    if isinstance(value, bool) or not isinstance(value, kinds) or not np.isfinite(value):
+        raise SettingsError(f"{name} is {value!r}; give a {'whole ' if isinstance(default, int) else ''}number {least}")
+    if value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
+        raise SettingsError(f"{name} is {value!r}; give a number {least}")
+    return type(default)(value)

@@ -1,0 +1,200 @@
+"""Logs cut into intervals of equal length, each a rollout of its own: the lanes of multiple shooting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.identification.methods.lo_diransac.augmented_model import AugmentedModel, augmented_model
+from diransac.simulation import Measurements, RolloutBatch, rollouts
+
+if TYPE_CHECKING:
+    from diransac.data.dataset import ParameterLayout
+    from diransac.model import Model
+    from diransac.simulation import GaussNewtonBatch, Simulator
+
+__all__ = ["ShootingIntervals"]
+
+_DIVERGED = 1e6
+_WELL_CONDITIONED = 1e8
+
+
+@dataclass(frozen=True)
+class ShootingIntervals:
+    """Rows of all logs as intervals of ``length`` rows; made by `of`, which fills up the last interval of each log.
+
+    Parameters
+    ----------
+    model : what is identified
+    layout : places of each log's parameters
+    measured, known : (N, n_s)   every signal of the model, in its order; nothing is known of rows that fill up
+    inputs : (N, n_u)
+    is_logged : (N,)   rows of the logs, as opposed to those that fill up
+    log_of : (W,)   log of each interval
+    dt : s
+    length : rows of an interval
+    substeps : integration steps from row to row
+    """
+
+    model: Model
+    layout: ParameterLayout
+    measured: FloatArray
+    known: BoolArray
+    inputs: FloatArray
+    is_logged: BoolArray
+    log_of: IntArray
+    dt: float
+    length: int
+    substeps: int
+
+    @classmethod
+    def of(
+        cls,
+        model: Model,
+        layout: ParameterLayout,
+        logs: Sequence[tuple[FloatArray, BoolArray, FloatArray]],
+        dt: float,
+        length: int,
+        substeps: int,
+    ) -> ShootingIntervals:
+        """Intervals of logs, each given as measured, known (N, n_s) and inputs (N, n_u)."""
+        missing = [-len(inputs) % length for _, _, inputs in logs]
+        measured, inputs = (
+            np.concatenate([_filled_up(log[k], more) for log, more in zip(logs, missing, strict=True)]) for k in (0, 2)
+        )
+        known = np.concatenate([np.pad(log[1], ((0, n), (0, 0))) for log, n in zip(logs, missing, strict=True)])
+        sizes = [len(inputs) for _, _, inputs in logs]
+        is_logged = np.concatenate([np.arange(n + more) < n for n, more in zip(sizes, missing, strict=True)])
+        log_of = np.repeat(np.arange(len(logs)), [-(-n // length) for n in sizes])
+        return cls(model, layout, measured, known, inputs, is_logged, log_of, dt, length, substeps)
+
+    def __len__(self) -> int:
+        return len(self.log_of)
+
+    @cached_property
+    def starts(self) -> IntArray:
+        """First row of each interval."""
+        return np.arange(len(self), dtype=np.int64) * self.length
+
+    @cached_property
+    def linked(self) -> BoolArray:
+        """Whether each interval but the last goes on in the next one ``(W - 1,)``: both are of one log."""
+        return np.asarray(self.log_of[1:] == self.log_of[:-1])
+
+    @cached_property
+    def first_of_log(self) -> IntArray:
+        """First row of each log."""
+        return self.starts[np.searchsorted(self.log_of, np.arange(self.layout.n_logs))]
+
+    @cached_property
+    def log_of_row(self) -> IntArray:
+        """Log of each row ``(N,)``."""
+        return np.repeat(self.log_of, self.length)
+
+    @property
+    def duration(self) -> float:
+        """Of an interval, s."""
+        return self.length * self.dt
+
+    @cached_property
+    def augmented(self) -> AugmentedModel:
+        """The model with its discrepancies."""
+        return augmented_model(self.model)
+
+    @property
+    def n_p(self) -> int:
+        """Number of parameters, per-log ones of every log included."""
+        return len(self.layout)
+
+    @property
+    def n_shared(self) -> int:
+        """Number of unknowns that intervals share: parameters, discrepancies, delay."""
+        return self.n_p + self.augmented.n_discrepancies + 1
+
+    @cached_property
+    def rollouts(self) -> Simulator:
+        """Of the augmented model."""
+        return rollouts(self.augmented.model, substeps=self.substeps)
+
+    @cached_property
+    def moving_inputs(self) -> FloatArray:
+        """Inputs, and their change per sample of delay, (N, 2 n_u)."""
+        later = np.zeros_like(self.inputs)
+        for rows in self.rows_of_logs:
+            if rows.stop - rows.start > 1:
+                later[rows] = np.gradient(self.inputs[rows], axis=0)
+        return np.hstack([self.inputs, -later])
+
+    @cached_property
+    def rows_of_logs(self) -> list[slice]:
+        """Rows of each log, with those that fill up."""
+        edges = [*self.first_of_log.tolist(), len(self.inputs)]
+        return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+    def delayed(self, rows: int) -> ShootingIntervals:
+        """The same logs with their inputs acting some rows later."""
+        at = [np.clip(np.arange(r.start, r.stop) - rows, r.start, r.stop - 1) for r in self.rows_of_logs]
+        return replace(self, inputs=self.inputs[np.concatenate(at)])
+
+    def parameters_of(self, values: FloatArray, logs: IntArray) -> FloatArray:
+        """Parameters ``(n, n_p of the model)`` of each of the logs ``(n,)`` from a vector, or one that serves all."""
+        return values if self.layout.is_shared else values[self.layout.index[logs]]
+
+    def batch(
+        self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray | None = None, more_rows: int = 0
+    ) -> RolloutBatch:
+        """Lanes of all intervals, or of the chosen ones, with so many rows more."""
+        chosen = np.arange(len(self)) if chosen is None else chosen
+        own = np.broadcast_to(self.parameters_of(shared[: self.n_p], self.log_of[chosen]), (len(chosen), self.model.n_p))
+        rest = np.broadcast_to(shared[self.n_p :], (len(chosen), len(shared) - self.n_p))
+        parameters = np.hstack([own, rest, d[chosen]])
+        return RolloutBatch(
+            parameters, x[chosen], self.moving_inputs, self.dt, self.starts[chosen], self.length + more_rows
+        )
+
+    @cached_property
+    def measurements(self) -> Measurements:
+        """All rows count; what isn't known in them has no weight."""
+        return Measurements(self.measured, np.ones(len(self.measured), bool))
+
+    def residuals(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
+        """Simulated less measured, (N, n_s); huge from a divergence on."""
+        errors = self.rollouts.errors(self.batch(shared, x, d), self.measurements).reshape(self.measured.shape)
+        return np.nan_to_num(errors, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
+
+    def gauss_newton(self, shared: FloatArray, x: FloatArray, d: FloatArray, weights: FloatArray) -> GaussNewtonBatch:
+        """Least-squares sums of every interval; ``weights (N, n_s)``."""
+        return self.rollouts.gauss_newton(self.batch(shared, x, d), self.measurements, weights)
+
+    def ends(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
+        """States (W - 1, n_x) in which intervals end, where their successors begin; the successor's where unlinked."""
+        chosen = np.flatnonzero(self.linked)
+        found = x[1:].copy()
+        if len(chosen):
+            series = self.rollouts.trajectories(self.batch(shared, x, d, chosen, more_rows=1))
+            found[chosen] = series[:, -1, : x.shape[1]]
+        return found
+
+    def origins(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
+        """States (W - 1, n_x) from which intervals, but for the last, would end where their successors begin.
+
+        By one Newton step; states as they are where that has no answer.
+        """
+        sums = self.gauss_newton(shared, x, d, np.zeros(self.measured.shape))
+        jumps, slopes = x[1:] - sums.final_states[:-1], sums.final_slopes[:-1, :, -x.shape[1] :]
+        finite = np.isfinite(jumps).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2)) & self.linked
+        usable = np.flatnonzero(finite)
+        usable = usable[np.linalg.cond(slopes[usable]) < _WELL_CONDITIONED]
+        found = x[:-1].copy()
+        found[usable] += np.linalg.solve(slopes[usable], jumps[usable][:, :, None])[:, :, 0]
+        return found
+
+
+def _filled_up(values: FloatArray, more: int) -> FloatArray:
+    """The rows with the last one repeated."""
+    return np.pad(values, ((0, more), (0, 0)), mode="edge") if more else values

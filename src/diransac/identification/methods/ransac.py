@@ -1,0 +1,479 @@
+"""Algorithm 1: random minimal samples, simulated over all logs, judged by consensus, refitted to their inliers.
+
+Samples do not depend on earlier results, so hypotheses are fitted and simulated a batch at a time ("speculate"); their
+scores are then walked in order exactly as the algorithm says ("replay"), and only a chain of refits runs on its own.
+The answer is that of the sequential algorithm, whatever the batch size.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.errors import IdentificationError, LogError
+from diransac.identification.estimate import Estimate, Resolution
+from diransac.identification.estimators import Estimator, OrdinaryLeastSquares, as_estimator, name_of
+from diransac.identification.evaluation import Scores, Scoring, Simulation, choose_scoring, mean_squared_error, rms_error
+from diransac.identification.method import report
+from diransac.identification.methods.least_squares import bound_to, fitted
+from diransac.identification.nonlinear import NonlinearLeastSquares
+from diransac.identification.sampling import sample_rows
+from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
+
+if TYPE_CHECKING:
+    from diransac.data.dataset import Dataset
+    from diransac.identification.estimators import BoundEstimator
+    from diransac.identification.method import Callback
+    from diransac.model import Model
+
+__all__ = ["Diransac", "Evaluator", "Hypothesis", "IDiransac", "Score", "ScoredBatch", "SearchState", "Variant", "search"]
+
+Sampler = Callable[[int, IntArray, int, int, int], IntArray]
+
+_FIRST_BATCH = 16
+_SEARCH = ("sample_size", "max_iterations", "refit")
+
+
+# ---------------------------------------------------------------------- consensus
+
+
+@dataclass(frozen=True)
+class Score:
+    """A hypothesis' ``error`` (eq. (2) or its square sibling; infinite where it diverged) and ``inlier_fraction``."""
+
+    error: float = np.inf
+    inlier_fraction: float = 0.0
+
+
+class Variant(Protocol):
+    """The parts in which DIRANSAC and I-DIRANSAC differ."""
+
+    @property
+    def name(self) -> str:
+        """Name of the method."""
+
+    @property
+    def criteria(self) -> Settings:
+        """Settings of the search."""
+
+    def errors(self, sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
+        """Model-fit error of every hypothesis."""
+
+    def improves(self, new: Score, best: Score) -> bool:
+        """Whether a hypothesis is worth more than a look (Algorithm 1, line 19)."""
+
+    def accepts(self, new: Score, best: Score) -> bool:
+        """Whether an improving hypothesis is stored (line 20)."""
+
+    def refits(self, *, stored: bool) -> bool:
+        """Whether an improving hypothesis hands its inliers to the next one (lines 25-31)."""
+
+    def is_finished(self, best: Score, stop_inlier_fraction: float | None) -> bool:
+        """Whether the stored model ends the search early (line 3)."""
+
+
+@dataclass(frozen=True)
+class _Ransac:
+    """The parts that both variants share: settings, the estimator inside, and the search.
+
+    Parameters
+    ----------
+    criteria : settings of the search and of the evaluation
+    estimator : inside the search; None: `OrdinaryLeastSquares`, or `NonlinearLeastSquares` where the model is not
+        affine in its parameters
+
+    Raises
+    ------
+    SettingsError
+        A setting has no use here, or the estimator is none.
+    """
+
+    criteria: Settings = field(default_factory=Settings)
+    estimator: object = None
+    needs_all_signals = True
+
+    def options(self) -> Mapping[str, Any]:
+        """None beside the criteria and the estimator."""
+        return {}
+
+    def _estimator(self, model: Model) -> Estimator:
+        if self.estimator is not None:
+            return as_estimator(self.estimator)
+        return NonlinearLeastSquares() if model.nonlinear_parameters else OrdinaryLeastSquares()
+
+    def _fit(self, variant: Variant, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
+        settings, estimator = self.criteria, self._estimator(dataset.model)
+        bound = bound_to(estimator, dataset)
+        evaluator = Evaluator(dataset, choose_scoring(dataset, settings), variant)
+        if bound.n_rows < settings.sample_size:
+            raise LogError(
+                f"{dataset.source}: {bound.n_rows} usable rows are fewer than sample_size = "
+                f"{settings.sample_size}; give a longer log or a smaller sample_size"
+            )
+        found = search(variant, bound, evaluator, sample_rows, int(seed), callback)
+        assert found.best is not None
+        estimate = fitted(
+            bound,
+            dataset,
+            found.best.parameters,
+            np.sort(found.best.rows),
+            estimator=name_of(estimator),
+            resolution=Resolution(settings.integrator, settings.substeps),
+        )
+        return replace(
+            estimate,
+            iterations=found.iterations,
+            n_hypotheses=found.n_hypotheses,
+            stop_reason=found.stop_reason,
+            rejected=dict(found.rejected),
+        )
+
+
+@dataclass(frozen=True)
+class IDiransac(_Ransac):
+    """I-DIRANSAC: RMS error, eq. (3), a refit of the inliers of every improving hypothesis, a stop by inlier fraction.
+
+    References
+    ----------
+    Dimmig et al. 2023, Algorithm 1.
+    """
+
+    name = "i-diransac"
+
+    def __post_init__(self) -> None:
+        used = (*_SEARCH, "stop_inlier_fraction", "acceptance_weights", *JUDGING, *SIMULATION)
+        check_used(self.criteria, used, self.name)
+
+    def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
+        """The best hypothesis of the search.
+
+        Raises
+        ------
+        IdentificationError
+            The dataset does not determine the parameters, or no hypothesis was accepted.
+        LogError
+            There are fewer rows than a sample has, or an initial state is missing.
+        """
+        return self._fit(self, dataset, seed, callback)
+
+    def errors(self, sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
+        """Eq. (2)."""
+        return rms_error(sum_squares, n_rows, weights)
+
+    def improves(self, new: Score, best: Score) -> bool:
+        """More inliers or less error."""
+        return new.inlier_fraction > best.inlier_fraction or new.error < best.error
+
+    def accepts(self, new: Score, best: Score) -> bool:
+        """``nu_e e^2 + nu_f / f^2`` is less, eq. (3); a term of zero weight is left out."""
+        if self.criteria.acceptance_weights[1] > 0.0 and new.inlier_fraction == 0.0:
+            return False
+        return self._cost(new) < self._cost(best)
+
+    def _cost(self, score: Score) -> float:
+        for_error, for_inliers = self.criteria.acceptance_weights
+        # A product overflows to infinity, where a power of a Python float raises.
+        cost = for_error * (score.error * score.error) if for_error > 0.0 else 0.0
+        if for_inliers > 0.0:
+            cost += for_inliers * (1.0 / score.inlier_fraction) ** 2 if score.inlier_fraction > 0.0 else np.inf
+        return cost
+
+    def refits(self, *, stored: bool) -> bool:
+        """Near misses, too."""
+        return True
+
+    def is_finished(self, best: Score, stop_inlier_fraction: float | None) -> bool:
+        """The stored fraction of inliers has reached the threshold."""
+        return stop_inlier_fraction is not None and best.inlier_fraction >= stop_inlier_fraction
+
+
+@dataclass(frozen=True)
+class Diransac(_Ransac):
+    """DIRANSAC, the predecessor: mean squared error, the smallest is stored and refitted, the cap alone ends it.
+
+    References
+    ----------
+    Dimmig et al. 2023, section III, on its reference [22].
+    """
+
+    name = "diransac"
+
+    def __post_init__(self) -> None:
+        # It never ends early, which is what stop_inlier_fraction = None says.
+        used = (*_SEARCH, *JUDGING, *SIMULATION)
+        check_used(self.criteria, used if self.criteria.stop_inlier_fraction else (*used, "stop_inlier_fraction"), self.name)
+
+    def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
+        """The best hypothesis of the search; raises as `IDiransac.fit`."""
+        return replace(self._fit(self, dataset, seed, callback), squared_error=True)
+
+    def errors(self, sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
+        """Eq. (2) without the root."""
+        return mean_squared_error(sum_squares, n_rows, weights)
+
+    def improves(self, new: Score, best: Score) -> bool:
+        """Less error; inliers play no part."""
+        return new.error < best.error
+
+    def accepts(self, new: Score, best: Score) -> bool:
+        """Whatever improves is stored."""
+        return True
+
+    def refits(self, *, stored: bool) -> bool:
+        """Only what was stored."""
+        return stored
+
+    def is_finished(self, best: Score, stop_inlier_fraction: float | None) -> bool:
+        """Never early."""
+        return False
+
+
+# ---------------------------------------------------------------------- hypotheses
+
+
+class ScoredBatch:
+    """Scores of a batch of hypotheses, and the rows that are their inliers."""
+
+    def __init__(self, scores: Scores, errors: FloatArray, n_rows: int, valid: Sequence[BoolArray]) -> None:
+        self._scores, self._valid = scores, valid
+        fractions = scores.inlier_count / n_rows
+        self.scores = [Score(e, f) for e, f in zip(errors.tolist(), fractions.tolist(), strict=True)]
+
+    def inliers(self, lane: int) -> IntArray:
+        """Usable rows, numbered log after log, that are inliers of one hypothesis, ascending."""
+        masks = self._scores.inlier_masks(lane)
+        return np.flatnonzero(np.concatenate([m[v] for m, v in zip(masks, self._valid, strict=True)]))
+
+
+class Evaluator:
+    """Bounds, simulation, error and inliers of hypotheses over a dataset.
+
+    Raises
+    ------
+    LogError
+        A log lacks its initial state.
+    """
+
+    def __init__(self, dataset: Dataset, scoring: Scoring, variant: Variant) -> None:
+        settings, judged = variant.criteria, scoring.judged
+        self._dataset, self._variant = dataset, variant
+        self._weights, self._thresholds = scoring.weights[judged], scoring.thresholds[judged]
+        self._min_inlier_signals = scoring.min_inlier_signals
+        self._valid = [one.valid for one in dataset.segments]
+        resolution, rules = Resolution(settings.integrator, settings.substeps), [settings.initial_state] * len(self._valid)
+        self._simulation = Simulation(dataset, judged, resolution, rules, settings.threads)
+        self._simulation.starts  # noqa: B018  refuses a log without an initial state
+
+    def admits(self, parameters: FloatArray) -> BoolArray:
+        """Preliminary test of ``(n_vectors, n)`` parameters: every one within its bounds."""
+        return self._dataset.layout.admits(parameters)
+
+    def score(self, parameters: FloatArray) -> ScoredBatch:
+        """Error, inlier fraction and inliers of every hypothesis ``(n_vectors, n)``."""
+        scores = self._simulation.score(parameters, self._thresholds, self._min_inlier_signals)
+        n_rows = self._dataset.n_rows
+        return ScoredBatch(scores, self._variant.errors(scores.sum_squares, n_rows, self._weights), n_rows, self._valid)
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Parameters ``(n,)``, the usable rows that they were fitted to, ascending, and their place in a scored batch."""
+
+    parameters: FloatArray
+    rows: IntArray
+    batch: ScoredBatch
+    lane: int
+
+    @property
+    def score(self) -> Score:
+        """Error and inlier fraction."""
+        return self.batch.scores[self.lane]
+
+
+# ---------------------------------------------------------------------- the search
+
+
+@dataclass
+class SearchState:
+    """State of a search.
+
+    Parameters
+    ----------
+    best : the stored hypothesis; None while nothing was accepted
+    iterations : k, samples drawn
+    n_hypotheses : hypotheses looked at, refits included
+    rejected : hypotheses that went no further, by reason
+    stop_reason : why it ended
+    """
+
+    best: Hypothesis | None = None
+    iterations: int = 0
+    n_hypotheses: int = 0
+    rejected: Counter[str] = field(default_factory=Counter)
+    stop_reason: str = ""
+
+    @property
+    def score(self) -> Score:
+        """Score of the stored hypothesis; infinite error and no inliers while there is none."""
+        return Score() if self.best is None else self.best.score
+
+
+def search(
+    variant: Variant,
+    estimator: BoundEstimator,
+    evaluator: Evaluator,
+    sampler: Sampler,
+    seed: int,
+    callback: Callback | None = None,
+) -> SearchState:
+    """Algorithm 1 in the given variant.
+
+    Parameters
+    ----------
+    sampler : ``(seed, iterations, n_rows, start, stop) -> rows``, as `sampling.sample_rows`
+    callback : called after every batch
+
+    Raises IdentificationError: the whole log is not well-defined, or nothing was ever accepted.
+    References: Dimmig et al. 2023, Algorithm 1.
+    """
+    settings, state = variant.criteria, SearchState()
+    for batch in _batches(settings):
+        drawn = _speculate(batch, settings.sample_size, estimator, evaluator, sampler, seed)
+        for hypothesis in drawn:
+            if variant.is_finished(state.score, settings.stop_inlier_fraction):
+                break
+            state.iterations += 1
+            _replay(hypothesis, state, variant, estimator, evaluator)
+        fraction = state.iterations / settings.max_iterations
+        report(callback, "searching", fraction, f"{state.score.inlier_fraction:.0%} inliers")
+        if variant.is_finished(state.score, settings.stop_inlier_fraction):
+            break
+    if state.best is None:
+        raise IdentificationError(_nothing_accepted(state))
+    finished = variant.is_finished(state.score, settings.stop_inlier_fraction)
+    state.stop_reason = "inlier fraction reached" if finished else "iteration limit reached"
+    return state
+
+
+def _batches(settings: Settings) -> Iterator[IntArray]:
+    """Iterations in batches that grow from a few to ``batch_size`` where the search may stop early, as many do."""
+    may_stop = settings.stop_inlier_fraction is not None
+    start, size = 0, min(_FIRST_BATCH, settings.batch_size) if may_stop else settings.batch_size
+    while start < settings.max_iterations:
+        stop = min(start + size, settings.max_iterations)
+        yield np.arange(start, stop)
+        start, size = stop, min(2 * size, settings.batch_size)
+
+
+def _speculate(
+    batch: IntArray,
+    sample_size: int,
+    estimator: BoundEstimator,
+    evaluator: Evaluator,
+    sampler: Sampler,
+    seed: int,
+) -> list[Hypothesis | None]:
+    """The hypothesis of every sample in the batch, None where it fails the preliminary test."""
+    samples: list[IntArray] = list(sampler(seed, batch, estimator.n_rows, 0, sample_size))
+    selected = estimator.select(samples)
+    poor = np.flatnonzero(~selected.well_defined())
+    for i in poor:
+        samples[i] = _grow(samples[i], batch[i : i + 1], estimator, sampler, seed)
+    parameters = (estimator.select(samples) if len(poor) else selected).fit()
+    admitted = np.flatnonzero(evaluator.admits(parameters))
+    if not len(admitted):
+        return [None] * len(samples)
+    scored, lanes = evaluator.score(parameters[admitted]), {int(i): lane for lane, i in enumerate(admitted)}
+    return [
+        Hypothesis(parameters[i], np.sort(rows), scored, lanes[i]) if i in lanes else None
+        for i, rows in enumerate(samples)
+    ]
+
+
+def _grow(sample: IntArray, k: IntArray, estimator: BoundEstimator, sampler: Sampler, seed: int) -> IntArray:
+    """The sample with as many more random observations as make it well-defined (lines 6-10).
+
+    Adding an observation never lowers the smallest eigenvalue: the least number is found by doubling, then bisection.
+    """
+    low, whole = len(sample), sample
+    while not estimator.select([whole]).well_defined()[0]:
+        low = len(whole)
+        if low == estimator.n_rows:
+            raise IdentificationError("the whole log is not well-defined: it does not determine the parameters")
+        more = sampler(seed, k, estimator.n_rows, low, min(2 * low, estimator.n_rows))[0]
+        whole = np.concatenate([whole, more])
+    high = len(whole)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if estimator.select([whole[:middle]]).well_defined()[0] else (middle, high)
+    return whole[:high]
+
+
+def _replay(
+    hypothesis: Hypothesis | None,
+    state: SearchState,
+    variant: Variant,
+    estimator: BoundEstimator,
+    evaluator: Evaluator,
+) -> None:
+    """One sample and the chain of refits that it starts (lines 13-34)."""
+    settings, used = variant.criteria, set[bytes]()
+    while True:
+        state.n_hypotheses += 1
+        if hypothesis is None:
+            state.rejected["out of bounds"] += 1
+            return
+        stored = _judge(hypothesis, state, variant)
+        if stored is None or settings.refit == "none" or not variant.refits(stored=stored):
+            return
+        used.add(_fingerprint(hypothesis.rows, estimator.n_rows))
+        inliers = hypothesis.batch.inliers(hypothesis.lane)
+        if _fingerprint(inliers, estimator.n_rows) in used:
+            return
+        selected = estimator.select([inliers])
+        if not selected.well_defined()[0]:
+            return
+        limit = state.iterations >= settings.max_iterations
+        if limit or variant.is_finished(state.score, settings.stop_inlier_fraction):
+            return
+        hypothesis = _refit(inliers, selected.fit(), evaluator)
+
+
+def _fingerprint(rows: IntArray, n_rows: int) -> bytes:
+    """A bit a row: a chain may be thousands of refits long, and knows every set of inliers that it has met."""
+    chosen = np.zeros(n_rows, bool)
+    chosen[rows] = True
+    return np.packbits(chosen).tobytes()
+
+
+def _judge(hypothesis: Hypothesis, state: SearchState, variant: Variant) -> bool | None:
+    """Whether a hypothesis was stored; None where it does not even improve (lines 19-23)."""
+    score = hypothesis.score
+    if not variant.improves(score, state.score):
+        state.rejected["diverged" if np.isinf(score.error) else "no improvement"] += 1
+        return None
+    if not variant.accepts(score, state.score):
+        state.rejected["diverged" if np.isinf(score.error) else "not accepted"] += 1
+        return False
+    state.best = hypothesis
+    return True
+
+
+def _refit(inliers: IntArray, parameters: FloatArray, evaluator: Evaluator) -> Hypothesis | None:
+    """The hypothesis of an inlier set with its parameters ``(1, n)``, None where it fails the preliminary test."""
+    if not evaluator.admits(parameters)[0]:
+        return None
+    return Hypothesis(parameters[0], inliers, evaluator.score(parameters), 0)
+
+
+def _nothing_accepted(state: SearchState) -> str:
+    counts: Sequence[str] = [f"{n} {reason}" for reason, n in state.rejected.most_common()]
+    return (
+        f"no hypothesis was accepted in {state.iterations} samples ({', '.join(counts)}); check units and signs of "
+        "the inputs, widen the parameter bounds or the inlier thresholds, or clean the log"
+    )

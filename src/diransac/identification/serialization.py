@@ -1,0 +1,148 @@
+"""JSON forms of frozen dataclasses: declared by their annotations, written and checked by pydantic.
+
+Fields that hold arrays name their form in their annotation (`Numbers`, `Mask`, `Series`, ...).  Pydantic is imported
+when something is first written or read.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray, IntArray
+
+__all__ = ["Mask", "Masks", "Number", "NumberPairs", "Numbers", "Series", "Values", "WholeNumbers", "dump", "load"]
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Form:
+    """Annotation of a field: how its value is written to JSON and read back."""
+
+    encode: Callable[[Any], Any]
+    decode: Callable[[Any], Any]
+
+    def __get_pydantic_core_schema__(self, _source: object, _handler: object) -> Any:
+        from pydantic_core import core_schema
+
+        written = core_schema.plain_serializer_function_ser_schema(self.encode)
+        return core_schema.no_info_plain_validator_function(self._checked, serialization=written)
+
+    def _checked(self, value: object) -> Any:
+        try:
+            return self.decode(value)
+        except (TypeError, AttributeError, KeyError) as error:
+            raise ValueError(f"{type(error).__name__}: {error}") from error
+
+    def by_name(self) -> _Form:
+        """The form of a mapping from names to such values."""
+        return _Form(
+            lambda values: {str(name): self.encode(x) for name, x in values.items()},
+            lambda data: {str(name): self.decode(x) for name, x in data.items()},
+        )
+
+
+def _encode_number(x: float) -> float | str:
+    """JSON has no infinity and no NaN."""
+    return float(x) if np.isfinite(x) else str(float(x))
+
+
+def _decode_number(x: object) -> float:
+    if isinstance(x, bool) or not isinstance(x, int | float | str):
+        raise ValueError(f"{x!r} is no number")
+    return float(x)
+
+
+def _encode_numbers(values: FloatArray) -> Any:
+    if np.isfinite(values).all():
+        return values.tolist()
+    return [_encode_numbers(x) for x in values] if values.ndim > 1 else [_encode_number(x) for x in values]
+
+
+def _decode_numbers(data: object) -> FloatArray:
+    if not isinstance(data, list):
+        raise ValueError(f"{data!r:.40} is no list of numbers")
+    return np.array(data, np.float64)
+
+
+def _decode_whole_numbers(data: object) -> IntArray:
+    if not isinstance(data, list) or not all(type(x) is int for x in data):
+        raise ValueError(f"{data!r:.40} is no list of whole numbers")
+    return np.array(data, np.int64)
+
+
+def _encode_mask(mask: BoolArray) -> dict[str, Any]:
+    return {"rows": len(mask), "bits": base64.b64encode(np.packbits(mask).tobytes()).decode()}
+
+
+def _decode_mask(data: Any) -> BoolArray:
+    n_rows = int(data["rows"])
+    packed = np.frombuffer(base64.b64decode(data["bits"], validate=True), dtype=np.uint8)
+    if len(packed) != (n_rows + 7) // 8:
+        raise ValueError(f"a mask of {n_rows} rows has {len(packed)} bytes")
+    return np.unpackbits(packed, count=n_rows).astype(bool)
+
+
+def _decode_pair(data: Any) -> tuple[float, float]:
+    first, second = data
+    return _decode_number(first), _decode_number(second)
+
+
+_NUMBER, _NUMBERS = _Form(_encode_number, _decode_number), _Form(_encode_numbers, _decode_numbers)
+_MASK = _Form(_encode_mask, _decode_mask)
+_PAIR = _Form(lambda pair: [_encode_number(x) for x in pair], _decode_pair)
+
+Number = Annotated[float, _NUMBER]
+"""A number that may be infinite or NaN."""
+Numbers = Annotated[FloatArray, _NUMBERS]
+"""An array of numbers of any shape, as nested lists."""
+WholeNumbers = Annotated[IntArray, _Form(lambda values: values.tolist(), _decode_whole_numbers)]
+"""An array ``(n,)`` of whole numbers."""
+Mask = Annotated[BoolArray, _MASK]
+"""An array ``(N,)`` of Booleans, packed."""
+Values = Annotated[Mapping[str, float], _NUMBER.by_name()]
+"""Numbers by name."""
+NumberPairs = Annotated[Mapping[str, tuple[float, float]], _PAIR.by_name()]
+"""Pairs of numbers by name."""
+Series = Annotated[Mapping[str, FloatArray], _NUMBERS.by_name()]
+"""Arrays by name."""
+Masks = Annotated[Mapping[str, BoolArray], _MASK.by_name()]
+"""Masks by name."""
+
+
+def dump(value: object) -> Any:
+    """A dataclass as a mapping that JSON can hold; `load` reads it back."""
+    return _adapter(type(value)).dump_python(value, mode="json")
+
+
+def load(kind: type[T], data: Mapping[str, Any]) -> T:
+    """The dataclass of that kind that `dump` wrote, from the keys that are its fields.
+
+    Raises
+    ------
+    ValueError
+        A key is missing, or holds something else; one line says which.
+    """
+    from pydantic import ValidationError
+
+    own = {f.name: data[f.name] for f in dataclasses.fields(kind) if f.name in data}  # type: ignore[arg-type]
+    try:
+        found: T = _adapter(kind).validate_python(own)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(x) for x in first["loc"])
+        raise ValueError(f"{place}: {first['msg']}") from error
+    return found
+
+
+@cache
+def _adapter(kind: type) -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(kind)
