@@ -10,7 +10,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import LogError, SettingsError
 from diransac.identification.methods.consensus import Score, Variant
-from diransac.simulation import Scores, default_threads, rollouts
+from diransac.simulation import Measurements, RolloutBatch, ScoreBatch, default_threads, rollouts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -126,15 +126,10 @@ class Simulation:
         self._observations, self._variant, self._scoring = observations, variant, scoring
         self._weights, self._thresholds = scoring.weights[judged], scoring.thresholds[judged]
         self._rollouts = rollouts(observations.model, names, integrator=settings.integrator, substeps=settings.substeps)
-        self._log_arrays = (
-            observations.initial_state(settings.initial_state),
-            observations.inputs,
-            np.ascontiguousarray(observations.measured[:, judged]),
-            observations.valid,
-            observations.log.dt,
-        )
+        self._start = observations.initial_state(settings.initial_state)
+        self._measurements = Measurements(observations.measured[:, judged], observations.valid)
         self._threads = settings.threads or default_threads()
-        self._latest: dict[bytes, tuple[Scores, int]] = {}
+        self._latest: dict[bytes, tuple[ScoreBatch, int]] = {}
 
     def admits(self, parameters: FloatArray) -> BoolArray:
         """Preliminary test of ``(n, n_p)`` parameters: every one within its bounds."""
@@ -144,7 +139,11 @@ class Simulation:
     def scores(self, parameters: FloatArray) -> list[Score]:
         """Error and inlier fraction of every hypothesis ``(n, n_p)``."""
         found = self._rollouts.score(
-            parameters, *self._log_arrays, self._thresholds, self._scoring.min_inlier_signals, threads=self._threads
+            RolloutBatch(parameters, self._start, self._observations.inputs, self._observations.log.dt),
+            self._measurements,
+            self._thresholds,
+            self._scoring.min_inlier_signals,
+            threads=self._threads,
         )
         self._latest = {p.tobytes(): (found, lane) for lane, p in enumerate(parameters)}
         n_rows = self._observations.n_rows

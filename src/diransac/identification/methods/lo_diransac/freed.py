@@ -57,27 +57,9 @@ class Freed:
         return self.n_p + self.n_pushes + 1
 
 
+@lru_cache(maxsize=16)
 def freed(model: Model) -> Freed:
     """The model with latent accelerations, pushes, and an input delay."""
-    return _freed(_ByEquations(model))
-
-
-class _ByEquations:
-    """A model as a key: equal where the equations are."""
-
-    def __init__(self, model: Model) -> None:
-        self.model = model
-
-    def __hash__(self) -> int:
-        return hash(self.model.fingerprint)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ByEquations) and other.model.fingerprint == self.model.fingerprint
-
-
-@lru_cache(maxsize=16)
-def _freed(key: _ByEquations) -> Freed:
-    model = key.model
     derived = model.kinematics is None
     own = list(model.coordinates if derived else model.velocities)
     later, latent = [f"{n}_later" for n in model.inputs], [f"latent_{n}" for n in own]

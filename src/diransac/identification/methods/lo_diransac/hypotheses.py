@@ -20,7 +20,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.nonlinear import NonlinearLeastSquares
 from diransac.identification.sampling import sample_rows
-from diransac.simulation import rollouts
+from diransac.simulation import Measurements, RolloutBatch, rollouts
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
@@ -155,10 +155,12 @@ def robust_scores(windows: Windows, motion: Motion, parameters: FloatArray, plac
     starts = windows.starts[places]
     seen: BoolArray = np.asarray(windows.known.any(axis=0))
     names = [s for s, k in zip(windows.model.signals, seen, strict=True) if k]
-    errors = rollouts(windows.model, names).errors(
+    batch = RolloutBatch(
         np.repeat(parameters, len(starts), axis=0), np.tile(motion.signals[starts, :n_x], (n, 1)), windows.inputs,
-        windows.measured[:, seen], windows.every, windows.dt, start_rows=np.tile(starts, n), n_rows=windows.length,
-    ).reshape(n, -1, len(names))  # fmt: skip
+        windows.dt, np.tile(starts, n), windows.length,
+    )  # fmt: skip
+    measurements = Measurements(windows.measured[:, seen], windows.every)
+    errors = rollouts(windows.model, names).errors(batch, measurements).reshape(n, -1, len(names))
     rows = (starts[:, None] + np.arange(windows.length)).ravel()
     known = np.broadcast_to(windows.known[rows][:, seen], errors.shape)
     scale = lower_scale(np.nan_to_num(errors, nan=np.inf), known)

@@ -63,10 +63,7 @@ class NormalEquations:
 def linearize(windows: Windows, fit: Fit, weights: FloatArray) -> NormalEquations:
     """Gauss and Newton's normal equations; ``weights (N, n_signals)`` are those of the measurements."""
     n_x, k = fit.x.shape[1], fit.x.shape[1] + fit.d.shape[1]
-    sums = windows.rollouts.gauss_newton(
-        *windows.lanes(fit.shared, fit.x, fit.d), windows.measured, windows.every, windows.dt, weights,
-        start_rows=windows.starts, n_rows=windows.length,
-    )  # fmt: skip
+    sums = windows.rollouts.gauss_newton(windows.lanes(fit.shared, fit.x, fit.d), windows.measurements, weights)
     order = _order(len(fit.shared), n_x, k)
     H, g = sums.normal_matrix[:, order][:, :, order], -sums.gradient[:, order]
     F = sums.final_slopes[:-1][:, :, order]

@@ -163,9 +163,8 @@ def inertial_forces(windows: Windows, motion: Motion, p: FloatArray) -> FloatArr
 def _motion(windows: Windows, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Fitted coordinates, velocities and accelerations, and the inputs as they act, each (N, n)."""
     model = windows.model
-    series = windows.rollouts.trajectories(
-        *windows.lanes(fit.shared, fit.x, fit.d), windows.dt, start_rows=windows.starts, n_rows=windows.length
-    ).reshape(len(windows.measured), -1)
+    series = windows.rollouts.trajectories(windows.lanes(fit.shared, fit.x, fit.d))
+    series = series.reshape(len(windows.measured), -1)
     q, v, a = np.split(series, [model.n_q, model.n_q + model.n_v], axis=1)
     return q, v, a, windows.inputs + fit.shared[-1] * windows.moving_inputs[:, model.n_u :]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.freed import Freed, freed
-from diransac.simulation import rollouts
+from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
@@ -100,9 +100,15 @@ class Windows:
         at = np.clip(np.arange(len(self.inputs)) - rows, 0, len(self.inputs) - 1)
         return replace(self, inputs=self.inputs[at])
 
-    def lanes(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Parameters of every lane, initial states and inputs, as `Rollouts` takes them."""
-        return np.hstack([np.broadcast_to(shared, (len(x), len(shared))), d]), x, self.moving_inputs
+    @cached_property
+    def measurements(self) -> Measurements:
+        """Of every row."""
+        return Measurements(self.measured, self.every)
+
+    def lanes(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> RolloutBatch:
+        """A rollout for every window."""
+        parameters = np.hstack([np.broadcast_to(shared, (len(x), len(shared))), d])
+        return RolloutBatch(parameters, x, self.moving_inputs, self.dt, self.starts, self.length)
 
     def judged(self, fit: Fit) -> Fit:
         """The fit with the residuals that it has here."""
@@ -114,9 +120,9 @@ class Windows:
 
     def ends(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
         """States (W - 1, n_x) in which the windows end, but for the last: where their successors begin."""
-        parameters, states, inputs = self.lanes(shared, x, d)
+        lanes = self.lanes(shared, x, d)
         series = self.rollouts.trajectories(
-            parameters[:-1], states[:-1], inputs, self.dt, start_rows=self.starts[:-1], n_rows=self.length + 1
+            RolloutBatch(lanes.parameters[:-1], x[:-1], lanes.inputs, self.dt, self.starts[:-1], self.length + 1)
         )
         return series[:, -1, : x.shape[1]]
 
@@ -125,10 +131,7 @@ class Windows:
 
         By one of Newton's steps; states as they are where that has no answer.
         """
-        sums = self.rollouts.gauss_newton(
-            *self.lanes(shared, x, d), self.measured, self.every, self.dt, np.zeros(self.measured.shape),
-            start_rows=self.starts, n_rows=self.length,
-        )  # fmt: skip
+        sums = self.rollouts.gauss_newton(self.lanes(shared, x, d), self.measurements, np.zeros(self.measured.shape))
         jumps, slopes = x[1:] - sums.final_states[:-1], sums.final_slopes[:-1, :, -x.shape[1] :]
         finite = np.isfinite(jumps).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
         usable = np.flatnonzero(finite)
@@ -138,7 +141,5 @@ class Windows:
         return found
 
     def _errors(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
-        series = self.rollouts.errors(
-            *self.lanes(shared, x, d), self.measured, self.every, self.dt, start_rows=self.starts, n_rows=self.length
-        )
+        series = self.rollouts.errors(self.lanes(shared, x, d), self.measurements)
         return series.reshape(self.measured.shape)
