@@ -1,14 +1,31 @@
-"""Small machines, logs of them, and a plain loop: what the tests of rollouts share."""
+"""Small machines, their logs, and a plain loop, for the tests of rollouts."""
 
 from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
+import pytest
+from llvmlite import binding
 
 from diransac.model import Model, Parameter
+from diransac.simulation import Measurements, RolloutBatch
 from diransac.simulation.compiler import Target
 
-TARGETS = {"host": None, "avx2": Target("haswell"), "avx512": Target("skylake-avx512")}
+
+def _forced(cpu, *features):
+    """Target as a parameter of a test, skipped where this processor lacks its instructions."""
+    has = binding.get_host_cpu_features()
+    missing = [name for name in features if not has.get(name)]
+    reason = f"this processor lacks {', '.join(missing)}: it cannot run code for {cpu}"
+    return pytest.param(Target(cpu), id=features[0], marks=pytest.mark.skipif(bool(missing), reason=reason))
+
+
+NARROW = _forced("haswell", "avx2", "fma", "bmi2")
+WIDE = _forced("skylake-avx512", "avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl")
+HOST = pytest.param(None, id="host")
+ON_EVERY_TARGET = pytest.mark.parametrize("target", [HOST, NARROW, WIDE])
+"""The same test on code for this processor, with registers of half a vector, and with registers of a whole one."""
+
 INTEGRATORS = {"rk4": 4, "euler": 1, "semi-implicit-euler": 1}
 """Each integrator's order."""
 
@@ -135,16 +152,27 @@ def plain_trajectory(model, p, x, inputs, dt, integrator="rk4", substeps=1):
     return np.array(rows)
 
 
-def score_of(engine, task, parameters=None, *, thresholds=0.7, least=2, **options):
+def batch_of(task, parameters=None, *, start_rows=None, n_rows=None):
+    """The lanes of a problem, or others."""
+    p = task.parameters if parameters is None else parameters
+    return RolloutBatch(p, task.states, task.inputs, task.dt, start_rows, n_rows)
+
+
+def measurements_of(engine, task):
+    """The measurements of as many signals as are scored."""
+    return Measurements(task.measured[:, : len(engine.signals)], task.valid)
+
+
+def score_of(engine, task, parameters=None, *, thresholds=0.7, least=2, threads=1, **rows):
     """Score a problem with the same threshold for every signal."""
-    n_signals = len(engine.signals)
+    limits = np.full(len(engine.signals), thresholds)
     return engine.score(
-        task.parameters if parameters is None else parameters, task.states, task.inputs, task.measured[:, :n_signals],
-        task.valid, task.dt, np.full(n_signals, thresholds), least, **options,
-    )  # fmt: skip
+        batch_of(task, parameters, **rows), measurements_of(engine, task), limits, least, threads=threads
+    )
 
 
 def assert_same(found, expected):
-    """All arrays of two outcomes agree bit for bit, NaN included."""
+    """All arrays of two results agree bit for bit, NaN included."""
     for name, value in vars(expected).items():
-        np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
+        if name != "batch":
+            np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)

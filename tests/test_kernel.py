@@ -16,6 +16,7 @@ from diransac.errors import ModelError, SettingsError
 from diransac.simulation.compiler import Target, compile_map
 from diransac.simulation.compiler.graph import read_graph
 from diransac.simulation.compiler.operations import OPERATIONS
+from rolling import ON_EVERY_TARGET
 
 x, y, z = (ca.SX.sym(name) for name in "xyz")
 UNARY = [
@@ -297,7 +298,7 @@ def test_map_takes_inputs_that_all_rows_share():
     assert compile_map(f)(q[0], p)[0].shape == (1, 9)
 
 
-@pytest.mark.parametrize("target", [None, Target("haswell"), Target("skylake-avx512")], ids=["host", "avx2", "avx512"])
+@ON_EVERY_TARGET
 def test_map_gives_the_same_bits_for_any_batch_threads_and_target(target):
     f = ca.Function("f", [ca.vertcat(x, y, z)], [ca.sin(x * y) / (1 + z * z) + ca.exp(-x) * y - ca.tanh(z) ** 3.3])
     rows = np.random.default_rng(2).standard_normal((1003, 3))

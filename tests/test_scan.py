@@ -6,7 +6,7 @@ import pytest
 
 from diransac.errors import ModelError, SettingsError
 from diransac.simulation.compiler import compile_scan
-from rolling import TARGETS
+from rolling import ON_EVERY_TARGET
 
 carry, row, constants = ca.SX.sym("c", 2), ca.SX.sym("r", 3), ca.SX.sym("k", 2)
 ROTATING = ca.Function(
@@ -67,11 +67,11 @@ def test_rows_that_all_lanes_share_are_given_once(n_lanes):
     np.testing.assert_array_equal(scan(start, rows[0], constant), expected)
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@ON_EVERY_TARGET
 def test_a_scan_has_the_same_bits_for_any_number_of_lanes_threads_and_target(target):
     start, rows, constant = task_of(37, 30)
     expected = compile_scan(ROTATING)(start, rows, constant)
-    scan = compile_scan(ROTATING, TARGETS[target])
+    scan = compile_scan(ROTATING, target)
     np.testing.assert_array_equal(scan(start, rows, constant, threads=3), expected)
     for part in (slice(0, 1), slice(7, 8), slice(5, 20)):
         np.testing.assert_array_equal(scan(start[part], rows[part], constant[part]), expected[part])

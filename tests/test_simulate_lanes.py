@@ -1,5 +1,6 @@
 """The promise that a lane depends on nothing but its own data, and what is refused."""
 
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
@@ -9,8 +10,18 @@ import pytest
 
 from diransac.errors import ModelError, SettingsError
 from diransac.model import Model
-from diransac.simulation import rollouts
-from rolling import BODY, PENDULUM, ROTORCRAFT, TARGETS, assert_same, log_of, score_of
+from diransac.simulation import Measurements, RolloutBatch, rollouts
+from rolling import (
+    BODY,
+    ON_EVERY_TARGET,
+    PENDULUM,
+    ROTORCRAFT,
+    assert_same,
+    batch_of,
+    log_of,
+    measurements_of,
+    score_of,
+)
 
 
 # Windows -------------------------------------------------------------------------------------------------------------
@@ -20,16 +31,17 @@ def test_a_window_is_a_log_of_its_own():
     starts = rng.integers(0, 100, 21)
     states = rng.standard_normal((21, 7))
     engine = rollouts(BODY, substeps=2)
-    problem = (task.parameters, states, task.inputs, task.measured, task.valid, task.dt)
-    found = engine.score(*problem, np.full(10, 0.7), 2, start_rows=starts, n_rows=20)
-    errors = engine.errors(*problem, start_rows=starts, n_rows=20)
+    batch = RolloutBatch(task.parameters, states, task.inputs, task.dt, starts, 20)
+    found = engine.score(batch, measurements_of(engine, task), np.full(10, 0.7), 2)
+    errors = engine.errors(batch, measurements_of(engine, task))
     for lane, start in enumerate(starts):
         rows = slice(start, start + 20)
-        one = (task.parameters[lane : lane + 1], states[lane], task.inputs[rows], task.measured[rows], task.valid[rows])
-        alone = engine.score(*one, task.dt, np.full(10, 0.7), 2)
+        one = RolloutBatch(task.parameters[lane : lane + 1], states[lane], task.inputs[rows], task.dt)
+        seen = Measurements(task.measured[rows], task.valid[rows])
+        alone = engine.score(one, seen, np.full(10, 0.7), 2)
         np.testing.assert_array_equal(found.sum_squares[lane], alone.sum_squares[0])
         assert found.inlier_count[lane] == alone.inlier_count[0]
-        np.testing.assert_array_equal(errors[lane], engine.errors(*one, task.dt)[0])
+        np.testing.assert_array_equal(errors[lane], engine.errors(one, seen)[0])
 
 
 def test_lanes_with_a_common_window_are_those_of_the_cut_log():
@@ -42,12 +54,12 @@ def test_lanes_with_a_common_window_are_those_of_the_cut_log():
 
 
 # The same bits -------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("target", TARGETS)
+@ON_EVERY_TARGET
 @pytest.mark.parametrize("model", [ROTORCRAFT, BODY], ids=lambda model: model.name)
 def test_scores_have_the_same_bits_for_any_batch_threads_and_target(model, target):
     task = log_of(model, 150)
     expected = score_of(rollouts(model), task)
-    engine = rollouts(model, target=TARGETS[target])
+    engine = rollouts(model, target=target)
     assert_same(score_of(engine, task, threads=3), expected)
     for first, end in ((0, 1), (7, 9), (4, 21), (20, 21)):
         part = score_of(engine, task, task.parameters[first:end])
@@ -55,14 +67,13 @@ def test_scores_have_the_same_bits_for_any_batch_threads_and_target(model, targe
         np.testing.assert_array_equal(part.inlier_count, expected.inlier_count[first:end])
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@ON_EVERY_TARGET
 def test_series_have_the_same_bits_for_any_batch_threads_and_target(target):
     task = log_of(BODY, 50)
-    p, problem = task.parameters, (task.states, task.inputs, task.dt)
-    expected = rollouts(BODY).trajectories(p, *problem)
-    engine = rollouts(BODY, ("q0", "v2_dot"), target=TARGETS[target])
-    np.testing.assert_array_equal(engine.trajectories(p, *problem, threads=2), expected)
-    np.testing.assert_array_equal(engine.trajectories(p[11:13], *problem), expected[11:13])
+    expected = rollouts(BODY).trajectories(batch_of(task))
+    engine = rollouts(BODY, ("q0", "v2_dot"), target=target)
+    np.testing.assert_array_equal(engine.trajectories(batch_of(task), threads=2), expected)
+    np.testing.assert_array_equal(engine.trajectories(batch_of(task, task.parameters[11:13])), expected[11:13])
 
 
 def test_what_is_scored_does_not_change_what_is_simulated():
@@ -82,11 +93,20 @@ def test_callers_in_several_threads_get_the_same_scores():
 
 
 # What users meet -----------------------------------------------------------------------------------------------------
-def test_rollouts_of_equal_equations_are_made_once():
-    again = Model.from_dict(PENDULUM.to_dict())
+@pytest.mark.parametrize("copy", [lambda x: Model.from_dict(x.to_dict()), lambda x: pickle.loads(pickle.dumps(x))])
+def test_rollouts_of_equal_models_are_compiled_once(copy):
+    again = copy(PENDULUM)
     assert again is not PENDULUM
     assert rollouts(again) is rollouts(PENDULUM)
     assert rollouts(PENDULUM, ("q0",)) is not rollouts(PENDULUM)
+    assert rollouts(PENDULUM, substeps=2) is not rollouts(PENDULUM)
+
+
+def test_scores_keep_their_batch():
+    task = log_of(PENDULUM, 10)
+    scores = score_of(rollouts(PENDULUM), task, n_rows=5)
+    np.testing.assert_array_equal(scores.batch.parameters, task.parameters)
+    assert scores.inliers(20).shape == (scores.batch.rows_per_lane,) == (5,)
 
 
 def test_no_lanes_give_empty_scores():
@@ -112,14 +132,15 @@ def test_arrays_are_left_as_they_are():
     [
         ({"parameters": np.ones((5, 3))}, r"parameters has shape \(5, 3\), but \(any, 2\) is needed"),
         ({"states": np.ones(3)}, r"initial_states has shape \(3,\)"),
-        ({"states": np.ones((4, 2))}, r"initial_states has shape \(4, 2\), but \(21, 2\)"),
+        ({"states": np.ones((4, 2))}, r"initial_states has shape \(4, 2\), but \(21, any\)"),
         ({"inputs": np.ones(20)}, "inputs has shape"),
-        ({"measured": np.ones((19, 3))}, r"measured has shape \(19, 3\), but \(20, 3\)"),
+        ({"measured": np.ones((19, 3))}, "valid must be 19 Booleans"),
         ({"measured": np.full((20, 3), np.nan)}, "NaN or an infinity in a valid row"),
+        ({"measured": np.ones((19, 3)), "valid": np.ones(19, bool)}, r"values has shape \(19, 3\), but \(20, 3\)"),
         ({"valid": np.ones(20)}, "20 Booleans"),
         ({"dt": 0.0}, "dt is 0.0"),
         ({"start_rows": np.zeros(21, int)}, "start_rows is given without n_rows"),
-        ({"start_rows": np.zeros(3, int), "n_rows": 5}, "one integer a lane, 21 in all"),
+        ({"start_rows": np.zeros(3, int), "n_rows": 5}, "one integer per lane, 21 in all"),
         ({"start_rows": np.full(21, 16), "n_rows": 5}, "do not lie within the log's 20 rows"),
         ({"n_rows": 21}, "n_rows is 21, but the log has 20 rows"),
         ({"threads": 0}, "threads is 0"),

@@ -5,8 +5,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from diransac.simulation import inlier_mask, rollouts
-from rolling import BODY, EXPLOSIVE, PENDULUM, ROTORCRAFT, assert_same, log_of, plain_trajectory, score_of
+from diransac.simulation import Measurements, RolloutBatch, inlier_mask, rollouts
+from rolling import (
+    BODY,
+    EXPLOSIVE,
+    PENDULUM,
+    ROTORCRAFT,
+    assert_same,
+    batch_of,
+    log_of,
+    measurements_of,
+    plain_trajectory,
+    score_of,
+)
 
 
 # Scores --------------------------------------------------------------------------------------------------------------
@@ -15,9 +26,8 @@ def test_scores_are_those_of_the_errors(signals):
     task = log_of(BODY, 200)
     task.measured[~task.valid] = np.nan
     engine = rollouts(BODY, signals)
-    measured = task.measured[:, : len(engine.signals)]
     scores = score_of(engine, task, thresholds=0.4)
-    errors = engine.errors(task.parameters, task.states, task.inputs, measured, task.valid, task.dt)
+    errors = engine.errors(batch_of(task), measurements_of(engine, task))
     counted = np.where(task.valid[:, None], errors, 0.0)
     np.testing.assert_array_equal(scores.sum_squares, np.cumsum(counted**2, axis=1)[:, -1])
     mask = inlier_mask(errors, task.valid, np.full(len(engine.signals), 0.4), 2)
@@ -30,31 +40,30 @@ def test_scores_are_those_of_the_errors(signals):
 def test_errors_are_simulated_less_measured():
     task = log_of(ROTORCRAFT, 50)
     measured = task.measured[:, :2]
-    errors = rollouts(ROTORCRAFT, ("v2", "q1")).errors(
-        task.parameters, task.states, task.inputs, measured, task.valid, task.dt
-    )
-    simulated = rollouts(ROTORCRAFT).trajectories(task.parameters, task.states, task.inputs, task.dt)
+    errors = rollouts(ROTORCRAFT, ("v2", "q1")).errors(batch_of(task), Measurements(measured, task.valid))
+    simulated = rollouts(ROTORCRAFT).trajectories(batch_of(task))
     np.testing.assert_array_equal(errors, simulated[..., [5, 1]] - measured)
 
 
 def test_a_quaternion_is_compared_whatever_its_sign():
     task = log_of(BODY, 100)
-    engine = rollouts(BODY)
-    (truth,) = engine.trajectories(task.parameters[:1], task.states, task.inputs, task.dt)
+    engine, batch = rollouts(BODY), batch_of(task, task.parameters[:1])
+    (truth,) = engine.trajectories(batch)
     flipped = truth.copy()
     flipped[::3, :4] *= -1
-    errors = engine.errors(task.parameters[:1], task.states, task.inputs, flipped, task.valid, task.dt)
+    errors = engine.errors(batch, Measurements(flipped, task.valid))
     assert np.abs(errors).max() == 0.0
     three = rollouts(BODY, ("q0", "q1", "q2"))  # not the whole quaternion: taken as it is
-    errors = three.errors(task.parameters[:1], task.states, task.inputs, flipped[:, :3], task.valid, task.dt)
+    errors = three.errors(batch, Measurements(flipped[:, :3], task.valid))
     np.testing.assert_array_equal(errors[0, ::3], 2 * truth[::3, :3])
 
 
 def test_thresholds_are_strict_and_zero_switches_a_signal_off():
     engine = rollouts(PENDULUM, ("q0", "v0"))
-    problem = ([[0.0, 0.0]], [0.0, 0.0], np.zeros((4, 1)), np.array([[0.5, 0], [0.4, 0], [0, 0], [0, 1]]))
+    batch = RolloutBatch([[0.0, 0.0]], [0.0, 0.0], np.zeros((4, 1)), 0.01)
+    measurements = Measurements([[0.5, 0], [0.4, 0], [0, 0], [0, 1]], np.ones(4, bool))
     counts = [
-        engine.score(*problem, np.ones(4, bool), 0.01, thresholds, least).inlier_count[0]
+        engine.score(batch, measurements, thresholds, least).inlier_count[0]
         for thresholds, least in (([0.5, 0.1], 2), ([0.5, 0.1], 1), ([0.5, 0.0], 1), ([0.0, 0.0], 1), ([0.0, 0.0], 0))
     ]
     assert counts == [2, 4, 3, 0, 4]
@@ -66,9 +75,8 @@ def test_squares_keep_the_order_of_errors_and_thresholds(threshold, steps):
     error = threshold
     for _ in range(abs(steps)):
         error = np.nextafter(error, np.copysign(np.inf, steps))
-    scores = rollouts(PENDULUM, ("q0",)).score(
-        [[0.0, 0.0]], [0.0, 0.0], np.zeros((1, 1)), [[error]], np.ones(1, bool), 0.01, [threshold], 1
-    )
+    batch = RolloutBatch([[0.0, 0.0]], [0.0, 0.0], np.zeros((1, 1)), 0.01)
+    scores = rollouts(PENDULUM, ("q0",)).score(batch, Measurements([[error]], [True]), [threshold], 1)
     assert scores.inlier_count[0] == (error < threshold)
 
 
@@ -78,10 +86,11 @@ def test_a_divergence_makes_every_sum_infinite_and_all_later_rows_outliers():
     p = np.array([[1.0, 0.0], [-1.0, 0.0], [4.0, 0.0]])
     inputs, valid, measured = np.full((n_rows, 1), 1.0), np.ones(n_rows, bool), np.zeros((n_rows, 1))
     engine = rollouts(EXPLOSIVE, ("q1",))  # the second coordinate never moves; the first, unscored, explodes
-    scores = engine.score(p, np.zeros(4), inputs, measured, valid, 0.02, [0.1], 1)
+    batch, measurements = RolloutBatch(p, np.zeros(4), inputs, 0.02), Measurements(measured, valid)
+    scores = engine.score(batch, measurements, [0.1], 1)
     np.testing.assert_array_equal(scores.diverged, [True, False, True])
     np.testing.assert_array_equal(scores.sum_squares[:, 0], [np.inf, 0.0, np.inf])
-    errors = engine.errors(p, np.zeros(4), inputs, measured, valid, 0.02)
+    errors = engine.errors(batch, measurements)
     with np.errstate(all="ignore"):
         plain = [plain_trajectory(EXPLOSIVE, row, np.zeros(4), inputs, 0.02) for row in p]
     finite = [np.logical_and.accumulate(np.isfinite(rows).all(axis=1)) for rows in plain]
@@ -92,7 +101,8 @@ def test_a_divergence_makes_every_sum_infinite_and_all_later_rows_outliers():
 
 def test_a_divergence_that_only_an_acceleration_shows_counts():
     engine = rollouts(EXPLOSIVE, ("q1",))
-    found = engine.score([[1.0, 0.0]], [1e120, 0, 0, 0], np.zeros((1, 1)), [[0.0]], np.ones(1, bool), 0.01, [1.0], 1)
+    batch = RolloutBatch([[1.0, 0.0]], [1e120, 0, 0, 0], np.zeros((1, 1)), 0.01)
+    found = engine.score(batch, Measurements([[0.0]], [True]), [1.0], 1)
     assert found.diverged.all()
     assert np.isinf(found.sum_squares).all()
     assert found.inlier_count[0] == 0
@@ -116,12 +126,10 @@ def test_invalid_rows_are_simulated_through_but_not_counted():
     task.measured[~task.valid] = np.nan
     engine = rollouts(PENDULUM)
     scores = score_of(engine, task)
-    none = engine.score(
-        task.parameters, task.states, task.inputs, task.measured, np.zeros(100, bool), task.dt, np.ones(3), 1
-    )
+    none = engine.score(batch_of(task), Measurements(task.measured, np.zeros(100, bool)), np.ones(3), 1)
     np.testing.assert_array_equal(none.sum_squares, 0.0)
     np.testing.assert_array_equal(none.inlier_count, 0)
     assert np.isfinite(scores.sum_squares).all()
     measured = np.where(task.valid[:, None], task.measured, 1e9)
-    again = engine.score(task.parameters, task.states, task.inputs, measured, task.valid, task.dt, np.full(3, 0.7), 2)
+    again = engine.score(batch_of(task), Measurements(measured, task.valid), np.full(3, 0.7), 2)
     assert_same(again, scores)

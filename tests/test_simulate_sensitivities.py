@@ -8,8 +8,21 @@ import pytest
 
 from diransac.errors import SettingsError
 from diransac.model.library import double_pendulum
-from diransac.simulation import rollouts
-from rolling import BODY, EXPLOSIVE, INTEGRATORS, PENDULUM, ROTORCRAFT, TARGETS, assert_same, log_of, machine, score_of
+from diransac.simulation import Measurements, RolloutBatch, rollouts
+from rolling import (
+    BODY,
+    EXPLOSIVE,
+    INTEGRATORS,
+    ON_EVERY_TARGET,
+    PENDULUM,
+    ROTORCRAFT,
+    assert_same,
+    batch_of,
+    log_of,
+    machine,
+    measurements_of,
+    score_of,
+)
 
 MODELS = [ROTORCRAFT, PENDULUM, BODY, double_pendulum()]
 EVERY_MODEL = pytest.mark.parametrize("model", MODELS, ids=lambda model: model.name)
@@ -26,19 +39,17 @@ def KINKS(q, v, u, p):
     return [v[0]], [u[0] - spring - 0.3 * ca.fabs(v[0]) * v[0]]
 
 
-def linearised(engine, task, parameters=None, **options):
+def linearised(engine, task, parameters=None, *, unknowns=None, threads=1, **rows):
     """Linearised errors of a problem."""
-    p = task.parameters if parameters is None else parameters
-    measured = task.measured[:, : len(engine.signals)]
-    return engine.linearized_errors(p, task.states, task.inputs, measured, task.valid, task.dt, **options)
+    batch = batch_of(task, parameters, **rows)
+    return engine.linearized_errors(batch, measurements_of(engine, task), unknowns=unknowns, threads=threads)
 
 
-def sums_of(engine, task, parameters=None, weights=None, **options):
+def sums_of(engine, task, parameters=None, weights=None, *, unknowns=None, threads=1, **rows):
     """Gauss-Newton sums of a problem."""
-    p = task.parameters if parameters is None else parameters
     w = np.linspace(0.5, 2.0, len(engine.signals)) if weights is None else weights
-    measured = task.measured[:, : len(engine.signals)]
-    return engine.gauss_newton(p, task.states, task.inputs, measured, task.valid, task.dt, w, **options)
+    batch = batch_of(task, parameters, **rows)
+    return engine.gauss_newton(batch, measurements_of(engine, task), w, unknowns=unknowns, threads=threads)
 
 
 def differences(engine, model, p, x, inputs, dt, step=1e-6):
@@ -46,7 +57,7 @@ def differences(engine, model, p, x, inputs, dt, step=1e-6):
     z = np.concatenate([p, x])
     steps = step * np.maximum(1.0, np.abs(z)) * np.eye(len(z))
     lanes = np.concatenate([z + steps, z - steps])
-    found = engine.trajectories(lanes[:, : len(p)], lanes[:, len(p) :], inputs, dt)
+    found = engine.trajectories(RolloutBatch(lanes[:, : len(p)], lanes[:, len(p) :], inputs, dt))
     up, down = np.split(found, 2)
     return np.moveaxis((up - down) / (2 * np.diag(steps))[:, None, None], 0, -1)
 
@@ -101,7 +112,7 @@ def test_derivatives_of_a_linear_system_are_powers_of_its_step():
     step = sum(np.linalg.matrix_power(h * A, k) / f for k, f in enumerate((1, 1, 2, 6, 24)))
     powers = np.array([np.linalg.matrix_power(step, k) for k in range(n + 1)])
     engine = rollouts(LINEAR, ("q0", "v0"))
-    problem = ([p], [1.0, 0.0], np.zeros((n, 1)), np.zeros((n, 2)), np.ones(n, bool), h)
+    problem = RolloutBatch([p], [1.0, 0.0], np.zeros((n, 1)), h), Measurements(np.zeros((n, 2)), np.ones(n, bool))
     found = engine.linearized_errors(*problem, unknowns=("q0", "v0"))
     np.testing.assert_allclose(found.jacobian[0], powers[:n], rtol=1e-12, atol=1e-13)
     sums = engine.gauss_newton(*problem, np.array([2.0, 3.0]), unknowns=("q0", "v0"))
@@ -119,10 +130,11 @@ def test_a_branch_that_is_not_taken_leaves_no_nan_in_the_derivatives(start):
     engine = rollouts(KINKS)
     p, n = np.array([[2.0, 1.5]]), 400
     inputs = np.full((n, 1), 0.1)
-    found = engine.linearized_errors(p, start, inputs, np.zeros((n, 3)), np.ones(n, bool), 0.01).jacobian[0]
+    batch = RolloutBatch(p, start, inputs, 0.01)
+    found = engine.linearized_errors(batch, Measurements(np.zeros((n, 3)), np.ones(n, bool))).jacobian[0]
     assert np.isfinite(found).all()
     expected = differences(engine, KINKS, p[0], np.array(start), inputs, 0.01)
-    (path,) = engine.trajectories(p, start, inputs, 0.01)
+    (path,) = engine.trajectories(batch)
     crossing = int(np.argmax(np.sign(path[:, 0]) != np.sign(start[0])))  # a step over the kink has no derivative
     assert crossing > 50
     np.testing.assert_allclose(found[: crossing - 1], expected[: crossing - 1], rtol=1e-5, atol=1e-5)
@@ -130,7 +142,8 @@ def test_a_branch_that_is_not_taken_leaves_no_nan_in_the_derivatives(start):
 
 def test_at_rest_dry_friction_has_a_finite_derivative():
     engine = rollouts(KINKS)
-    found = engine.linearized_errors([[2.0, 1.5]], [-1.0, 0.0], np.zeros((3, 1)), np.zeros((3, 3)), [True] * 3, 0.01)
+    batch = RolloutBatch([[2.0, 1.5]], [-1.0, 0.0], np.zeros((3, 1)), 0.01)
+    found = engine.linearized_errors(batch, Measurements(np.zeros((3, 3)), [True] * 3))
     assert np.isfinite(found.jacobian).all()
 
 
@@ -138,7 +151,7 @@ def test_the_sign_of_a_quaternion_turns_its_derivatives_too():
     task = log_of(BODY, 40)
     engine = rollouts(BODY)
     p = task.parameters[:1]
-    (truth,) = engine.trajectories(p, task.states, task.inputs, task.dt)
+    (truth,) = engine.trajectories(batch_of(task, p))
     task.measured = truth + 0.01
     plain, sums = linearised(engine, task, p), sums_of(engine, task, p)
     task.measured = task.measured.copy()
@@ -158,7 +171,7 @@ def test_the_sign_of_a_quaternion_turns_its_derivatives_too():
 def test_linearised_errors_are_the_errors(model):
     task = log_of(model, 60)
     engine = rollouts(model, substeps=2)
-    errors = engine.errors(task.parameters, task.states, task.inputs, task.measured, task.valid, task.dt)
+    errors = engine.errors(batch_of(task), measurements_of(engine, task))
     np.testing.assert_array_equal(linearised(engine, task).errors, errors)
 
 
@@ -223,7 +236,7 @@ def test_a_gauss_newton_step_finds_the_parameters_of_a_clean_log():
     task = log_of(ROTORCRAFT, 200)
     engine = rollouts(ROTORCRAFT)
     truth = np.concatenate([task.parameters[0], task.states])
-    task.measured = engine.trajectories(truth[None, :3], truth[3:], task.inputs, task.dt)[0]
+    task.measured = engine.trajectories(batch_of(task, truth[None, :3]))[0]
     z = truth * 1.05
     for _ in range(8):
         task.states = z[3:]
@@ -249,7 +262,7 @@ def test_a_window_is_a_log_of_its_own_and_ends_where_the_next_begins():
     engine = rollouts(BODY, substeps=2)
     p = np.repeat(task.parameters[:1], 4, axis=0)
     weights = np.random.default_rng(2).uniform(0, 1, (100, 10))
-    (path,) = engine.trajectories(p[:1], task.states, task.inputs, task.dt)
+    (path,) = engine.trajectories(batch_of(task, p[:1]))
     starts = np.array([0, 25, 50, 75])
     task.states = path[starts, :7]
     found = sums_of(engine, task, p, weights, start_rows=starts, n_rows=25)
@@ -257,11 +270,12 @@ def test_a_window_is_a_log_of_its_own_and_ends_where_the_next_begins():
     np.testing.assert_array_equal(found.final_states[:-1], path[starts[1:], :7])
     for lane, start in enumerate(starts):
         cut = slice(start, start + 25)
-        one = (p[lane : lane + 1], path[start, :7], task.inputs[cut], task.measured[cut], task.valid[cut], task.dt)
-        alone = engine.gauss_newton(*one, weights[cut])
+        one = RolloutBatch(p[lane : lane + 1], path[start, :7], task.inputs[cut], task.dt)
+        seen = Measurements(task.measured[cut], task.valid[cut])
+        alone = engine.gauss_newton(one, seen, weights[cut])
         for name in ("cost", "gradient", "normal_matrix", "final_states", "final_slopes"):
             np.testing.assert_array_equal(getattr(found, name)[lane], getattr(alone, name)[0], err_msg=name)
-        np.testing.assert_array_equal(rows.jacobian[lane], engine.linearized_errors(*one).jacobian[0])
+        np.testing.assert_array_equal(rows.jacobian[lane], engine.linearized_errors(one, seen).jacobian[0])
 
 
 def test_final_states_and_slopes_are_those_of_one_row_more():
@@ -269,17 +283,17 @@ def test_final_states_and_slopes_are_those_of_one_row_more():
     engine = rollouts(ROTORCRAFT, ROTORCRAFT.state)
     longer = linearised(engine, task)
     found = sums_of(engine, task, n_rows=30)
-    states = engine.trajectories(task.parameters, task.states, task.inputs, task.dt)[:, 30, :6]
+    states = engine.trajectories(batch_of(task))[:, 30, :6]
     np.testing.assert_array_equal(found.final_states, states)
     np.testing.assert_array_equal(found.final_slopes, longer.jacobian[:, 30])
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@ON_EVERY_TARGET
 @pytest.mark.parametrize("model", [ROTORCRAFT, BODY], ids=lambda model: model.name)
 def test_sums_have_the_same_bits_for_any_batch_threads_and_target(model, target):
     task = log_of(model, 60)
     expected = sums_of(rollouts(model), task)
-    engine = rollouts(model, target=TARGETS[target])
+    engine = rollouts(model, target=target)
     assert_same(sums_of(engine, task, threads=3), expected)
     for first, end in ((0, 1), (7, 9), (4, 21), (20, 21)):
         part = sums_of(engine, task, task.parameters[first:end])

@@ -12,7 +12,7 @@ from diransac.arrays import FloatArray
 from diransac.data.log import Log
 from diransac.errors import SettingsError
 from diransac.model.plant import ModelWithParameters, Plant, as_plant
-from diransac.simulation import Law, Rollouts, default_threads, rollouts
+from diransac.simulation import LinearFeedback, RolloutBatch, Rollouts, default_threads, rollouts
 
 if TYPE_CHECKING:
     from diransac.flight.trajectory import Trajectory
@@ -116,9 +116,10 @@ def _flown_together(
 ) -> list[Log]:
     """Logs of flights with equally many integration steps a sample."""
     engine, n_x = _engine(plants, substeps), len(plants[0].model.state)
-    laws, law_of_lane = _laws(controllers, len(states[0]))
+    feedback, feedback_of_lane = _feedback(controllers, len(states[0]))
     constants = np.array([plant.constants for plant in plants])
-    flights = engine.fly(constants, np.array(states), laws, controllers[0].dt, law_of_lane=law_of_lane, threads=threads)
+    batch = RolloutBatch(constants, np.array(states), feedback.u_ref[0], controllers[0].dt)
+    flights = engine.fly(batch, feedback, feedback_of_lane=feedback_of_lane, threads=threads)
     signals = np.delete(flights.signals, np.s_[n_x : len(states[0])], axis=-1)
     return [
         _log(plant, controller, x, u, substeps)
@@ -203,8 +204,8 @@ def _check_names(plants: Sequence[Plant], controllers: Sequence[Controller]) -> 
             )
 
 
-def _laws(controllers: Sequence[Controller], n_x: int) -> tuple[Law, npt.NDArray[np.int64]]:
-    """Laws of different controllers as a table, and which of them steers each lane; disturbances' states go unseen."""
+def _feedback(controllers: Sequence[Controller], n_x: int) -> tuple[LinearFeedback, npt.NDArray[np.int64]]:
+    """Feedback laws of different controllers as a table, and each lane's index; disturbances' states have no gain."""
     different = list({id(controller): controller for controller in controllers}.values())
     first = different[0]
     for other in different[1:]:
@@ -217,7 +218,8 @@ def _laws(controllers: Sequence[Controller], n_x: int) -> tuple[Law, npt.NDArray
     u_ref, x_ref, K = (np.array([getattr(one, name) for one in different]) for name in ("inputs", "states", "gains"))
     x_ref, K = (np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, hidden)]) for array in (x_ref, K))
     place = {id(controller): k for k, controller in enumerate(different)}
-    return Law(u_ref, x_ref, K, first.u_min, first.u_max), np.array([place[id(one)] for one in controllers])
+    feedback = LinearFeedback(u_ref, x_ref, K, first.u_min, first.u_max)
+    return feedback, np.array([place[id(one)] for one in controllers])
 
 
 def _log(plant: Plant, controller: Controller, signals: FloatArray, inputs: FloatArray, substeps: int) -> Log:

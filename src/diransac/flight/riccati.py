@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
 import casadi as ca
@@ -35,7 +35,7 @@ def gains_of(model: Model, problems: Sequence[Problem], threads: int) -> list[Fl
 
     Raises PlanningError: derivatives or gains that are not finite.
     """
-    compiled = _compiled(_Equations(model.fingerprint, model))
+    compiled = _compiled(model)
     entries = [_entries(model, compiled.linearize, problem, threads) for problem in problems]
     rows = np.empty((len(problems), max(len(own) for own in entries), entries[0].shape[1]))
     for backward, own in zip(rows, entries, strict=True):
@@ -83,14 +83,6 @@ def _checked(model: Model, problem: Problem, outputs: FloatArray) -> FloatArray:
 
 # What is compiled ----------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
-class _Equations:
-    """A model as a value: equal ones are compiled once."""
-
-    fingerprint: str
-    model: Model = field(compare=False, repr=False)
-
-
-@dataclass(frozen=True)
 class _Compiled:
     """Rows apart from the recurrence: they are independent of each other, so that one trajectory fills vectors, too.
 
@@ -105,9 +97,9 @@ class _Compiled:
 
 
 @lru_cache(maxsize=64)
-def _compiled(equations: _Equations) -> _Compiled:
-    """What is compiled for a model."""
-    step = linearized_step(equations.model)
+def _compiled(model: Model) -> _Compiled:
+    """Compiled functions of a model; the same ones again for an equal model."""
+    step = linearized_step(model)
     arguments = [ca.SX.sym(name, step.sparsity_in(name)) for name in step.name_in()]
     _, A, B = step(*arguments)
     varying = [e for M in (A, B) for e in ca.vertsplit(M.nz[:]) if not e.is_constant()]

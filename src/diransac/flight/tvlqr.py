@@ -15,7 +15,7 @@ from diransac.flight.riccati import Problem, gains_of
 from diransac.flight.trajectory import Trajectory
 from diransac.model import Model
 from diransac.model.plant import ModelWithParameters, as_plant
-from diransac.simulation import Law
+from diransac.simulation import LinearFeedback
 
 __all__ = ["Controller", "tvlqr", "tvlqr_batch"]
 
@@ -65,7 +65,7 @@ class Controller:
     input_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        law = Law(self.inputs, self.states, self.gains, self.u_min, self.u_max)
+        law = LinearFeedback(self.inputs, self.states, self.gains, self.u_min, self.u_max)
         time = _checked_time(self.time)
         if time.shape != law.u_ref.shape[:1]:
             raise SettingsError(
@@ -90,9 +90,9 @@ class Controller:
     def __len__(self) -> int:
         return len(self.time)
 
-    def law(self) -> Law:
+    def law(self) -> LinearFeedback:
         """The controller as simulations take it, row by row."""
-        return Law(self.inputs, self.states, self.gains, self.u_min, self.u_max)
+        return LinearFeedback(self.inputs, self.states, self.gains, self.u_min, self.u_max)
 
     def at(self, time: npt.ArrayLike, how: str = "hold") -> Controller:
         """The controller on another time grid; before its first row and after its last it stays what it is there.

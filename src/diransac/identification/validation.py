@@ -13,7 +13,7 @@ from diransac.data.dataset import Observations, observe
 from diransac.data.log import Log
 from diransac.errors import LogError, SettingsError
 from diransac.model.plant import ModelWithParameters, as_plant
-from diransac.simulation import Rollouts, rollouts
+from diransac.simulation import Measurements, RolloutBatch, Rollouts, rollouts
 from diransac.text_table import aligned
 
 __all__ = ["Scores", "Validation", "validate"]
@@ -150,16 +150,16 @@ def _score(
     complete = _complete(states)
     starts = np.arange(int(np.argmax(complete)), len(states) - steps, steps)
     starts = starts[complete[starts]]
-    errors = engine.errors(
+    batch = RolloutBatch(
         np.tile(parameters, (len(starts), 1)),
         states[starts],
         observations.inputs,
-        np.nan_to_num(observations.measured),
-        np.ones_like(observations.valid),
         observations.log.dt,
         start_rows=starts,
         n_rows=steps + 1,
-    )[:, 1:]
+    )
+    measurements = Measurements(np.nan_to_num(observations.measured), np.ones_like(observations.valid))
+    errors = engine.errors(batch, measurements)[:, 1:]
     rows = starts[:, None] + np.arange(1, steps + 1)
     measured = observations.measured[rows]
     present = np.isfinite(measured)

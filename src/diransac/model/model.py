@@ -307,6 +307,14 @@ class Model:
         """SHA-256 of the names, units, bounds and equations."""
         return str(self.to_dict()["checksum"])
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Model):
+            return NotImplemented
+        return self is other or self.fingerprint == other.fingerprint
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint)
+
     def to_dict(self) -> dict[str, Any]:
         """Names, units, bounds and serialised equations, ready for JSON; `from_dict` reads it back."""
         data = {

@@ -176,7 +176,7 @@ class DisturbedModel:
     """A model and disturbances as one set of equations; simulated as a `Model` is, by `diransac.simulation.rollouts`.
 
     The state is ``[q; v; own states of the disturbances; t]``, t only where it is used; the parameters are the model's,
-    then the disturbances' constants.
+    then the disturbances' constants. Equal where these equations are, whatever the values of the constants.
 
     Parameters
     ----------
@@ -193,6 +193,20 @@ class DisturbedModel:
         self.state = (*model.state, *self.own_states)
         self.signals = (*self.state, *model.accelerations)
         self.quaternions = model.quaternions
+
+    @cached_property
+    def _equations(self) -> tuple[Any, ...]:
+        """The model, and the names and effect of every disturbance."""
+        effects = ((one.name, *one.constants, "", *one.states, one.effect.serialize()) for one in self.disturbances)
+        return (self.model, *effects)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, DisturbedModel):
+            return NotImplemented
+        return self is other or self._equations == other._equations
+
+    def __hash__(self) -> int:
+        return hash(self._equations)
 
     @property
     def n_q(self) -> int:

@@ -20,7 +20,7 @@ from diransac.identification.evaluation import as_diagnosed, choose_scoring, jud
 from diransac.identification.result import Result
 from diransac.identification.settings import Settings
 from diransac.identification.validation import Validation, validate
-from diransac.simulation import Rollouts, inlier_mask, rollouts
+from diransac.simulation import Measurements, RolloutBatch, Rollouts, inlier_mask, rollouts
 
 __all__ = ["Run", "bulk", "diagnosis_of", "labelled", "simulate_on"]
 
@@ -263,10 +263,9 @@ def _simulated(
     inputs, measured = (np.pad(x, more, mode="edge") for x in (observations.inputs, observations.measured))
     parameters = np.tile(model.parameter_vector(result.parameters), (len(states), 1))
     rows, dt, every = n_rows * np.arange(len(states)), observations.log.dt, np.ones(len(inputs), dtype=bool)
-    everything = engine.trajectories(parameters, states, inputs, dt, start_rows=rows, n_rows=n_rows)
-    errors = engine.errors(
-        parameters, states, inputs, np.nan_to_num(measured), every, dt, start_rows=rows, n_rows=n_rows
-    )
+    batch = RolloutBatch(parameters, states, inputs, dt, start_rows=rows, n_rows=n_rows)
+    everything = engine.trajectories(batch)
+    errors = engine.errors(batch, Measurements(np.nan_to_num(measured), every))
     missing = ~np.isfinite(observations.measured)
     return everything.reshape(len(inputs), -1)[:n], np.where(missing, np.nan, errors.reshape(len(inputs), -1)[:n])
 

@@ -1,30 +1,42 @@
-"""Many rollouts of a model at once: scored against a log, differentiated, or flown under feedback on the way.
+"""Batches of rollouts of a model: scored against a log, differentiated, or under feedback.
 
 Observation `j` is the state at `t_j`; then the input `u_j` is held to `t_{j+1}`; the acceleration at `t_j` is the one
 under `u_j`.
 
-| file | what it holds |
+| file | contents |
 |---|---|
-| `steps.py` | integrators, and their derivatives, as expressions |
-| `engine.py` | `Rollouts`: their compiled form |
-| `outcomes.py` | what rollouts give |
-| `law.py` | feedback laws |
+| `batch.py` | arguments and results, and `Simulator`, the interface of a back end |
+| `integrators.py` | integration steps and their derivatives as expressions |
+| `rollouts.py` | `Rollouts`, the compiled simulator |
+| `compiler/` | expression graph to machine code |
 """
 
+from diransac.simulation.batch import (
+    ClosedLoopBatch,
+    GaussNewtonBatch,
+    LinearFeedback,
+    LinearizedErrors,
+    Measurements,
+    RolloutBatch,
+    ScoreBatch,
+    Simulator,
+    inlier_mask,
+)
 from diransac.simulation.compiler.machine_code import default_threads
-from diransac.simulation.feedback import Law
 from diransac.simulation.integrators import INTEGRATORS, linearized_step
-from diransac.simulation.outcomes import Flights, GaussNewton, LinearizedErrors, Scores, inlier_mask
 from diransac.simulation.rollouts import Rollouts, rollouts
 
 __all__ = [
     "INTEGRATORS",
-    "Flights",
-    "GaussNewton",
-    "Law",
+    "ClosedLoopBatch",
+    "GaussNewtonBatch",
+    "LinearFeedback",
     "LinearizedErrors",
+    "Measurements",
+    "RolloutBatch",
     "Rollouts",
-    "Scores",
+    "ScoreBatch",
+    "Simulator",
     "default_threads",
     "inlier_mask",
     "linearized_step",

@@ -1,68 +1,34 @@
-"""From equations of motion to the expressions of one row: integration steps, and their exact derivatives.
+"""Expressions of one row of a simulation: integration steps, and their exact derivatives.
 
-The integrators are written once, for a matrix of columns: the state, and the derivatives of it that are wanted. The
-dynamics of a column of derivatives are the variational equations, A S + P with A = df/dx and P = df/dp; every
-integrator here is made of sums and of the dynamics, so what it does to those columns is the derivative of what it does
-to the state. Derivatives that are always zero or always one are no variables.
+Each integrator is written once, for a matrix of columns: the state, and its derivatives with respect to the unknowns.
+The dynamics of a column of derivatives are the variational equations, A S + P with A = df/dx and P = df/dp. Every
+integrator consists of sums and of the dynamics, so applied to those columns it gives the derivatives of the state after
+the step. Derivatives that are always zero or always one are not variables.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
 
 import casadi as ca
 import numpy as np
 
+from diransac.arrays import BoolArray, FloatArray
 from diransac.simulation.compiler.graph import read_graph
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from diransac.model import Model
     from diransac.model.plant import DisturbedModel
-    from diransac.simulation.compiler.time_loop import Plan
+    from diransac.simulation.compiler.time_loop import LoopSpecification
 
-__all__ = ["INTEGRATORS", "Equations", "Sensitivities", "linearized_step", "plan_of", "sensitivities_of"]
+    SimulatedModel: TypeAlias = Model | DisturbedModel
+
+__all__ = ["INTEGRATORS", "Sensitivities", "linearized_step", "loop_specification", "sensitivities_of"]
 
 Dynamics = Callable[[ca.SX], ca.SX]
-"""State and derivatives of it, in columns -> their rates, with inputs and parameters held."""
-
-
-@dataclass(frozen=True)
-class Equations:
-    """A model's equations of motion and how they are integrated, as a value: equal ones are compiled once.
-
-    Attributes
-    ----------
-    dynamics : (x, u, p) -> (dx/dt, accelerations), serialised
-    sizes : of coordinates, velocities, inputs and parameters
-    parameters, signals : names of the parameters, and of the states and accelerations
-    quaternions : positions in q
-    integrator : one of `INTEGRATORS`
-    substeps : integration steps from one row to the next
-    model : one that has these equations
-    """
-
-    dynamics: str
-    sizes: tuple[int, int, int, int]
-    parameters: tuple[str, ...]
-    signals: tuple[str, ...]
-    quaternions: tuple[tuple[int, ...], ...]
-    integrator: str
-    substeps: int
-    model: Model | DisturbedModel = field(compare=False, repr=False)
-
-    @property
-    def n_x(self) -> int:
-        """Number of states."""
-        return self.sizes[0] + self.sizes[1]
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Names of the states."""
-        return self.signals[: self.n_x]
+"""State and its derivatives, in columns -> their rates, with inputs and parameters held."""
 
 
 # Integrators ---------------------------------------------------------------------------------------------------------
@@ -92,44 +58,46 @@ INTEGRATORS = {"rk4": _rk4, "euler": _euler, "semi-implicit-euler": _semi_implic
 # Sensitivities -------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Sensitivities:
-    """Which derivatives of the state with respect to the unknowns there are; made by `sensitivities_of`.
+    """Structure of the derivatives of the state with respect to the unknowns; made by `sensitivities_of`.
 
     Attributes
     ----------
-    unknowns : names of parameters and of states, whose initial values are meant
-    initial : (n_x, n_z)   derivatives of the initial state: 1 where a state meets itself
-    varying : (n_x, n_z)   which change during a rollout; the others keep their initial value
+    unknowns : tuple of str
+        Names of parameters, and of states for their initial values.
+    initial : (n_x, n_z)
+        Derivatives of the initial state: 1 of a state with respect to itself, else 0.
+    varying : (n_x, n_z)
+        Entries that change during a rollout; the others keep their initial value.
     """
 
     unknowns: tuple[str, ...]
-    initial: NDArray[np.float64]
-    varying: NDArray[np.bool_]
+    initial: FloatArray
+    varying: BoolArray
 
     @property
     def entries(self) -> list[tuple[int, int]]:
-        """Row and column of each varying one, in the order in which they follow the state."""
+        """Row and column of each varying entry, in the order in which they follow the state."""
         return [(int(i), int(j)) for i, j in np.argwhere(self.varying)]
 
-    def appended(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Initial states (n_x, n), and below them the initial values of the varying ones."""
+    def appended(self, states: FloatArray) -> FloatArray:
+        """Initial states (n_x, n), and below them the initial values of the varying entries."""
         values = self.initial[self.varying]
         return np.concatenate([states, np.repeat(values[:, None], states.shape[1], axis=1)])
 
-    def matrix(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def matrix(self, values: FloatArray) -> FloatArray:
         """Whole matrices (n, n_x, n_z) from the varying entries (n, n_varying)."""
         whole = np.repeat(self.initial[None], len(values), axis=0)
         whole[:, self.varying] = values
         return whole
 
 
-def sensitivities_of(equations: Equations, unknowns: Sequence[str]) -> Sensitivities:
-    """What can change of d(state)/d(unknowns), by following which entries are not zero until no more appear."""
+def sensitivities_of(model: SimulatedModel, unknowns: Sequence[str]) -> Sensitivities:
+    """Structure of d(state)/d(unknowns): non-zero entries are propagated until no more appear."""
+    n_x, n_p, names = len(model.state), model.n_p, (*model.parameters, *model.state)
     if not unknowns:
-        return Sensitivities((), np.zeros((equations.n_x, 0)), np.zeros((equations.n_x, 0), bool))
-    n_x, names = equations.n_x, (*equations.parameters, *equations.states)
+        return Sensitivities((), np.zeros((n_x, 0)), np.zeros((n_x, 0), bool))
     columns = [names.index(name) for name in unknowns]
-    n_p = len(equations.parameters)
-    jacobians = equations.model.rate_jacobians
+    jacobians = model.rate_jacobians
     A, P = (np.array(ca.DM(jacobians.sparsity_out(k), 1)) != 0 for k in ("dx", "dp"))
     initial = np.hstack([np.zeros((n_x, n_p)), np.eye(n_x)])[:, columns]
     driven = np.hstack([P, np.zeros((n_x, n_x), bool)])[:, columns]
@@ -138,13 +106,13 @@ def sensitivities_of(equations: Equations, unknowns: Sequence[str]) -> Sensitivi
         before = varying
         present = varying | (initial != 0)
         varying = varying | driven | (A.astype(int) @ present > 0)
-        for four in equations.quaternions:
+        for four in model.quaternions:
             varying[list(four)] |= present[list(four)].any(axis=0)
     return Sensitivities(tuple(unknowns), initial, varying)
 
 
 def _variables(sensitivities: Sensitivities, values: ca.SX) -> ca.SX:
-    """Sparse matrix (n_x, n_z) of the derivatives, the varying ones given."""
+    """Sparse matrix (n_x, n_z) of the derivatives, from its varying entries."""
     S = ca.SX(*sensitivities.initial.shape)
     for i, j in zip(*np.nonzero(sensitivities.initial), strict=True):
         S[int(i), int(j)] = 1
@@ -153,74 +121,79 @@ def _variables(sensitivities: Sensitivities, values: ca.SX) -> ca.SX:
     return S
 
 
-def _driving(equations: Equations, unknowns: Sequence[str], P: ca.SX) -> ca.SX:
+def _driving(model: SimulatedModel, unknowns: Sequence[str], P: ca.SX) -> ca.SX:
     """P = df/dp, as columns of the unknowns; those of initial states are zero."""
-    columns = ca.horzcat(P, ca.SX(equations.n_x, equations.n_x))
-    names = (*equations.parameters, *equations.states)
+    columns = ca.horzcat(P, ca.SX(len(model.state), len(model.state)))
+    names = (*model.parameters, *model.state)
     return columns[:, [names.index(name) for name in unknowns]]
 
 
 # A row ---------------------------------------------------------------------------------------------------------------
-def plan_of(equations: Equations, signals: Sequence[str], sensitivities: Sensitivities) -> Plan:
+def loop_specification(
+    model: SimulatedModel, signals: Sequence[str], sensitivities: Sensitivities, integrator: str, substeps: int
+) -> LoopSpecification:
     """Expressions of one row, as graphs.
 
     Parameters
     ----------
-    equations : what is simulated
-    signals : those that are scored
-    sensitivities : what is differentiated
+    model : Model or DisturbedModel
+        The model to simulate.
+    signals : sequence of str
+        Signals that are compared with measurements.
+    sensitivities : Sensitivities
+        The derivatives to simulate.
+    integrator : str
+        One of `INTEGRATORS`.
+    substeps : int
+        Integration steps from one row to the next.
     """
-    from diransac.simulation.compiler.time_loop import PARAMETER, STEP, Plan
+    from diransac.simulation.compiler.time_loop import PARAMETER, STEP, LoopSpecification
 
-    entries = sensitivities.entries
-    arguments = [
-        ca.SX.sym(name, n)
-        for name, n in (
-            ("x", equations.n_x + len(entries)), ("u", equations.sizes[2]), ("p", equations.sizes[3]), ("h", 1)
-        )
-    ]  # fmt: skip
-    scored = tuple(equations.signals.index(name) for name in signals)
-    after, simulated, slopes = _expressions(equations, sensitivities, arguments)
+    n_states = len(model.state) + len(sensitivities.entries)
+    sizes = {"x": n_states, "u": model.n_u, "p": model.n_p, "h": 1}
+    arguments = [ca.SX.sym(name, n) for name, n in sizes.items()]
+    scored = tuple(model.signals.index(name) for name in signals)
+    after, simulated, slopes = _expressions(model, sensitivities, integrator, arguments)
     step, further_step = (
         read_graph(ca.Function("step", arguments, results), (PARAMETER, STEP), reciprocals=True)
         for results in ([after, simulated, slopes[list(scored), :]], [after])
     )
-    return Plan(
+    return LoopSpecification(
         step=step,
         further_step=further_step,
-        substeps=equations.substeps,
-        n_states=equations.n_x + len(entries),
-        n_inputs=equations.sizes[2],
-        n_signals=len(equations.signals),
+        substeps=substeps,
+        n_states=n_states,
+        n_inputs=model.n_u,
+        n_signals=len(model.signals),
         n_unknowns=slopes.size2(),
         scored=scored,
-        quaternions=_scored_quaternions(equations, tuple(signals)),
-        state_quaternions=equations.quaternions,
+        quaternions=_scored_quaternions(model, tuple(signals)),
+        state_quaternions=tuple(model.quaternions),
     )
 
 
 def _expressions(
-    equations: Equations, sensitivities: Sensitivities, arguments: Sequence[ca.SX]
+    model: SimulatedModel, sensitivities: Sensitivities, integrator: str, arguments: Sequence[ca.SX]
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
     """State after a step with the varying derivatives, all signals before it, and the derivatives of these."""
-    function, n_x, n_q = ca.Function.deserialize(equations.dynamics), equations.n_x, equations.sizes[0]
+    n_x, n_q = len(model.state), model.n_q
     states, u, p, h = arguments
     S = _variables(sensitivities, states[n_x:])
 
     def rates(columns: ca.SX) -> ca.SX:
         x = columns[:, 0]
-        rate = function(x, u, p)[0]
+        rate = model.dynamics(x, u, p)[0]
         if not sensitivities.unknowns:
             return rate
-        A, _, P = equations.model.rate_jacobians(x, u, p)
-        return ca.horzcat(rate, A @ columns[:, 1:] + _driving(equations, sensitivities.unknowns, P))
+        A, _, P = model.rate_jacobians(x, u, p)
+        return ca.horzcat(rate, A @ columns[:, 1:] + _driving(model, sensitivities.unknowns, P))
 
     columns = ca.horzcat(states[:n_x], S)
     slope = rates(columns)
-    after = INTEGRATORS[equations.integrator](rates, columns, h, slope, n_q)
-    after = _normalised(after, equations.quaternions)
+    after = INTEGRATORS[integrator](rates, columns, h, slope, n_q)
+    after = _normalised(after, model.quaternions)
     moved = [after[i, 1 + j] for i, j in sensitivities.entries]
-    acceleration = function(states[:n_x], u, p)[1]
+    acceleration = model.dynamics(states[:n_x], u, p)[1]
     return (
         ca.vertcat(after[:, 0], *moved),
         ca.vertcat(states[:n_x], acceleration),
@@ -229,7 +202,7 @@ def _expressions(
 
 
 def _normalised(columns: ca.SX, quaternions: Sequence[Sequence[int]]) -> ca.SX:
-    """Return the state with every quaternion scaled to length one, and its derivatives with what this makes of them."""
+    """State with every quaternion scaled to length one, and the derivatives of the scaled state."""
     rows = ca.vertsplit(columns)
     for four in quaternions:
         values = ca.vertcat(*(rows[k] for k in four))
@@ -241,9 +214,9 @@ def _normalised(columns: ca.SX, quaternions: Sequence[Sequence[int]]) -> ca.SX:
     return ca.vertcat(*rows)
 
 
-def _scored_quaternions(equations: Equations, signals: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
+def _scored_quaternions(model: SimulatedModel, signals: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
     """Positions among the scored signals of the quaternions that are scored whole."""
-    named = [[equations.signals[k] for k in four] for four in equations.quaternions]
+    named = [[model.signals[k] for k in four] for four in model.quaternions]
     return tuple(tuple(signals.index(name) for name in four) for four in named if set(four) <= set(signals))
 
 

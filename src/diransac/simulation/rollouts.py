@@ -1,4 +1,4 @@
-"""Compiled rollouts: arrays in, arrays out."""
+"""Compiled rollouts: the simulator that runs on the CPU."""
 
 from __future__ import annotations
 
@@ -12,50 +12,66 @@ from numpy.typing import ArrayLike
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
+from diransac.simulation.batch import (
+    ClosedLoopBatch,
+    GaussNewtonBatch,
+    LinearFeedback,
+    LinearizedErrors,
+    Measurements,
+    RolloutBatch,
+    ScoreBatch,
+    Simulator,
+)
 from diransac.simulation.compiler.lanes import (
     Lanes,
     aligned,
+    arranged_feedback,
     arranged_lanes,
-    arranged_laws,
     arranged_measurements,
     arranged_weights,
     run_time_loop,
     squared_thresholds,
 )
 from diransac.simulation.compiler.machine_code import LANES, MachineCode, Target, compile_function
-from diransac.simulation.integrators import INTEGRATORS, Equations, Sensitivities, plan_of, sensitivities_of
-from diransac.simulation.outcomes import Flights, GaussNewton, LinearizedErrors, Scores, gauss_newton_of
+from diransac.simulation.integrators import INTEGRATORS, Sensitivities, loop_specification, sensitivities_of
 
 if TYPE_CHECKING:
-    from diransac.model import Model
-    from diransac.model.plant import DisturbedModel
-    from diransac.simulation.compiler.time_loop import Inputs, Kept, Plan
-    from diransac.simulation.feedback import Law
+    from diransac.simulation.compiler.time_loop import InputSource, LoopSpecification, Output
+    from diransac.simulation.integrators import SimulatedModel
 
 __all__ = ["Rollouts", "rollouts"]
 
 
 def rollouts(
-    model: Model | DisturbedModel,
+    model: SimulatedModel,
     signals: Sequence[str] | None = None,
     *,
     integrator: str = "rk4",
     substeps: int = 1,
     target: Target | None = None,
 ) -> Rollouts:
-    """Compiled rollouts of a model; the same ones again for the same equations and options.
+    """Compiled rollouts of a model; the same object again for an equal model and equal options.
 
     Parameters
     ----------
-    model : what is simulated, a `Model` or what `Plant.simulated` gives: its `dynamics`, an SX function (x, u, p) ->
-        (dx/dt, accelerations)
-    signals : those that are compared with measurements, in the order of their columns; all by default
-    integrator : `rk4`, `euler` or `semi-implicit-euler` (velocities first, then coordinates with the new velocities)
-    substeps : integration steps from one row to the next
-    target : processor to compile for; this one by default
+    model : Model or DisturbedModel
+        The model to simulate, or `Plant.simulated`: its `dynamics` are an SX function (x, u, p) -> (dx/dt,
+        accelerations).
+    signals : sequence of str, optional
+        Signals that are compared with measurements, in the order of their columns; all by default.
+    integrator : {"rk4", "euler", "semi-implicit-euler"}
+        The last one steps velocities first, then coordinates with the new velocities.
+    substeps : int
+        Integration steps from one row to the next.
+    target : Target, optional
+        Processor to compile for; this one by default.
 
-    Raises SettingsError: an unknown signal or integrator, or no sub-step.
-    Raises ModelError: the dynamics hold an operation that cannot be compiled.
+    Raises
+    ------
+    SettingsError
+        A signal or the integrator is unknown, or there is no integration step.
+    ModelError
+        The dynamics hold an operation that cannot be compiled.
     """
     names = tuple(model.signals)
     scored = names if signals is None else tuple(signals)
@@ -71,308 +87,241 @@ def rollouts(
         raise SettingsError(f"substeps is {substeps}, but a row takes at least 1 integration step.")
     if not model.dynamics.is_a("SXFunction"):
         raise ModelError(f"the dynamics of model {model.name!r} are not made of SX symbols; expand them: .expand().")
-    quaternions = tuple(tuple(int(k) for k in four) for four in model.quaternions)
-    sizes = (model.n_q, model.n_v, model.n_u, model.n_p)
-    dynamics, parameters = model.dynamics.serialize(), tuple(model.parameters)
-    equations = Equations(dynamics, sizes, parameters, names, quaternions, integrator, int(substeps), model)
-    return _rollouts(equations, scored, target)
+    return _rollouts(model, scored, integrator, int(substeps), target)
 
 
 @lru_cache(maxsize=64)
-def _rollouts(equations: Equations, signals: tuple[str, ...], target: Target | None) -> Rollouts:
+def _rollouts(
+    model: SimulatedModel, signals: tuple[str, ...], integrator: str, substeps: int, target: Target | None
+) -> Rollouts:
     """Rollouts by value of what defines them."""
-    return Rollouts(equations, signals, target)
+    return Rollouts(model, signals, integrator, substeps, target)
 
 
-class Rollouts:
-    """Rollouts of one model, integrator and choice of scored signals; made by `rollouts`.
+class Rollouts(Simulator):
+    """Compiled rollouts of one model, integrator and choice of scored signals; made by `rollouts`.
 
-    A lane is one rollout: its parameters, its initial state, and with `start_rows` a window of the log of its own. What
-    a lane gives depends on nothing but its own data: not on the other lanes, their number, `threads`, or what is kept.
-    All methods share these arguments:
-
-    Parameters
-    ----------
-    parameters : (n_lanes, n_p)   each parameter's unit
-    initial_states : (n_x,) or (n_lanes, n_x)   coordinates, then velocities
-    inputs : (n_log, n_u)   held from each row to the next
-    measured : (n_log, n_s)   in the order of `signals`; NaN is allowed where `valid` is false
-    valid : (n_log,)   rows that count; the others are simulated through
-    dt : s   from row to row
-    start_rows : (n_lanes,)   row at which each lane starts; row 0 by default
-    n_rows : rows that a lane simulates; all of the log by default, required with `start_rows`
-    threads : how many blocks of lanes run at a time
-
-    Raises SettingsError: an array of another shape, a window outside the log, a time step that isn't positive.
+    Each method compiles a variant of the time loop when it is first called.
     """
 
-    def __init__(self, equations: Equations, signals: tuple[str, ...], target: Target | None) -> None:
+    def __init__(
+        self, model: SimulatedModel, signals: tuple[str, ...], integrator: str, substeps: int, target: Target | None
+    ) -> None:
         self.signals = signals
-        self._equations = equations
-        self._target = target
-        self._plans: dict[tuple[str, ...], tuple[Plan, Sensitivities]] = {}
+        self._model, self._integrator, self._substeps, self._target = model, integrator, substeps, target
+        self._specifications: dict[tuple[str, ...], tuple[LoopSpecification, Sensitivities]] = {}
         self._code: dict[tuple[Any, ...], MachineCode] = {}
         self._lock = RLock()
-        self._plan(())  # refuses now what could not be compiled later
+        self._specified(())  # refuses now what could not be compiled later
 
     def score(
         self,
-        parameters: ArrayLike,
-        initial_states: ArrayLike,
-        inputs: ArrayLike,
-        measured: ArrayLike,
-        valid: ArrayLike,
-        dt: float,
+        batch: RolloutBatch,
+        measurements: Measurements,
         thresholds: ArrayLike,
         min_inlier_signals: int,
         *,
-        start_rows: ArrayLike | None = None,
-        n_rows: int | None = None,
         threads: int = 1,
-    ) -> Scores:
-        """Sums of squared errors and inliers of every lane; row by row, one bit of each is stored.
-
-        The squares are added row after row, so `errors` reproduces the sums exactly.
-
-        Parameters
-        ----------
-        thresholds : (n_s,)   a signal is near where `|error| < threshold`; 0 switches it off
-        min_inlier_signals : near signals that make a row an inlier
-        """
-        from diransac.simulation.compiler import kept
+    ) -> ScoreBatch:
+        """Sums of squared errors and inliers of every lane; see `Simulator.score`."""
+        from diransac.simulation.compiler.outputs import ScoreOutput
 
         n_signals = len(self.signals)
-        lanes = self._lanes(parameters, initial_states, inputs, start_rows, n_rows)
+        lanes = self._lanes(batch)
         sums, counts = np.empty((n_signals, lanes.n_padded)), np.empty((2, lanes.n_padded), np.int64)
         bits = np.zeros((lanes.n_padded // LANES, lanes.n_rows), np.uint8)
         values = {
-            **arranged_measurements(lanes, n_signals, measured, valid),
+            **arranged_measurements(lanes, n_signals, measurements.values, measurements.valid),
             "squared_thresholds": squared_thresholds(thresholds, n_signals),
             "min_inlier_signals": int(min_inlier_signals),
             "sums": sums,
             "counts": counts,
             "inlier_bits": bits,
         }
-        self._run(kept.Scores, lanes, dt, values, threads)
+        self._run(ScoreOutput, batch, lanes, values, threads)
         n = lanes.n_lanes
-        return Scores(sums[:, :n].T.copy(), counts[0, :n].copy(), counts[1, :n] != 0, bits)
+        return ScoreBatch(batch, sums[:, :n].T.copy(), counts[0, :n].copy(), counts[1, :n] != 0, bits)
 
-    def errors(
-        self,
-        parameters: ArrayLike,
-        initial_states: ArrayLike,
-        inputs: ArrayLike,
-        measured: ArrayLike,
-        valid: ArrayLike,
-        dt: float,
-        *,
-        start_rows: ArrayLike | None = None,
-        n_rows: int | None = None,
-        threads: int = 1,
-    ) -> FloatArray:
-        """Simulated less measured, (n_lanes, n_rows, n_s), NaN from a divergence on; the ones that `score` sums.
-
-        A quaternion's sign is ignored: its four simulated numbers change sign where that brings them nearer.
-        """
-        from diransac.simulation.compiler import kept
+    def errors(self, batch: RolloutBatch, measurements: Measurements, *, threads: int = 1) -> FloatArray:
+        """Simulated less measured, (n_lanes, n_rows, n_s), NaN from a divergence on; see `Simulator.errors`."""
+        from diransac.simulation.compiler.outputs import ErrorOutput
 
         n_signals = len(self.signals)
-        lanes = self._lanes(parameters, initial_states, inputs, start_rows, n_rows)
+        lanes = self._lanes(batch)
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_signals))
-        measurements = arranged_measurements(lanes, n_signals, measured, valid)
-        self._run(kept.Errors, lanes, dt, {**measurements, "series": series}, threads)
+        values = arranged_measurements(lanes, n_signals, measurements.values, measurements.valid)
+        self._run(ErrorOutput, batch, lanes, {**values, "series": series}, threads)
         return series
 
-    def trajectories(
-        self,
-        parameters: ArrayLike,
-        initial_states: ArrayLike,
-        inputs: ArrayLike,
-        dt: float,
-        *,
-        start_rows: ArrayLike | None = None,
-        n_rows: int | None = None,
-        threads: int = 1,
-    ) -> FloatArray:
+    def trajectories(self, batch: RolloutBatch, *, threads: int = 1) -> FloatArray:
         """All signals of the model, (n_lanes, n_rows, n_signals): states, accelerations; NaN from a divergence on."""
-        from diransac.simulation.compiler import kept
+        from diransac.simulation.compiler.outputs import SignalOutput
 
-        lanes = self._lanes(parameters, initial_states, inputs, start_rows, n_rows)
-        series = np.empty((lanes.n_lanes, lanes.n_rows, len(self._equations.signals)))
-        self._run(kept.Signals, lanes, dt, {"series": series}, threads)
+        lanes = self._lanes(batch)
+        series = np.empty((lanes.n_lanes, lanes.n_rows, len(self._model.signals)))
+        self._run(SignalOutput, batch, lanes, {"series": series}, threads)
         return series
 
     def gauss_newton(
         self,
-        parameters: ArrayLike,
-        initial_states: ArrayLike,
-        inputs: ArrayLike,
-        measured: ArrayLike,
-        valid: ArrayLike,
-        dt: float,
+        batch: RolloutBatch,
+        measurements: Measurements,
         weights: ArrayLike,
         *,
         unknowns: Sequence[str] | None = None,
-        start_rows: ArrayLike | None = None,
-        n_rows: int | None = None,
         threads: int = 1,
-    ) -> GaussNewton:
-        """Sums e' W e, J' W e and J' W J of every lane, J the exact derivative of the errors that `errors` gives.
+    ) -> GaussNewtonBatch:
+        """Sums e' W e, J' W e and J' W J of every lane; see `Simulator.gauss_newton`."""
+        from diransac.simulation.compiler.outputs import GaussNewtonOutput
 
-        A kink (`fabs`, `if_else`) has the derivative of the branch that is taken; at the kink itself, CasADi's choice.
-
-        Parameters
-        ----------
-        weights : (n_s,) or (n_log, n_s)   W, inverse of each signal's unit squared: 1 / sigma^2, or what robust
-            reweighting makes of it. A measurement whose weight is 0 may be NaN
-        unknowns : names of parameters, and of states, whose initial values are meant; all parameters, then all states
-            by default
-        """
-        from diransac.simulation.compiler import kept
-
-        lanes = self._lanes(parameters, initial_states, inputs, start_rows, n_rows)
+        lanes = self._lanes(batch)
         names, sensitivities = self._unknowns(unknowns)
         n_z, n_blocks = len(names), lanes.n_padded // LANES
         sums = aligned((n_blocks, 1 + n_z + n_z * (n_z + 1) // 2, LANES))
-        final = aligned((n_blocks, self._equations.n_x + int(sensitivities.varying.sum()), LANES))
-        weighted = arranged_weights(lanes, len(self.signals), measured, valid, weights)
+        final = aligned((n_blocks, len(self._model.state) + int(sensitivities.varying.sum()), LANES))
         values = {
-            **weighted,
+            **arranged_weights(lanes, len(self.signals), measurements.values, measurements.valid, weights),
             "initial_states": sensitivities.appended(lanes.arrays["initial_states"]),
             "sums": sums,
             "final": final,
         }
-        self._run(kept.Sums, lanes, dt, values, threads, unknowns=names)
-        return gauss_newton_of(sensitivities, lanes.n_lanes, sums, final)
+        self._run(GaussNewtonOutput, batch, lanes, values, threads, unknowns=names)
+        return _unpacked(sensitivities, lanes.n_lanes, sums, final)
 
     def linearized_errors(
         self,
-        parameters: ArrayLike,
-        initial_states: ArrayLike,
-        inputs: ArrayLike,
-        measured: ArrayLike,
-        valid: ArrayLike,
-        dt: float,
+        batch: RolloutBatch,
+        measurements: Measurements,
         *,
         unknowns: Sequence[str] | None = None,
-        start_rows: ArrayLike | None = None,
-        n_rows: int | None = None,
         threads: int = 1,
     ) -> LinearizedErrors:
-        """Errors and Jacobian row by row, those that `gauss_newton` sums; for a few lanes, because all is stored.
+        """Errors and Jacobian row by row; see `Simulator.linearized_errors`."""
+        from diransac.simulation.compiler.outputs import LinearizedErrorOutput
 
-        Parameters
-        ----------
-        unknowns : as `gauss_newton` has them
-        """
-        from diransac.simulation.compiler import kept
-
-        lanes = self._lanes(parameters, initial_states, inputs, start_rows, n_rows)
+        lanes = self._lanes(batch)
         names, sensitivities = self._unknowns(unknowns)
         n_s, n_z = len(self.signals), len(names)
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_s * (1 + n_z)))
-        measurements = arranged_measurements(lanes, n_s, measured, valid)
         values = {
-            **measurements,
+            **arranged_measurements(lanes, n_s, measurements.values, measurements.valid),
             "initial_states": sensitivities.appended(lanes.arrays["initial_states"]),
             "series": series,
         }
-        self._run(kept.LinearizedErrors, lanes, dt, values, threads, unknowns=names)
+        self._run(LinearizedErrorOutput, batch, lanes, values, threads, unknowns=names)
         jacobian = series[..., n_s:].reshape(*series.shape[:2], n_s, n_z)
         return LinearizedErrors(names, series[..., :n_s], jacobian)
 
     def fly(
         self,
-        parameters: ArrayLike,
-        initial_states: ArrayLike,
-        law: Law,
-        dt: float,
+        batch: RolloutBatch,
+        feedback: LinearFeedback,
         *,
-        law_of_lane: ArrayLike | None = None,
-        start_rows: ArrayLike | None = None,
-        n_rows: int | None = None,
+        feedback_of_lane: ArrayLike | None = None,
         threads: int = 1,
-    ) -> Flights:
-        """Signals of closed loops, and the inputs that were applied.
+    ) -> ClosedLoopBatch:
+        """Signals of closed loops, and the inputs that were applied; see `Simulator.fly`."""
+        from diransac.simulation.compiler.outputs import ClosedLoopOutput
+        from diransac.simulation.compiler.time_loop import inputs_by_feedback, inputs_by_shared_feedback
 
-        Parameters
-        ----------
-        law : gives the inputs of every row; its rows are the log's
-        law_of_lane : (n_lanes,)   which law of a table steers each lane; by default the first lane's is the first, ...
-        """
-        from diransac.simulation.compiler import inputs, kept
-
-        n_signals, n_u, n_x = len(self._equations.signals), self._equations.sizes[2], self._equations.n_x
-        if (law.n_x, law.n_u) != (n_x, n_u):
+        model, n_signals = self._model, len(self._model.signals)
+        if (feedback.n_x, feedback.n_u) != (len(model.state), model.n_u):
             raise SettingsError(
-                f"the law is for {law.n_x} states and {law.n_u} inputs, but the model has {n_x} and {n_u}."
+                f"the feedback is for {feedback.n_x} states and {feedback.n_u} inputs, but the model has "
+                f"{len(model.state)} and {model.n_u}."
             )
-        lanes = self._lanes(parameters, initial_states, np.zeros((law.n_rows, n_u)), start_rows, n_rows)
-        values = arranged_laws(lanes, law.table(), law.n_laws, law_of_lane)
-        series = np.empty((lanes.n_lanes, lanes.n_rows, n_signals + n_u))
-        values |= {"limits": np.array([law.u_min, law.u_max]), "series": series}
-        source = inputs.fed_back if "law_starts" in values else inputs.fed_back_alike
-        self._run(kept.Flights, lanes, dt, values, threads, inputs=source)
-        return Flights(series[..., :n_signals], series[..., n_signals:])
+        if batch.n_log != feedback.n_rows:
+            raise SettingsError(f"the batch's inputs have {batch.n_log} rows, but the feedback has {feedback.n_rows}.")
+        lanes = self._lanes(batch, np.zeros((batch.n_log, model.n_u)))
+        values = arranged_feedback(lanes, feedback.table(), feedback.n_laws, feedback_of_lane)
+        series = np.empty((lanes.n_lanes, lanes.n_rows, n_signals + model.n_u))
+        values |= {"limits": np.array([feedback.u_min, feedback.u_max]), "series": series}
+        source = inputs_by_feedback if "feedback_starts" in values else inputs_by_shared_feedback
+        self._run(ClosedLoopOutput, batch, lanes, values, threads, inputs=source)
+        return ClosedLoopBatch(series[..., :n_signals], series[..., n_signals:])
 
-    def _lanes(
-        self,
-        parameters: ArrayLike,
-        initial_states: ArrayLike,
-        inputs: ArrayLike,
-        start_rows: ArrayLike | None,
-        n_rows: int | None,
-    ) -> Lanes:
-        """Check and arrange what every kind of run starts from."""
-        n_q, n_v, n_u, n_p = self._equations.sizes
-        return arranged_lanes((n_p, n_q + n_v, n_u), parameters, initial_states, inputs, start_rows, n_rows)
+    def _lanes(self, batch: RolloutBatch, inputs: FloatArray | None = None) -> Lanes:
+        """Lanes of a batch as the time loop reads them, with other inputs where given."""
+        sizes = (self._model.n_p, len(self._model.state), self._model.n_u)
+        inputs = batch.inputs if inputs is None else inputs
+        return arranged_lanes(
+            sizes, batch.parameters, batch.initial_states, inputs, batch.start_rows, batch.rows_per_lane
+        )
 
     def _unknowns(self, unknowns: Sequence[str] | None) -> tuple[tuple[str, ...], Sensitivities]:
-        """Check names of unknowns, and find what there is to differentiate."""
-        known = (*self._equations.parameters, *self._equations.states)
+        """Names of the unknowns, checked, and the derivatives with respect to them."""
+        known = (*self._model.parameters, *self._model.state)
         names = known if unknowns is None else tuple(unknowns)
         if not names or len(set(names)) < len(names) or not set(names) <= set(known):
             raise SettingsError(
                 f"unknowns are {', '.join(names) or 'none'}, but at least one is needed, each a parameter or a state, "
                 f"once; there are {', '.join(known)}."
             )
-        return names, self._plan(names)[1]
+        return names, self._specified(names)[1]
 
     def _run(
         self,
-        kept: type[Kept],
+        output: type[Output],
+        batch: RolloutBatch,
         lanes: Lanes,
-        dt: float,
         values: dict[str, Any],
         threads: int,
         *,
-        inputs: Inputs | None = None,
+        inputs: InputSource | None = None,
         unknowns: tuple[str, ...] = (),
     ) -> None:
         """Run the time loop over all blocks of lanes; `values` are its other arguments by name."""
-        from diransac.simulation.compiler.inputs import held
+        from diransac.simulation.compiler.time_loop import inputs_from_log
 
-        if not (np.isfinite(dt) and dt > 0):
-            raise SettingsError(f"dt is {dt}, but the time from row to row must be positive seconds.")
         if lanes.n_lanes:
-            code = self._compiled(kept, inputs or held, unknowns, lanes.has_windows)
-            run_time_loop(code, lanes, {"step": dt / self._equations.substeps, **values}, threads)
+            code = self._compiled(output, inputs or inputs_from_log, unknowns, lanes.has_windows)
+            run_time_loop(code, lanes, {"step": batch.dt / self._substeps, **values}, threads)
 
-    def _plan(self, unknowns: tuple[str, ...]) -> tuple[Plan, Sensitivities]:
+    def _specified(self, unknowns: tuple[str, ...]) -> tuple[LoopSpecification, Sensitivities]:
         """Expressions of a row and their derivatives with respect to some unknowns, made when first needed."""
         with self._lock:
-            if unknowns not in self._plans:
-                sensitivities = sensitivities_of(self._equations, unknowns)
-                self._plans[unknowns] = plan_of(self._equations, self.signals, sensitivities), sensitivities
-            return self._plans[unknowns]
+            if unknowns not in self._specifications:
+                sensitivities = sensitivities_of(self._model, unknowns)
+                specification = loop_specification(
+                    self._model, self.signals, sensitivities, self._integrator, self._substeps
+                )
+                self._specifications[unknowns] = specification, sensitivities
+            return self._specifications[unknowns]
 
-    def _compiled(self, kept: type[Kept], inputs: Inputs, unknowns: tuple[str, ...], windows: bool) -> MachineCode:
+    def _compiled(
+        self, output: type[Output], inputs: InputSource, unknowns: tuple[str, ...], windows: bool
+    ) -> MachineCode:
         """Machine code of a variant of the time loop, compiled when first needed."""
         from diransac.simulation.compiler.time_loop import ARGUMENTS, emit_time_loop
 
-        variant = (kept, inputs, unknowns, windows)
+        variant = (output, inputs, unknowns, windows)
         with self._lock:
             if variant not in self._code:
-                module = emit_time_loop(self._plan(unknowns)[0], kept, inputs, windows=windows)
+                module = emit_time_loop(self._specified(unknowns)[0], output, inputs, windows=windows)
                 self._code[variant] = compile_function(module, "time_loop", ARGUMENTS.values(), self._target)
             return self._code[variant]
+
+
+def _unpacked(sensitivities: Sensitivities, n_lanes: int, sums: FloatArray, final: FloatArray) -> GaussNewtonBatch:
+    """Results of lanes from the blocks that the time loop writes, without the lanes that fill the last block.
+
+    Parameters
+    ----------
+    sums : (n_blocks, 1 + n_z + n_z (n_z + 1) / 2, 8)
+        e' W e, J' W e, and the upper triangle of J' W J.
+    final : (n_blocks, n_states, 8)
+        State, then its varying derivatives.
+    """
+    sums, final = (
+        array.swapaxes(1, 2).reshape(len(array) * LANES, array.shape[1])[:n_lanes] for array in (sums, final)
+    )
+    n_x, n_z = sensitivities.initial.shape
+    upper = np.triu_indices(n_z)
+    normal_matrix = np.empty((n_lanes, n_z, n_z))
+    normal_matrix[:, *upper] = normal_matrix[:, *upper[::-1]] = sums[:, 1 + n_z :]
+    cost, gradient = sums[:, 0].copy(), sums[:, 1 : 1 + n_z].copy()
+    diverged = np.isinf(cost)
+    slopes = sensitivities.matrix(final[:, n_x:])
+    slopes[diverged] = np.nan
+    states = final[:, :n_x].copy()
+    return GaussNewtonBatch(sensitivities.unknowns, cost, gradient, normal_matrix, states, slopes, diverged)

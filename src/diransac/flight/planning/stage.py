@@ -9,7 +9,7 @@ Names, of a stage: ``s`` its state, ``u`` its input, ``z = [s; u]``; ``Z = ds/dz
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -135,23 +135,9 @@ class Stage:
         return values[:, 0], gradients, curvatures.reshape(-1, self.n_z, self.n_z)
 
 
-def stage_of(model: Model, free_time: bool) -> Stage:
-    """Compiled stage of a model; the same one again for equal equations."""
-    return _stage(_Equations(model.fingerprint, free_time, model))
-
-
-@dataclass(frozen=True)
-class _Equations:
-    """What defines a stage, as a value."""
-
-    fingerprint: str
-    free_time: bool
-    model: Model = field(compare=False, repr=False)
-
-
 @lru_cache(maxsize=32)
-def _stage(equations: _Equations) -> Stage:
-    model, free_time = equations.model, equations.free_time
+def stage_of(model: Model, free_time: bool) -> Stage:
+    """Compiled stage of a model; the same one again for an equal model."""
     n_s = len(model.state) + free_time
     s, u, p, c = (ca.SX.sym(n, size) for n, size in (("s", n_s), ("u", model.n_u), ("p", model.n_p), ("c", 1)))
     arguments = [s, u, p, c]

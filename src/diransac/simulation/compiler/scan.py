@@ -18,7 +18,7 @@ from diransac.simulation.compiler.machine_code import MachineCode, Target, compi
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from diransac.simulation.compiler.time_loop import Plan
+    from diransac.simulation.compiler.time_loop import LoopSpecification
 
 
 __all__ = ["Scan", "compile_scan"]
@@ -74,21 +74,20 @@ class Scan:
 
     def _compiled(self, windows: bool) -> MachineCode:
         """Machine code for lanes with rows of their own, or with the same ones."""
-        from diransac.simulation.compiler.inputs import held
-        from diransac.simulation.compiler.kept import Signals
-        from diransac.simulation.compiler.time_loop import ARGUMENTS, emit_time_loop
+        from diransac.simulation.compiler.outputs import SignalOutput
+        from diransac.simulation.compiler.time_loop import ARGUMENTS, emit_time_loop, inputs_from_log
 
         with self._lock:
             if windows not in self._code:
-                module = emit_time_loop(self._plan(), Signals, held, windows=windows)
+                module = emit_time_loop(self._specification(), SignalOutput, inputs_from_log, windows=windows)
                 self._code[windows] = compile_function(module, "time_loop", ARGUMENTS.values(), self._target)
             return self._code[windows]
 
-    def _plan(self) -> Plan:
+    def _specification(self) -> LoopSpecification:
         """The recurrence as a simulation that has no sub-steps and is compared with nothing."""
-        from diransac.simulation.compiler.time_loop import Plan
+        from diransac.simulation.compiler.time_loop import LoopSpecification
 
-        return Plan(
+        return LoopSpecification(
             step=self._graph,
             further_step=Graph((), ((),), ()),
             substeps=1,

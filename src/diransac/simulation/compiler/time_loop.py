@@ -1,7 +1,7 @@
 """The time loop of a simulation, as machine code: eight rollouts to a vector.
 
 A lane is one rollout: its parameters, its initial state, its window of rows. What a lane computes is the same in every
-variant of the loop; variants differ in what they keep (`kept.py`) and in where the inputs come from (`inputs.py`).
+variant of the loop; variants differ in their output (`outputs.py`) and in the source of the inputs.
 """
 
 from __future__ import annotations
@@ -32,21 +32,33 @@ if TYPE_CHECKING:
 
     from diransac.simulation.compiler.graph import Graph
 
-__all__ = ["ARGUMENTS", "Block", "Inputs", "Kept", "Plan", "Row", "TimeLoop", "emit_time_loop"]
+__all__ = [
+    "ARGUMENTS",
+    "Block",
+    "InputSource",
+    "LoopRow",
+    "LoopSpecification",
+    "Output",
+    "TimeLoop",
+    "emit_time_loop",
+    "inputs_by_feedback",
+    "inputs_by_shared_feedback",
+    "inputs_from_log",
+]
 
 ARGUMENTS = {
     "parameters": "pointer",  # (n_p, n_padded) float64
     "initial_states": "pointer",  # (n_states, n_padded) float64
-    "inputs": "pointer",  # (n_log, n_u) float64, read where inputs are held
-    "laws": "pointer",  # (n_laws, n_log, width) float64, read where inputs are fed back
-    "law_starts": "pointer",  # (n_padded,) int64, row of all laws' rows at which each lane's law starts
-    "limits": "pointer",  # (2, n_u) float64, smallest and largest inputs of the laws
+    "inputs": "pointer",  # (n_log, n_u) float64, read where the log gives the inputs
+    "feedback": "pointer",  # (n_laws, n_log, width) float64, read where feedback gives the inputs
+    "feedback_starts": "pointer",  # (n_padded,) int64, row of all laws' rows at which each lane's law starts
+    "limits": "pointer",  # (2, n_u) float64, smallest and largest inputs of the feedback
     "measured": "pointer",  # (n_log, n_s) float64
     "valid": "pointer",  # (n_log,) bytes, 0 or 1
     "weights": "pointer",  # (n_log, n_s) float64
     "squared_thresholds": "pointer",  # (n_s,) float64
     "start_rows": "pointer",  # (n_padded,) int64, read where lanes have windows of their own
-    "sums": "pointer",  # float64, written by what is kept; so are the next four
+    "sums": "pointer",  # float64, written by the output; so are the next four
     "counts": "pointer",  # (2, n_padded) int64
     "inlier_bits": "pointer",  # (n_blocks, n_rows) bytes, a bit a lane
     "series": "pointer",  # (n_lanes, n_rows, width) float64
@@ -65,8 +77,8 @@ STATE, INPUT, PARAMETER, STEP = range(4)
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a time loop computes.
+class LoopSpecification:
+    """Expressions and sizes of a time loop.
 
     Attributes
     ----------
@@ -94,13 +106,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Block:
-    """What belongs to the eight lanes of a block.
+    """Values of the eight lanes of a block.
 
     Attributes
     ----------
     first : position of the first lane among the padded ones
     starts : per lane, row of the log at which it starts; empty if all start at the first
-    step, further_step : results of the graphs that hold for the whole rollout
+    step, further_step : invariant results of the graphs
     """
 
     first: Value
@@ -110,7 +122,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Row:
+class LoopRow:
     """One row of a block's rollouts.
 
     Attributes
@@ -118,7 +130,7 @@ class Row:
     index : row of the rollout
     inputs : those that act from this row to the next
     signals : states and accelerations at this row
-    slopes : Jacobian of the scored signals, by signal and unknown; None where it is always zero
+    slopes : Jacobian of the scored signals, by signal and unknown; None where always zero
     alive : whether every signal has been finite in all rows so far
     """
 
@@ -129,8 +141,8 @@ class Row:
     alive: Value
 
 
-class Kept(Protocol):
-    """What a variant of the loop keeps; it emits its own code into the loop that it is made with."""
+class Output(Protocol):
+    """Output of a variant of the loop; it emits its own code into the loop that it is made with."""
 
     ends_early: bool
     """Whether a block can be left once all its lanes have diverged."""
@@ -138,26 +150,28 @@ class Kept(Protocol):
     def __init__(self, loop: TimeLoop) -> None: ...
 
     def start(self, block: Block) -> None:
-        """Emit what happens before a block's first row."""
+        """Emit the code before a block's first row."""
 
-    def row(self, block: Block, row: Row) -> None:
-        """Emit what is kept of a row."""
+    def row(self, block: Block, row: LoopRow) -> None:
+        """Emit the output of a row."""
 
     def end(self, block: Block) -> None:
-        """Emit what happens after a block's last row."""
+        """Emit the code after a block's last row."""
 
 
-Inputs: TypeAlias = "Callable[[TimeLoop, Block, Value], list[Value]]"
+InputSource: TypeAlias = "Callable[[TimeLoop, Block, Value], list[Value]]"
 """Emits the inputs of a block's lanes at a row."""
 
 
-def emit_time_loop(plan: Plan, kept: type[Kept], inputs: Inputs, *, windows: bool) -> Value:
+def emit_time_loop(
+    specification: LoopSpecification, output: type[Output], inputs: InputSource, *, windows: bool
+) -> Value:
     """LLVM module with one function, `time_loop`, that takes `ARGUMENTS`.
 
     Parameters
     ----------
-    plan : what to compute
-    kept : what to keep of it
+    specification : expressions and sizes
+    output : emits the output of a row
     inputs : emits the inputs of a row
     windows : every lane starts at its own row of the log, not all at its first
     """
@@ -169,37 +183,37 @@ def emit_time_loop(plan: Plan, kept: type[Kept], inputs: Inputs, *, windows: boo
         argument.name = name
         if kind == "pointer":
             argument.add_attribute("noalias")
-    TimeLoop(plan, windows, function).emit(kept, inputs)
+    TimeLoop(specification, windows, function).emit(output, inputs)
     return module
 
 
 class TimeLoop:
-    """Emits the function: blocks of lanes, and in them rows; gives what is kept access to what is logged."""
+    """Emitter of the function: blocks of lanes, and in them rows; gives outputs access to the log."""
 
-    def __init__(self, plan: Plan, windows: bool, function: Value) -> None:
-        self.plan, self.windows = plan, windows
+    def __init__(self, specification: LoopSpecification, windows: bool, function: Value) -> None:
+        self.specification, self.windows = specification, windows
         self.arguments = {argument.name: argument for argument in function.args}
         self.v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
         self.builder = self.v.builder
-        self.state: list[Cell] = [self.v.cell(self.v.number(0.0)) for _ in range(plan.n_states)]
+        self.state: list[Cell] = [self.v.cell(self.v.number(0.0)) for _ in range(specification.n_states)]
         self.guard = self.v.cell(self.v.number(0.0))
         """Zero as long as every signal has been finite."""
 
-    def emit(self, variant: type[Kept], inputs: Inputs) -> None:
+    def emit(self, variant: type[Output], inputs: InputSource) -> None:
         """Emit the whole function."""
-        kept, v = variant(self), self.v
+        output, v = variant(self), self.v
         with v.repeat(self.arguments["first_block"], self.arguments["end_block"]) as blocks:
             block = self._start(blocks.index)
-            kept.start(block)
+            output.start(block)
             with v.repeat(integer(0), self.arguments["n_rows"]) as rows:
                 u = inputs(self, block, rows.index)
-                self._row(kept, block, rows, u)
-            kept.end(block)
+                self._row(output, block, rows, u)
+            output.end(block)
         self.builder.ret_void()
 
     def _start(self, index: Value) -> Block:
-        """Load what a block of lanes starts from, and compute what holds for all its rows."""
-        v, plan = self.v, self.plan
+        """Load the initial values of a block of lanes, and compute the invariants of its rows."""
+        v, specification = self.v, self.specification
         first = self.builder.mul(index, integer(LANES))
         for k, cell in enumerate(self.state):
             v.set(cell, self._lane_vector("initial_states", k, first))
@@ -212,7 +226,7 @@ class TimeLoop:
 
         constant = [
             evaluate(v, graph, [k for k in graph.needed(chain(*graph.outputs)) if graph.invariant[k]], load)
-            for graph in (plan.step, plan.further_step)
+            for graph in (specification.step, specification.further_step)
         ]
         return Block(first, self.whole_numbers("start_rows", first) if self.windows else [], *constant)
 
@@ -221,37 +235,37 @@ class TimeLoop:
         vector = self.v.load(self.arguments[name], first, INTEGERS)
         return [self.v.lane(vector, lane) for lane in range(LANES)]
 
-    def _row(self, kept: Kept, block: Block, rows: Loop, u: list[Value]) -> None:
-        """Keep what is wanted of one row, then step to the next."""
-        v, graph = self.v, self.plan.step
+    def _row(self, output: Output, block: Block, rows: Loop, u: list[Value]) -> None:
+        """Emit the output of one row, then step to the next."""
+        v, graph = self.v, self.specification.step
         results = self._evaluate(graph, chain(*graph.outputs), u, block.step)
         after, signals, slopes = (numbers(v, results, positions) for positions in graph.outputs)
         alive = self._still_finite(signals)
-        kept.row(block, Row(rows.index, u, signals, self._by_signal(slopes), alive))
-        if kept.ends_early:
+        output.row(block, LoopRow(rows.index, u, signals, self._by_signal(slopes), alive))
+        if output.ends_early:
             with self.builder.if_then(self.builder.not_(v.any_lane(alive))):
                 self.builder.branch(rows.leave)
         self._set_state(after)
-        if self.plan.substeps > 1:
+        if self.specification.substeps > 1:
             self._further_steps(u, block)
 
     def _by_signal(self, slopes: list[Value]) -> list[list[Value | None]]:
         """Jacobian by signal and unknown, from its elements column by column."""
-        graph, n_scored = self.plan.step, len(self.plan.scored)
+        graph, n_scored = self.specification.step, len(self.specification.scored)
         zeros = [graph.instructions[k].is_zero for k in graph.outputs[2]]
         entries = [None if zero else slope for slope, zero in zip(slopes, zeros, strict=True)]
         return [entries[k::n_scored] for k in range(n_scored)]
 
     def _further_steps(self, u: list[Value], block: Block) -> None:
         """Take the sub-steps after the first."""
-        plan = self.plan
-        (after,) = plan.further_step.outputs
-        with self.v.repeat(integer(1), integer(plan.substeps)):
-            results = self._evaluate(plan.further_step, after, u, block.further_step)
+        specification = self.specification
+        (after,) = specification.further_step.outputs
+        with self.v.repeat(integer(1), integer(specification.substeps)):
+            results = self._evaluate(specification.further_step, after, u, block.further_step)
             self._set_state(numbers(self.v, results, after))
 
     def _set_state(self, after: list[Value]) -> None:
-        """Let the state be another one."""
+        """Set the state."""
         for cell, value in zip(self.state, after, strict=True):
             self.v.set(cell, value)
 
@@ -282,3 +296,44 @@ class TimeLoop:
         """One element of an array that holds a value for every lane."""
         index = self.builder.add(self.builder.mul(self.arguments["n_padded"], integer(element)), first)
         return self.v.load(self.arguments[name], index, NUMBERS)
+
+
+# Sources of the inputs ------------------------------------------------------------------------------------------------
+def inputs_from_log(loop: TimeLoop, block: Block, row: Value) -> list[Value]:
+    """Emit the log's inputs at a row."""
+    return loop.logged("inputs", loop.specification.n_inputs, block, row)
+
+
+def inputs_by_feedback(loop: TimeLoop, block: Block, row: Value) -> list[Value]:
+    """Emit the inputs by each lane's own feedback law."""
+    rows = [loop.builder.add(start, row) for start in loop.whole_numbers("feedback_starts", block.first)]
+    return _feedback_inputs(loop, [loop.v.join(column) for column in _columns(loop, rows)])
+
+
+def inputs_by_shared_feedback(loop: TimeLoop, _block: Block, row: Value) -> list[Value]:
+    """Emit the inputs by one feedback law, at the same row for all lanes."""
+    return _feedback_inputs(loop, [loop.v.splat(*column) for column in _columns(loop, [row])])
+
+
+def _columns(loop: TimeLoop, rows: list[Value]) -> list[list[Value]]:
+    """Numbers of the feedback's rows, column by column: u_ref, x_ref, and the gains row by row."""
+    n_u, n_x = loop.specification.n_inputs, loop.specification.n_states
+    width = n_u + n_x + n_u * n_x
+    return [[loop.v.element(loop.arguments["feedback"], at, width, k, DOUBLE) for at in rows] for k in range(width)]
+
+
+def _feedback_inputs(loop: TimeLoop, law: list[Value]) -> list[Value]:
+    """clip(u_ref - K (x - x_ref)); the state's quaternions first take the sign nearer to the reference's."""
+    v, n_u, n_x = loop.v, loop.specification.n_inputs, loop.specification.n_states
+    u_ref, x_ref, gains = law[:n_u], law[n_u : n_u + n_x], law[n_u + n_x :]
+    x = [v.get(cell) for cell in loop.state]
+    for four in loop.specification.state_quaternions:
+        x, _ = v.turned_towards(x, x_ref, four)
+    errors = [v.sub(a, b) for a, b in zip(x, x_ref, strict=True)]
+    inputs = []
+    for k, u in enumerate(u_ref):
+        for gain, error in zip(gains[k * n_x : (k + 1) * n_x], errors, strict=True):
+            u = v.fma(v.neg(gain), error, u)
+        lowest, highest = (v.splat(v.load(loop.arguments["limits"], integer(k + at), DOUBLE)) for at in (0, n_u))
+        inputs.append(v.smaller(v.larger(u, lowest), highest))
+    return inputs

@@ -1,4 +1,4 @@
-"""What a time loop keeps of its rollouts: scores, sums for Gauss-Newton steps, or series row by row."""
+"""Outputs of a time loop: scores, sums for Gauss-Newton steps, or series row by row."""
 
 from __future__ import annotations
 
@@ -11,18 +11,25 @@ from diransac.simulation.compiler.machine_code import LANES
 from diransac.simulation.compiler.vectors import BYTE, DOUBLE, NUMBERS, Value, integer
 
 if TYPE_CHECKING:
-    from diransac.simulation.compiler.time_loop import Block, Row, TimeLoop
+    from diransac.simulation.compiler.time_loop import Block, LoopRow, TimeLoop
 
-__all__ = ["Errors", "Flights", "LinearizedErrors", "Scores", "Signals", "Sums"]
+__all__ = [
+    "ClosedLoopOutput",
+    "ErrorOutput",
+    "GaussNewtonOutput",
+    "LinearizedErrorOutput",
+    "ScoreOutput",
+    "SignalOutput",
+]
 
 
-class _Kept:
-    """Shared by all: the loop, and comparing with what was measured."""
+class _Output:
+    """Base of the outputs: the loop, and errors against the measurements."""
 
     ends_early = False
 
     def __init__(self, loop: TimeLoop) -> None:
-        self.loop, self.v, self.plan, self.arguments = loop, loop.v, loop.plan, loop.arguments
+        self.loop, self.v, self.specification, self.arguments = loop, loop.v, loop.specification, loop.arguments
 
     def start(self, block: Block) -> None:
         """Nothing before the first row."""
@@ -30,12 +37,12 @@ class _Kept:
     def end(self, block: Block) -> None:
         """Nothing after the last row."""
 
-    def errors(self, block: Block, row: Row) -> tuple[list[Value], list[list[Value | None]]]:
+    def errors(self, block: Block, row: LoopRow) -> tuple[list[Value], list[list[Value | None]]]:
         """Simulated less measured, and the Jacobian; a quaternion first takes the sign that is nearer."""
         v = self.v
-        predicted, slopes = [row.signals[k] for k in self.plan.scored], row.slopes
+        predicted, slopes = [row.signals[k] for k in self.specification.scored], row.slopes
         measured = self.loop.logged("measured", len(predicted), block, row.index)
-        for four in self.plan.quaternions:
+        for four in self.specification.quaternions:
             predicted, opposite = v.turned_towards(predicted, measured, four)
             slopes = [
                 [s if s is None else v.select(opposite, v.neg(s), s) for s in row_of] if k in four else row_of
@@ -45,7 +52,7 @@ class _Kept:
 
 
 # Sums ----------------------------------------------------------------------------------------------------------------
-class Scores(_Kept):
+class ScoreOutput(_Output):
     """`sums` (n_s, n_padded) of squared errors, and `counts` (2, n_padded): inliers, and 1 where the lane diverged.
 
     `inlier_bits` (n_blocks, n_rows) has a bit for every inlier, up to the row at which all lanes have diverged.
@@ -55,19 +62,19 @@ class Scores(_Kept):
 
     def __init__(self, loop: TimeLoop) -> None:
         super().__init__(loop)
-        self.sums = [self.v.cell(self.v.number(0.0)) for _ in self.plan.scored]
+        self.sums = [self.v.cell(self.v.number(0.0)) for _ in self.specification.scored]
         self.inliers = self.v.cell(self.v.integer(0))
 
     def start(self, block: Block) -> None:
-        """Begin the sums and the count."""
+        """Set the sums and the count to zero."""
         for cell in self.sums:
             self.v.set(cell, self.v.number(0.0))
         self.v.set(self.inliers, self.v.integer(0))
         builder = self.loop.builder
         self.first_bits = builder.mul(builder.udiv(block.first, integer(LANES)), self.arguments["n_rows"])
 
-    def row(self, block: Block, row: Row) -> None:
-        """Add a row's squared errors to the sums, and the row to the inliers if it is one."""
+    def row(self, block: Block, row: LoopRow) -> None:
+        """Add a row's squared errors to the sums, and count its inliers."""
         v = self.v
         (flags,) = self.loop.logged("valid", 1, block, row.index, BYTE)
         valid = self.loop.builder.icmp_unsigned("!=", flags, ir.Constant(flags.type, [ir.Constant(BYTE, 0)] * LANES))
@@ -84,7 +91,7 @@ class Scores(_Kept):
         v.store_bits(inlier, self.arguments["inlier_bits"], self.loop.builder.add(self.first_bits, row.index))
 
     def end(self, block: Block) -> None:
-        """Write a block's sums and counts; where a lane diverged, its sums are infinite."""
+        """Write a block's sums and counts; the sums of a lane that diverged are infinite."""
         v, builder, n_padded = self.v, self.loop.builder, self.arguments["n_padded"]
         diverged = v.is_nan(v.get(self.loop.guard))
         for k, total in enumerate(self.sums):
@@ -95,29 +102,29 @@ class Scores(_Kept):
         v.store(flag, self.arguments["counts"], builder.add(n_padded, block.first))
 
 
-class Sums(_Kept):
+class GaussNewtonOutput(_Output):
     """`sums` (n_blocks, 1 + n_z + n_z (n_z + 1) / 2, 8) of e'we, J'we, J'wJ's upper triangle; `final` states.
 
-    There are too many sums for registers: each is fetched, added to and put back where it ends up, which lies close
-    together for a block. Where a lane diverged e'we is infinite, the other sums are zero, and its final state is NaN.
+    The sums exceed the registers: each is loaded, increased and stored in its final place, close together for a block.
+    In a lane that diverged e'we is infinite, the other sums are zero, and the final state is NaN.
     """
 
     ends_early = True
 
     def __init__(self, loop: TimeLoop) -> None:
         super().__init__(loop)
-        n_z = self.plan.n_unknowns
+        n_z = self.specification.n_unknowns
         self.pairs = list(combinations_with_replacement(range(n_z), 2))
         self.n_sums = 1 + n_z + len(self.pairs)
 
     def start(self, block: Block) -> None:
-        """Begin the sums."""
+        """Set the sums to zero."""
         for k in range(self.n_sums):
             self.v.store(self.v.number(0.0), *self._place("sums", block, self.n_sums, k))
 
-    def row(self, block: Block, row: Row) -> None:
+    def row(self, block: Block, row: LoopRow) -> None:
         """Add a row to the sums."""
-        v, n_z = self.v, self.plan.n_unknowns
+        v, n_z = self.v, self.specification.n_unknowns
         errors, slopes = self.errors(block, row)
         weights = self.loop.logged("weights", len(errors), block, row.index)
         weighted = [v.mul(w, e) for w, e in zip(weights, errors, strict=True)]
@@ -132,7 +139,7 @@ class Sums(_Kept):
             self._add(block, 1 + n_z + k, [(s[i], t[j]) for s, t in zip(slopes, scaled, strict=True)])
 
     def _add(self, block: Block, k: int, products: list[tuple[Value | None, Value | None]]) -> None:
-        """Add products, one a signal, to a sum; those with a factor that is always zero are left out."""
+        """Add products, one per signal, to a sum; those with a factor that is always zero are left out."""
         v = self.v
         present = [(x, y) for x, y in products if x is not None and y is not None]
         if not present:
@@ -144,9 +151,9 @@ class Sums(_Kept):
         v.store(total, base, index)
 
     def end(self, block: Block) -> None:
-        """Write the final state; flag lanes in which anything is not finite."""
+        """Write the sums and the final state; mark lanes in which anything is not finite."""
         v = self.v
-        n_states = self.plan.n_states
+        n_states = self.specification.n_states
         totals = [v.load(*self._place("sums", block, self.n_sums, k), NUMBERS) for k in range(self.n_sums)]
         states = [v.get(cell) for cell in self.loop.state]
         guard = v.get(self.loop.guard)
@@ -157,8 +164,8 @@ class Sums(_Kept):
             instead = v.number(0.0 if k else float("inf"))
             v.store(v.select(diverged, instead, total), *self._place("sums", block, self.n_sums, k))
         for k, state in enumerate(states):
-            kept = v.select(diverged, v.number(float("nan")), state)
-            v.store(kept, *self._place("final", block, n_states, k))
+            final = v.select(diverged, v.number(float("nan")), state)
+            v.store(final, *self._place("final", block, n_states, k))
 
     def _place(self, name: str, block: Block, width: int, k: int) -> tuple[Value, Value]:
         """Array, and position in it, of a block's vector; `first` is eight times the block."""
@@ -167,15 +174,15 @@ class Sums(_Kept):
 
 
 # Series --------------------------------------------------------------------------------------------------------------
-class _Series(_Kept):
-    """`series` (n_lanes, n_rows, width) of what `values` gives, NaN from a lane's divergence on."""
+class _SeriesOutput(_Output):
+    """`series` (n_lanes, n_rows, width) of `values`, NaN from a lane's divergence on."""
 
-    def values(self, block: Block, row: Row) -> list[Value]:
-        """What is kept of a row."""
+    def values(self, block: Block, row: LoopRow) -> list[Value]:
+        """Values of a row."""
         raise NotImplementedError
 
-    def row(self, block: Block, row: Row) -> None:
-        """Write a row of every lane; lanes past the last repeat it, in its place."""
+    def row(self, block: Block, row: LoopRow) -> None:
+        """Write a row of every lane; lanes that fill the block write the last one again."""
         v, builder = self.v, self.loop.builder
         values = self.values(block, row)
         last = builder.sub(self.arguments["n_lanes"], integer(1))
@@ -189,34 +196,34 @@ class _Series(_Kept):
                 v.store(v.lane(value, lane), self.arguments["series"], builder.add(place, integer(k)))
 
 
-class Signals(_Series):
+class SignalOutput(_SeriesOutput):
     """All signals."""
 
-    def values(self, block: Block, row: Row) -> list[Value]:
+    def values(self, block: Block, row: LoopRow) -> list[Value]:
         """All signals."""
         return row.signals
 
 
-class Flights(_Series):
+class ClosedLoopOutput(_SeriesOutput):
     """All signals, then the inputs."""
 
-    def values(self, block: Block, row: Row) -> list[Value]:
+    def values(self, block: Block, row: LoopRow) -> list[Value]:
         """All signals, then the inputs."""
         return [*row.signals, *row.inputs]
 
 
-class Errors(_Series):
+class ErrorOutput(_SeriesOutput):
     """Errors of the scored signals."""
 
-    def values(self, block: Block, row: Row) -> list[Value]:
+    def values(self, block: Block, row: LoopRow) -> list[Value]:
         """Errors of the scored signals."""
         return self.errors(block, row)[0]
 
 
-class LinearizedErrors(_Series):
+class LinearizedErrorOutput(_SeriesOutput):
     """Errors of the scored signals, then their Jacobian, signal by signal."""
 
-    def values(self, block: Block, row: Row) -> list[Value]:
+    def values(self, block: Block, row: LoopRow) -> list[Value]:
         """Errors of the scored signals, then their Jacobian."""
         errors, slopes = self.errors(block, row)
         zero = self.v.number(0.0)
