@@ -92,7 +92,7 @@ class Observations:
 
     def acting_inputs(self) -> FloatArray:
         """Inputs ``(N, n_u)`` that belong to each row's accelerations; see `preprocessing.acting_inputs`."""
-        return preprocessing.acting_inputs(self.log, self.inputs)
+        return preprocessing.acting_inputs(self.log.filter, self.inputs)
 
     def initial_state(self, rule: str | Mapping[str, float]) -> FloatArray:
         """State ``(n_x,)`` at row 0, by ``Settings.initial_state``'s rule.

@@ -308,7 +308,7 @@ def regression(observations: Observations) -> tuple[FloatArray, FloatArray]:
     model, log = observations.model, observations.log
     W, b = compile_map(model.regressor)(*observations.state_arrays(), observations.acting_inputs())
     W = W.reshape(len(observations), model.n_p, model.n_v).transpose(0, 2, 1)
-    W, b = (preprocessing.filter_rows(log, rows, observations.valid) for rows in (W, b))
+    W, b = (preprocessing.filter_rows(log.filter, log.dt, rows, observations.valid) for rows in (W, b))
     return np.ascontiguousarray(W[observations.valid]), np.ascontiguousarray(b[observations.valid])
 
 

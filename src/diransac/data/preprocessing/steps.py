@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = [
     "check_factor",
     "despike",
+    "origins_of",
     "rename",
     "rename_columns",
     "resample",
@@ -50,8 +52,10 @@ def rename(log: Log, names: Mapping[str, str]) -> Log:
     Raises LogError: the log has no such signal, or has the new name already.
     """
     signals = rename_columns(log.signals, names, log.source)
-    units = {new: log.units[old] for new, old in _origins(log.signals, names).items() if old in log.units}
-    return log.with_step({"step": "rename", "names": dict(names)}, signals=signals, units=units)
+    origins = origins_of(log.signals, names)
+    units = {new: log.units[old] for new, old in origins.items() if old in log.units}
+    renamed = log.with_step({"step": "rename", "names": dict(names)}, signals=signals, units=units)
+    return renamed if log.filter is None else replace(renamed, filter=log.filter.renamed(origins))
 
 
 def rename_columns(columns: Mapping[str, Column], names: Mapping[str, str], source: str) -> dict[str, Column]:
@@ -67,10 +71,10 @@ def rename_columns(columns: Mapping[str, Column], names: Mapping[str, str], sour
                 f'{source}: "{old}" cannot be called "{new}", there is a column of that name; '
                 f"give that one another name, too (--map {new}={old},{new}_other={new})"
             )
-    return {new: columns[old] for new, old in _origins(columns, names).items()}
+    return {new: columns[old] for new, old in origins_of(columns, names).items()}
 
 
-def _origins(columns: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
+def origins_of(columns: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
     """New name -> old name of every column, in the columns' order; a column may be given several names."""
     origins: dict[str, str] = {}
     for column in columns:
