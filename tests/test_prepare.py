@@ -156,7 +156,7 @@ def resting_encoder():
     ids=["rest", "step", "encoder", "ramp", "square wave", "nothing"],
 )
 def test_despike_leaves_alone_what_has_no_spikes(x):
-    assert not prepare.spikes(x).any()
+    assert not prepare.hampel(x)[0].any()
 
 
 def test_despike_finds_a_spike_in_rest_and_an_infinity_and_skips_holes():
@@ -172,6 +172,22 @@ def test_despike_finds_a_spike_in_rest_and_an_infinity_and_skips_holes():
 def test_despike_refuses_a_window_without_a_middle(window, threshold):
     with pytest.raises(SettingsError, match="odd window"):
         prepare.despike(log_of(x=T), window=window, threshold=threshold)
+
+
+@pytest.mark.parametrize("n", [2, 5, 200])
+@pytest.mark.parametrize("scale", [None, prepare.running_deviation])
+def test_hampel_gives_the_median_of_every_window_and_takes_signals_one_by_one(n, scale):
+    x = np.random.default_rng(n).normal(size=(n, 3)).cumsum(axis=0)
+    x[n // 2] += 100.0, 0.0, -100.0
+    mask, median = prepare.hampel(x, 5, 8.0, scale)
+    padded = np.pad(x, ((2, 2), (0, 0)), mode="reflect") if n > 2 else np.pad(x, ((1, 1), (0, 0)), mode="reflect")
+    width = len(padded) - n + 1
+    assert np.array_equal(median, [np.median(padded[i : i + width], axis=0) for i in range(n)])
+    for k in range(3):
+        alone = prepare.hampel(x[:, k], 5, 8.0, scale)
+        assert np.array_equal(mask[:, k], alone[0])
+        assert np.array_equal(median[:, k], alone[1])
+    assert n < 200 or mask[n // 2].tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize(("turn", "unit"), [(2 * np.pi, "rad"), (360.0, "deg"), (2 * np.pi, None)])
