@@ -1,6 +1,7 @@
 """`Log`: what it holds, what it refuses, what it writes."""
 
 import copy
+import dataclasses
 import pickle
 import re
 
@@ -11,9 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from diransac.data.filters import FilterSpecification
 from diransac.data.log import Log
+from diransac.data.preprocessing import differentiate, rename, scale
 from diransac.data.readers import read_log
-from diransac.errors import LogError
+from diransac.errors import LogError, SettingsError
+from diransac.identification.identify import identify
+from diransac.model.library.servo_axis import servo_axis
 
 
 def example(n=100, dt=0.01, **signals):
@@ -316,4 +321,131 @@ def test_an_unknown_ending_or_folder_is_refused(tmp_path):
         example().write(tmp_path / "a.xlsx")
     with pytest.raises(LogError, match="No such file or directory"):
         example().write(tmp_path / "nowhere" / "a.csv")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---------------------------------------------------------------------- metadata of files
+
+
+def differentiated():
+    t = np.arange(1500) * 0.01
+    position, force = 0.1 * np.sin(3 * t) + 0.02 * np.sin(7 * t), 50.0 * np.cos(3 * t) + np.sin(11 * t)
+    log = Log.from_arrays(t, {"position": position, "force": force}, {"position": "m", "force": "N"})
+    return differentiate(log, servo_axis(), 5.0)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_written_log_reads_back_whole(tmp_path, ending):
+    frame = pl.DataFrame(
+        {"t": np.arange(9) * 0.1, "x [m]": [1.0, float("nan"), *range(7)], "µ": [0.1] * 9, "mode": "a"}
+    )
+    log = dataclasses.replace(
+        Log.from_frame(frame)[1:],
+        filter=FilterSpecification(1 / 3, 0.1, {"x": "µ"}),
+        notes=("an é\n\u2028 'of' \"it\"",),
+    )
+    log = scale(log, {"µ": 1 / 3})
+    log.write(tmp_path / f"a{ending}")
+    back = read_log(tmp_path / f"a{ending}")
+    assert (back.fingerprint, back.names, back.units) == (log.fingerprint, log.names, {"x": "m"})
+    assert (back.filter, back.history) == (log.filter, log.history)
+    assert back.notes[: len(log.notes)] == log.notes
+    with pytest.raises(LogError, match="\"mode\" is not numeric: row 0 holds 'a'"):
+        back["mode"]
+    back.write(tmp_path / f"b{ending}")
+    again = read_log(tmp_path / f"b{ending}")
+    assert (again.notes, again.unusable, again.filter, again.history) == (
+        back.notes,
+        back.unusable,
+        back.filter,
+        back.history,
+    )
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("part", [slice(None), slice(200, 900)], ids=["whole", "part"])
+def test_a_differentiated_log_that_is_read_back_gives_the_same_identification(tmp_path, ending, part):
+    log = differentiated()[part]
+    log.write(tmp_path / f"a{ending}")
+    back = read_log(tmp_path / f"a{ending}")
+    one, two = (identify(servo_axis(), each, "ols") for each in (log, back))
+    assert one.parameters == two.parameters
+    assert one.standard_errors == two.standard_errors
+    assert one.parameters != identify(servo_axis(), dataclasses.replace(log, filter=None), "ols").parameters
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x: x[100:300],
+        lambda x: x.between(2.0, 4.0),
+        lambda x: x.split(0.5)[1],
+        lambda x: x.with_step({"step": "nothing"}),
+        lambda x: scale(x, {"force": 2.0}),
+        lambda x: pickle.loads(pickle.dumps(x)),
+        copy.deepcopy,
+    ],
+    ids=["slice", "between", "split", "with_step", "scale", "pickle", "deepcopy"],
+)
+def test_a_log_keeps_its_filter(change):
+    log = differentiated()
+    assert log.filter == FilterSpecification(5.0, 20.0, {"position_dot": "position", "position_ddot": "position"})
+    assert change(log).filter == log.filter
+
+
+@pytest.mark.parametrize("by_reading", [False, True])
+def test_names_in_the_filter_follow_their_signals(tmp_path, by_reading):
+    log, names = differentiated(), {"x": "position", "x_ddot": "position_ddot"}
+    log.write(tmp_path / "a.csv")
+    new = read_log(tmp_path / "a.csv", rename=names) if by_reading else rename(log, names)
+    assert new.filter == FilterSpecification(5.0, 20.0, {"position_dot": "x", "x_ddot": "x"})
+
+
+@pytest.mark.parametrize("bandwidths", [(0.0, 1.0), (1.0, -1.0), (np.nan, 1.0), (1.0, np.inf)])
+def test_a_filter_has_positive_bandwidths(bandwidths):
+    with pytest.raises(SettingsError, match=r"bandwidth is .*; give a positive number of Hz"):
+        FilterSpecification(*bandwidths)
+
+
+def test_a_filter_too_long_for_any_memory_is_refused():
+    with pytest.raises(LogError, match="a filter of 1e-12 Hz is too long for its rate"):
+        dataclasses.replace(example(), filter=FilterSpecification(1e-12, 1.0))
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_no_signal_can_be_taken_for_metadata(tmp_path, ending):
+    columns = {name: np.arange(3.0) for name in ("diransac", "diransac.json", "# diransac:", "#", '"')}
+    log = Log.from_arrays(np.arange(3), columns, {"#": "m"})
+    log.write(tmp_path / f"a{ending}")
+    back = read_log(tmp_path / f"a{ending}")
+    assert back.names == log.names
+    assert back.fingerprint == log.fingerprint
+    assert back.units == {"#": "m"}
+
+
+def test_other_tools_read_the_columns(tmp_path):
+    log = differentiated()
+    for ending in ENDINGS:
+        log.write(tmp_path / f"a{ending}")
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert np.array_equal(arrays["position"], log["position"])
+    for frame in (
+        pl.read_csv(tmp_path / "a.csv", comment_prefix="#"),
+        pd.read_csv(tmp_path / "a.csv", comment="#"),
+        pd.read_csv(tmp_path / "a.csv.gz", comment="#"),
+        pl.read_parquet(tmp_path / "a.parquet"),
+    ):
+        assert list(frame.columns) == ["t", *log.names]
+        assert np.allclose(frame["position"].to_numpy(), log["position"], rtol=1e-15, atol=0.0)
+
+
+def test_a_log_without_facts_is_written_without_metadata(tmp_path):
+    log = Log.from_arrays([0, 1], {"x": [0, 1]})
+    log.write(tmp_path / "a.csv")
+    assert (tmp_path / "a.csv").read_text() == "t,x\n0.0,0.0\n1.0,1.0\n"
+
+
+def test_a_step_that_json_cannot_hold_is_refused(tmp_path):
+    with pytest.raises(LogError, match="history cannot be written as JSON"):
+        example().with_step({"step": "mine", "model": object()}).write(tmp_path / "a.csv")
     assert list(tmp_path.iterdir()) == []

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from diransac.data import preprocessing as prepare
+from diransac.data.filters import half_length, kernels
 from diransac.data.log import Log
 from diransac.data.preprocessing.bandwidth import choose_bandwidth
-from diransac.data.preprocessing.filters import half_length, kernels
 from diransac.data.readers import read_log
 from diransac.errors import LogError, SettingsError
 from diransac.model import Model, Parameter
@@ -156,7 +156,7 @@ def resting_encoder():
     ids=["rest", "step", "encoder", "ramp", "square wave", "nothing"],
 )
 def test_despike_leaves_alone_what_has_no_spikes(x):
-    assert not prepare.spikes(x).any()
+    assert not prepare.hampel(x)[0].any()
 
 
 def test_despike_finds_a_spike_in_rest_and_an_infinity_and_skips_holes():
@@ -172,6 +172,22 @@ def test_despike_finds_a_spike_in_rest_and_an_infinity_and_skips_holes():
 def test_despike_refuses_a_window_without_a_middle(window, threshold):
     with pytest.raises(SettingsError, match="odd window"):
         prepare.despike(log_of(x=T), window=window, threshold=threshold)
+
+
+@pytest.mark.parametrize("n", [2, 5, 200])
+@pytest.mark.parametrize("scale", [None, prepare.running_deviation])
+def test_hampel_gives_the_median_of_every_window_and_takes_signals_one_by_one(n, scale):
+    x = np.random.default_rng(n).normal(size=(n, 3)).cumsum(axis=0)
+    x[n // 2] += 100.0, 0.0, -100.0
+    mask, median = prepare.hampel(x, 5, 8.0, scale)
+    padded = np.pad(x, ((2, 2), (0, 0)), mode="reflect") if n > 2 else np.pad(x, ((1, 1), (0, 0)), mode="reflect")
+    width = len(padded) - n + 1
+    assert np.array_equal(median, [np.median(padded[i : i + width], axis=0) for i in range(n)])
+    for k in range(3):
+        alone = prepare.hampel(x[:, k], 5, 8.0, scale)
+        assert np.array_equal(mask[:, k], alone[0])
+        assert np.array_equal(median[:, k], alone[1])
+    assert n < 200 or mask[n // 2].tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize(("turn", "unit"), [(2 * np.pi, "rad"), (360.0, "deg"), (2 * np.pi, None)])
@@ -418,25 +434,25 @@ def test_filtered_rows_of_true_equations_are_true_equations():
     b = W @ p
     valid = rng.random(len(log)) > 0.1
     W[~valid, 0, 1] = np.nan
-    Wf, bf = prepare.filter_rows(log, W, valid), prepare.filter_rows(log, b, valid)
+    Wf, bf = (prepare.filter_rows(log.filter, log.dt, x, valid) for x in (W, b))
     assert np.allclose((Wf @ p)[valid], bf[valid], atol=1e-12)
     assert np.isnan(bf[~valid]).all()
     assert Wf[valid].std() < 0.5 * W[valid].std()
-    assert np.array_equal(prepare.filter_rows(log, W), Wf, equal_nan=True)
+    assert np.array_equal(prepare.filter_rows(log.filter, log.dt, W), Wf, equal_nan=True)
 
 
 def test_rows_and_inputs_of_a_log_with_measured_accelerations_are_left_alone():
     log = log_of(x=T)
     W = np.random.default_rng(0).normal(size=(N, 2))
-    assert prepare.filter_rows(log, W) is W
-    assert prepare.acting_inputs(log, W) is W
+    assert prepare.filter_rows(log.filter, log.dt, W) is W
+    assert prepare.acting_inputs(log.filter, W) is W
 
 
 def test_acting_inputs_are_those_of_a_held_sine_in_the_mean():
     log = differentiated()
     k = np.arange(len(log))
     for f in (0.01, 0.05, 0.1):
-        acting = prepare.acting_inputs(log, np.sin(2 * np.pi * f * k)[:, None])[:, 0]
+        acting = prepare.acting_inputs(log.filter, np.sin(2 * np.pi * f * k)[:, None])[:, 0]
         exact = np.sinc(f) * np.sin(2 * np.pi * f * (k - 0.5))
         assert np.abs(acting - exact)[2:-2].max() < 2.0 * (f * 2 * np.pi) ** 4 / 100.0
 
@@ -447,9 +463,9 @@ def test_acting_inputs_are_those_of_a_held_sine_in_the_mean():
 def fit_axis(log, bandwidth=None):
     """Mass, viscous and dry friction and offset by least squares from position and force alone."""
     log = prepare.differentiate(log, servo_axis(), bandwidth)
-    v, u = log["position_dot"], prepare.acting_inputs(log, log["force"][:, None])
+    v, u = log["position_dot"], prepare.acting_inputs(log.filter, log["force"][:, None])
     W = np.column_stack([log["position_ddot"], v, np.sign(v), np.ones_like(v)])
-    rows = prepare.filter_rows(log, np.column_stack([W, u]))
+    rows = prepare.filter_rows(log.filter, log.dt, np.column_stack([W, u]))
     return np.linalg.lstsq(rows[:, :4], rows[:, 4], rcond=None)[0], log.history[-1]["bandwidth"]
 
 

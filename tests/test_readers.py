@@ -126,6 +126,98 @@ HOSTILE = {
 }
 
 
+METADATA = {
+    "text": ("units are metres", "JSONDecodeError: Expecting value"),
+    "cut": ('{"version": 1, "units": {"x"', "JSONDecodeError"),
+    "a list": ("[1]", "AttributeError"),
+    "a number": ("3", "AttributeError"),
+    "later": ('{"version": 2, "filters": []}', "of version 2, this diransac reads version 1; update diransac, or"),
+    "no version": ("{}", "of version None"),
+    "units": ('{"version": 1, "units": {"x": 3}}', "a number stands where a text belongs"),
+    "units as a list": ('{"version": 1, "units": ["x"]}', "ValueError"),
+    "notes": ('{"version": 1, "notes": [1]}', "a number stands"),
+    "history": ('{"version": 1, "history": [3]}', "TypeError"),
+    "a step without a name": ('{"version": 1, "history": [{}]}', "a step of the history has no name"),
+    "half a filter": ('{"version": 1, "filter": {"bandwidth": 1.0}}', "KeyError"),
+    "no filter": ('{"version": 1, "filter": 3}', "TypeError"),
+    "no number": (
+        '{"version": 1, "filter": {"bandwidth": "wide", "derivation_bandwidth": 1, "derived": {}}}',
+        "could not convert",
+    ),
+    "negative": (
+        '{"version": 1, "filter": {"bandwidth": -1, "derivation_bandwidth": 1, "derived": {}}}',
+        "bandwidth is -1.0; give a positive number",
+    ),
+    "endless": (
+        '{"version": 1, "filter": {"bandwidth": 1e-300, "derivation_bandwidth": 1, "derived": {}}}',
+        "too long for its rate",
+    ),
+    "deep": ("[" * 100_000, "RecursionError"),
+    "unnamed": ('{"version": 1, "unusable": {"": "is text"}}', "cannot name a signal"),
+}
+
+
+def with_metadata(text):
+    """A small log in every format that has metadata."""
+    buffer = io.BytesIO()
+    pl.DataFrame({"t": T, "x": T}).write_parquet(buffer, metadata={"diransac": text})
+    rows = "".join(f"{t},{t}\n" for t in T)
+    csv = f"# diransac: {text}\nt,x\n{rows}".encode()
+    archive = zipped(("t.npy", npy(T)), ("x.npy", npy(T)), ("diransac.json", text))
+    return {"a.csv": csv, "a.csv.gz": gzip.compress(csv), "a.npz": archive, "a.parquet": buffer.getvalue()}
+
+
+@pytest.mark.parametrize("case", METADATA)
+def test_hostile_metadata_end_in_one_sentence_that_names_the_file(tmp_path, case):
+    text, message = METADATA[case]
+    for name, data in with_metadata(text).items():
+        with pytest.raises(LogError, match=message) as caught:
+            read(tmp_path, data, name)
+        said = str(caught.value)
+        assert said.startswith(f'log "{tmp_path / name}": ')
+        assert "\n" not in said
+        assert len(said) < len(str(tmp_path)) + 400
+
+
+def test_metadata_of_columns_that_are_gone_are_harmless(tmp_path):
+    text = '{"version": 1, "units": {"x": "m", "y": "s"}, "unusable": {"x": "was text", "y": "is text"}}'
+    for name, data in with_metadata(text).items():
+        log = read(tmp_path, data, name)
+        assert log.units == {"x": "m"}
+        assert log.unusable == {"y": "is text"}
+        assert np.array_equal(log["x"], T)
+
+
+def test_units_in_headers_prevail_over_metadata(tmp_path):
+    assert read(tmp_path, '# diransac: {"version": 1, "units": {"x": "m"}}\nt,x [mm]\n0,1\n1,2\n').units == {"x": "mm"}
+
+
+def test_metadata_that_a_spreadsheet_has_split_are_refused(tmp_path):
+    with pytest.raises(LogError, match=r"metadata are damaged .*; remove its first line$"):
+        read(tmp_path, '"# diransac: {""version"": 1"," ""units"": {}}"\nt,x\n0,1\n1,2\n')
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("0,1\n1,2,3\n", "line 4 has 3 fields"),
+        ('0,"1"\n1,2,3\n', "line 4 has 3 fields"),
+        ("0,1\n\n1,2\n", "line 4 is blank"),
+        ('0,1\n1,"2\n', "line 4 cannot be read"),
+        ("0,1\nnoon,2\n", 'line 4 holds "noon"'),
+        ("", "no row"),
+    ],
+)
+def test_lines_are_counted_with_the_metadata(tmp_path, rows, message):
+    with pytest.raises(LogError, match=message):
+        read(tmp_path, '# diransac: {"version": 1}\nt,x\n' + rows)
+
+
+def test_metadata_alone_are_no_log(tmp_path):
+    with pytest.raises(LogError, match="no header line after the metadata"):
+        read(tmp_path, '# diransac: {"version": 1}\n')
+
+
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_file_ends_in_one_sentence_that_names_it(tmp_path, name):
     data, message = HOSTILE[name]
@@ -168,6 +260,7 @@ def test_a_file_that_the_system_withholds_is_refused(tmp_path, monkeypatch):
         ("a.parquet", parquet(t=T, x=T)),
         ("a.npz", npz(t=T, x=T)),
         ("a.mat", mat(t=T, x=T)),
+        *with_metadata('{"version": 1, "units": {"x": "m"}, "history": [{"step": "cut"}], "notes": ["x"]}').items(),
     ],
 )
 def test_a_file_cut_or_changed_anywhere_is_read_or_refused_by_our_own_error(tmp_path, name, data):

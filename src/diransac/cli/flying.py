@@ -12,7 +12,7 @@ import typer
 
 from diransac.cli.arguments import numbers
 from diransac.cli.options import output_file
-from diransac.data.writing import ENDINGS
+from diransac.data.files import ENDINGS
 from diransac.errors import ModelError
 from diransac.flight.corruption import Noise
 from diransac.model import Model

@@ -15,8 +15,9 @@ import numpy.typing as npt
 from diransac.arrays import FloatArray
 from diransac.data import checks
 from diransac.data.checks import as_column, numeric_columns
+from diransac.data.files import Metadata, write_columns
+from diransac.data.filters import FilterSpecification
 from diransac.data.units import split_unit
-from diransac.data.writing import write_columns
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ __all__ = ["Log"]
 
 
 _LARGEST = 1e150
+_LOWEST_BANDWIDTH = 4e-7
 _ROUNDING = 1e-6
 
 
@@ -60,10 +62,12 @@ class Log:
     history : preparation steps in order, each a mapping that JSON can hold
     notes : what was found when the log was made, a sentence each
     unusable : name -> why a column of the file is not among the signals
+    filter : filters of the signals and of the regression; None for signals as they were recorded
 
     The arrays are copies and read-only.  Rows count from 0.
 
-    Raises LogError: fewer than 2 rows, unequal lengths, a time that is not finite, increasing and even.
+    Raises LogError: fewer than 2 rows, unequal lengths, a time that is not finite, increasing and even; a filter whose
+    bandwidth is less than 4e-7 of the rate.
     """
 
     time: FloatArray
@@ -73,6 +77,7 @@ class Log:
     history: tuple[dict[str, Any], ...] = ()
     notes: tuple[str, ...] = ()
     unusable: Mapping[str, str] = field(default_factory=dict)
+    filter: FilterSpecification | None = None
 
     def __post_init__(self) -> None:
         checks.check_names(self.signals, self.source)
@@ -83,6 +88,8 @@ class Log:
                 raise LogError(f'{self.source}: signal "{name}" has {len(values)} rows, the time has {len(time)}')
         checks.check_time_order(time, self.source)
         checks.check_even(time, self.source)
+        if self.filter is not None and self.filter.bandwidth * np.mean(np.diff(time)) < _LOWEST_BANDWIDTH:
+            raise LogError(f"{self.source}: a filter of {self.filter.bandwidth:.3g} Hz is too long for its rate")
         units = {name: unit for name, unit in self.units.items() if name in signals}
         for key, value in (("time", time), ("signals", signals), ("units", units), ("unusable", dict(self.unusable))):
             object.__setattr__(self, key, MappingProxyType(value) if isinstance(value, dict) else value)
@@ -277,12 +284,14 @@ class Log:
 
     def __reduce__(self) -> tuple[Any, ...]:
         state = (self.time, dict(self.signals), dict(self.units), self.source, self.history, self.notes)
-        return (Log, (*state, dict(self.unusable)))
+        return (Log, (*state, dict(self.unusable), self.filter))
 
     def write(self, path: str | Path) -> None:
         """Write time and signals to ``.csv``, ``.csv.gz``, ``.parquet`` or ``.npz``; every number reads back exactly.
 
-        The file appears whole or not at all.  Units, history and notes are not written.
+        Units, filter, history, notes and the reasons for unusable columns are written beside them (see `data.files`),
+        so that `read_log` returns an equal log.  The file appears whole or not at all.
         Raises LogError: another ending, or the file cannot be written.
         """
-        write_columns(Path(path), {"t": self.time, **self.signals})
+        facts = Metadata(self.units, self.filter, self.history, self.notes, self.unusable)
+        write_columns(Path(path), {"t": self.time, **self.signals}, facts)

@@ -167,7 +167,7 @@ def _signal_facts(log: Log, name: str) -> SignalFacts:
     run = _longest_run(values)
     frozen = run * log.dt if run >= _FROZEN_SAMPLES else 0.0
     with np.errstate(over="ignore"):  # a bound that overflows is infinite, and nothing is beyond it
-        n_spikes = int(preprocessing.spikes(values).sum())
+        n_spikes = int(preprocessing.hampel(values)[0].sum())
     return SignalFacts(
         log.units.get(name), float(low), float(high), float(spread), int(np.isnan(values).sum()), n_spikes, frozen
     )

@@ -4,17 +4,27 @@ Each step adds one mapping to ``Log.history`` and, where it did something to the
 """
 
 from diransac.data.preprocessing.differentiation import acting_inputs, differentiate, filter_rows
-from diransac.data.preprocessing.steps import despike, rename, resample, scale, shift, spikes, unwrap
+from diransac.data.preprocessing.steps import (
+    despike,
+    hampel,
+    rename,
+    resample,
+    running_deviation,
+    scale,
+    shift,
+    unwrap,
+)
 
 __all__ = [
     "acting_inputs",
     "despike",
     "differentiate",
     "filter_rows",
+    "hampel",
     "rename",
     "resample",
+    "running_deviation",
     "scale",
     "shift",
-    "spikes",
     "unwrap",
 ]

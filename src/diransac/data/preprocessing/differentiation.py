@@ -11,13 +11,14 @@ the mean, half of the input before and half of the one after it: `acting_inputs`
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
+from diransac.data.filters import REACH, FilterSpecification, convolve, half_length, kernels
 from diransac.data.preprocessing.bandwidth import Bandwidth, choose_bandwidth
-from diransac.data.preprocessing.filters import REACH, convolve, half_length, kernels
 from diransac.data.preprocessing.steps import unwrap
 from diransac.data.units import same_unit
 from diransac.errors import LogError, SettingsError
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 __all__ = ["acting_inputs", "differentiate", "filter_rows"]
 
 
-_STEP = "differentiate"
 _DERIVATION = 4.0
 _HIGHEST = 1.0 / 3.0
 _SHORTEST = 2.0 * REACH
@@ -72,13 +72,15 @@ def differentiate(log: Log, model: Model, bandwidth: float | None = None) -> Log
     derived = {**{name: (name, 0) for name in names}, **sources}
     spoilt = {name: _near_long_gaps(log[name], _LONGEST_BRIDGE / (bandwidth * log.dt), L) for name in names}
     signals = {**log.signals, **_derived(bridged, derived, spoilt, kernels(wide, log.dt))}
-    return log.with_step(
-        _step(bandwidth, wide, chosen, sources, names, L),
+    specification = FilterSpecification(bandwidth, wide, {name: source for name, (source, _) in sources.items()})
+    filtered = log.with_step(
+        _step(specification, chosen, names, L),
         time=log.time[L:-L],
         signals={name: values[L:-L] for name, values in signals.items()},
         units={**log.units, **_units(log, model, sources)},
         notes=_notes(bandwidth, chosen, sources, L * log.dt),
     )
+    return replace(filtered, filter=specification)
 
 
 def _derived(
@@ -96,39 +98,56 @@ def _derived(
     return signals
 
 
-def filter_rows(log: Log, array: FloatArray, valid: BoolArray | None = None) -> FloatArray:
-    """Rows ``(N, ...)`` of a regression over the log, filtered as `differentiate` recorded; as they are without it.
+def filter_rows(
+    specification: FilterSpecification | None, dt: float, array: FloatArray, valid: BoolArray | None = None
+) -> FloatArray:
+    """Rows of a regression ``W p = b``, filtered as a log's specification demands.
 
     Parameters
     ----------
-    array : (N, ...)   W or b; both sides of the equations are to be filtered alike
-    valid : (N,)   rows that hold equations; others have no weight and come out as NaN.  None: those without NaN
+    specification : FilterSpecification or None
+        `Log.filter`; with None the array is returned as it is.
+    dt : float
+        Time from row to row, seconds.
+    array : (N, ...) array
+        ``W`` or ``b``; both sides of the equation are filtered alike.
+    valid : (N,) bool array, optional
+        Rows that hold equations; the others have no weight and are NaN in the result.  None: the rows without NaN.
+
+    Returns
+    -------
+    (N, ...) array
     """
-    step = _recorded(log)
-    if step is None:
+    if specification is None:
         return array
     found = np.isfinite(array).all(axis=tuple(range(1, array.ndim))) if valid is None else valid
     held = np.reshape(found, (-1, *(1,) * (array.ndim - 1)))
-    filtered = convolve(np.where(held, array, 0.0), kernels(step["row_filter"], log.dt)[0])
+    filtered = convolve(np.where(held, array, 0.0), kernels(specification.bandwidth, dt)[0])
     return np.where(held, filtered, np.nan)
 
 
-def acting_inputs(log: Log, inputs: FloatArray) -> FloatArray:
-    """Inputs ``(N, n_u)`` that act around each row of a regression, where `differentiate` derived its accelerations.
+def acting_inputs(specification: FilterSpecification | None, inputs: FloatArray) -> FloatArray:
+    """Mean inputs that act around each row of a regression whose accelerations were derived by `differentiate`.
 
-    An input is held until the next sample, so that half a sample lies between what is recorded and what acts in the
-    mean.  A log with recorded accelerations, which belong to the input that begins in their row, is left as it is.
+    An input is held until the next sample, so that half a sample lies between the recorded input and its mean effect.
+    A recorded acceleration belongs to the input that begins in its row.
+
+    Parameters
+    ----------
+    specification : FilterSpecification or None
+        `Log.filter`; with None the inputs are returned as they are.
+    inputs : (N, n_u) array
+        Recorded inputs.
+
+    Returns
+    -------
+    (N, n_u) array
     """
-    if _recorded(log) is None or len(inputs) < 2:
+    if specification is None or len(inputs) < 2:
         return inputs
     padded = np.concatenate([inputs[:1], inputs[:1], inputs, inputs[-1:]])
     n = len(inputs)
     return np.asarray(sum(weight * padded[i : i + n] for i, weight in enumerate(_HOLD)))
-
-
-def _recorded(log: Log) -> Mapping[str, Any] | None:
-    steps = [step for step in log.history if step["step"] == _STEP]
-    return steps[-1] if steps else None
 
 
 # ---------------------------------------------------------------------- what comes from what
@@ -230,21 +249,16 @@ def _near_long_gaps(values: FloatArray, longest: float, reach: int) -> BoolArray
 
 
 def _step(
-    bandwidth: float,
-    wide: float,
-    chosen: Bandwidth | None,
-    sources: Mapping[str, tuple[str, int]],
-    filtered: list[str],
-    n_cut: int,
+    specification: FilterSpecification, chosen: Bandwidth | None, filtered: list[str], n_cut: int
 ) -> dict[str, Any]:
     return {
-        "step": _STEP,
-        "bandwidth": float(bandwidth),
+        "step": "differentiate",
+        "bandwidth": specification.bandwidth,
         "chosen": chosen is not None,
         "noise_share": None if chosen is None else chosen.noise_share,
-        "derivation_bandwidth": wide,
-        "row_filter": float(bandwidth),
-        "derived": {name: source for name, (source, _) in sources.items()},
+        "derivation_bandwidth": specification.derivation_bandwidth,
+        "row_filter": specification.bandwidth,
+        "derived": dict(specification.derived),
         "filtered": filtered,
         "rows_cut": n_cut,
     }

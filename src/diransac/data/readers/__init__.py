@@ -11,7 +11,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.checks import check_clock, check_names, check_time_order
 from diransac.data.log import Log
-from diransac.data.preprocessing.steps import check_factor, rename_columns, resample_columns
+from diransac.data.preprocessing.steps import check_factor, origins_of, rename_columns, resample_columns
 from diransac.data.readers.comma_separated import read_csv, read_csv_gz
 from diransac.data.readers.mat import read_mat
 from diransac.data.readers.npz import read_npz
@@ -53,12 +53,13 @@ def read_log(
 
     The time column is ``t``, in seconds; every other column is a signal, one that does not hold numbers is left out and
     said.  A header ``theta [deg]`` is the signal ``theta`` in degrees.  Rows count from 0, lines of text from 1.
+    A file that `Log.write` has written gives its units, filter, history and notes back.
     Raises LogError: the file cannot be read, or does not hold a log; one sentence says which, where, and what to try.
     """
     path = Path(path)
     source = f'log "{path}"'
     table = _reader(path, source)(_content(path, source), source)
-    history: list[dict[str, Any]] = []
+    history: list[dict[str, Any]] = list(table.history)
     if rename:
         names = {new: split_unit(old)[0] if old not in table.columns else old for new, old in rename.items()}
         table = _renamed(table, names, source)
@@ -79,8 +80,8 @@ def read_log(
         history.append(step)
         notes += said
     units = {n: unit for n, unit in table.units.items() if abs(factors.get(n, 1.0)) == 1.0}
-    log = Log(time, signals, units, source, tuple(history), unusable=unusable)
-    return replace(log, notes=(*notes, *log.findings()))
+    log = Log(time, signals, units, source, tuple(history), unusable=unusable, filter=table.filter)
+    return replace(log, notes=tuple(dict.fromkeys((*notes, *log.findings()))))
 
 
 def _reader(path: Path, source: str) -> Callable[[bytes, str], Table]:
@@ -108,7 +109,8 @@ def _renamed(table: Table, names: Mapping[str, str], source: str) -> Table:
     columns = rename_columns(table.columns, names, source)
     units = {new: table.units[old] for new, old in names.items() if old in table.units}
     kept = {name: unit for name, unit in table.units.items() if name in columns and name not in names}
-    return replace(table, columns=columns, units=kept | units)
+    specification = None if table.filter is None else table.filter.renamed(origins_of(table.columns, names))
+    return replace(table, columns=columns, units=kept | units, filter=specification)
 
 
 def _time(table: Table, factors: Mapping[str, float], source: str) -> FloatArray:

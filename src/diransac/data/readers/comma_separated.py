@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.data.readers.table import Table, check_unique
+from diransac.data.files import COMMENT
+from diransac.data.readers.table import Table, check_unique, with_metadata
 from diransac.data.units import split_unit
 from diransac.errors import LogError
 
@@ -38,17 +39,28 @@ def read_csv(data: bytes, source: str) -> Table:
     Raises LogError: it is not UTF-8 text with a header line and as many fields in every line.
     """
     lines = _text(data, source).split("\n")
+    metadata = lines.pop(0).strip('"').removeprefix(COMMENT) if _is_metadata(lines[0]) else None
+    if not lines:
+        raise LogError(f"{source}: there is no header line after the metadata; give one, and one line a row")
+    line = 1 if metadata is None else 2
     separator = _separator(lines[0])
     headers = _header(lines[0], separator, source)
-    _check_ragged(lines, separator, source)
+    _check_ragged(lines, line, separator, source)
     if len(lines) == 1:
         raise LogError(f"{source}: there is a header ({', '.join(headers)[:200]}) but no row")
     named = [split_unit(header) for header in headers]
     check_unique([name for name, _ in named if name], source)
     frame = _frame(lines, separator, source)
-    columns = {n: _numbers(s, separator) for (n, _), s in zip(named, frame.get_columns(), strict=True) if n}
+    fields = zip(named, frame.get_columns(), strict=True)
+    columns = {name: _numbers(column, line + 1, separator) for (name, _), column in fields if name}
     units = {name: unit for name, unit in named if unit is not None}
-    return Table(columns, units, tuple(_notes(named, separator)))
+    table = Table(columns, units, tuple(_notes(named, separator)))
+    return table if metadata is None else with_metadata(table, metadata, source, "remove its first line")
+
+
+def _is_metadata(line: str) -> bool:
+    """Whether a first line holds metadata; spreadsheets put it into quotation marks, and damage it."""
+    return line.lstrip('"').startswith(COMMENT)
 
 
 def _text(data: bytes, source: str) -> str:
@@ -91,15 +103,15 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _check_ragged(lines: list[str], separator: str, source: str) -> None:
-    """Raise LogError at the first line that has not as many fields as the header."""
+def _check_ragged(lines: list[str], first: int, separator: str, source: str) -> None:
+    """Raise LogError at the first line that has not as many fields as the header, which is line ``first``."""
     if any('"' in line for line in lines):
-        counts = _quoted_counts(lines, separator, source)
+        counts = _quoted_counts(lines, first, separator, source)
     else:
-        counts = [(row + 1, line.count(separator) + 1) for row, line in enumerate(lines)]
+        counts = [(number, line.count(separator) + 1) for number, line in enumerate(lines, first)]
     expected = counts[0][1]
     for number, count in counts:
-        if count != expected and not lines[number - 1].strip():
+        if count != expected and not lines[number - first].strip():
             n = sum(not line.strip() for line in lines)
             which = f"line {number} is blank, the first of {n}" if n > 1 else f"line {number} is blank"
             raise LogError(f"{source}: {which}; remove blank lines")
@@ -107,13 +119,13 @@ def _check_ragged(lines: list[str], separator: str, source: str) -> None:
             raise LogError(f"{source}: line {number} has {count} fields, the header has {expected}")
 
 
-def _quoted_counts(lines: list[str], separator: str, source: str) -> list[tuple[int, int]]:
+def _quoted_counts(lines: list[str], first: int, separator: str, source: str) -> list[tuple[int, int]]:
     """Line number and number of fields of every record, quotation marks understood."""
     reader = csv.reader((line + "\n" for line in lines), delimiter=separator, strict=True)
     try:
-        return [(reader.line_num, len(record)) for record in reader]
+        return [(reader.line_num + first - 1, len(record)) for record in reader]
     except csv.Error as error:
-        raise LogError(f"{source}: line {reader.line_num} cannot be read ({error})") from error
+        raise LogError(f"{source}: line {reader.line_num + first - 1} cannot be read ({error})") from error
 
 
 def _frame(lines: list[str], separator: str, source: str) -> pl.DataFrame:
@@ -127,8 +139,11 @@ def _frame(lines: list[str], separator: str, source: str) -> pl.DataFrame:
         raise LogError(f"{source}: it cannot be read as CSV ({str(error).splitlines()[0]})") from error
 
 
-def _numbers(fields: pl.Series, separator: str) -> FloatArray | str:
-    """A column of text as numbers, empty fields as NaN; or which field is none.  Semicolons allow decimal commas."""
+def _numbers(fields: pl.Series, first: int, separator: str) -> FloatArray | str:
+    """A column of text, from line ``first``, as numbers, empty fields as NaN; or which field is none.
+
+    Semicolons allow decimal commas.
+    """
     import polars as pl
 
     text = fields.str.strip_chars()
@@ -137,7 +152,7 @@ def _numbers(fields: pl.Series, separator: str) -> FloatArray | str:
     bad = (numbers.is_null() & text.is_not_null() & ~text.str.to_lowercase().is_in(_MISSING)).to_numpy()
     if bad.any():
         row = int(bad.argmax())
-        return f'is not numeric: line {row + 2} holds "{text[row]:.60}"'
+        return f'is not numeric: line {row + first} holds "{text[row]:.60}"'
     return numbers.fill_null(np.nan).to_numpy().astype(np.float64)
 
 

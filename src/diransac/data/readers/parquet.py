@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.data.readers.table import Table, check_unique
+from diransac.data.files import KEY
+from diransac.data.readers.table import Table, check_unique, with_metadata
 from diransac.data.units import split_unit
 from diransac.errors import LogError
 
@@ -32,12 +33,14 @@ def read_parquet(data: bytes, source: str) -> Table:
         raise LogError(f"{source}: it {what} (no {_MAGIC.decode()} mark at its {'end' if 'cut' in what else 'start'})")
     try:
         frame = pl.read_parquet(io.BytesIO(data))
+        metadata = pl.read_parquet_metadata(io.BytesIO(data)).get(KEY)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, MemoryError) as error:
         raise LogError(f"{source}: the Parquet data are damaged ({str(error).splitlines()[0]})") from error
     named = [split_unit(header) for header in frame.columns]
     check_unique([name for name, _ in named], source)
     columns = {name: _numbers(series) for (name, _), series in zip(named, frame.get_columns(), strict=True)}
-    return Table(columns, {name: unit for name, unit in named if unit is not None})
+    table = Table(columns, {name: unit for name, unit in named if unit is not None})
+    return table if metadata is None else with_metadata(table, metadata, source)
 
 
 def _numbers(series: pl.Series) -> FloatArray | str:

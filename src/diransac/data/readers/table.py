@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.data.checks import as_numbers
+from diransac.data.files import decode_metadata
+from diransac.data.filters import FilterSpecification
 from diransac.data.units import split_unit
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["Table", "check_unique", "table_of_arrays"]
+__all__ = ["Table", "check_unique", "table_of_arrays", "with_metadata"]
 
 
 @dataclass(frozen=True)
@@ -28,11 +30,30 @@ class Table:
     columns : name -> (n,) numbers, or why the column has none, such as ``is not numeric: line 3 holds "takeoff"``
     units : name -> unit that the header states
     notes : what was found while reading
+    history, filter : of the log that was written to the file, as `Log` has them
     """
 
     columns: Mapping[str, FloatArray | str]
     units: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    history: tuple[dict[str, Any], ...] = ()
+    filter: FilterSpecification | None = None
+
+
+def with_metadata(table: Table, text: str | bytes, source: str, remedy: str = "write the log again") -> Table:
+    """The table with what the file's metadata add; units in headers, which an editor may have changed, prevail.
+
+    Raises LogError: the metadata are damaged.
+    """
+    facts = decode_metadata(text, source, remedy)
+    return replace(
+        table,
+        columns={**table.columns, **{name: why for name, why in facts.unusable.items() if name not in table.columns}},
+        units={**facts.units, **table.units},
+        notes=(*facts.notes, *table.notes),
+        history=facts.history,
+        filter=facts.filter,
+    )
 
 
 def check_unique(names: Sequence[str], source: str) -> None:

@@ -52,12 +52,13 @@ class CorruptedLog(Log):
     @classmethod
     def of(cls, log: Log, planted: Mapping[str, BoolArray]) -> CorruptedLog:
         """A log with masks."""
-        rows = (log.time, log.signals, log.units, log.source, log.history, log.notes, log.unusable)
+        rows = (log.time, log.signals, log.units, log.source, log.history, log.notes, log.unusable, log.filter)
         return cls(*rows, planted)
 
     def without_masks(self) -> Log:
         """The plain log."""
-        return Log(self.time, self.signals, self.units, self.source, self.history, self.notes, self.unusable)
+        rows = (self.time, self.signals, self.units, self.source, self.history, self.notes)
+        return Log(*rows, self.unusable, self.filter)
 
     def _cut(self, rows: slice) -> Log:
         return CorruptedLog.of(self.without_masks()[rows], {name: mask[rows] for name, mask in self.planted.items()})

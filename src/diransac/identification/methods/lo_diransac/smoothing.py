@@ -22,6 +22,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data import preprocessing
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 
 if TYPE_CHECKING:
@@ -77,14 +78,9 @@ def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[
 
     A simulation goes on from a wrong input with a wrong state, so inputs cannot be left to the noise model.
     """
-    N = len(inputs)
-    if N < window or not inputs.shape[1]:
+    if len(inputs) < window or not inputs.shape[1]:
         return inputs, 0
-    median = _medians(inputs, window)
-    distance = np.abs(inputs - median)
-    scale = 1.4826 * _medians(distance, window)
-    typical = 1.4826 * np.median(np.abs(inputs - np.median(inputs, axis=0)), axis=0)
-    leaps = distance > threshold * np.maximum(scale, typical)
+    leaps, median = preprocessing.hampel(inputs, window, threshold, preprocessing.running_deviation)
     return np.where(leaps, median, inputs), int(leaps.any(axis=1).sum())
 
 
