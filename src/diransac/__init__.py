@@ -98,6 +98,10 @@ _FOUND_IN = {
     "flight.tvlqr": ("Controller", "tvlqr", "tvlqr_batch"),
     "identification.estimators": ("OrdinaryLeastSquares", "ScikitLearnEstimator", "TotalLeastSquares"),
     "identification.identify": ("METHODS", "identify"),
+    "identification.method": ("Progress",),
+    "identification.methods.least_squares": ("LeastSquares",),
+    "identification.methods.lo_diransac": ("LoDiransac",),
+    "identification.methods.ransac": ("Diransac", "IDiransac"),
     "data.log": ("Log",),
     "flight.corruption": ("CorruptedLog", "Noise", "corrupt"),
     "identification.nonlinear": ("NonlinearLeastSquares",),
@@ -110,7 +114,7 @@ _FOUND_IN = {
     "identification.settings": ("Settings",),
     "study": ("Study", "run_study"),
     "flight.trajectory": ("Trajectory",),
-    "identification.validation": ("Validation", "validate"),
+    "identification.validation": ("CrossValidation", "Validation", "cross_validate", "validate"),
 }
 _LATER = {name: module for module, names in _FOUND_IN.items() for name in names}
 _SUBMODULES = ("simulation", "study")

@@ -264,7 +264,9 @@ class Dataset:
         found = {name for one in segments for name in one.signals}
         signals = tuple(name for name in model.signals if name in found)
         layout = ParameterLayout(model.parameters, len(several))
-        return cls(model, several if given is None else tuple(given), tuple(_widened(x, signals) for x in segments), layout)
+        return cls(
+            model, several if given is None else tuple(given), tuple(_widened(x, signals) for x in segments), layout
+        )
 
     def __len__(self) -> int:
         """Rows of all segments."""

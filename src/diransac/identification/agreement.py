@@ -25,9 +25,7 @@ _NEGLIGIBLE = 1e-3
 """Relative difference that is none, however narrow the intervals are."""
 
 
-def disagreements(
-    method: Method, dataset: Dataset, seed: int, callback: Callback | None = None
-) -> tuple[str, ...]:
+def disagreements(method: Method, dataset: Dataset, seed: int, callback: Callback | None = None) -> tuple[str, ...]:
     """A sentence for each log whose own estimate disagrees with those of the others; empty where it agrees.
 
     Each log is identified alone.  A shared parameter of log ``i`` is compared with the precision-weighted mean of the
@@ -87,7 +85,9 @@ def _worst(found: Mapping[int, Estimate], i: int, names: Sequence[str], level: f
         surprise = abs(own - mean) / allowed if allowed > 0.0 else 0.0
         if surprise > worst:
             worst = float(surprise)
-            sentence = f"{name} {own:.4g} ± {np.sqrt(variance):.2g} here, {mean:.4g} ± {np.sqrt(ratio * spread):.2g} there"
+            sentence = (
+                f"{name} {own:.4g} ± {np.sqrt(variance):.2g} here, {mean:.4g} ± {np.sqrt(ratio * spread):.2g} there"
+            )
     return worst, sentence
 
 

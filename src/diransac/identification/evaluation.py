@@ -198,30 +198,37 @@ class Simulation:
             sums, counts = sums + batch.sum_squares, counts + batch.inlier_count
         return Scores(sums, counts, tuple(batches))
 
-    def restarted(
+    def errors(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
-    ) -> tuple[FloatArray, FloatArray]:
-        """Simulations of one log that restart from given states.
+    ) -> FloatArray:
+        """Simulated less measured ``(K, n_rows, n_s)`` of one log, restarted from given states.
+
+        NaN from a divergence on; a missing sample counts as measured 0.
 
         Parameters
         ----------
         parameters : (n_p,)   of the model
-        states : (K, n_x)   initial state of each
-        start_rows : (K,)   first row of each; rows past the end of the log repeat the last input
-
-        Returns
-        -------
-        All signals of the model ``(K, n_rows, n_signals)``, and simulated less measured ``(K, n_rows, n_s)`` of the
-        compared ones, NaN from a divergence on; a missing sample counts as measured 0.
+        states : (K, n_x)   initial state of each window
+        start_rows : (K,)   first row of each; rows past the end of the log repeat its last one
         """
-        one, measured = self._dataset.segments[log], self._measured[log].values
+        batch, measured = self._restarted(log, parameters, states, start_rows, n_rows)
+        return self._simulator.errors(batch, measured)
+
+    def trajectories(
+        self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
+    ) -> FloatArray:
+        """All signals of the model ``(K, n_rows, n_signals)``, restarted as in `errors`."""
+        return self._simulator.trajectories(self._restarted(log, parameters, states, start_rows, n_rows)[0])
+
+    def _restarted(
+        self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
+    ) -> tuple[RolloutBatch, Measurements]:
+        one, measured = self._dataset.segments[log], np.nan_to_num(self._measured[log].values)
         more = ((0, max(0, int(start_rows.max()) + n_rows - len(one))), (0, 0))
-        inputs, measured = (np.pad(x, more, mode="edge") for x in (one.inputs, np.nan_to_num(measured)))
-        batch = RolloutBatch(
-            np.tile(parameters, (len(states), 1)), states, inputs, one.log.dt, start_rows=start_rows, n_rows=n_rows
-        )
-        compared = Measurements(measured, np.ones(len(measured), bool))
-        return self._simulator.trajectories(batch), self._simulator.errors(batch, compared)
+        inputs, measured = (np.pad(x, more, mode="edge") for x in (one.inputs, measured))
+        lanes = np.tile(parameters, (len(states), 1))
+        batch = RolloutBatch(lanes, states, inputs, one.log.dt, start_rows, n_rows)
+        return batch, Measurements(measured, np.ones(len(measured), bool))
 
 
 def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: Settings) -> Evaluation:

@@ -121,7 +121,10 @@ def _derived(model: Model, logs: Sequence[Log], bandwidth: float | None) -> tupl
     found = [preprocessing.differentiate(log, model, bandwidth) for log in logs]
     chosen = [log.filter.bandwidth for log in found if log.filter is not None]
     lowest = min(chosen)
-    again = [x if used == lowest else preprocessing.differentiate(log, model, lowest) for x, used, log in zip(found, chosen, logs, strict=True)]
+    again = [
+        x if used == lowest else preprocessing.differentiate(log, model, lowest)
+        for x, used, log in zip(found, chosen, logs, strict=True)
+    ]
     return tuple(again)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data import preprocessing
-from diransac.data.dataset import observe
+from diransac.data.dataset import Dataset
 from diransac.errors import LogError
 from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.evaluation import choose_scoring
@@ -207,10 +207,10 @@ def _fitness(log: Log, model: Model) -> Fitness:
             model.name, missing, derivable, {}, f"not affine in {names}: only a search can tell what is excited"
         )
     try:
-        observations = observe(model, derived)
-        excitation, reason = _excitation(OrdinaryLeastSquares().bind(observations), model)
+        dataset = Dataset.of(model, derived)
+        excitation, reason = _excitation(OrdinaryLeastSquares().bind(dataset), model)
         if not reason:
-            choose_scoring(observations, Settings())  # refuses a log in which nothing moves, as identify does
+            choose_scoring(dataset, Settings())  # refuses a log in which nothing moves, as identify does
     except LogError as error:
         return Fitness(model.name, missing, derivable, {}, str(error))
     return Fitness(model.name, missing, derivable, excitation, reason)
@@ -236,11 +236,12 @@ def _excitation(bound: BoundEstimator, model: Model) -> tuple[dict[str, Excitati
     """How well the whole log determines each parameter; where it leaves some open, those alone, and what that means."""
     names, units = list(model.parameters), [parameter.unit for parameter in model.parameters.values()]
     rows = np.arange(bound.n_rows)
-    if not bound.well_defined([rows])[0]:
+    selected = bound.select([rows])
+    if not selected.well_defined()[0]:
         loose = bound.unidentifiable() or range(len(names))
         found = {names[i]: Excitation(units[i], np.nan, np.inf) for i in loose}
         return found, f"the motion that would show {', '.join(found)} is missing, or moves with another"
-    estimates = bound.fit([rows])[0]
+    estimates = selected.fit()[0]
     errors = np.sqrt(np.diag(jackknife_covariance(bound, rows)))
     relative = np.divide(errors, np.abs(estimates), out=np.full(len(names), np.inf), where=estimates != 0.0)
     rated = zip(names, units, estimates, relative, strict=True)

@@ -172,7 +172,7 @@ class _BoundNonlinear:
 
     def _errors(self, rows: IntArray, free: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Scaled errors ``(B, n r)`` and their Jacobian ``(B, n r, n_p)`` in the free coordinates."""
-        n_lanes, n = rows.shape
+        n_lanes = len(rows)
         p, slope = self._chart.to_parameters(free), self._chart.slope(free)
         flat = rows.reshape(-1)
         own = self._own(p, rows)
@@ -184,7 +184,6 @@ class _BoundNonlinear:
         bad = ~(np.all(np.abs(errors) < _HUGE, axis=1) & np.all(np.abs(J) < _HUGE, axis=(1, 2)))
         errors[bad], J[bad] = np.inf, 0.0
         return errors, J
-
 
     def _own(self, p: FloatArray, rows: IntArray) -> FloatArray:
         """Parameters of the model ``(B n, n_p)`` at each row of ``(B, n)``, from vectors ``(B, n_all)``."""

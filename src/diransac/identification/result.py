@@ -208,9 +208,7 @@ class Result:
     @property
     def inlier_times(self) -> FloatArray:
         """Time of every inlier in its own log, s."""
-        parts = [
-            log.start + log.dt * np.flatnonzero(self.inliers[self.log_rows(i)]) for i, log in enumerate(self.logs)
-        ]
+        parts = [log.start + log.dt * np.flatnonzero(self.inliers[self.log_rows(i)]) for i, log in enumerate(self.logs)]
         return np.concatenate(parts)
 
     # ------------------------------------------------------------------ files

@@ -142,7 +142,7 @@ def load(kind: type[T], data: Mapping[str, Any]) -> T:
 
 
 @cache
-def _adapter(kind: type) -> Any:
+def _adapter(kind: Any) -> Any:
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)

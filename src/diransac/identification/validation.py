@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
-from diransac.data.dataset import Observations, observe
+from diransac.arrays import FloatArray
+from diransac.data.dataset import Dataset, Segment, as_logs
 from diransac.data.log import Log
-from diransac.errors import LogError, SettingsError
-from diransac.model.plant import ModelWithParameters, as_plant
-from diransac.simulation import Measurements, RolloutBatch, Rollouts, rollouts
+from diransac.errors import DiransacError, LogError, SettingsError
+from diransac.identification.estimate import Resolution
+from diransac.identification.evaluation import Simulation
+from diransac.identification.identify import identify
+from diransac.model.plant import ModelWithParameters, Plant, as_plant
 from diransac.text_table import aligned
 
-__all__ = ["Scores", "Validation", "validate"]
+if TYPE_CHECKING:
+    from diransac.identification.estimate import Estimate
+    from diransac.identification.result import Result
+    from diransac.model import Model
 
+__all__ = ["CrossValidation", "HorizonScores", "Validation", "cross_validate", "validate"]
 
 _NICE = (1.0, 2.0, 5.0)
 
 
 @dataclass(frozen=True)
-class Scores:
+class HorizonScores:
     """Open-loop prediction at one horizon, by signal.
 
     Parameters
@@ -58,7 +64,7 @@ class Validation:
 
     source: str
     units: Mapping[str, str]
-    horizons: tuple[Scores, ...]
+    horizons: tuple[HorizonScores, ...]
     asked: int
     notes: tuple[str, ...] = ()
 
@@ -98,105 +104,141 @@ class Validation:
 
 
 def validate(
-    plant: ModelWithParameters, log: Log, horizon: float | None = None, *, integrator: str = "rk4", substeps: int = 1
+    plant: ModelWithParameters,
+    logs: Log | Iterable[Log],
+    horizon: float | None = None,
+    *,
+    integrator: str | None = None,
+    substeps: int | None = None,
 ) -> Validation:
-    """Open-loop prediction of a log by a plant (a `Plant`, or a `Result`), as far as its model knows it.
+    """Open-loop prediction of logs by a plant (a `Plant`, or a `Result`), as far as its model goes.
 
     Parameters
     ----------
-    horizon : s; the simulation restarts from the measured state after each.  None: two that suit the log's length.  The
-        whole log from its first complete state on is always scored, too
-    integrator, substeps : as in `Settings`
+    logs : one log, or several, whose errors are pooled
+    horizon : s; the simulation restarts from the measured state after each.  None: two that suit the length of the
+        logs.  The whole of each log from its first complete state on is always scored, too
+    integrator, substeps : as in `Settings`; None: those of the method that identified a result, else "rk4" and 1
 
-    The first row of a window, where the state is the measured one, is not scored.
-    Raises LogError: the log lacks an input or an initial state; SettingsError: an argument is of another kind, a
-    horizon shorter than a sample.
+    Returns
+    -------
+    Validation
+        Scores by signal.  The first row of a window, whose state is the measured one, is not scored.
+
+    Raises
+    ------
+    LogError
+        A log lacks an input or an initial state.
+    SettingsError
+        An argument is of another kind, or a horizon shorter than a sample.
     """
-    _check_arguments(log, horizon)
-    plant = as_plant(plant)
-    observations = observe(plant.model, log, pointwise=False)
-    parameters = plant.model.parameter_vector(plant.parameters)
-    engine = rollouts(plant.model, observations.signals, integrator=integrator, substeps=substeps)
-    states = _states(observations)
-    n_steps = len(states) - 1 - int(np.argmax(_complete(states)))
-    if horizon is not None and not horizon > 0.5 * log.dt:
-        raise SettingsError(f"horizon is {horizon} s; give at least one sample, {log.dt:g} s")
-    span = n_steps * log.dt
-    wanted = [horizon] if horizon is not None else sorted({_nice(span / 50.0), _nice(span / 10.0)})
-    lengths = [round(h / log.dt) for h in wanted if h < span and round(h / log.dt) >= 1]
-    scores = [_score(engine, observations, states, parameters, n * log.dt, n) for n in lengths]
-    scores.append(_score(engine, observations, states, parameters, np.inf, n_steps))
-    asked = 0 if horizon is not None else len(scores) - 1
-    units = {n: plant.model.units[n] for n in observations.signals}
-    return Validation(log.source, units, tuple(scores), asked, observations.notes)
-
-
-def _check_arguments(log: object, horizon: object) -> None:
-    if not isinstance(log, Log):
-        raise SettingsError(f"log is a {type(log).__name__}; give a dr.Log, such as dr.read_log(path)")
+    several = as_logs(logs)
     if horizon is not None and not isinstance(horizon, (int, float, np.number)):
         raise SettingsError(f"horizon is {horizon!r:.60}; give seconds")
+    known = as_plant(plant)
+    estimate: Estimate | None = getattr(plant, "estimate", None)
+    fitted = Resolution() if estimate is None else estimate.resolution
+    resolution = Resolution(integrator or fitted.integrator, substeps or fitted.substeps)
+    dataset = Dataset.of(known.model, several, pointwise=False)
+    predictions = [_OpenLoop(dataset, i, known, resolution) for i in range(len(several))]
+    dt = max(log.dt for log in several)
+    if horizon is not None and not horizon > 0.5 * dt:
+        raise SettingsError(f"horizon is {horizon} s; give at least one sample, {dt:g} s")
+    span = max(one.duration for one in predictions)
+    wanted = [horizon] if horizon is not None else sorted({_nice(span / 50.0), _nice(span / 10.0)})
+    horizons = [h for h in wanted if any(one.steps(h) for one in predictions)]
+    scores = [_pooled(dataset.signals, h, predictions) for h in (*horizons, np.inf)]
+    asked = 0 if horizon is not None else len(scores) - 1
+    units = {n: known.model.units[n] for n in dataset.signals}
+    return Validation(dataset.source, units, tuple(scores), asked, dataset.notes)
 
 
-def _score(
-    engine: Rollouts,
-    observations: Observations,
-    states: FloatArray,
-    parameters: FloatArray,
-    horizon: float,
-    steps: int,
-) -> Scores:
-    """Scores of windows of so many steps, one after another; one that starts at an incomplete state is left out."""
-    complete = _complete(states)
-    starts = np.arange(int(np.argmax(complete)), len(states) - steps, steps)
-    starts = starts[complete[starts]]
-    batch = RolloutBatch(
-        np.tile(parameters, (len(starts), 1)),
-        states[starts],
-        observations.inputs,
-        observations.log.dt,
-        start_rows=starts,
-        n_rows=steps + 1,
-    )
-    measurements = Measurements(np.nan_to_num(observations.measured), np.ones_like(observations.valid))
-    errors = engine.errors(batch, measurements)[:, 1:]
-    rows = starts[:, None] + np.arange(1, steps + 1)
-    measured = observations.measured[rows]
-    present = np.isfinite(measured)
-    diverged = (~np.isfinite(errors) & present).any(axis=(1, 2))
-    with np.errstate(over="ignore"):
-        squares = np.where(np.isfinite(errors), np.square(errors), np.inf)
-        squared = np.where(present, squares, 0.0).sum(axis=(0, 1))
-    count = present.sum(axis=(0, 1))
-    mean = np.where(present, measured, 0.0).sum(axis=(0, 1)) / np.maximum(count, 1)
-    spread = np.where(present, np.square(measured - mean), 0.0).sum(axis=(0, 1))
+class _OpenLoop:
+    """Predictions of one log: its complete states, and simulations that restart from them."""
+
+    def __init__(self, dataset: Dataset, log: int, plant: Plant, resolution: Resolution) -> None:
+        self._log, self._segment = log, dataset.segments[log]
+        self._simulation = Simulation(dataset, resolution=resolution)
+        self._parameters = plant.model.parameter_vector(plant.parameters)
+        self._states = _states(self._segment)
+        self._complete = np.asarray(np.isfinite(self._states).all(axis=1))
+        self._n_steps = len(self._states) - 1 - int(np.argmax(self._complete))
+
+    @property
+    def duration(self) -> float:
+        """From the first complete state to the end, s."""
+        return self._n_steps * self._segment.log.dt
+
+    def steps(self, horizon: float) -> int:
+        """Samples of a horizon; 0 where the log is not longer than that."""
+        if np.isinf(horizon):
+            return self._n_steps
+        return round(horizon / self._segment.log.dt) if horizon < self.duration else 0
+
+    def sums(self, horizon: float) -> _Sums:
+        """Sums over windows of one horizon, one after another; one that starts at an incomplete state is left out."""
+        steps = self.steps(horizon)
+        starts = np.arange(int(np.argmax(self._complete)), len(self._states) - steps, steps) if steps else np.arange(0)
+        starts = starts[self._complete[starts]]
+        if not len(starts):
+            nothing = np.zeros(self._segment.measured.shape[1])
+            return _Sums(0, 0, nothing, nothing, np.empty((0, len(nothing))))
+        errors = self._simulation.errors(self._log, self._parameters, self._states[starts], starts, steps + 1)[:, 1:]
+        rows = starts[:, None] + np.arange(1, steps + 1)
+        measured = self._segment.measured[rows]
+        present = np.isfinite(measured)
+        diverged = (~np.isfinite(errors) & present).any(axis=(1, 2))
+        with np.errstate(over="ignore"):
+            squares = np.where(np.isfinite(errors), np.square(errors), np.inf)
+            squared = np.where(present, squares, 0.0).sum(axis=(0, 1))
+        return _Sums(
+            len(starts), int(diverged.sum()), squared, present.sum(axis=(0, 1)), measured.reshape(-1, measured.shape[2])
+        )
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Windows, diverged ones, squared errors and samples ``(n_s,)``, and the samples themselves ``(n, n_s)``."""
+
+    windows: int
+    diverged: int
+    squared: FloatArray
+    count: FloatArray
+    measured: FloatArray
+
+
+def _pooled(signals: Sequence[str], horizon: float, predictions: Sequence[_OpenLoop]) -> HorizonScores:
+    """Scores of one horizon over all logs; the spread of a signal is about its mean in each log."""
+    parts = [one.sums(horizon) for one in predictions]
+    squared, count = (sum((getattr(x, n) for x in parts), np.zeros(len(signals))) for n in ("squared", "count"))
+    spread = sum((_spread(x.measured) for x in parts), np.zeros(len(signals)))
     with np.errstate(divide="ignore", invalid="ignore"):
         rmse, ratio = np.sqrt(squared / count), squared / spread
-    by_name = (
-        dict(zip(observations.signals, x.tolist(), strict=True))
-        for x in (rmse, 100.0 * (1.0 - np.sqrt(ratio)), 1.0 - ratio)
-    )
-    return Scores(horizon, len(starts), int(diverged.sum()), *by_name)
+    by_name = (dict(zip(signals, x.tolist(), strict=True)) for x in (rmse, 100.0 * (1.0 - np.sqrt(ratio)), 1.0 - ratio))
+    return HorizonScores(horizon, sum(x.windows for x in parts), sum(x.diverged for x in parts), *by_name)
 
 
-def _states(observations: Observations) -> FloatArray:
+def _spread(measured: FloatArray) -> FloatArray:
+    """Sum of squares ``(n_s,)`` about the mean of the samples that are there."""
+    present = np.isfinite(measured)
+    mean = np.where(present, measured, 0.0).sum(axis=0) / np.maximum(present.sum(axis=0), 1)
+    return np.asarray(np.where(present, np.square(measured - mean), 0.0).sum(axis=0))
+
+
+def _states(segment: Segment) -> FloatArray:
     """The measured state ``(N, n_x)`` at every row, NaN where it is incomplete; 0 where nothing measured depends on it.
 
     Raises LogError: no row has a complete state.
     """
-    model = observations.model
-    states = np.tile(observations.initial_state("first"), (len(observations), 1))
-    matter = model.states_behind(observations.signals)
+    model = segment.model
+    states = np.tile(segment.initial_state("first"), (len(segment), 1))
+    matter = model.states_behind(segment.present)
     for i, name in enumerate(model.state):
-        if name in observations.signals and name in matter:
-            states[:, i] = observations.column(name)
-    if not _complete(states)[:-1].any():
-        raise LogError(f"{observations.log.source}: no row has a complete state ({', '.join(matter)}) to start from")
+        if name in segment.present and name in matter:
+            states[:, i] = segment.column(name)
+    if not np.isfinite(states).all(axis=1)[:-1].any():
+        raise LogError(f"{segment.log.source}: no row has a complete state ({', '.join(matter)}) to start from")
     return states
-
-
-def _complete(states: FloatArray) -> BoolArray:
-    return np.asarray(np.isfinite(states).all(axis=1))
 
 
 def _nice(seconds: float) -> float:
@@ -209,3 +251,91 @@ def _finite(x: object) -> object:
     if isinstance(x, Mapping):
         return {k: _finite(v) for k, v in x.items()}
     return x if not isinstance(x, float) or np.isfinite(x) else None
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Leave-one-log-out cross-validation: each log predicted by the model of the others.
+
+    Parameters
+    ----------
+    sources : how messages name each log
+    results : of all logs but that one; or why there is none
+    validations : prediction of that log; or why there is none
+    """
+
+    sources: tuple[str, ...]
+    results: tuple[Result | str, ...]
+    validations: tuple[Validation | str, ...]
+
+    @property
+    def rmse(self) -> dict[str, float]:
+        """Median over the logs of each signal's root mean squared error; infinite where a log has none."""
+        names = dict.fromkeys(n for one in self.validations if isinstance(one, Validation) for n in one.rmse)
+        found = {
+            n: [one.rmse.get(n, np.inf) if isinstance(one, Validation) else np.inf for one in self.validations]
+            for n in names
+        }
+        return {n: float(np.median(x)) for n, x in found.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, ready for JSON."""
+        folds = [
+            {
+                "log": source,
+                "parameters": result if isinstance(result, str) else result.parameters,
+                "validation": found if isinstance(found, str) else found.to_dict(),
+            }
+            for source, result, found in zip(self.sources, self.results, self.validations, strict=True)
+        ]
+        return {"folds": folds, "rmse": {n: _finite(x) for n, x in self.rmse.items()}}
+
+    def __str__(self) -> str:
+        signals = list(self.rmse)
+        parameters = next((list(x.parameters) for x in self.results if not isinstance(x, str)), [])
+        rows = [["log left out", *parameters, *(f"RMSE {n}" for n in signals)]]
+        remarks = []
+        for source, result, found in zip(self.sources, self.results, self.validations, strict=True):
+            estimates = ["" if isinstance(result, str) else f"{result.parameters[n]:.5g}" for n in parameters]
+            errors = ["" if isinstance(found, str) else f"{found.rmse.get(n, np.nan):.4g}" for n in signals]
+            rows.append([source, *estimates, *errors])
+            remarks += [f"{source}: {x}" for x in dict.fromkeys((result, found)) if isinstance(x, str)]
+        return "\n".join([*aligned(rows), *remarks])
+
+
+def cross_validate(
+    model: Model, logs: Iterable[Log], method: Any = "lo-diransac", *, horizon: float | None = None, **arguments: Any
+) -> CrossValidation:
+    """Leave-one-log-out cross-validation: identify from all logs but one, and predict that one, for each in turn.
+
+    A per-log parameter of the log that is left out takes the mean over the others.
+
+    Parameters
+    ----------
+    logs : two or more
+    method, arguments : as `identify` has them
+    horizon : s, as `validate` has it
+
+    Raises
+    ------
+    SettingsError
+        There are fewer than two logs, or an argument has no meaning.
+    """
+    several = as_logs(logs)
+    if len(several) < 2:
+        raise SettingsError("cross-validation leaves one log out; give at least two logs")
+    results, validations = list[Any](), list[Any]()
+    for i, left_out in enumerate(several):
+        try:
+            results.append(identify(model, [*several[:i], *several[i + 1 :]], method, **arguments))
+        except SettingsError:
+            raise
+        except DiransacError as error:
+            results.append(str(error))
+            validations.append("no model of the other logs")
+            continue
+        try:
+            validations.append(validate(results[-1], left_out, horizon))
+        except DiransacError as error:
+            validations.append(str(error))
+    return CrossValidation(tuple(x.source for x in several), tuple(results), tuple(validations))

@@ -13,7 +13,6 @@ from diransac.errors import SettingsError
 
 if TYPE_CHECKING:
     from diransac.identification.method import Method
-    from diransac.identification.settings import Settings
 
 __all__ = ["DEFAULT", "METHODS", "WITH_ESTIMATOR", "factory"]
 

@@ -71,7 +71,7 @@ class LeastSquares:
         """None beside the estimator."""
         return {}
 
-    def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:  # noqa: ARG002  nothing is random
+    def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
         """Parameters by least squares of all rows.
 
         Raises
@@ -84,9 +84,7 @@ class LeastSquares:
         rows = np.arange(bound.n_rows)
         parameters = bound.select([rows]).fit()[0]
         if not np.isfinite(parameters).all():
-            raise IdentificationError(
-                f"{dataset.source}: {self.name} finds no finite parameters; try another method"
-            )
+            raise IdentificationError(f"{dataset.source}: {self.name} finds no finite parameters; try another method")
         report(callback, "uncertainty", 0.5)
         resolution = Resolution(self.criteria.integrator, self.criteria.substeps)
         return fitted(bound, dataset, parameters, rows, estimator=name_of(self._estimator), resolution=resolution)

@@ -18,7 +18,14 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import IdentificationError, LogError
 from diransac.identification.estimate import Estimate, Resolution
 from diransac.identification.estimators import Estimator, OrdinaryLeastSquares, as_estimator, name_of
-from diransac.identification.evaluation import Scores, Scoring, Simulation, choose_scoring, mean_squared_error, rms_error
+from diransac.identification.evaluation import (
+    Scores,
+    Scoring,
+    Simulation,
+    choose_scoring,
+    mean_squared_error,
+    rms_error,
+)
 from diransac.identification.method import report
 from diransac.identification.methods.least_squares import bound_to, fitted
 from diransac.identification.nonlinear import NonlinearLeastSquares
@@ -31,7 +38,17 @@ if TYPE_CHECKING:
     from diransac.identification.method import Callback
     from diransac.model import Model
 
-__all__ = ["Diransac", "Evaluator", "Hypothesis", "IDiransac", "Score", "ScoredBatch", "SearchState", "Variant", "search"]
+__all__ = [
+    "Diransac",
+    "Evaluator",
+    "Hypothesis",
+    "IDiransac",
+    "Score",
+    "ScoredBatch",
+    "SearchState",
+    "Variant",
+    "search",
+]
 
 Sampler = Callable[[int, IntArray, int, int, int], IntArray]
 
@@ -206,7 +223,9 @@ class Diransac(_Ransac):
     def __post_init__(self) -> None:
         # It never ends early, which is what stop_inlier_fraction = None says.
         used = (*_SEARCH, *JUDGING, *SIMULATION)
-        check_used(self.criteria, used if self.criteria.stop_inlier_fraction else (*used, "stop_inlier_fraction"), self.name)
+        check_used(
+            self.criteria, used if self.criteria.stop_inlier_fraction else (*used, "stop_inlier_fraction"), self.name
+        )
 
     def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
         """The best hypothesis of the search; raises as `IDiransac.fit`."""
@@ -265,7 +284,10 @@ class Evaluator:
         self._weights, self._thresholds = scoring.weights[judged], scoring.thresholds[judged]
         self._min_inlier_signals = scoring.min_inlier_signals
         self._valid = [one.valid for one in dataset.segments]
-        resolution, rules = Resolution(settings.integrator, settings.substeps), [settings.initial_state] * len(self._valid)
+        resolution, rules = (
+            Resolution(settings.integrator, settings.substeps),
+            [settings.initial_state] * len(self._valid),
+        )
         self._simulation = Simulation(dataset, judged, resolution, rules, settings.threads)
         self._simulation.starts  # noqa: B018  refuses a log without an initial state
 

@@ -1,4 +1,6 @@
-"""A model augmented by discrepancies, all of them parameters, so that compiled rollouts and derivatives serve unchanged.
+"""A model augmented by discrepancies.
+
+All of them are parameters of an ordinary model, so that compiled rollouts and their derivatives serve unchanged:
 
 - Unmodelled accelerations, one for each of the model's: ``a = f(q, v, u, p) + d``.
 - Input gain and bias discrepancies: in every equation a constant force, and one in proportion to each input.  An

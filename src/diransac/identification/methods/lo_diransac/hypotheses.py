@@ -146,9 +146,7 @@ def _admitted(intervals: ShootingIntervals, p: FloatArray) -> FloatArray:
     return p[intervals.layout.admits(p)]
 
 
-def robust_scores(
-    intervals: ShootingIntervals, motion: Motion, parameters: FloatArray, chosen: IntArray
-) -> FloatArray:
+def robust_scores(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray, chosen: IntArray) -> FloatArray:
     """Score ``(n_hypotheses,)`` of each hypothesis, simulated over chosen intervals from the smoothed states.
 
     The score is the sum over signals of the log of the 35 % quantile of the residuals' size: it needs no threshold,

@@ -1,10 +1,9 @@
 """Parameters from the most probable motion by instrumental variables, and their covariance.
 
 Where the model is right, the parameters of the fit are the parameters.  Where it is not, the log is explained by
-parameters and discrepancies together, in proportions that depend on the noise.  The parameters that are wanted are
-those of least squares on noise-free data, for which the equations hold best.  ``W p = b`` is solved again, on the fitted
-motion, with instruments that leave the unmodelled accelerations out: accelerations with noise would pull inertias
-towards zero.
+parameters and discrepancies together, in proportions that depend on the noise.  Wanted are the parameters of least
+squares on noise-free data, for which the equations hold best.  ``W p = b`` is solved again, on the fitted motion, with
+instruments that leave the unmodelled accelerations out: accelerations with noise would pull inertias towards zero.
 
 The covariance has three parts: the fit's, carried through that solution; that of the unmodelled forces that no
 parameters make, as a sample of the forces on the machine, for another log would hold others; and the change under a
@@ -31,12 +30,19 @@ from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.model import Model
     from diransac.simulation.compiler import Map
 
-__all__ = ["InstrumentalEstimate", "discrepancy_units", "estimate_parameters", "inertial_forces", "parameter_units", "unexplained"]
+__all__ = [
+    "InstrumentalEstimate",
+    "discrepancy_units",
+    "estimate_parameters",
+    "inertial_forces",
+    "parameter_units",
+    "unexplained",
+]
 
 
 _TINY = 1e-300
@@ -115,7 +121,12 @@ def _gains(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatArr
 
 
 def _sampled(
-    intervals: ShootingIntervals, fit: Fit, by_rows: FloatArray, by_means: FloatArray, push: FloatArray, latent: FloatArray
+    intervals: ShootingIntervals,
+    fit: Fit,
+    by_rows: FloatArray,
+    by_means: FloatArray,
+    push: FloatArray,
+    latent: FloatArray,
 ) -> FloatArray:
     """Covariance of the parameters over logs with other unmodelled forces than these, which it estimates."""
     q, v, a, u = _motion(intervals, fit)

@@ -223,7 +223,7 @@ class _LocalSearch:
             return scores[rows]
 
         step = max(1, (high - low) // (_DELAYS_AT_A_TIME - 1))
-        tried: list[int] = [x for x in range(-(-low // step) * step, high + 1, step)]
+        tried = range(-(-low // step) * step, high + 1, step)
         best = min(tried, key=lambda rows: (score(rows), abs(rows)))
         while step > 1:
             step = max(1, step // 2)
@@ -334,7 +334,7 @@ def _on_given_logs(dataset: Dataset, intervals: ShootingIntervals, mask: BoolArr
 
 
 def _unmodelled_forces(intervals: ShootingIntervals, fit: Fit, result: InstrumentalEstimate) -> FloatArray | None:
-    """Generalised forces (W, n_v) that make the unmodelled accelerations, at the intervals' starts; None if no forces do."""
+    """Generalised forces (W, n_v) that make the unmodelled accelerations, at the intervals' starts; or None."""
     model = intervals.model
     try:
         response = model.force_response

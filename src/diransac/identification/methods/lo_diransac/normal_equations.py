@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from diransac.arrays import FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead

@@ -14,8 +14,8 @@ way down tau follows the median interval, so that intervals with large residuals
 
 References
 ----------
-MacKay 1992 (evidence updates); Chung et al. 2013 (scales that are kept off zero by a weak prior); Black, Rangarajan 1996
-and Yang et al. 2020 (graduated non-convexity).
+MacKay 1992 (evidence updates); Chung et al. 2013 (scales that are kept off zero by a weak prior); Black, Rangarajan
+1996 and Yang et al. 2020 (graduated non-convexity).
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from diransac.identification.methods.lo_diransac.normal_equations import Fit, co
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.arrowhead import Factored
-    from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.methods.lo_diransac.settings import LoDiransac
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.methods.lo_diransac.smoothing import Motion
 
 __all__ = ["Prior", "Refinement", "make_prior", "refine", "start", "weights_of"]
 
 
 # Where tau starts, in spreads of the accelerations; the largest change of any scale in a step.
 _TAU_START, _SHRINK = 0.3, 0.4
-# Continuity is exact for practical purposes: jumps are as small a part of what unmodelled accelerations do in an interval.
+# Continuity is exact for practical purposes: jumps are as small a part of the effect of tau in an interval.
 _CONTINUITY = 0.03
 _SIGMA_FLOOR = 1e-4
 # Tau on the way down, over its prior: noise must not explain what the model does not.
@@ -98,9 +98,7 @@ def make_prior(settings: LoDiransac, intervals: ShootingIntervals, motion: Motio
     )
 
 
-def start(
-    settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, p: FloatArray, prior: Prior
-) -> Fit:
+def start(settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, p: FloatArray, prior: Prior) -> Fit:
     """From a hypothesis, and the smoothed motion at the intervals' starts, or where the intervals before end."""
     n_x, n_v = intervals.model.n_q + intervals.model.n_v, intervals.model.n_v
     x, d = motion.signals[intervals.starts, :n_x].copy(), np.zeros((len(intervals), n_v))

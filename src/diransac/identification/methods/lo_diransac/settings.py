@@ -39,7 +39,7 @@ class LoDiransac:
         shorter of it and 25 samples.  Three times, nine times, ... as wide ones are chosen by cross-validation
     n_samples, n_nonlinear_samples : random samples of a model that is affine in its parameters, and of others
     largest_sample : rows of each equation in a sample at most, over the number of parameters
-    n_screening_intervals, n_finalists : intervals on which all hypotheses are scored, and the best that are scored on all
+    n_screening_intervals, n_finalists : intervals on which all hypotheses are scored; hypotheses that are scored on all
     delay_range : s, delays of the inputs that are tried before local optimisation, in whole samples
     max_delay_shifts : how often inputs are shifted by whole samples after it
     substeps : integration steps per sample: one is off by a percent where dry friction changes sign between samples or

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -134,7 +135,7 @@ class ShootingIntervals:
     def rows_of_logs(self) -> list[slice]:
         """Rows of each log, with those that fill up."""
         edges = [*self.first_of_log.tolist(), len(self.inputs)]
-        return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        return [slice(a, b) for a, b in pairwise(edges)]
 
     def delayed(self, rows: int) -> ShootingIntervals:
         """The same logs with their inputs acting some rows later."""
@@ -150,7 +151,9 @@ class ShootingIntervals:
     ) -> RolloutBatch:
         """Lanes of all intervals, or of the chosen ones, with so many rows more."""
         chosen = np.arange(len(self)) if chosen is None else chosen
-        own = np.broadcast_to(self.parameters_of(shared[: self.n_p], self.log_of[chosen]), (len(chosen), self.model.n_p))
+        own = np.broadcast_to(
+            self.parameters_of(shared[: self.n_p], self.log_of[chosen]), (len(chosen), self.model.n_p)
+        )
         rest = np.broadcast_to(shared[self.n_p :], (len(chosen), len(shared) - self.n_p))
         parameters = np.hstack([own, rest, d[chosen]])
         return RolloutBatch(

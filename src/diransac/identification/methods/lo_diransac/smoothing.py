@@ -28,7 +28,16 @@ from diransac.identification.methods.lo_diransac.mixture import lower_scale
 if TYPE_CHECKING:
     from diransac.model import Model
 
-__all__ = ["Motion", "Samples", "choose_half_width", "odd_window", "running_median", "screened_inputs", "smooth", "stuck_rows"]
+__all__ = [
+    "Motion",
+    "Samples",
+    "choose_half_width",
+    "odd_window",
+    "running_median",
+    "screened_inputs",
+    "smooth",
+    "stuck_rows",
+]
 
 _DEGREE, _STEPS = 4, 12
 _SHRINK = 0.3
@@ -103,7 +112,9 @@ def smooth(model: Model, logs: Sequence[Samples], dt: float, half: int) -> list[
     half : samples that a polynomial covers to either side of its knot
     """
     signals = [_smoothed(model, log, dt, half) for log in logs]
-    middle = np.concatenate([np.where(log.known.any(axis=0), log.centre, x) for log, x in zip(logs, signals, strict=True)])
+    middle = np.concatenate(
+        [np.where(log.known.any(axis=0), log.centre, x) for log, x in zip(logs, signals, strict=True)]
+    )
     spread = _spread(middle) + 1e-9
     return [Motion(x, spread) for x in signals]
 
