@@ -62,6 +62,8 @@ _DELAYS_AT_A_TIME = 12
 _ALL_OF_IT = 0.8
 # A significant delay: so many standard errors, and so many samples.
 _SIGNIFICANT, _SMALL_DELAY = 3.0, 0.25
+# Samples of running medians at most: spikes last for samples, however many of them there are in a second.
+_MOST_INPUTS, _MOST_SAMPLES = 15, 31
 _GAUSSIAN = 10_000
 """Degrees of freedom of an interval whose covariance is not itself an estimate from few numbers."""
 
@@ -146,12 +148,14 @@ def _screened(settings: LoDiransac, one: Segment, dt: float) -> tuple[Samples, F
     stuck = stuck_rows(one.measured[:, present]) if settings.stuck_rows else np.zeros(len(one), bool)
     known = np.isfinite(measured) & ~stuck[:, None]
     measured = np.where(known, measured, 0.0)
-    inputs, n_leaps = screened_inputs(one.inputs, odd_window(settings.input_window, dt), settings.input_threshold)
+    inputs, n_leaps = screened_inputs(
+        one.inputs, odd_window(settings.input_window, dt, _MOST_INPUTS), settings.input_threshold
+    )
     if stuck.any():
         notes.append(f"{stuck.sum()} rows repeat the row before in every signal, and were taken as missing")
     if n_leaps:
         notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median replaces them")
-    centre = running_median(measured, known, odd_window(settings.median_window, dt))
+    centre = running_median(measured, known, odd_window(settings.median_window, dt, _MOST_SAMPLES))
     return Samples(measured, known, centre), inputs, notes
 
 

@@ -25,16 +25,18 @@ __all__ = ["LoDiransac", "configured"]
 class LoDiransac:
     """Locally optimised DIRANSAC: random samples, consensus by simulation, one weak-constraint fit of all logs.
 
-    Every default works for any model and any subset of signals.  Times are in seconds; a window of less than a few
-    samples is widened to them.
+    Every default works for any model and any subset of signals.  Times are in seconds; a window of less than 5 samples
+    is widened to them.
 
     Parameters
     ----------
     criteria : settings of the evaluation: weights, thresholds and initial state, threads
     stuck_rows : whether rows that repeat the row before in every signal are taken as missing
-    input_window : s, window of the Hampel filter that replaces momentary leaps of inputs
+    input_window : s, window of the Hampel filter that replaces momentary leaps of inputs; the shorter of it and 15
+        samples
     input_threshold : of that filter, in local standard deviations
-    median_window : s, window of the running median that residuals of the smoothing start from
+    median_window : s, window of the running median that residuals of the smoothing start from; the shorter of it and 31
+        samples
     smoothing_half_width : s, narrowest half width of the smoothing polynomials, and of the shooting intervals; the
         shorter of it and 25 samples.  Three times, nine times, ... as wide ones are chosen by cross-validation
     n_samples, n_nonlinear_samples : random samples of a model that is affine in its parameters, and of others

@@ -70,9 +70,9 @@ class Motion:
 # ---------------------------------------------------------------------- screening
 
 
-def odd_window(seconds: float, dt: float) -> int:
-    """Samples of a window, an odd number from 5."""
-    return max(_FEWEST, 2 * round(0.5 * (seconds / dt - 1.0)) + 1)
+def odd_window(seconds: float, dt: float, most: int) -> int:
+    """Samples of a window, an odd number from 5 to ``most``."""
+    return max(_FEWEST, min(most, 2 * round(0.5 * (seconds / dt - 1.0)) + 1))
 
 
 def stuck_rows(measured: FloatArray) -> BoolArray:
