@@ -1,4 +1,4 @@
-"""`Parameter`: a constant of a model, with its unit and bounds."""
+"""Constants of a model, with units and bounds."""
 
 from __future__ import annotations
 
@@ -14,15 +14,21 @@ __all__ = ["Parameter"]
 
 @dataclass(frozen=True)
 class Parameter:
-    """A constant of the model that is to be identified, with the bounds that make it physical.
+    """Constant of a model that is to be identified, with its physical bounds.
 
     Parameters
     ----------
-    unit : its unit, such as ``"kg m^2"``
-    lower, upper : inclusive bounds in that unit
-    positive : a strict lower bound of zero, for what cannot vanish (a mass)
+    unit : str
+        Its unit, such as ``"kg m^2"``.
+    lower, upper : float
+        Inclusive bounds in that unit.
+    positive : bool
+        Adds a strict lower bound of zero, for a mass and the like.
 
-    Raises ModelError: the bounds leave no room, or are NaN.
+    Raises
+    ------
+    ModelError
+        No value is within the bounds, or one is NaN.
     """
 
     unit: str = "1"
@@ -38,7 +44,7 @@ class Parameter:
             )
 
     def admits(self, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Whether each value is finite and within the bounds (``PreliminaryTest`` of Algorithm 1, line 15)."""
+        """Mask of the values that are finite and within the bounds (``PreliminaryTest`` of Algorithm 1, line 15)."""
         x = np.asarray(values, dtype=float)
         inside = np.isfinite(x) & (x >= self.lower) & (x <= self.upper)
         return np.asarray(inside & (x > 0.0) if self.positive else inside)
