@@ -18,7 +18,7 @@ from kernel import timed
 
 import diransac as dr
 from diransac.flight.planning.flights import CORNERS, MEAN_SPEED, PLANNED_SHARE, ROTORCRAFT_LIMITS, ROUTE_WEIGHT
-from diransac.simulation import rollouts
+from diransac.simulation import LinearFeedback, RolloutBatch, rollouts
 
 Array = np.ndarray[Any, Any]
 MODEL = dr.models.planar_rotorcraft()
@@ -201,13 +201,13 @@ def compare_flying(nominal: dr.Trajectory, repetitions: int) -> None:
     starts = np.array([plant.initial_state(nominal.states[0], seed) for seed in seeds])
     hidden = [(0, starts.shape[1] - len(MODEL.state))]
     x_ref, gains = (np.pad(a, [(0, 0)] * (a.ndim - 1) + hidden) for a in (nominal.states, controllers[0].gains))
-    law = dr.simulate.Law(nominal.inputs, x_ref, gains, controllers[0].u_min, controllers[0].u_max)
+    feedback = LinearFeedback(nominal.inputs, x_ref, gains, controllers[0].u_min, controllers[0].u_max)
     engine, constants = rollouts(plant.simulated, substeps=substeps), np.tile(plant.constants, (N_LANES, 1))
     logs = fly_batch([plant] * N_LANES, controllers, seeds=seeds, threads=1)
     found = in_turns(
         {
             "logs": partial(fly_batch, [plant] * N_LANES, controllers, seeds=seeds, threads=1),
-            "rollouts": partial(engine.fly, constants, starts, law, nominal.dt),
+            "rollouts": partial(engine.fly, RolloutBatch(constants, starts, nominal.inputs, nominal.dt), feedback),
         },
         repetitions,
     )

@@ -10,7 +10,7 @@ from gauntlet_methods import METHODS, Estimate
 from gauntlet_studies import study_of
 
 import diransac as dr
-from diransac.simulation import rollouts
+from diransac.simulation import Measurements, RolloutBatch, rollouts
 from diransac.study import Study, record
 from diransac.study.flights import MISSIONS
 from diransac.study.judging import differ, hold, is_disturbed, relative_errors
@@ -171,7 +171,9 @@ def cramer_rao(plant: dr.Plant, clean: dr.Log, noise: dr.Noise) -> dict[str, flo
         [_weights(noisy[n] - clean[n], noisy.planted[n], np.std(clean[n])) for n in model.signals]
     )
     sums = rollouts(model, substeps=4).gauss_newton(
-        p[None], measured[0, : len(model.state)], inputs, measured, np.ones(len(clean), bool), clean.dt, weights
+        RolloutBatch(p[None], measured[0, : len(model.state)], inputs, clean.dt),
+        Measurements(measured, np.ones(len(clean), bool)),
+        weights,
     )
     N = sums.normal_matrix[0]
     scale = 1.0 / np.sqrt(np.diag(N))

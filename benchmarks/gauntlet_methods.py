@@ -18,7 +18,7 @@ from sklearn.linear_model import HuberRegressor, LinearRegression, RANSACRegress
 import diransac as dr
 from diransac.data.dataset import observe
 from diransac.identification.estimators import regression
-from diransac.simulation import rollouts
+from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 Array = np.ndarray[Any, Any]
 
@@ -119,14 +119,17 @@ def output_error(model: dr.Model, log: dr.Log, max_evaluations: int = 40) -> Est
     first = np.clip(list(hampel_least_squares(model, log).parameters.values()), low[: model.n_p], high[: model.n_p])
     measured, valid = np.nan_to_num(seen.measured), np.isfinite(seen.measured)
     spread = 1.4826 * np.nanmedian(np.abs(seen.measured - np.nanmedian(seen.measured, axis=0)), axis=0)
-    engine, log_arrays = rollouts(model, seen.signals), (seen.inputs, measured, np.ones(len(seen), bool), log.dt)
+    engine, measurements = rollouts(model, seen.signals), Measurements(measured, np.ones(len(seen), bool))
+
+    def batch(z: Array) -> RolloutBatch:
+        return RolloutBatch(z[None, : model.n_p], z[model.n_p :], seen.inputs, log.dt)
 
     def errors(z: Array) -> Array:
-        e = engine.errors(z[None, : model.n_p], z[model.n_p :], *log_arrays)[0] / spread
+        e = engine.errors(batch(z), measurements)[0] / spread
         return np.where(valid, np.clip(np.nan_to_num(e, nan=FAR), -FAR, FAR), 0.0).ravel()
 
     def jacobian(z: Array) -> Array:
-        found = engine.linearized_errors(z[None, : model.n_p], z[model.n_p :], *log_arrays, unknowns=names)
+        found = engine.linearized_errors(batch(z), measurements, unknowns=names)
         near = valid & (np.abs(found.errors[0] / spread) < FAR)
         J = found.jacobian[0] / spread[:, None]
         return np.where(near[..., None] & (np.abs(J) < 1e100), J, 0.0).reshape(-1, len(names))

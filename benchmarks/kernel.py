@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 import diransac as dr
-from diransac.simulation import rollouts
+from diransac.simulation import Measurements, RolloutBatch, Rollouts, ScoreBatch, rollouts
 from diransac.simulation.compiler import Target
 
 Array = np.ndarray[Any, Any]
@@ -78,11 +78,18 @@ def problem_of(model: Any, parameters: Sequence[float], trim: Sequence[float], n
     for four in model.quaternions:
         state[four[0]] = 1.0
     truth = np.array([parameters])
-    measured = rollouts(model).trajectories(truth, state, inputs, DT)[0]
+    measured = rollouts(model).trajectories(RolloutBatch(truth, state, inputs, DT))[0]
     measured = measured + 0.01 * rng.standard_normal(measured.shape)
     hypotheses = truth * rng.uniform(0.9, 1.1, (N_LANES, model.n_p))
     n_signals = len(model.signals)
     return hypotheses, state, inputs, measured, np.ones(n_rows, bool), DT, np.full(n_signals, 0.5), 3
+
+
+def score(engine: Rollouts, problem: Problem, n_lanes: int | None = None, threads: int = 1) -> ScoreBatch:
+    """Scores of the hypotheses, or of the first few."""
+    hypotheses, state, inputs, measured, valid, dt, thresholds, least = problem
+    batch = RolloutBatch(hypotheses[:n_lanes], state, inputs, dt)
+    return engine.score(batch, Measurements(measured, valid), thresholds, least, threads=threads)
 
 
 def aligned(shape: tuple[int, ...]) -> Array:
@@ -150,15 +157,15 @@ def compare_with_c(loops: CLoops, name: str, model: Any, parameters: Sequence[fl
     problem = problem_of(model, parameters, trim)
     start = time.perf_counter()
     engine = rollouts(model)
-    engine.score(problem[0][:1], *problem[1:])
+    score(engine, problem, 1)
     compiled = time.perf_counter() - start
     narrow = rollouts(model, target=Target("haswell"))
     by_c, sums, counts = loops.bound(name, problem)
     found = medians({
-        "c": by_c, "kernel": lambda: engine.score(*problem), "two": lambda: engine.score(*problem, threads=2),
-        "one lane": lambda: engine.score(problem[0][:1], *problem[1:]), "avx2": lambda: narrow.score(*problem),
+        "c": by_c, "kernel": lambda: score(engine, problem), "two": lambda: score(engine, problem, threads=2),
+        "one lane": lambda: score(engine, problem, 1), "avx2": lambda: score(narrow, problem),
     })  # fmt: skip
-    scores = engine.score(*problem)
+    scores = score(engine, problem)
     agreement = np.abs(sums / scores.sum_squares - 1).max()
     differing = int((counts != scores.inlier_count).sum())
     share = loops.share_of_peak(name, found["c"])
@@ -174,7 +181,7 @@ def compare_lengths(model: Any) -> None:
     """A log ten times as long."""
     problems = {n: problem_of(model, *ROTORCRAFT, n) for n in (N_ROWS, 10 * N_ROWS)}
     engine = rollouts(model)
-    found = medians({str(n): partial(engine.score, *problem) for n, problem in problems.items()})
+    found = medians({str(n): partial(score, engine, problem) for n, problem in problems.items()})
     short, long = found.values()
     show("rotorcraft: 25,000 rows over 2,500", long, short)
 
@@ -202,7 +209,7 @@ def compare_operations() -> None:
     """One more operation in an oscillator's acceleration, over the oscillator alone."""
     models = {name: oscillator(name) for name in ("nothing", *OPERATIONS)}
     problem = problem_of(models["nothing"], [4.0, 0.1], [0.0])
-    found = medians({name: partial(rollouts(model).score, *problem) for name, model in models.items()})
+    found = medians({name: partial(score, rollouts(model), problem) for name, model in models.items()})
     show("oscillator", found["nothing"])
     for name in OPERATIONS:
         show(f"oscillator with {name}", found[name], found["nothing"])
@@ -212,10 +219,12 @@ def compare_sensitivities(model: dr.Model, parameters: Sequence[float], trim: Se
     """Gauss-Newton sums over scores: the price of derivatives in rollouts."""
     problem = problem_of(model, parameters, trim)
     engine, weights = rollouts(model), np.ones(len(model.signals))
+    hypotheses, state, inputs, measured, valid, dt, _, _ = problem
+    batch, measurements = RolloutBatch(hypotheses, state, inputs, dt), Measurements(measured, valid)
     choices = {"parameters": tuple(model.parameters), "initial states": model.state, "both": None}
-    calls: dict[str, Call] = {"score": partial(engine.score, *problem)}
+    calls: dict[str, Call] = {"score": partial(score, engine, problem)}
     for name, unknowns in choices.items():
-        calls[name] = partial(engine.gauss_newton, *problem[:6], weights, unknowns=unknowns)
+        calls[name] = partial(engine.gauss_newton, batch, measurements, weights, unknowns=unknowns)
     compiled = {name: timed(call) for name, call in calls.items()}
     found = medians(calls)
     for name in choices:

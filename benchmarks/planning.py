@@ -19,7 +19,7 @@ import numpy as np
 import diransac as dr
 from diransac.flight.planning import planner, solvers
 from diransac.flight.planning.transcription import Program
-from diransac.simulation import rollouts
+from diransac.simulation import RolloutBatch, rollouts
 
 FLIGHTS: dict[str, Callable[..., dr.Trajectory]] = {"square": dr.square, "star": dr.star, "sine": dr.sine}
 REPETITIONS = 15
@@ -85,7 +85,8 @@ def coarse(name: str) -> None:
     outcome = calls["one"]()
     flown_inputs = np.repeat(program.split(outcome.unknowns)[1], counts, axis=0)
     p = np.array([list(PLANT.parameters.values())])
-    flown = rollouts(PLANT.model).trajectories(p, states[0], np.concatenate([flown_inputs, flown_inputs[-1:]]), 0.01)
+    batch = RolloutBatch(p, states[0], np.concatenate([flown_inputs, flown_inputs[-1:]]), 0.01)
+    flown = rollouts(PLANT.model).trajectories(batch)
     taken = medians(calls, REPETITIONS)
     miss = np.abs(np.asarray(flown[0])[-1, :2] - states[-1, :2]).max()
     print(

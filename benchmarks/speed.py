@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 import others
-from kernel import QUADROTOR, REPETITIONS, CLoops, medians, problem_of, quadrotor, timed
+from kernel import QUADROTOR, REPETITIONS, CLoops, medians, problem_of, quadrotor, score, timed
 
 import diransac as dr
 from diransac.data.dataset import observe
 from diransac.identification.estimators import regression
 from diransac.identification.sampling import sample_rows
-from diransac.simulation import rollouts
+from diransac.simulation import RolloutBatch, rollouts
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -103,8 +103,8 @@ def compare_identification(bench: Bench) -> float:
     """Rows (a), (b), (d); returns the seconds of one identification."""
     engine = rollouts(bench.model)
     calls: dict[str, Callable[[], Any]] = {
-        "one": partial(engine.score, *bench.problem),
-        "two": partial(engine.score, *bench.problem, threads=2),
+        "one": partial(score, engine, bench.problem),
+        "two": partial(score, engine, bench.problem, threads=2),
         "table iv": bench.identify,
         "defaults": lambda: dr.identify(
             bench.model, bench.log, settings=dr.Settings(stop_inlier_fraction=None, threads=2)
@@ -115,7 +115,7 @@ def compare_identification(bench: Bench) -> float:
         calls["c"], sums, _ = bench.loops.bound("rotorcraft", bench.problem)
         calls["c two"] = on_two_threads(calls["c"])
         calls["c"]()
-        agreement = f"; sums agree to {np.abs(sums / engine.score(*bench.problem).sum_squares - 1).max():.0e}"
+        agreement = f"; sums agree to {np.abs(sums / score(engine, bench.problem).sum_squares - 1).max():.0e}"
     found = medians(calls)
     if bench.loops:
         share = bench.loops.share_of_peak("rotorcraft", found["c"])
@@ -177,7 +177,7 @@ def hour_log() -> dr.Log:
     _, _, z_ddot = _sines(t + HOUR_DT / 2, {0.2: 1.0, 0.55: 0.3})
     inputs = np.column_stack([true["mass"] * (9.81 + z_ddot) / np.cos(theta), true["inertia"] * theta_ddot / 0.177])
     start = np.array([0.0, 0.0, 0.0, 0.0, 0.0, theta_dot[0]])
-    flown = rollouts(model).trajectories(np.array([list(true.values())]), start, inputs, HOUR_DT)[0]
+    flown = rollouts(model).trajectories(RolloutBatch(np.array([list(true.values())]), start, inputs, HOUR_DT))[0]
     columns = dict(zip((*model.signals, *model.inputs), (*flown.T, *inputs.T), strict=True))
     noise = dr.Noise(outlier_probability=0.1, outlier_magnitude=80.0)
     return dr.corrupt(dr.Log.from_arrays(t, columns), noise, seed=1, signals=model.signals)
@@ -243,15 +243,15 @@ def compare_quadrotor(loops: CLoops) -> None:
     problem = problem_of(model, *QUADROTOR)
     engine = rollouts(model)
     by_c, sums, _ = loops.bound("quadrotor", problem)
-    found = medians({"c": by_c, "kernel": partial(engine.score, *problem)})
-    agreement = np.abs(sums / engine.score(*problem).sum_squares - 1).max()
+    found = medians({"c": by_c, "kernel": partial(score, engine, problem)})
+    agreement = np.abs(sums / score(engine, problem).sum_squares - 1).max()
     note = f"{milliseconds(kernel=found['kernel'], C=found['c'])}; sums agree to {agreement:.0e}"
     row("(h) score a 13-state quadrotor / C loop", found["kernel"] / found["c"], "1.4, aim 1.1", note)
 
 
 def compare_others(bench: Bench, seconds: float) -> None:
     """What else there is, over the kernel on two threads or over a whole identification."""
-    ours = partial(rollouts(bench.model).score, *bench.problem, threads=2)
+    ours = partial(score, rollouts(bench.model), bench.problem, threads=2)
     exact = ours().sum_squares
     for name, simulate in (
         ("JAX, vmap and scan", others.jax_scan),

@@ -6,7 +6,7 @@ import numpy as np
 import diransac as dr
 from diransac.flight.trajectory import Trajectory
 from diransac.model.plant import Plant
-from diransac.simulation import rollouts
+from diransac.simulation import RolloutBatch, rollouts
 from rolling import BODY, normalised
 
 ROTORCRAFT = Plant(dr.models.planar_rotorcraft(), {"mass": 0.249, "inertia": 0.004, "drag": 0.025})
@@ -48,7 +48,7 @@ def moving(name, n_rows, dt=0.01, seed=0):
     waves = np.sin(time[:, None] * rng.uniform(2, 9, model.n_u) + rng.uniform(0, 6, model.n_u))
     inputs = np.array(HOVER[name]) + 0.1 * waves
     start = normalised(model, rest_state(plant) + 0.1 * rng.standard_normal(len(model.state)))
-    signals = rollouts(model).trajectories([list(plant.parameters.values())], start, inputs, dt)[0]
+    signals = rollouts(model).trajectories(RolloutBatch([list(plant.parameters.values())], start, inputs, dt))[0]
     return Trajectory(time, signals[:, : len(start)], inputs, model.state, tuple(model.inputs))
 
 

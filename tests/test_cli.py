@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import diransac as dr
 from command_line import MODEL, QUICK, TRUE, contents, run, swim, working_folder
 from diransac.cli.commands import app
-from diransac.simulation import rollouts
+from diransac.simulation import RolloutBatch, rollouts
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def test_identify_finds_the_true_parameters_by_every_method(folder: Path, method
     model, thrust = dr.models.underwater_vehicle(), swim(np.arange(600) * 0.01)["thrust"]
     plant = dr.Plant(model, TRUE)
     # The thrust is held from row to row, as simulations have it: lo-diransac tells what is not.
-    signals = rollouts(model).trajectories([plant.constants], np.zeros(2), thrust[:, None], 0.01)[0]
+    signals = rollouts(model).trajectories(RolloutBatch([plant.constants], np.zeros(2), thrust[:, None], 0.01))[0]
     columns = dict(zip(model.signals, signals.T, strict=True)) | {"thrust": thrust}
     dr.Log.from_arrays(np.arange(600) * 0.01, columns).write("held.csv")
     done = run("identify", "held.csv", *MODEL, "--method", method, *QUICK, "--json")

@@ -9,7 +9,7 @@ import pytest
 import diransac as dr
 from diransac.errors import ModelError
 from diransac.model.library import BLADE_FLAPPING, TABLE_I, extended_rotorcraft, planar_rotorcraft
-from diransac.simulation import rollouts
+from diransac.simulation import RolloutBatch, rollouts
 
 M, I, C = TABLE_I.values()
 G, CT, CP, D, L, LZ, RHO = 9.81, 0.06, 0.06, 0.127, 0.177, 0.01, 1.225
@@ -70,7 +70,7 @@ def test_compiled_flight_agrees_with_a_plain_loop_over_eq_20(convention, phase):
     plant, dt, substeps = extended_rotorcraft(gamma, dm, convention, phase), 0.01, 24
     inputs = lively_inputs(40, dt)
     engine = rollouts(plant.simulated, substeps=substeps)
-    flown = engine.trajectories([plant.constants], plant.initial_state(np.zeros(6)), inputs, dt)[0]
+    flown = engine.trajectories(RolloutBatch([plant.constants], plant.initial_state(np.zeros(6)), inputs, dt))[0]
     accelerations = flown[:, -3:]
 
     def rates(x, t, own, u):
@@ -95,9 +95,11 @@ def test_without_imbalance_it_is_the_baseline_to_rounding(convention, phase):
     plant = extended_rotorcraft(convention=convention, phase=phase)
     inputs = lively_inputs(1000, 0.01)
     with_rotors = rollouts(plant.simulated, substeps=4).trajectories(
-        [plant.constants], plant.initial_state(np.zeros(6)), inputs, 0.01
+        RolloutBatch([plant.constants], plant.initial_state(np.zeros(6)), inputs, 0.01)
     )[0]
-    baseline = rollouts(planar_rotorcraft(), substeps=4).trajectories([[M, I, C]], np.zeros(6), inputs, 0.01)[0]
+    baseline = rollouts(planar_rotorcraft(), substeps=4).trajectories(
+        RolloutBatch([[M, I, C]], np.zeros(6), inputs, 0.01)
+    )[0]
     own = len(plant.simulated.own_states)
     flown = np.delete(with_rotors, np.s_[6 : 6 + own], axis=1)
     np.testing.assert_allclose(flown, baseline, rtol=1e-13, atol=1e-13 * np.abs(baseline).max())
@@ -109,7 +111,7 @@ def test_energy_changes_by_the_work_of_the_rotors_alone():
     dt = 1e-3
     inputs = lively_inputs(4001, dt)
     flown = rollouts(plant.simulated).trajectories(
-        [plant.constants], plant.initial_state([0, 0, 0.3, 1.0, 0.5, 0]), inputs, dt
+        RolloutBatch([plant.constants], plant.initial_state([0, 0, 0.3, 1.0, 0.5, 0]), inputs, dt)
     )[0]
     _, z, theta, vx, vz, w = flown[:, :6].T
     energy = M / 2 * (vx**2 + vz**2) + I / 2 * w**2 + M * G * z
@@ -126,7 +128,7 @@ def test_drag_takes_the_energy_that_eq_4_says():
     dt = 1e-3
     inputs = np.tile([M * G, 0.0], (3001, 1))
     flown = rollouts(plant.simulated).trajectories(
-        [plant.constants], plant.initial_state([0, 0, 0, 3.0, 0, 0]), inputs, dt
+        RolloutBatch([plant.constants], plant.initial_state([0, 0, 0, 3.0, 0, 0]), inputs, dt)
     )[0]
     speed = flown[:, 3]
     # Upright, only x moves: m x'' = -C u x'.
@@ -137,7 +139,7 @@ def test_momentum_is_the_integral_of_forces_and_torques():
     plant = extended_rotorcraft(parameters={**TABLE_I, "drag": 0.0})
     inputs = np.column_stack([np.zeros(500), 0.02 * np.sin(np.arange(500) * 0.05)])
     flown = rollouts(plant.simulated).trajectories(
-        [plant.constants], plant.initial_state([0, 0, 0.4, 1.5, 2.0, 0]), inputs, 0.01
+        RolloutBatch([plant.constants], plant.initial_state([0, 0, 0.4, 1.5, 2.0, 0]), inputs, 0.01)
     )[0]
     t = np.arange(500) * 0.01
     np.testing.assert_allclose(flown[:, 3], 1.5, rtol=1e-14)
@@ -153,7 +155,9 @@ def test_eight_steps_a_turn_resolve_the_rotors_and_the_error_falls_with_the_four
 
     def state(substeps):
         engine = rollouts(plant.simulated, substeps=substeps)
-        return engine.trajectories([plant.constants], plant.initial_state(np.zeros(6)), inputs, 0.01)[0][-1, :6]
+        return engine.trajectories(RolloutBatch([plant.constants], plant.initial_state(np.zeros(6)), inputs, 0.01))[0][
+            -1, :6
+        ]
 
     turns = 0.01 * rotor_speeds([M * G, 0.0], convention)[0]
     exact = state(400)

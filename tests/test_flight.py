@@ -11,7 +11,7 @@ from diransac.flight.closed_loop import fly, fly_batch, tracking_error
 from diransac.flight.trajectory import Trajectory
 from diransac.flight.tvlqr import Controller, tvlqr
 from diransac.model.library import TABLE_I, extended_rotorcraft, planar_rotorcraft
-from diransac.simulation import rollouts
+from diransac.simulation import RolloutBatch, rollouts
 
 MODEL = planar_rotorcraft()
 TRUE = dr.Plant(MODEL, TABLE_I)
@@ -24,7 +24,7 @@ def wiggle(n_rows=300, dt=0.01, plant=TRUE):
     t = np.arange(n_rows)[:, None] * dt
     inputs = np.hstack([0.249 * 9.81 * (1 + 0.2 * np.sin(2 * t)), 0.02 * np.cos(4 * t)])
     p = [list(plant.parameters.values())]
-    states = rollouts(MODEL).trajectories(p, np.zeros(6), inputs, dt)[0, :, :6]
+    states = rollouts(MODEL).trajectories(RolloutBatch(p, np.zeros(6), inputs, dt))[0, :, :6]
     return Trajectory(t[:, 0], states, inputs, *NAMES, LIMITS)
 
 

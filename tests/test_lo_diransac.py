@@ -9,7 +9,7 @@ import diransac as dr
 from diransac.data.dataset import observe
 from diransac.errors import IdentificationError, LogError
 from diransac.identification.methods.lo_diransac import find
-from diransac.simulation import rollouts
+from diransac.simulation import RolloutBatch, rollouts
 from simulated import MACHINES, as_log, flight, with_outliers
 from test_nonlinear import log_of, swing
 from user_models import hanging_mass
@@ -209,7 +209,7 @@ def test_a_delay_of_inputs_that_leap_now_and_then_is_found_where_there_is_no_noi
     machine, inputs = held(2000)
     p = np.array(list(machine.truth.values()))
     model = dr.models.underwater_vehicle()
-    signals = rollouts(model).trajectories([p], np.zeros(2), inputs, 0.01)[0]
+    signals = rollouts(model).trajectories(RolloutBatch([p], np.zeros(2), inputs, 0.01))[0]
     columns = dict(zip(model.signals, signals[:-2].T, strict=True)) | {"thrust": inputs[2:, 0]}
     log = dr.Log.from_arrays(np.arange(len(signals) - 2) * 0.01, columns)
     result = dr.identify(model, log)
@@ -222,7 +222,7 @@ def test_windows_in_which_outliers_are_the_majority_are_carried_by_their_neighbo
     machine, inputs = held(2000, seed=4)
     p = np.array(list(machine.truth.values()))
     model = dr.models.underwater_vehicle()
-    signals = rollouts(model).trajectories([p], np.zeros(2), inputs, 0.01)[0]
+    signals = rollouts(model).trajectories(RolloutBatch([p], np.zeros(2), inputs, 0.01))[0]
     rng, bad = np.random.default_rng(0), np.zeros(signals.shape, bool)
     for first in (300, 900, 1500):
         bad[first : first + 120] = rng.random((120, 3)) < 0.8

@@ -493,6 +493,8 @@ def test_velocities_of_their_own_name_their_accelerations():
 def test_pickling_drops_closures_and_keeps_the_fingerprint(model):
     twin = pickle.loads(pickle.dumps(model))  # its functions are local: closures would not pickle
     assert twin.fingerprint == model.fingerprint
+    assert twin == model
+    assert hash(twin) == hash(model)
     q, v, a, u, p = random_arguments(model, 1)
     assert np.array_equal(np.array(twin.residual(q, v, a, u, p)), np.array(model.residual(q, v, a, u, p)))
     assert twin.quaternions == model.quaternions
@@ -505,15 +507,17 @@ def test_model_survives_json(model):
     assert twin.to_dict() == model.to_dict()
 
 
-def test_fingerprint_tells_models_apart():
+def test_models_are_equal_where_names_units_bounds_and_equations_are():
     models = [
         one_axis(plain),
         one_axis(lambda q, v, a, u, p: [p.m * a.x + 2 * p.k * v.x - u.f]),
         one_axis(plain, coordinates={"x": "mm"}),
         one_axis(plain, parameters={"m": Parameter("kg"), "k": Parameter("N s/m")}),
     ]
-    assert len({model.fingerprint for model in models}) == len(models)
+    assert len(set(models)) == len({model.fingerprint for model in models}) == len(models)
+    assert one_axis(plain) == models[0]
     assert one_axis(plain).fingerprint == models[0].fingerprint
+    assert models[0] != "one axis"
 
 
 def damage(path, value):

@@ -8,7 +8,7 @@ import pytest
 import diransac as dr
 import diransac.flight.planning.solvers
 from diransac.flight.planning.flights import CORNERS, ROTORCRAFT_LIMITS
-from diransac.simulation import rollouts
+from diransac.simulation import RolloutBatch, rollouts
 from planned import LIMITS, ROTORCRAFT, across, defects, mass, rotorcraft
 from rolling import BODY, plain_step
 from simulated import ROTORCRAFT as BY_HAND
@@ -117,7 +117,7 @@ def test_rows_are_what_a_simulation_gives(flight):
     _, found = flight
     p = np.array(list(BY_HAND.truth.values()))
     assert defects(lambda x, u: runge_kutta_step(BY_HAND, x, u, p, 0.01)[1], found).max() < 1e-9
-    flown = rollouts(ROTORCRAFT.model).trajectories(p[None], found.states[0], found.inputs, found.dt)[0]
+    flown = rollouts(ROTORCRAFT.model).trajectories(RolloutBatch(p[None], found.states[0], found.inputs, found.dt))[0]
     np.testing.assert_allclose(np.asarray(flown)[:, :6], found.states, atol=1e-5)
 
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import diransac as dr
 from diransac.errors import ModelError, SettingsError
 from diransac.model.plant import DisturbedModel, as_plant
-from diransac.simulation import rollouts
+from diransac.simulation import RolloutBatch, rollouts
 
 
 def mass(sign=1.0, *, definite=True):
@@ -81,7 +81,9 @@ def test_several_disturbances_add_up_and_keep_their_own_names():
 def test_a_force_of_the_time_moves_a_mass_as_its_integral_says():
     plant = pushed(forces=lambda q, v, u, p, d: {"x": ca.sin(3.0 * d.t)})
     engine = rollouts(plant.simulated, substeps=4)
-    flown = engine.trajectories([plant.constants], plant.initial_state(np.zeros(4)), np.zeros((201, 1)), 0.01)[0]
+    flown = engine.trajectories(
+        RolloutBatch([plant.constants], plant.initial_state(np.zeros(4)), np.zeros((201, 1)), 0.01)
+    )[0]
     t = np.arange(201) * 0.01
     np.testing.assert_allclose(flown[:, 0], (t / 3.0 - np.sin(3.0 * t) / 9.0) / 2.0, atol=1e-10)
     np.testing.assert_allclose(flown[:, plant.simulated.signals.index("x_ddot")], np.sin(3.0 * t) / 2.0, atol=1e-13)
@@ -98,7 +100,9 @@ def test_states_of_its_own_are_integrated_with_the_plant():
     )
     assert plant.simulated.state == ("x", "y", "x_dot", "y_dot", "push.rest", "push.speed")
     engine = rollouts(plant.simulated, substeps=5)
-    flown = engine.trajectories([plant.constants], plant.initial_state(np.zeros(4)), np.zeros((301, 1)), 0.01)[0]
+    flown = engine.trajectories(
+        RolloutBatch([plant.constants], plant.initial_state(np.zeros(4)), np.zeros((301, 1)), 0.01)
+    )[0]
 
     def rates(_t, s):
         return [s[1], 8.0 * (s[2] - s[0]) / 2.0, s[3], -sin(s[2]) - s[0]]
@@ -108,11 +112,16 @@ def test_states_of_its_own_are_integrated_with_the_plant():
 
 
 def test_other_constants_need_no_new_compilation():
-    def blown(strength):
-        return pushed(forces=lambda q, v, u, p, d: {"x": d.strength * ca.cos(q.x)}, constants={"strength": strength})
+    def blown(strength, function=ca.cos):
+        return pushed(forces=lambda q, v, u, p, d: {"x": d.strength * function(q.x)}, constants={"strength": strength})
 
     engines = {rollouts(blown(strength).simulated) for strength in (1.0, 2.0)}
     assert len(engines) == 1
+    again = pickle.loads(pickle.dumps(blown(3.0)))
+    assert again.simulated == blown(1.0).simulated
+    assert rollouts(again.simulated) in engines
+    assert blown(1.0, ca.sin).simulated != blown(1.0).simulated
+    assert blown(1.0).simulated != MASS
     assert accelerations(blown(2.0), np.zeros(4))[0] == 2.0 * accelerations(blown(1.0), np.zeros(4))[0] == 1.0
 
 

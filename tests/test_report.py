@@ -15,7 +15,7 @@ import diransac as dr
 from diransac.report import figures, markup
 from diransac.report.judgement import findings, verdict, worst
 from diransac.report.runs import bulk, labelled, simulate_on
-from diransac.simulation import rollouts
+from diransac.simulation import RolloutBatch, rollouts
 
 VOID = {"meta", "input", "link"}
 HOSTILE = '</script><script>alert(1)</script>"><img src=x onerror=alert(1)>'
@@ -70,7 +70,7 @@ def dive(model, n_rows=600, dt=0.02, source='log "dive.csv"'):
     """A noise-free dive: a thrust that sweeps, and what the vehicle does."""
     t = np.arange(n_rows) * dt
     thrust = 25.0 * np.sin(0.9 * t) + 12.0 * np.sin(2.3 * t + 0.4)
-    flown = rollouts(model).trajectories([list(PARAMETERS.values())], np.zeros(2), thrust[:, None], dt)[0]
+    flown = rollouts(model).trajectories(RolloutBatch([list(PARAMETERS.values())], np.zeros(2), thrust[:, None], dt))[0]
     signals = dict(zip(model.signals, flown.T, strict=True))
     return dr.Log.from_arrays(3.0 + t, {**signals, "thrust": thrust}, units=model.units, source=source)
 
@@ -363,9 +363,9 @@ def test_simulations_begin_anew_where_the_machine_was_and_the_whole_log_stays_to
         np.interp(pushed.time[begin], found.diagnosis.smoothed_time, x)
         for x in found.diagnosis.smoothed_states.values()
     ]
-    expected = rollouts(model).trajectories(
-        [list(found.parameters.values())], np.array(start), pushed["thrust"][begin:end, None], pushed.dt
-    )[0]
+    thrust = pushed["thrust"][begin:end, None]
+    batch = RolloutBatch([list(found.parameters.values())], np.array(start), thrust, pushed.dt)
+    expected = rollouts(model).trajectories(batch)[0]
     np.testing.assert_allclose(run.simulated[begin:end], expected, rtol=1e-12)
     drift = np.abs(run.throughout - run.observations.measured).max(axis=0)
     assert (np.nanmax(np.abs(run.errors), axis=0)[:2] < drift[:2]).all()
@@ -537,7 +537,9 @@ def test_an_outlier_of_eighty_does_not_decide_the_range_and_is_said(result, log,
 def test_a_rare_manoeuvre_that_the_simulation_meets_is_in_range(model):
     t = np.arange(2000) * 0.02
     thrust = np.where((t > 30.0) & (t < 31.0), 400.0, np.sin(t))
-    flown = rollouts(model).trajectories([list(PARAMETERS.values())], np.zeros(2), thrust[:, None], 0.02)[0]
+    flown = rollouts(model).trajectories(RolloutBatch([list(PARAMETERS.values())], np.zeros(2), thrust[:, None], 0.02))[
+        0
+    ]
     log = dr.Log.from_arrays(t, {**dict(zip(model.signals, flown.T, strict=True)), "thrust": thrust})
     low, high = simulate_on("ols", dr.identify(model, log, "ols"), log).ranges["x_ddot"]
     assert (low, high) == (log["x_ddot"].min(), log["x_ddot"].max())

@@ -10,7 +10,7 @@ import diransac as dr
 from diransac.errors import PlanningError
 from diransac.flight.trajectory import Trajectory
 from diransac.model.plant import Plant
-from diransac.simulation import Law, linearized_step, rollouts
+from diransac.simulation import LinearFeedback, RolloutBatch, linearized_step, rollouts
 from rolling import plain_step
 from steering import (
     HOVER,
@@ -136,9 +136,9 @@ def linear_costs(K, starts, Q, R, Qf):
     """Cost of each start under gains K (K, 1, 2), flown by the servo axis, which is linear without dry friction."""
     rest, dt = rest_state(SERVO), 0.01
     padded = np.concatenate([K, np.zeros((1, *K.shape[1:]))])
-    law = Law(np.tile(HOVER["servo"], (len(padded), 1)), np.tile(rest, (len(padded), 1)), padded)
+    law = LinearFeedback(np.tile(HOVER["servo"], (len(padded), 1)), np.tile(rest, (len(padded), 1)), padded)
     parameters = np.tile(list(SERVO.parameters.values()), (len(starts), 1))
-    flown = rollouts(SERVO.model).fly(parameters, starts, law, dt)
+    flown = rollouts(SERVO.model).fly(RolloutBatch(parameters, starts, law.u_ref, dt), law)
     x, u = flown.signals[..., :2], flown.inputs[:, :-1] - HOVER["servo"]
     running = np.einsum("lki,ij,lkj->l", x[:, :-1], Q, x[:, :-1]) + np.einsum("lki,ij,lkj->l", u, R, u)
     return dt * running + np.einsum("li,ij,lj->l", x[:, -1], Qf, x[:, -1])
@@ -166,7 +166,7 @@ def test_a_machine_returns_to_rest_and_stays_there(name, reach):
     law = dr.tvlqr(Plant(plant.model, known), trajectory).law()
     starts = rest_state(plant) + reach * np.random.default_rng(1).uniform(-1, 1, (8, law.n_x))
     parameters = np.tile(list(plant.parameters.values()), (8, 1))
-    flown = rollouts(plant.model, substeps=5).fly(parameters, starts, law, trajectory.dt)
+    flown = rollouts(plant.model, substeps=5).fly(RolloutBatch(parameters, starts, law.u_ref, trajectory.dt), law)
     errors = np.abs(flown.signals[..., : law.n_x] - rest_state(plant))
     assert errors[:, 0].max() > reach / 2
     assert errors[:, -300:].max() < 2e-3
@@ -175,11 +175,12 @@ def test_a_machine_returns_to_rest_and_stays_there(name, reach):
 def test_a_moving_rotorcraft_is_brought_back_to_its_trajectory():
     trajectory = moving("rotorcraft", 600)
     start = trajectory.states[0] + [0.5, -0.5, 0.3, 0.5, -0.5, 0.5]
+    batch = RolloutBatch([list(ROTORCRAFT.parameters.values())], start, trajectory.inputs, trajectory.dt)
     held, free = (
-        rollouts(ROTORCRAFT.model).fly([list(ROTORCRAFT.parameters.values())], start, law, trajectory.dt).signals
+        rollouts(ROTORCRAFT.model).fly(batch, law).signals
         for law in (
             dr.tvlqr(ROTORCRAFT, trajectory).law(),
-            Law(trajectory.inputs, trajectory.states, np.zeros((600, 2, 6))),
+            LinearFeedback(trajectory.inputs, trajectory.states, np.zeros((600, 2, 6))),
         )
     )
     assert np.abs(held[0, -1, :6] - trajectory.states[-1]).max() < 0.01
@@ -194,7 +195,8 @@ def test_a_quaternion_body_is_stabilised_whichever_sign_its_attitude_has():
     starts[:, :4] /= np.linalg.norm(starts[:, :4], axis=1, keepdims=True)
     starts[3:, :4] *= -1
     parameters = np.tile(list(SATELLITE.parameters.values()), (6, 1))
-    flown = rollouts(SATELLITE.model).fly(parameters, starts, controller.law(), trajectory.dt).signals
+    batch = RolloutBatch(parameters, starts, trajectory.inputs, trajectory.dt)
+    flown = rollouts(SATELLITE.model).fly(batch, controller.law()).signals
     aligned = np.abs(np.einsum("li,i->l", flown[:, -1, :4], trajectory.states[-1, :4]))
     np.testing.assert_allclose(aligned, 1.0, atol=1e-6)
     np.testing.assert_allclose(flown[:, -1, 4:7], np.tile(trajectory.states[-1, 4:], (6, 1)), atol=1e-3)

@@ -125,9 +125,9 @@ def test_a_scan_says_which_shapes_it_wants(shapes, message):
 
 def test_what_is_no_recurrence_of_symbols_is_refused():
     c, r, k = map(ca.SX.sym, "crk")
-    with pytest.raises(ModelError, match=r"'grows' is no recurrence"):
+    with pytest.raises(ModelError, match=r"'grows' is not a recurrence"):
         compile_scan(ca.Function("grows", [c, r, k], [ca.vertcat(c, r), c]))
-    with pytest.raises(ModelError, match="is no recurrence"):
+    with pytest.raises(ModelError, match="is not a recurrence"):
         compile_scan(ca.Function("two", [c, r], [c, c]))
     arguments = [ca.MX.sym(name) for name in "crk"]
     with pytest.raises(ModelError, match="not made of SX symbols"):

@@ -17,7 +17,7 @@ from diransac.identification.methods.consensus import Diransac, InlierBiasedDira
 from diransac.identification.methods.search import Outcome, search
 from diransac.identification.settings import Settings
 from diransac.model.library import builtin
-from diransac.simulation import rollouts
+from diransac.simulation import RolloutBatch, rollouts
 from simulated import MACHINES, as_log, flight, rollout, with_outliers
 
 VARIANTS = ("i-diransac", "diransac")
@@ -146,7 +146,7 @@ def run_literal(case: Case, variant: str, simulator: str) -> Story:
     start = signals[0, : 2 * len(machine.coordinates)]
     engine = rollouts(model)
     simulators = {
-        "ours": lambda p: engine.trajectories(p[None], start, inputs, dt)[0],
+        "ours": lambda p: engine.trajectories(RolloutBatch(p[None], start, inputs, dt))[0],
         "its own": lambda p: rollout(machine, p, start, inputs, dt),
     }
     bounds = list(model.parameters.values())

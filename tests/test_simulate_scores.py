@@ -1,4 +1,4 @@
-"""What rollouts say of how well they agree with a log."""
+"""Scores and errors of rollouts against a log."""
 
 import numpy as np
 import pytest

@@ -1,8 +1,8 @@
-"""From a user's residual function to checked symbolic parts: ``r = W p - b`` and ``r = M a + c``.
+"""Checked symbolic parts of a residual function: ``r = W p - b`` and ``r = M a + c``.
 
-Affinity is decided by evaluation at random points.  The expression graph alone is not enough on either side:
-``sign(p.k)`` has a vanishing second derivative without being affine, and ``m * (a + k / m * v)`` is affine without
-looking so.
+Affinity is decided by evaluation at random points, because the expression graph does not settle it: ``sign(p.k)`` has a
+vanishing second derivative without being affine, and ``m * (a + k / m * v)`` is affine although its graph has a
+quotient of parameters.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _N_POINTS = 40
 _SINGULAR = 1e-10
 _TOLERANCE = 1e-8
 _ARGUMENTS = "qvaup"
-# What a user's function raises when it meets a symbol where it expects a number, or the wrong count of arguments.
+# Errors of a user's function that gets a symbol instead of a number, or a wrong number of arguments.
 _USER_ERRORS = (RuntimeError, TypeError, ValueError, ArithmeticError, LookupError, NameError, AttributeError)
 
 
@@ -58,10 +58,10 @@ class Symbols:
 
 
 def call_user(label: str, what: str, function: Callable[..., Any], *arguments: Symbols) -> ca.SX:
-    """What the user's function returns, as one column of SX.
+    """Return value of a user's function as one column of SX.
 
-    Raises ModelError: it branches on a symbol, fails, or returns something else than numbers and expressions of the
-    model's own symbols.
+    Raises ModelError: it branches on a symbol, fails, or returns anything but numbers and expressions of the model's
+    own symbols.
     """
     try:
         returned = function(*arguments)
@@ -85,7 +85,7 @@ def call_user(label: str, what: str, function: Callable[..., Any], *arguments: S
 
 
 def check_groups(label: str, units: Mapping[str, object], parameters: object) -> None:
-    """Raises ModelError: a group of signals does not map names to units, or the parameters are none."""
+    """Raises ModelError: a group of signals is not a mapping from names to units, or one of parameters is not."""
     for kind, group in units.items():
         if not isinstance(group, Mapping):
             raise ModelError(f'{label}: {kind} = {group!r}; give a mapping from name to unit, such as {{"x": "m"}}')
@@ -102,7 +102,7 @@ def check_groups(label: str, units: Mapping[str, object], parameters: object) ->
 def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
     """Check names of coordinates, velocities, accelerations, inputs and parameters, in that order.
 
-    Raises ModelError: a name is no identifier, is taken twice, or a group that is needed is empty.
+    Raises ModelError: a name is not an identifier or is used twice, or there are no coordinates or parameters.
     """
     names = [n for group in groups for n in group]
     for name in names:
@@ -111,7 +111,7 @@ def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
                 f"{label}: {name!r} cannot name a signal or parameter; use letters, digits and underscores"
             )
         if name == "t":
-            raise ModelError(f'{label}: the name "t" is kept for time; choose another')
+            raise ModelError(f'{label}: the name "t" is reserved for time; choose another')
         if names.count(name) > 1:
             raise ModelError(f"{label}: the name {name!r} is used twice; signals and parameters need different names")
     for kind, group in (("coordinates", groups[0]), ("parameters", groups[4])):
@@ -163,12 +163,12 @@ def _nan_outputs(function: ca.Function) -> Iterator[tuple[int, str]]:
 
 
 class Probe:
-    """A residual function evaluated at fixed random points, to decide what expression graphs cannot.
+    """A residual function evaluated at fixed random points, for properties that expression graphs do not settle.
 
     Parameters
     ----------
     residual : ``(q, v, a, u, p) -> r (r)``
-    parameters : their bounds, which the points respect
+    parameters : bounds that the points respect
 
     Points are ``(n, n_points)`` for each argument; ``everywhere`` holds parameters of both signs and many magnitudes.
     """
@@ -186,7 +186,7 @@ class Probe:
     def affine_parts(self, argument: str, symbols: Sequence[ca.SX]) -> tuple[ca.SX, ca.SX]:
         """``(J, c)`` with ``r = J z + c`` for the argument ``z``, if ``r`` is affine in it.
 
-        Where the graph shows it, they are taken at ``z = 0``; elsewhere at a point within the bounds.
+        They are taken at ``z = 0`` where the graph is affine in ``z``, elsewhere at a point within the bounds.
         """
         k = _ARGUMENTS.index(argument)
         z, r = symbols[k], self.residual(*symbols)
@@ -198,7 +198,7 @@ class Probe:
         return J0, r0 - J0 @ z0
 
     def is_affine(self, argument: str, values: FloatArray) -> bool:
-        """Whether ``r = J z + c`` wherever ``r`` is finite, with ``values (n, n_points)`` of the argument ``z``."""
+        """True if ``r = J z + c`` wherever ``r`` is finite, with ``values (n, n_points)`` of the argument ``z``."""
         symbols = [ca.SX.sym(n, self.residual.size1_in(i)) for i, n in enumerate(_ARGUMENTS)]
         k = _ARGUMENTS.index(argument)
         J, c = self.affine_parts(argument, symbols)
@@ -248,7 +248,7 @@ def affine_in_acceleration(
 def mass_matrix_sign(label: str, probe: Probe, mass_matrix: ca.Function, accelerations: Mapping[str, str]) -> int:
     """1 or -1 where ``M`` is symmetric and positive or negative definite at every point, else 0.
 
-    Raises ModelError: ``M`` is singular at every point; it names the accelerations that are left unidentifiable.
+    Raises ModelError: ``M`` is singular at every point; the message names the undetermined accelerations.
     """
     q, v, _, u, p = probe.points
     stacked = np.array(ca.densify(mass_matrix(q, v, u, p)))
@@ -284,7 +284,7 @@ def nonlinear_parameters(probe: Probe, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _is_curved(both: ca.Function, others: Sequence[FloatArray], start: FloatArray, i: int) -> bool:
-    """Whether a step in ``p_i`` alone leaves its tangent, or a step in the others turns it."""
+    """True if a step in ``p_i`` alone leaves its tangent, or a step in the others changes the slope."""
     n_p = len(start)
 
     def evaluate(p: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -306,7 +306,7 @@ def _is_curved(both: ca.Function, others: Sequence[FloatArray], start: FloatArra
 
 
 def find_quaternions(kinematics: ca.Function) -> tuple[tuple[int, int, int, int], ...]:
-    """Runs of four coordinates whose norm the kinematics conserve, but that of no fewer of them."""
+    """Runs of four coordinates whose norm the kinematics conserve, but not the norm of fewer of them."""
     rng = np.random.default_rng(20231002)
     q = rng.normal(size=(kinematics.size1_in(0), _N_POINTS))
     rates = np.array(kinematics(q, rng.normal(size=(kinematics.size1_in(1), _N_POINTS))))
@@ -328,12 +328,12 @@ def find_quaternions(kinematics: ca.Function) -> tuple[tuple[int, int, int, int]
 def deserialize(text: str) -> ca.Function:
     """The SX function that ``Function.serialize`` wrote.
 
-    Raises ResultError: it is damaged, or no SX function.
+    Raises ResultError: the text is damaged, or not an SX function.
     """
     try:
         function = ca.Function.deserialize(text)
     except (RuntimeError, UnicodeDecodeError, MemoryError, TypeError, NotImplementedError) as error:
         raise ResultError("the stored equations cannot be read; identify again") from error
     if function.is_null() or not function.is_a("SXFunction"):
-        raise ResultError("the stored equations are no SX function; identify again")
+        raise ResultError("the stored equations are not an SX function; identify again")
     return function

@@ -1,4 +1,4 @@
-"""Equations of motion, written once; everything else is derived from them.
+"""Second-order models, given by their equations of motion.
 
 A second-order plant has coordinates ``q``, velocities ``v``, accelerations ``a``, inputs ``u`` and constant parameters
 ``p``.  The user writes residuals ``r(q, v, a, u, p) = 0``, one per acceleration.  From them come
@@ -36,20 +36,37 @@ class Model:
 
     Parameters
     ----------
-    name : how messages and files call it
-    coordinates : name -> unit; a coordinate ``x`` has velocity ``x_dot`` and acceleration ``x_ddot``
-    inputs : name -> unit
-    parameters : name -> `Parameter`
-    equations : ``equations(q, v, a, u, p)`` returns the residuals, one per acceleration; each argument gives its
-        components by name (``q.theta``, ``v.theta``, ``a.theta``, ``u.thrust``, ``p.mass``), mathematics is CasADi's
-    velocities : name -> unit, where velocities are not the derivatives of the coordinates (``wx`` with acceleration
-        ``wx_dot``); then ``kinematics`` is needed
-    kinematics : ``kinematics(q, v)`` returns the derivative of every coordinate.  Four consecutive coordinates whose
-        norm it conserves are a unit quaternion: normalised after every integration step, its sign is ignored in errors
+    name : str
+        Name in messages and files.
+    coordinates : mapping from name to unit
+        A coordinate ``x`` has velocity ``x_dot`` and acceleration ``x_ddot``.
+    inputs : mapping from name to unit
+        Known signals that act on the plant.
+    parameters : mapping from name to Parameter
+        Constants to be identified.
+    equations : callable
+        ``equations(q, v, a, u, p)`` returns the residuals, one per acceleration. Each argument has its components as
+        attributes (``q.theta``, ``v.theta``, ``a.theta``, ``u.thrust``, ``p.mass``); mathematical functions are
+        CasADi's.
+    velocities : mapping from name to unit, optional
+        Velocities that are not the derivatives of the coordinates (``wx`` with acceleration ``wx_dot``); requires
+        ``kinematics``.
+    kinematics : callable, optional
+        ``kinematics(q, v)`` returns the derivative of every coordinate. Four consecutive coordinates whose norm it
+        conserves are a unit quaternion: it is normalised after every integration step, and errors ignore its sign.
+    description : str
+        One line for lists of models.
 
-    Raises ModelError: an unknown or repeated name, a wrong number of residuals, a NaN constant (``math.sin`` of a
-    symbol makes one silently), Python branching on a symbol, residuals that are not affine in the accelerations, a
-    singular mass matrix.
+    Raises
+    ------
+    ModelError
+        A name is unknown or repeated, the number of residuals is wrong, a constant is NaN (such as ``math.sin`` of a
+        symbol), Python code branches on a symbol, the residuals are not affine in the accelerations, or the mass matrix
+        is singular.
+
+    Notes
+    -----
+    Models are immutable. Two are equal, and share compiled code, if their names, units, bounds and equations are.
     """
 
     def __init__(
@@ -132,7 +149,7 @@ class Model:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Names of everything a simulation predicts: coordinates, velocities, accelerations."""
+        """Names of the simulated signals: coordinates, velocities, accelerations."""
         return (*self.state, *self.accelerations)
 
     @property
@@ -147,11 +164,11 @@ class Model:
 
     @property
     def rate_names(self) -> tuple[str, ...]:
-        """Names that equations use for velocities and accelerations: ``theta``, not ``theta_dot``."""
+        """Names of velocities and accelerations in the equations: ``theta``, not ``theta_dot``."""
         return tuple(self.coordinates if self._velocities_are_derivatives else self.velocities)
 
     def named(self, *vectors: ca.SX) -> tuple[Symbols, ...]:
-        """The vectors q, v, a, u and p, or the first few of them, with components by name: as equations see them."""
+        """The arguments of the equations: the vectors q, v, a, u and p, or the first few, with named components."""
         names = {
             "coordinates": self.coordinates,
             "velocities": self.rate_names,
@@ -185,14 +202,14 @@ class Model:
 
     @cached_property
     def required_signals(self) -> tuple[str, ...]:
-        """Names of the signals and inputs that the residuals depend on: what a pointwise estimator must be given."""
+        """Names of the signals and inputs that the residuals depend on, which a pointwise estimator requires."""
         names = (*self.signals, *self.inputs)
         q, v, a, u, p = self._symbols()
         depends = ca.which_depends(self.residual(q, v, a, u, p), ca.vertcat(q, v, a, u), 1, False)
         return tuple(n for n, d in zip(names, depends, strict=True) if d)
 
     def states_behind(self, signals: Iterable[str]) -> tuple[str, ...]:
-        """Names of the states whose initial value changes the simulation of any of these signals."""
+        """Names of the states whose initial value affects the simulation of any of these signals."""
         x = ca.vertcat(*(ca.SX.sym(n) for n in self.state))
         u, p = ca.SX.sym("u", self.n_u), ca.SX.sym("p", self.n_p)
         rates, accelerations = self.dynamics(x, u, p)
@@ -209,13 +226,16 @@ class Model:
         """Indices of the coordinates that form unit quaternions, found by the norm that ``kinematics`` conserves."""
         return () if self.kinematics is None else derivation.find_quaternions(self.kinematics)
 
-    # ------------------------------------------------------------------ what is derived
+    # ------------------------------------------------------------------ derived functions
 
     @cached_property
     def regressor(self) -> ca.Function:
         """Function ``(q, v, a, u) -> (W (r, n_p), b (r))`` with ``W p = b`` for every solution, eqs. (1) and (5).
 
-        Raises ModelError: the residuals are not affine in the parameters; it names them.
+        Raises
+        ------
+        ModelError
+            The residuals are not affine in the parameters that the message names.
         """
         if self.nonlinear_parameters:
             raise ModelError(
@@ -259,14 +279,17 @@ class Model:
 
     @cached_property
     def force_response(self) -> ca.Function:
-        """Function ``(q, v, u, p, f) -> M^-1 f (n_v)``: what generalised forces add, ``M a + c = f``.
+        """Function ``(q, v, u, p, f) -> M^-1 f (n_v)``, the accelerations by generalised forces: ``M a + c = f``.
 
-        Raises ModelError: ``M`` is not symmetric and definite, so that residuals are no balance of forces.
+        Raises
+        ------
+        ModelError
+            ``M`` is not symmetric and definite, so the residuals are not a balance of forces.
         """
         if self._definite == 0:
             raise ModelError(
-                f"{self._label}: the mass matrix dr/da is not symmetric and definite, so the equations are no "
-                "balance of forces that others could join; write them as such, or give accelerations"
+                f"{self._label}: the mass matrix dr/da is not symmetric and definite, so the equations are not a "
+                "balance of forces to which others could be added; write them as such, or give accelerations"
             )
         q, v, _, u, p = self._symbols()
         f = ca.SX.sym("f", self.n_v)
@@ -288,7 +311,10 @@ class Model:
     def parameter_vector(self, parameters: Mapping[str, float]) -> FloatArray:
         """Values ``(n_p,)`` in the model's order.
 
-        Raises ModelError: a name is missing, unknown, or its value is not finite.
+        Raises
+        ------
+        ModelError
+            A name is missing or unknown, or its value is not finite.
         """
         if set(parameters) != set(self.parameters):
             raise ModelError(
@@ -316,7 +342,7 @@ class Model:
         return hash(self.fingerprint)
 
     def to_dict(self) -> dict[str, Any]:
-        """Names, units, bounds and serialised equations, ready for JSON; `from_dict` reads it back."""
+        """Names, units, bounds and serialised equations as JSON data, which `from_dict` reads."""
         data = {
             "name": self.name,
             "description": self.description,
@@ -333,7 +359,10 @@ class Model:
     def from_dict(cls, data: Mapping[str, Any]) -> Model:
         """The model that `to_dict` wrote.
 
-        Raises ResultError: the data are damaged.
+        Raises
+        ------
+        ResultError
+            The data are damaged.
         """
         try:
             return cls._from_checked(data)

@@ -1,4 +1,4 @@
-"""`Parameter`: a constant of a model, with its unit and bounds."""
+"""Constants of a model, with units and bounds."""
 
 from __future__ import annotations
 
@@ -14,16 +14,23 @@ __all__ = ["Parameter"]
 
 @dataclass(frozen=True)
 class Parameter:
-    """A constant of the model that is to be identified, with the bounds that make it physical.
+    """Constant of a model that is to be identified, with its physical bounds.
 
     Parameters
     ----------
-    unit : its unit, such as ``"kg m^2"``
-    lower, upper : inclusive bounds in that unit
-    positive : a strict lower bound of zero, for what cannot vanish (a mass)
-    per_log : one value per log (the bias of a sensor, a payload) where several logs are identified together
+    unit : str
+        Its unit, such as ``"kg m^2"``.
+    lower, upper : float
+        Inclusive bounds in that unit.
+    positive : bool
+        Adds a strict lower bound of zero, for a mass and the like.
+    per_log : bool
+        One value per log (the bias of a sensor, a payload) where several logs are identified together.
 
-    Raises ModelError: the bounds leave no room, or are NaN.
+    Raises
+    ------
+    ModelError
+        No value is within the bounds, or one is NaN.
     """
 
     unit: str = "1"
@@ -40,7 +47,7 @@ class Parameter:
             )
 
     def admits(self, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Whether each value is finite and within the bounds (``PreliminaryTest`` of Algorithm 1, line 15)."""
+        """Mask of the values that are finite and within the bounds (``PreliminaryTest`` of Algorithm 1, line 15)."""
         x = np.asarray(values, dtype=float)
         inside = np.isfinite(x) & (x >= self.lower) & (x <= self.upper)
         return np.asarray(inside & (x > 0.0) if self.positive else inside)

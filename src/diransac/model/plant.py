@@ -300,7 +300,7 @@ class Plant:
         object.__setattr__(self, "disturbances", tuple(self.disturbances))
         names = [one.name for one in self.disturbances]
         for one in self.disturbances:
-            if one.model.fingerprint != self.model.fingerprint:
+            if one.model != self.model:
                 raise ModelError(
                     f'disturbance "{one.name}" was made for model "{one.model.name}", not for "{self.model.name}"; '
                     "make it for the plant's own"

@@ -224,7 +224,7 @@ def _scored_quaternions(model: SimulatedModel, signals: tuple[str, ...]) -> tupl
 def linearized_step(model: Model, integrator: str = "rk4") -> ca.Function:
     """Function (x, u, p, h) -> (x after h seconds, A = d(x after)/dx, B = d(x after)/du), the matrices sparse.
 
-    It is the step that a simulation takes, u held and quaternions scaled to length one, and its exact derivatives.
+    It is the step of a simulation, with u held and quaternions scaled to length one, and its exact derivatives.
     """
     n_x, n_u = len(model.state), model.n_u
     x, u, p, h = (ca.SX.sym(name, n) for name, n in (("x", n_x), ("u", n_u), ("p", model.n_p), ("h", 1)))

@@ -1,8 +1,8 @@
-"""Expression graph of a CasADi SX function, as a list of instructions that a code generator can walk.
+"""Expression graph of a CasADi SX function, as a list of instructions.
 
-Equal sub-expressions are one instruction. A product is fused into the sums and differences that take it; what depends
-on invariant inputs alone is marked, to be computed once instead of in every step. Each is decided by what an
-instruction depends on, never by what depends on it, so an expression has the same bits whatever is computed beside it.
+Equal sub-expressions are one instruction. Products are fused into the sums and differences that use them; instructions
+that depend on invariant inputs only are marked, to be computed once instead of in every step. Both decisions depend on
+an instruction's operands, never on its users, so an expression has the same bits whatever else is computed.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Instruction:
 
     @property
     def is_zero(self) -> bool:
-        """Whether it is the constant zero."""
+        """True for the constant zero."""
         return self.operation == "CONST" and self.value == 0.0
 
 
@@ -58,7 +58,7 @@ class Graph:
     ----------
     instructions : each refers to earlier ones only
     outputs : for each output of the function, the instruction that gives each of its elements, column by column
-    invariant : of each instruction, whether it depends on constants and invariant inputs alone
+    invariant : true for each instruction that depends on constants and invariant inputs only
     """
 
     instructions: tuple[Instruction, ...]
@@ -66,7 +66,7 @@ class Graph:
     invariant: tuple[bool, ...]
 
     def needed(self, wanted: Iterable[int], known: Collection[int] = ()) -> frozenset[int]:
-        """Return `wanted` and all that they depend on, without what is known already."""
+        """Return the wanted instructions and all that they depend on, without those that are known."""
         alive = set(wanted).difference(known)
         for position in range(len(self.instructions) - 1, -1, -1):
             if position in alive:
@@ -76,7 +76,7 @@ class Graph:
 
 @dataclass
 class _Builder:
-    """Collects instructions; one that is there already is used again."""
+    """Collector of instructions; an equal one is used again."""
 
     instructions: list[Instruction] = field(default_factory=list)
     positions: dict[Instruction, int] = field(default_factory=dict)
@@ -109,7 +109,7 @@ def read_graph(function: ca.Function, invariant_inputs: Collection[int] = (), *,
     Parameters
     ----------
     function : CasADi SX function
-    invariant_inputs : arguments of it that stay the same in all that is computed in one go
+    invariant_inputs : arguments that are constant over all steps or rows of a call
     reciprocals : divide by an invariant as `x * (1 / p)`, so that the loop only multiplies. The quotient may differ in
         its last two bits, and where `|p|` lies outside 2**-1022 .. 2**1022 its reciprocal over- or underflows
 
@@ -179,7 +179,7 @@ def _refuse(name: str, function: ca.Function) -> None:
 
 
 def _marked(instructions: list[Instruction], outputs: Iterable[Iterable[int]], inputs: frozenset[int]) -> Graph:
-    """Graph whose instructions know whether they depend on invariant inputs alone."""
+    """Graph with the instructions marked that depend on invariant inputs only."""
     invariant: list[bool] = []
     for instruction in instructions:
         fixed = instruction.source[0] in inputs if instruction.operation == "INPUT" else True
@@ -204,15 +204,15 @@ def _with_reciprocals(graph: Graph, inputs: frozenset[int]) -> Graph:
 
 
 def _fused(graph: Graph, inputs: frozenset[int]) -> Graph:
-    """Graph whose sums take in the products that they add: one rounding and one operation less."""
+    """Graph with products fused into the sums that add them: one rounding and one operation less."""
     fused = [_fuse(graph, position) for position in range(len(graph.instructions))]
     return _marked(fused, graph.outputs, inputs)
 
 
 def _fuse(graph: Graph, position: int) -> Instruction:
-    """Fuse a sum or difference with its first operand, else its second, if that is a product fit for it.
+    """Fuse a sum or difference with its first operand, else its second, if that is a product.
 
-    What else uses the product does not matter: a sum has the same bits whatever is computed beside it.
+    Other users of the product do not matter: a sum has the same bits whatever else is computed.
     """
     instruction = graph.instructions[position]
     if instruction.operation not in ("ADD", "SUB"):
@@ -221,8 +221,8 @@ def _fuse(graph: Graph, position: int) -> Instruction:
     for side, name in enumerate(names):
         factor = instruction.operands[side]
         product = graph.instructions[factor]
-        # A product that waits outside the loop costs nothing inside it: fusing would only occupy a register more.
-        waits = graph.invariant[factor] and not graph.invariant[position]
-        if product.operation == "MUL" and not waits:
+        # An invariant product costs nothing inside the loop: fusing it would only occupy one more register.
+        hoisted = graph.invariant[factor] and not graph.invariant[position]
+        if product.operation == "MUL" and not hoisted:
             return Instruction(name, (*product.operands, instruction.operands[1 - side]))
     return instruction

@@ -1,4 +1,4 @@
-"""Arrays of many rollouts, arranged as the time loop reads them; a lane is one rollout."""
+"""Arrays of many rollouts, arranged for the time loop; a lane is one rollout."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Lanes:
 
     @property
     def has_windows(self) -> bool:
-        """Whether lanes start at rows of their own."""
+        """True if lanes start at different rows."""
         return "start_rows" in self.arrays
 
 

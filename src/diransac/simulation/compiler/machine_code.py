@@ -1,4 +1,4 @@
-"""From LLVM's intermediate representation to machine code, and running it on several threads."""
+"""Machine code from LLVM's intermediate representation, run on several threads."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 __all__ = ["LANES", "MachineCode", "Target", "compile_function", "default_threads", "run_blocks"]
 
 LANES = 8
-"""Lanes of a vector, on every processor: what is computed never depends on the width of the machine."""
+"""Lanes of a vector, on every processor: results do not depend on the width of its registers."""
 
 CHUNKS_PER_THREAD = 4
 
 PASSES = ("sroa", "simplify_cfg", "loop_rotate")
-"""What LLVM does to the code: variables into registers, tidying. Its own list takes 3 times as long, for no gain."""
+"""Optimisation passes: variables into registers, tidying. LLVM's default list takes 3 times as long, for no gain."""
 
 LLVM: TypeAlias = Any
-"""Something of llvmlite, which has no types."""
+"""An object of llvmlite, which has no type annotations."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Target:
     @staticmethod
     @cache
     def host() -> Target:
-        """Return the processor that this runs on, its full register width included."""
+        """Return the processor of this process, with its full register width."""
         binding = _binding()
         features = binding.get_host_cpu_features()
         if "avx512f" in features:
@@ -56,11 +56,11 @@ class Target:
 
 @dataclass(frozen=True)
 class MachineCode:
-    """A compiled function; it can be called as long as this lives.
+    """A compiled function; it can be called as long as this object lives.
 
     Attributes
     ----------
-    call : takes what its signature says; releases Python's lock while it runs
+    call : takes the arguments of its signature; releases Python's lock while it runs
     engine : owns the memory
     """
 
@@ -114,11 +114,14 @@ def _optimise(module: LLVM, machine: LLVM) -> None:
 
 
 def default_threads() -> int:
-    """How many threads to use where nobody says: `DIRANSAC_THREADS`, one in a worker process, else all own cores.
+    """Default number of threads: `DIRANSAC_THREADS`, else one in a worker process, else all available cores.
 
-    A pool has a worker for every core already; what starts workers in other ways sets the variable for them.
+    A process pool has one worker per core already; set the variable where workers are started in other ways.
 
-    Raises SettingsError: the variable is no positive whole number.
+    Raises
+    ------
+    SettingsError
+        The variable is not a positive whole number.
     """
     asked = os.environ.get("DIRANSAC_THREADS", "")
     if asked:
@@ -129,7 +132,7 @@ def default_threads() -> int:
 
     if parent_process() is not None:
         return 1
-    # What the system lets this process use; not every system can tell.
+    # The cores that this process may use; not every system has the call.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -1,20 +1,23 @@
-"""Vector form of every operation that CasADi's SX knows, in one table, and the emission of a graph by it."""
+"""Vector form of every operation of CasADi's SX, and the emission of graphs: once, or as a loop over rows."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from llvmlite import ir
+
 from diransac.errors import ModelError
-from diransac.simulation.compiler import angles, exponentials
+from diransac.simulation.compiler import elementary
+from diransac.simulation.compiler.machine_code import LANES
+from diransac.simulation.compiler.vectors import DOUBLE, INTEGER, POINTER, Value, Vectors, integer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from diransac.simulation.compiler.graph import Graph
-    from diransac.simulation.compiler.vectors import Value, Vectors
 
-__all__ = ["OPERATIONS", "Operation", "evaluate", "numbers"]
+__all__ = ["OPERATIONS", "Operation", "emit_map_loop", "evaluate", "map_signature", "numbers"]
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ OPERATIONS: dict[str, Operation] = {
     "FMAX": Operation(lambda v, x, y: v.larger(x, y), "nn"),
     "FMOD": Operation(lambda v, x, y: v.libm("fmod", x, y), "nn"),
     "REMAINDER": Operation(lambda v, x, y: v.libm("remainder", x, y), "nn"),
-    "HYPOT": Operation(angles.hypot, "nn"),
+    "HYPOT": Operation(elementary.hypot, "nn"),
     # conditions
     "LT": Operation(lambda v, x, y: v.compare("<", x, y), "nn", "c"),
     "LE": Operation(lambda v, x, y: v.compare("<=", x, y), "nn", "c"),
@@ -72,28 +75,28 @@ OPERATIONS: dict[str, Operation] = {
     "OR": Operation(lambda v, x, y: v.either(x, y), "cc", "c"),
     "IF_ELSE_ZERO": Operation(lambda v, c, x: v.select(c, x, v.number(0.0)), "cn"),
     # exponentials
-    "EXP": Operation(exponentials.exp),
-    "EXPM1": Operation(exponentials.expm1),
-    "LOG": Operation(exponentials.log),
-    "LOG1P": Operation(exponentials.log1p),
-    "POW": Operation(exponentials.power, "nn"),
-    "CONSTPOW": Operation(exponentials.power, "nn"),
-    "SINH": Operation(exponentials.sinh),
-    "COSH": Operation(exponentials.cosh),
-    "TANH": Operation(exponentials.tanh),
-    "ASINH": Operation(exponentials.asinh),
-    "ACOSH": Operation(exponentials.acosh),
-    "ATANH": Operation(exponentials.atanh),
+    "EXP": Operation(elementary.exp),
+    "EXPM1": Operation(elementary.expm1),
+    "LOG": Operation(elementary.log),
+    "LOG1P": Operation(elementary.log1p),
+    "POW": Operation(elementary.power, "nn"),
+    "CONSTPOW": Operation(elementary.power, "nn"),
+    "SINH": Operation(elementary.sinh),
+    "COSH": Operation(elementary.cosh),
+    "TANH": Operation(elementary.tanh),
+    "ASINH": Operation(elementary.asinh),
+    "ACOSH": Operation(elementary.acosh),
+    "ATANH": Operation(elementary.atanh),
     "ERF": Operation(lambda v, x: v.libm("erf", x)),
-    "ERFINV": Operation(exponentials.erfinv),
+    "ERFINV": Operation(elementary.erfinv),
     # angles
-    "SIN": Operation(angles.sin),
-    "COS": Operation(angles.cos),
-    "TAN": Operation(angles.tan),
-    "ASIN": Operation(angles.asin),
-    "ACOS": Operation(angles.acos),
-    "ATAN": Operation(angles.atan),
-    "ATAN2": Operation(angles.atan2, "nn"),
+    "SIN": Operation(elementary.sin),
+    "COS": Operation(elementary.cos),
+    "TAN": Operation(elementary.tan),
+    "ASIN": Operation(elementary.asin),
+    "ACOS": Operation(elementary.acos),
+    "ATAN": Operation(elementary.atan),
+    "ATAN2": Operation(elementary.atan2, "nn"),
 }
 """Vector form of every operation of an expression graph, by CasADi's name for it; FMA, FMS and FNMA are ours."""
 
@@ -157,3 +160,76 @@ def _as_kind(v: Vectors, value: Value, kind: str) -> Value:
     if kind == "c" and not is_condition:
         return v.compare("!=", value, v.number(0.0))
     return value
+
+
+# A loop over rows ----------------------------------------------------------------------------------------------------
+def map_signature(n_arrays: int) -> list[str]:
+    """Kinds of the compiled function's arguments: inputs and outputs, n_rows, first_block, end_block."""
+    return ["pointer"] * n_arrays + ["integer"] * 3
+
+
+def emit_map_loop(graph: Graph, widths_in: Sequence[int]) -> Value:
+    """LLVM module with one function, `map_loop`, that takes `map_signature`.
+
+    Parameters
+    ----------
+    graph : of the function; its invariant inputs are those that all rows share
+    widths_in : elements of each input, whose array is (n_rows, width) or, shared, (width,)
+
+    The outputs' arrays are (n_rows, width).
+    """
+    module = ir.Module("diransac")
+    kinds = {"pointer": POINTER, "integer": INTEGER}
+    signature = map_signature(len(widths_in) + len(graph.outputs))
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [kinds[k] for k in signature]), "map_loop")
+    arrays, (n_rows, first_block, end_block) = function.args[:-3], function.args[-3:]
+    for array in arrays:
+        array.add_attribute("noalias")
+    v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
+    load_shared = _shared_loader(v, arrays)
+    wanted = [k for row in graph.outputs for k in row]
+    known = evaluate(v, graph, [k for k in graph.needed(wanted) if graph.invariant[k]], load_shared)
+    with v.repeat(first_block, end_block) as blocks:
+        rows = _rows(v, blocks.index, n_rows)
+        values = evaluate(v, graph, wanted, _row_loader(v, arrays, widths_in, rows), known)
+        for array, positions in zip(arrays[len(widths_in) :], graph.outputs, strict=True):
+            _store(v, array, rows, numbers(v, values, positions))
+    v.builder.ret_void()
+    return module
+
+
+def _shared_loader(v: Vectors, arrays: Sequence[Value]) -> Callable[[int, int], Value]:
+    """Loader of elements that all rows share."""
+    return lambda argument, element: v.splat(v.load(arrays[argument], integer(element), DOUBLE))
+
+
+def _row_loader(
+    v: Vectors, arrays: Sequence[Value], widths: Sequence[int], rows: Sequence[Value]
+) -> Callable[[int, int], Value]:
+    """Loader of elements of some rows."""
+
+    def load(argument: int, element: int) -> Value:
+        return v.join([v.load(arrays[argument], _place(v, row, widths[argument], element), DOUBLE) for row in rows])
+
+    return load
+
+
+def _rows(v: Vectors, block: Value, n_rows: Value) -> list[Value]:
+    """Rows of a block; those past the end are the last one."""
+    builder = v.builder
+    last = builder.sub(n_rows, integer(1))
+    first = builder.mul(block, integer(LANES))
+    rows = [builder.add(first, integer(lane)) for lane in range(LANES)]
+    return [builder.select(builder.icmp_signed("<", row, last), row, last) for row in rows]
+
+
+def _place(v: Vectors, row: Value, width: int, element: int) -> Value:
+    """Position of an element of a row."""
+    return v.builder.add(v.builder.mul(row, integer(width)), integer(element))
+
+
+def _store(v: Vectors, array: Value, rows: Sequence[Value], values: Sequence[Value]) -> None:
+    """Write one output's elements of some rows."""
+    for lane, row in enumerate(rows):
+        for element, value in enumerate(values):
+            v.store(v.lane(value, lane), array, _place(v, row, len(values), element))

@@ -131,7 +131,7 @@ class LoopRow:
     inputs : those that act from this row to the next
     signals : states and accelerations at this row
     slopes : Jacobian of the scored signals, by signal and unknown; None where always zero
-    alive : whether every signal has been finite in all rows so far
+    alive : lanes in which every signal has been finite in all rows so far
     """
 
     index: Value
@@ -145,7 +145,7 @@ class Output(Protocol):
     """Output of a variant of the loop; it emits its own code into the loop that it is made with."""
 
     ends_early: bool
-    """Whether a block can be left once all its lanes have diverged."""
+    """True if a block ends once all its lanes have diverged."""
 
     def __init__(self, loop: TimeLoop) -> None: ...
 
@@ -277,7 +277,7 @@ class TimeLoop:
         return evaluate(self.v, graph, list(wanted), lambda argument, k: (x if argument == STATE else u)[k], known)
 
     def _still_finite(self, signals: list[Value]) -> Value:
-        """Whether every signal has been finite in all rows so far: zero times it stays zero."""
+        """Lanes in which every signal has been finite in all rows so far: zero times it stays zero."""
         v = self.v
         guard = v.get(self.guard)
         for signal in signals:

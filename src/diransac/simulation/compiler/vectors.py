@@ -1,7 +1,7 @@
 """Eight float64 lanes at a time: llvmlite's IR builder with vector types.
 
-Nothing here knows about models. Every method emits instructions whose lanes are independent and correctly rounded (no
-fast-math flags), so a lane's bits depend neither on its neighbours nor on the width of the machine's registers.
+Every method emits instructions whose lanes are independent and correctly rounded (no fast-math flags), so the bits of a
+lane depend neither on its neighbours nor on the width of the registers.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ def integer(value: int) -> Value:
 
 
 class Vectors:
-    """Emits arithmetic on vectors of eight lanes at the end of a builder's block."""
+    """Emitter of arithmetic on vectors of eight lanes, at the end of a builder's block."""
 
     def __init__(self, builder: Value) -> None:
         self.builder = builder
         self._memory: dict[tuple[str, Value], Value] = {}
 
     def once(self, name: str, operand: Value, emit: Callable[[], Value]) -> Value:
-        """`emit()`, or what it gave before for the same name and operand: sin and cos share their work."""
+        """`emit()`, or its earlier value for the same name and operand: sin and cos share their work."""
         key = (name, operand)
         if key not in self._memory:
             self._memory[key] = emit()
@@ -158,7 +158,7 @@ class Vectors:
         return emit(relation, x, y)
 
     def is_condition(self, x: Value) -> bool:
-        """Whether a value holds conditions rather than numbers."""
+        """True for a vector of conditions, false for one of numbers."""
         return bool(x.type == CONDITIONS)
 
     def is_nan(self, x: Value) -> Value:
@@ -186,7 +186,7 @@ class Vectors:
         return self.builder.sub(total, self.builder.sext(condition, INTEGERS))
 
     def any_lane(self, condition: Value) -> Value:
-        """Return one bit: whether the condition holds in some lane."""
+        """Return one bit, set if the condition holds in some lane."""
         return self.builder.icmp_unsigned("!=", self.builder.bitcast(condition, BITS), ir.Constant(BITS, 0))
 
     def turned_towards(
@@ -290,15 +290,15 @@ class Vectors:
         return Cell(address, value.type)
 
     def get(self, cell: Cell) -> Value:
-        """Return what a variable holds."""
+        """Return the value of a variable."""
         return self.builder.load(cell.address, typ=cell.type)
 
     def set(self, cell: Cell, value: Value) -> None:
-        """Let a variable hold another value."""
+        """Set a variable."""
         self.builder.store(value, cell.address)
 
     def call_aside(self, name: str, emit: Callable[..., Value], *operands: Value) -> Value:
-        """Return `emit(vectors, *operands)`, run as a function of its own that the module holds once: for what is rare.
+        """Return `emit(vectors, *operands)`, as a separate function, once per module: for rare cases.
 
         Parameters
         ----------
@@ -316,7 +316,7 @@ class Vectors:
 
     @contextmanager
     def repeat(self, first: Value, end: Value) -> Iterator[Loop]:
-        """Emit what is inside once, to run with every index from `first` to before `end`."""
+        """Emit a loop over every index from `first` to before `end`; the context is its body."""
         builder = self.builder
         index = self.cell(first)
         test, body, leave = (builder.append_basic_block(name) for name in ("test", "body", "leave"))

@@ -1,4 +1,4 @@
-"""Rollouts under feedback against a plain closed loop."""
+"""Rollouts under linear feedback against a plain closed loop."""
 
 import numpy as np
 import pytest

@@ -1,10 +1,14 @@
-"""Exponentials, logarithms and powers, eight at a time: polynomials that the compiler can inline.
+"""Elementary functions of eight numbers at a time: angles, lengths, exponentials, logarithms and powers.
 
-Each is good to a few units in the last place over the whole range of float64, and agrees with C on infinities, NaN and
-the signs of zeros. Nothing is looked up and nothing branches.
+Each is a polynomial that the compiler can inline, good to a few units in the last place over the whole range of
+float64, and agrees with C on infinities, NaN and the signs of zeros. There are no tables, and no branches except in the
+sine and cosine of arguments beyond 2**40, where the result still depends on a lane's own argument alone.
 
-References: Cody and Waite, Software Manual for the Elementary Functions, 1980, for the reduction of arguments. The
-coefficients of the logarithm are those of Sun's fdlibm.
+References
+----------
+W. J. Cody and W. Waite, Software Manual for the Elementary Functions, 1980, for the reduction of arguments, which fused
+multiply-adds make exact with fewer parts. The coefficients of sine and cosine are those of Moshier's Cephes, of the arc
+tangent and the logarithm those of Sun's fdlibm.
 """
 
 from __future__ import annotations
@@ -13,12 +17,54 @@ import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from diransac.simulation.compiler.vectors import Value, Vectors
 
 ROUND = 1.5 * 2.0**52
-"""Adding it rounds to an integer, which then stands in the low bits; taking it away again leaves the integer."""
+"""Adding it rounds to an integer, which then stands in the low bits; subtracting it leaves the integer."""
+ROUND_BITS = 0x4338000000000000
+SIGN_BIT = -(2**63)
 EXPONENT_SHIFT = 52
 MANTISSA_BITS = 2**52 - 1
+
+HALF_PI = (1.5707963267948966, 6.123233995736765e-17, 1.082856673921914e-32)  # all positive: sin(-0) is -0
+MOST_QUARTERS = 2.0**40
+SINE = (
+    1.58962301576546568060e-10,
+    -2.50507477628578072866e-8,
+    2.75573136213857245213e-6,
+    -1.98412698295895385996e-4,
+    8.33333333332211858878e-3,
+    -1.66666666666666307295e-1,
+    1.0,
+)
+COSINE = (
+    -1.13585365213876817300e-11,
+    2.08757008419747316778e-9,
+    -2.75573141792967388112e-7,
+    2.48015872888517045348e-5,
+    -1.38888888888730564116e-3,
+    4.16666666666665929218e-2,
+    -0.5,
+    1.0,
+)
+
+QUARTER_PI = (0.7853981633974483, 3.061616997868383e-17)
+TAN_EIGHTH_PI = 0.41421356237309503
+ARC_TANGENT = (
+    1.62858201153657823623e-02,
+    -3.65315727442169155270e-02,
+    4.97687799461593236017e-02,
+    -5.83357013379057348645e-02,
+    6.66107313738753120669e-02,
+    -7.69187620504482999495e-02,
+    9.09088713343650656196e-02,
+    -1.11111104054623557880e-01,
+    1.42857142725034663711e-01,
+    -1.99999999998764832476e-01,
+    3.33333333333329318027e-01,
+)
 
 LOG2_E = 1.4426950408889634
 LN_2 = (0.6931471805599453, 2.3190468138462996e-17)
@@ -44,6 +90,143 @@ ARC_HYPERBOLIC_TANGENT = tuple(2.0 / k for k in range(27, 3, -2))
 TWO_THIRDS = (0.6666666666666666, 3.700743415417188e-17)
 
 
+# Angles and lengths --------------------------------------------------------------------------------------------------
+def sin(v: Vectors, x: Value) -> Value:
+    """Return the sine; cos of the same argument shares its work."""
+    return _sin_cos(v, x)[0]
+
+
+def cos(v: Vectors, x: Value) -> Value:
+    """Return the cosine; sin of the same argument shares its work."""
+    return _sin_cos(v, x)[1]
+
+
+def tan(v: Vectors, x: Value) -> Value:
+    """Return the tangent."""
+    return v.div(*_sin_cos(v, x))
+
+
+def _sin_cos(v: Vectors, x: Value) -> tuple[Value, Value]:
+    """Sine and cosine, the C library's where an argument is huge."""
+
+    def emit() -> tuple[Value, Value]:
+        sine, cosine, suspect = _fast_sin_cos(v, x)
+        cells = {"sin": v.cell(sine), "cos": v.cell(cosine)}
+        with v.builder.if_then(v.any_lane(suspect), likely=False):
+            for name, cell in cells.items():
+                v.set(cell, v.call_aside(f"{name}_of_huge", _replaced_where_huge(name), x, v.get(cell)))
+        return v.get(cells["sin"]), v.get(cells["cos"])
+
+    pair: tuple[Value, Value] = v.once("sin_cos", x, emit)
+    return pair
+
+
+def _fast_sin_cos(v: Vectors, x: Value) -> tuple[Value, Value, Value]:
+    """Sine and cosine by polynomials on the nearest quarter turn, and where they may be wrong: k >= 2**40, NaN.
+
+    x = k pi/2 + r, |r| <= pi/4. The first product is exact, so r is good to its last place but one even where x is all
+    but a multiple of pi/2.
+    """
+    rounded = v.fma(x, v.number(2.0 / math.pi), v.number(ROUND + MOST_QUARTERS))
+    k = v.sub(rounded, v.number(ROUND + MOST_QUARTERS))
+    r = x
+    for part in HALF_PI:
+        r = v.fma(k, v.number(-part), r)
+    z = v.mul(r, r)
+    sine = v.mul(r, v.polynomial(z, SINE))
+    cosine = v.polynomial(z, COSINE)
+    quarters = v.bits(rounded)
+    after = v.add_integers(quarters, v.integer(1 - ROUND_BITS))  # k + 1 + 2**40, and a number below 2**42 if k is fit
+    odd = v.lowest_bit(quarters)
+    return (
+        _flipped(v, v.select(odd, cosine, sine), quarters),
+        _flipped(v, v.select(odd, sine, cosine), after),
+        v.has_bits(after, -(2**42)),
+    )
+
+
+def _replaced_where_huge(name: str) -> Callable[[Vectors, Value, Value], Value]:
+    """Emitter of the C library's value in the lanes whose argument is too large for the polynomial, if any is."""
+
+    def emit(v: Vectors, x: Value, fast: Value) -> Value:
+        size = v.absolute(x)
+        huge = v.both(v.compare(">", size, v.number(MOST_QUARTERS)), v.compare("<", size, v.number(math.inf)))
+        cell = v.cell(fast)
+        with v.builder.if_then(v.any_lane(huge)):
+            v.set(cell, v.select(huge, v.libm(name, x), fast))
+        return v.get(cell)
+
+    return emit
+
+
+def _flipped(v: Vectors, x: Value, quarters: Value) -> Value:
+    """Change the sign where bit 1 of the number of quarter turns is set."""
+    return v.from_bits(v.exclusive_or(v.bits(x), v.both(v.shift_left(quarters, 62), v.integer(SIGN_BIT))))
+
+
+def asin(v: Vectors, x: Value) -> Value:
+    """Return the arc sine."""
+    return atan2(v, x, _other_leg(v, x))
+
+
+def acos(v: Vectors, x: Value) -> Value:
+    """Return the arc cosine."""
+    return atan2(v, _other_leg(v, x), x)
+
+
+def _other_leg(v: Vectors, x: Value) -> Value:
+    """sqrt(1 - x x), without cancellation."""
+    one = v.number(1.0)
+    return v.intrinsic("sqrt", v.mul(v.sub(one, x), v.add(one, x)))
+
+
+def atan(v: Vectors, x: Value) -> Value:
+    """Return the arc tangent."""
+    return atan2(v, x, v.number(1.0))
+
+
+def atan2(v: Vectors, y: Value, x: Value) -> Value:
+    """Return the angle of (x, y), by the arc tangent of |t| <= tan(pi/8) added to or taken from eighths of a turn."""
+    ax, ay = v.absolute(x), v.absolute(y)
+    steep = v.compare(">", ay, ax)
+    long, short = _safe_ratio(v, v.select(steep, ay, ax), v.select(steep, ax, ay))
+    wide = v.compare(">", short, v.mul(long, v.number(TAN_EIGHTH_PI)))
+    t = v.div(v.select(wide, v.sub(short, long), short), v.select(wide, v.add(short, long), long))
+    z = v.mul(t, t)
+    angle = v.fma(v.neg(t), v.mul(z, v.polynomial(z, ARC_TANGENT)), t)
+    eighths = v.select(wide, v.number(1.0), v.number(0.0))
+    behind = v.sign_bit(x)
+    for turned, total in ((steep, 2.0), (behind, 4.0)):
+        eighths = v.select(turned, v.sub(v.number(total), eighths), eighths)
+        angle = v.select(turned, v.neg(angle), angle)
+    high, low = (v.number(part) for part in QUARTER_PI)
+    result = v.intrinsic("copysign", v.fma(eighths, high, v.fma(eighths, low, angle)), y)
+    return v.select(v.either(v.is_nan(x), v.is_nan(y)), v.add(x, y), result)
+
+
+def _safe_ratio(v: Vectors, long: Value, short: Value) -> tuple[Value, Value]:
+    """Two lengths of the same ratio whose sum is finite and the first of which is not zero."""
+    one, zero, infinity = v.number(1.0), v.number(0.0), v.number(math.inf)
+    scale = v.select(v.compare(">", long, v.number(2.0**1000)), v.number(2.0**-60), one)
+    endless = v.compare("==", long, infinity)
+    corner = v.select(v.compare("==", short, infinity), one, zero)
+    short = v.select(endless, corner, v.mul(short, scale))
+    long = v.select(v.either(endless, v.compare("==", long, zero)), one, v.mul(long, scale))
+    return long, short
+
+
+def hypot(v: Vectors, x: Value, y: Value) -> Value:
+    """Return sqrt(x x + y y) without over- or underflow; infinite if either is."""
+    ax, ay = v.absolute(x), v.absolute(y)
+    largest = v.larger(ax, ay)
+    scale = v.select(v.compare(">", largest, v.number(2.0**500)), v.number(2.0**-600), v.number(1.0))
+    scale = v.select(v.compare("<", largest, v.number(2.0**-400)), v.number(2.0**600), scale)
+    a, b = v.mul(ax, scale), v.mul(ay, scale)
+    length = v.div(v.intrinsic("sqrt", v.fma(a, a, v.mul(b, b))), scale)
+    return v.select(v.compare("==", largest, v.number(math.inf)), largest, length)
+
+
+# Exponentials --------------------------------------------------------------------------------------------------------
 def exp(v: Vectors, x: Value) -> Value:
     """Return e**x."""
     return _scaled_exp(v, v.clamped(x, SMALLEST_EXP, LARGEST_EXP), v.number(0.0), 0)
@@ -52,7 +235,7 @@ def exp(v: Vectors, x: Value) -> Value:
 def expm1(v: Vectors, x: Value) -> Value:
     """Return e**x - 1, accurate near zero."""
     half = _scaled_expm1(v, v.clamped(x, -50.0, LARGEST_EXP), -1)
-    return _kept_where_tiny(v, x, v.add(half, half))
+    return _identity_where_tiny(v, x, v.add(half, half))
 
 
 def sinh(v: Vectors, x: Value) -> Value:
@@ -60,7 +243,7 @@ def sinh(v: Vectors, x: Value) -> Value:
     quarter = _scaled_expm1(v, v.clamped(v.absolute(x), 0.0, LARGEST_SINH), -2)
     other = v.div(quarter, v.fma(quarter, v.number(4.0), v.number(1.0)))
     size = v.mul(v.number(2.0), v.add(quarter, other))
-    return _kept_where_tiny(v, x, v.intrinsic("copysign", size, x))
+    return _identity_where_tiny(v, x, v.intrinsic("copysign", size, x))
 
 
 def cosh(v: Vectors, x: Value) -> Value:
@@ -73,11 +256,11 @@ def tanh(v: Vectors, x: Value) -> Value:
     """Return the hyperbolic tangent, E / (E + 2) with E = e**2x - 1."""
     size = v.clamped(v.absolute(x), 0.0, 20.0)
     half = _scaled_expm1(v, v.add(size, size), -1)
-    return _kept_where_tiny(v, x, v.intrinsic("copysign", v.div(half, v.add(half, v.number(1.0))), x))
+    return _identity_where_tiny(v, x, v.intrinsic("copysign", v.div(half, v.add(half, v.number(1.0))), x))
 
 
 def _scaled_exp(v: Vectors, x: Value, low: Value, exponent: int) -> Value:
-    """2**exponent e**(x + low), |low| << |x|: the power of two is applied in two halves, lest either overflow."""
+    """2**exponent e**(x + low), |low| << |x|: the power of two is applied in two halves, so that neither overflows."""
     k, r = _reduced(v, x)
     r = v.add(r, low)
     k = v.add(k, v.number(exponent))
@@ -95,7 +278,7 @@ def _scaled_expm1(v: Vectors, x: Value, exponent: int) -> Value:
 
 
 def _reduced(v: Vectors, x: Value) -> tuple[Value, Value]:
-    """K, r of x = k ln(2) + r, |r| <= ln(2) / 2."""
+    """The pair (k, r) of x = k ln(2) + r, |r| <= ln(2) / 2."""
     k = v.sub(v.fma(x, v.number(LOG2_E), v.number(ROUND)), v.number(ROUND))
     return k, v.fma(k, v.number(-LN_2[1]), v.fma(k, v.number(-LN_2[0]), x))
 
@@ -105,6 +288,12 @@ def _power_of_two(v: Vectors, k: Value) -> Value:
     return v.from_bits(v.shift_left(v.bits(v.add(k, v.number(ROUND + 1023.0))), EXPONENT_SHIFT))
 
 
+def _identity_where_tiny(v: Vectors, x: Value, value: Value) -> Value:
+    """The argument itself where it is so small that f(x) = x + O(x**2) rounds to it."""
+    return v.select(v.compare("<", v.absolute(x), v.number(2.0**-54)), x, value)
+
+
+# Logarithms ----------------------------------------------------------------------------------------------------------
 def log(v: Vectors, x: Value) -> Value:
     """Return the natural logarithm."""
     k, m = _exponent_and_mantissa(v, x)
@@ -122,7 +311,7 @@ def log1p(v: Vectors, x: Value) -> Value:
     plain = v.compare("==", k, v.number(0.0))
     f = v.select(plain, x, v.sub(m, one))
     correction = v.select(plain, v.number(0.0), v.div(lost, total))
-    return _kept_where_tiny(v, x, _with_log_edges(v, total, _log(v, k, f, correction)))
+    return _identity_where_tiny(v, x, _with_log_edges(v, total, _log(v, k, f, correction)))
 
 
 def asinh(v: Vectors, x: Value) -> Value:
@@ -156,7 +345,7 @@ def _log1p_or_log_twice(v: Vectors, size: Value, inside: Value) -> Value:
 
 
 def _exponent_and_mantissa(v: Vectors, x: Value) -> tuple[Value, Value]:
-    """K, m of x = m 2**k with sqrt(1/2) <= m < sqrt(2), of positive finite numbers."""
+    """The pair (k, m) of x = m 2**k with sqrt(1/2) <= m < sqrt(2), of positive finite numbers."""
     small = v.compare("<", x, v.number(SMALLEST_NORMAL))
     bits = v.bits(v.select(small, v.mul(x, v.number(2.0**54)), x))
     shifted = v.add_integers(bits, v.integer(ONE_BITS - HALF_ROOT_BITS))
@@ -179,13 +368,14 @@ def _log(v: Vectors, k: Value, f: Value, correction: Value) -> Value:
 
 
 def _with_log_edges(v: Vectors, x: Value, value: Value) -> Value:
-    """The logarithm where x isn't positive and finite: -infinity of 0, NaN below, x itself where infinite or NaN."""
+    """The logarithm where x is not positive and finite: -infinity of 0, NaN below, x itself where infinite or NaN."""
     zero = v.number(0.0)
     value = v.select(v.compare("<", x, v.number(math.inf)), value, x)
     edge = v.select(v.compare("==", x, zero), v.number(-math.inf), v.number(math.nan))
     return v.select(v.compare("<=", x, zero), edge, value)
 
 
+# Powers --------------------------------------------------------------------------------------------------------------
 def power(v: Vectors, x: Value, y: Value) -> Value:
     """Return x**y as e**(y log|x|), the logarithm in two parts, with the signs and edges of C's pow."""
     one = v.number(1.0)
@@ -239,7 +429,7 @@ def _log_in_two_parts(v: Vectors, x: Value) -> tuple[Value, Value]:
 
 
 def _ratio_in_two_parts(v: Vectors, m: Value) -> tuple[Value, Value]:
-    """(m - 1) / (m + 1), sqrt(1/2) <= m < sqrt(2), as a quotient and what the division left over."""
+    """(m - 1) / (m + 1), sqrt(1/2) <= m < sqrt(2), as a quotient and the remainder of the division over m + 1."""
     one = v.number(1.0)
     f, d = v.sub(m, one), v.add(m, one)
     d_low = v.sub(m, v.sub(d, one))
@@ -263,6 +453,7 @@ def _edges_in_two_parts(v: Vectors, x: Value, high: Value, low: Value) -> tuple[
     return v.select(finite, high, edge), v.select(finite, low, zero)
 
 
+# Inverse error function ----------------------------------------------------------------------------------------------
 def erfinv(v: Vectors, x: Value) -> Value:
     """Return the inverse of the error function: a rational guess and three Newton steps, on erfc near one."""
     size = v.absolute(x)
@@ -290,8 +481,3 @@ def _outer_erfinv(v: Vectors, gap: Value) -> Value:
     z = v.intrinsic("sqrt", v.neg(log(v, v.mul(gap, v.number(0.5)))))
     above = v.polynomial(z, (1.641345311, 3.429567803, -1.624906493, -1.970840454))
     return v.div(above, v.polynomial(z, (1.637067800, 3.543889200, 1.0)))
-
-
-def _kept_where_tiny(v: Vectors, x: Value, value: Value) -> Value:
-    """X itself where it is so small that f(x) = x + O(x**2) rounds to it."""
-    return v.select(v.compare("<", v.absolute(x), v.number(2.0**-54)), x, value)
