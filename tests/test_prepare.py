@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from diransac.data import preprocessing as prepare
 from diransac.data.filters import half_length, kernels
 from diransac.data.log import Log
-from diransac.data.preprocessing.bandwidth import choose_bandwidth
+from diransac.data.preprocessing.differentiation import choose_bandwidth
 from diransac.data.readers import read_log
 from diransac.errors import LogError, SettingsError
 from diransac.model import Model, Parameter

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import json
 import random
 import zipfile
 from pathlib import Path
@@ -177,6 +178,24 @@ def test_hostile_metadata_end_in_one_sentence_that_names_the_file(tmp_path, case
         assert said.startswith(f'log "{tmp_path / name}": ')
         assert "\n" not in said
         assert len(said) < len(str(tmp_path)) + 400
+
+
+ANY_JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.sampled_from(["x", "t"]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["x", "t", "", "step"]), inner),
+    max_leaves=6,
+)
+ANY_FILTER = st.fixed_dictionaries({"bandwidth": ANY_JSON, "derivation_bandwidth": ANY_JSON, "derived": ANY_JSON})
+
+
+@given(
+    st.dictionaries(st.sampled_from(["units", "history", "notes", "unusable", "filter"]), ANY_JSON),
+    st.none() | ANY_FILTER,
+)
+def test_any_metadata_are_read_or_refused_by_our_own_error(tmp_path_factory, facts, filtered):
+    text = json.dumps({**facts, **({"filter": filtered} if filtered else {}), "version": 1})
+    folder = tmp_path_factory.mktemp("metadata")
+    assert is_log_or_sentence(folder, with_metadata(text)["a.csv"])
 
 
 def test_metadata_of_columns_that_are_gone_are_harmless(tmp_path):

@@ -14,9 +14,14 @@ __all__ = ["write_text", "write_with"]
 
 
 def write_with(path: str | Path, write: Callable[[Path], None]) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then rename it over ``path``.
+    """Write a file whole or not at all: a temporary file beside it, then a rename.
 
-    Whatever ``write`` raises passes through; ``path`` is then untouched and nothing is left beside it.
+    Parameters
+    ----------
+    path : str or Path
+    write : callable
+        ``write(temporary)`` fills the temporary file.  Its errors pass through; ``path`` is then untouched, and nothing
+        is left beside it.
     """
     target = Path(path)
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")

@@ -1,4 +1,4 @@
-"""Linear algebra on one thread: where matrices are small, or every core is busy already, more would only wait."""
+"""Linear algebra on one thread, for small matrices and for processes whose cores are busy already."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ __all__ = ["single_threaded"]
 
 
 class _Limit:
-    """One thread for the whole process as long as anybody asks for it; then as many as before the first did.
+    """Context in which BLAS has one thread; the process has its earlier number again when the last context ends.
 
-    The number is the process's: threads that each kept and restored what they found would restore each other's one.
+    The number belongs to the process, so that threads which each restored their own would restore each other's.
     """
 
     def __init__(self) -> None:
-        self._lock, self._asking = threading.Lock(), 0
+        self._lock, self._n_contexts = threading.Lock(), 0
         self._limits: threadpool_limits | None = None
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
-        """BLAS takes one thread meanwhile."""
+        """A context with one BLAS thread."""
         with self._lock:
             if self._limits is None:
                 self._limits = threadpool_limits(limits=1, user_api="blas")
-            self._asking += 1
+            self._n_contexts += 1
         try:
             yield
         finally:
             with self._lock:
-                self._asking -= 1
-                if not self._asking:
+                self._n_contexts -= 1
+                if not self._n_contexts:
                     self._limits.restore_original_limits()
                     self._limits = None
 
 
 single_threaded = _Limit()
-"""``with single_threaded():`` BLAS takes one thread, whatever other threads of the process begin or end meanwhile."""
+"""``with single_threaded():`` BLAS has one thread, also while other threads of the process enter and leave."""

@@ -15,6 +15,6 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def telling_digits(low: float, high: float) -> int:
-    """Significant digits that tell the ends of an interval apart, at least 5."""
+    """Number of significant digits in which the ends of an interval differ, at least 5."""
     size, width = max(abs(low), abs(high)), high - low
     return 5 if not 0.0 < width < size else min(12, max(5, 2 + math.ceil(math.log10(size / width))))

@@ -1,42 +1,53 @@
-"""Python files of users: they are run, and what they define is used."""
+"""Definitions in users' Python files, with the output of their code kept off the terminal.
+
+Stdout is for results and stderr for a few lines; text that a user's own code prints goes to neither.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import runpy
 import sys
 import threading
 import traceback
 from collections.abc import Iterator, Mapping
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from diransac.errors import DiransacError, ModelError
-from diransac.silence import silenced
 
-__all__ = ["blaming", "definitions", "file_and_name", "running"]
+__all__ = ["blaming", "definitions", "file_and_name", "leave_stdout", "running"]
 
 _ALONE = threading.RLock()
 """Held while users' code runs, which may run more of it: threads share stdout, stderr and the module path."""
 
 _FILE = re.compile(r"([^\0\n]+\.py)(?::(\w+))?")
+_STDOUT, _STDERR = 1, 2
 
 
 def file_and_name(text: str, default: str) -> tuple[Path, str] | None:
-    """The two parts of ``file.py[:name]``, the default for a name that isn't there; None for text of another form."""
+    """File and name of ``file.py[:name]``, with ``default`` for an absent name; None for text of another form."""
     match = _FILE.fullmatch(text)
     return None if match is None else (Path(match[1]), match[2] or default)
 
 
 def definitions(file: Path, what: str) -> Mapping[str, object]:
-    """What a file defines, by name; it may import its neighbours, and what it prints is not shown.
+    """Objects that a file defines, by name.
+
+    The file is run; it can import its neighbours, and its output is dropped.
 
     Parameters
     ----------
-    file : it is run
-    what : such as "model": what it is to define
+    file : Path
+    what : str
+        Kind of object that the file is to define, for messages, such as ``"model"``.
 
-    Raises ModelError: there is no such file, or it cannot be run; it says in which line.
+    Raises
+    ------
+    ModelError
+        There is no such file, or it cannot be run; the message names the line.
     """
     if not file.is_file():
         raise ModelError(f'{what} file "{file}" does not exist; give a built-in name or file.py[:name]')
@@ -46,14 +57,14 @@ def definitions(file: Path, what: str) -> Mapping[str, object]:
 
 @contextlib.contextmanager
 def running(file: Path, what: str) -> Iterator[None]:
-    """A file's own code, one thread at a time: it can import its neighbours, nothing is shown, and errors name it."""
-    with _ALONE, blaming(file, what), _importable(file.resolve().parent), silenced():
+    """Context for a file's own code, one thread at a time: neighbours importable, no output, errors name the file."""
+    with _ALONE, blaming(file, what), _importable(file.resolve().parent), _silenced():
         yield
 
 
 @contextlib.contextmanager
 def blaming(file: Path, what: str) -> Iterator[None]:
-    """Whatever is raised meanwhile is a ModelError of one line of text, which names the file and its line."""
+    """Context that turns every error into a ModelError of one line, which names the file and its line."""
     try:
         yield
     except DiransacError as error:
@@ -77,7 +88,7 @@ def _importable(folder: Path) -> Iterator[None]:
 
 
 def _line(error: BaseException, file: Path) -> str:
-    """``, line 12``: where in the user's file an error arose; nothing where it did not."""
+    """``, line 12`` for an error that arose in the user's file; empty otherwise."""
     if isinstance(error, SyntaxError):
         return f", line {error.lineno}" if error.lineno else ""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)]
@@ -87,3 +98,48 @@ def _line(error: BaseException, file: Path) -> str:
 def _in_one_line(said: object) -> str:
     """Text without line breaks."""
     return " ".join(str(said).split())
+
+
+# ---------------------------------------------------------------------- output
+
+
+@contextlib.contextmanager
+def _silenced() -> Iterator[None]:
+    """Context without output of the process, in whatever language it is written; ``--debug`` sends it to stderr.
+
+    It acts on all threads, and two of them must not enter it at a time: the later would restore the earlier's state.
+    """
+    _flush()
+    kept = {channel: os.dup(channel) for channel in (_STDOUT, _STDERR) if _is_open(channel)}
+    sink = os.dup(_STDERR) if "--debug" in sys.argv and _STDERR in kept else os.open(os.devnull, os.O_WRONLY)
+    try:
+        for channel in kept:
+            os.dup2(sink, channel)
+        with redirect_stdout(sys.stdout), redirect_stderr(sys.stderr):  # user's code may assign to them
+            yield
+    finally:
+        _flush()
+        for channel, copy in kept.items():
+            os.dup2(copy, channel)
+            os.close(copy)
+        os.close(sink)
+
+
+def leave_stdout() -> None:
+    """Drop all later output on stdout, such as that of exit handlers in users' code."""
+    sink = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, _STDOUT)
+
+
+def _is_open(channel: int) -> bool:
+    try:
+        os.fstat(channel)
+    except OSError:
+        return False
+    return True
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:  # where a process has none
+            stream.flush()

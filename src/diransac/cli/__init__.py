@@ -11,7 +11,7 @@ def main() -> None:
     if "--debug" not in sys.argv:
         sys.excepthook = _say_that_it_is_our_fault
     from diransac.cli.commands import app
-    from diransac.silence import leave_stdout
+    from diransac.user_files import leave_stdout
 
     try:
         app()

@@ -1,4 +1,4 @@
-"""What makes columns a log: real numbers under usable names, and a time that increases evenly."""
+"""Requirements of a log: real numbers under valid names, and a time that increases evenly."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ __all__ = [
     "check_even",
     "check_names",
     "check_time_order",
+    "describe_gaps",
+    "describe_jitter",
     "numeric_columns",
-    "say_gaps",
-    "say_jitter",
 ]
 
 
-# Of a sample: the jitter that is not worth a word, and the one that is an error; of a usual interval: a gap.
+# In mean intervals: the jitter that is not reported, and the one that is an error; in median intervals: a gap.
 _SILENT_JITTER, _TOLERATED_JITTER, _GAP = 1e-3, 0.2, 1.5
 _ROUNDING = 1e-6
 
-# Seconds from row to row that are likely, and those beyond which there is no log.  Clocks that explain longer ones: a
-# tick in seconds, and the number of ticks from row to row above which it is this clock rather than the next.
+# Likely seconds from row to row, and the most that are accepted.  Clocks that explain longer ones: their tick in
+# seconds, and the number of ticks from row to row above which it is this clock rather than the next.
 _SHORTEST, _LONGEST, _ABSURD = 1e-7, 1.0, 1e3
 _CLOCKS = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("milliseconds", 1e-3, _LONGEST))
 
@@ -40,7 +40,7 @@ _CLOCKS = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("millisec
 
 
 def as_numbers(values: npt.NDArray[Any]) -> FloatArray | str:
-    """A copy of an array as float64, or why there is none: ``is not numeric: row 3 holds 'takeoff'``."""
+    """Copy of an array as float64, or the reason why it has none: ``is not numeric: row 3 holds 'takeoff'``."""
     if values.dtype.kind in "biuf":
         return values.astype(np.float64)
     if values.dtype.kind != "O":
@@ -55,26 +55,26 @@ def as_numbers(values: npt.NDArray[Any]) -> FloatArray | str:
 
 
 def numeric_columns(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """The columns that hold numbers, and why each of the others does not."""
+    """Columns that hold numbers, and for each of the others the reason why it does not."""
     converted = {name: as_numbers(values) for name, values in columns.items()}
     numbers = {name: values for name, values in converted.items() if not isinstance(values, str)}
     return numbers, {name: why for name, why in converted.items() if isinstance(why, str)}
 
 
 def as_column(values: npt.ArrayLike, name: str, source: str) -> FloatArray:
-    """A read-only copy ``(N,)``.  Raises LogError: it is not one column of real numbers."""
+    """Read-only copy ``(N,)``.  Raises LogError: the values are not one column of real numbers."""
     array = np.asarray(values)
     numbers = as_numbers(array)
     if isinstance(numbers, str):
         raise LogError(f'{source}: signal "{name}" {numbers}')
     if numbers.ndim != 1:
-        raise LogError(f'{source}: signal "{name}" has shape {numbers.shape}; give one number a row, (N,)')
+        raise LogError(f'{source}: signal "{name}" has shape {numbers.shape}; give one number per row, (N,)')
     numbers.flags.writeable = False
     return numbers
 
 
 def check_names(names: Iterable[object], source: str) -> None:
-    """Raise LogError where a name cannot stand for a signal."""
+    """Raise LogError for a name that no signal can have."""
     for name in names:
         if not isinstance(name, str) or not name or name != name.strip():
             raise LogError(f"{source}: {name!r} cannot name a signal; use a text that has no spaces around it")
@@ -82,15 +82,15 @@ def check_names(names: Iterable[object], source: str) -> None:
             raise LogError(f'{source}: "t" is the time; give the signal another name')
 
 
-def say_gaps(time: FloatArray, signals: Mapping[str, FloatArray]) -> list[str]:
-    """Which signals have missing or infinite samples, how many, and where the first is."""
+def describe_gaps(time: FloatArray, signals: Mapping[str, FloatArray]) -> list[str]:
+    """Sentences about missing and infinite samples: signals, number, and time of the first."""
     missing = {name: np.isnan(values) for name, values in signals.items()}
     infinite = {name: np.isinf(values) for name, values in signals.items()}
     return [*_where("NaN", missing, time), *_where("infinite", infinite, time)]
 
 
 def _where(word: str, flags: Mapping[str, npt.NDArray[np.bool_]], time: FloatArray) -> list[str]:
-    """Sentences such as ``"x", "z" are NaN in 3 of 100 rows``, one for all signals that are so in the same rows."""
+    """Sentences such as ``"x", "z" are NaN in 3 of 100 rows``, one for all signals with the same rows."""
     groups: dict[bytes, list[str]] = {}
     for name, flag in flags.items():
         if flag.any():
@@ -108,7 +108,7 @@ def _where(word: str, flags: Mapping[str, npt.NDArray[np.bool_]], time: FloatArr
 
 
 def check_time_order(time: FloatArray, source: str) -> None:
-    """Raise LogError where time ``(N,)`` has fewer than 2 rows, is not finite, repeats or runs backwards."""
+    """Raise LogError if time ``(N,)`` has fewer than 2 rows, is not finite, repeats or runs backwards."""
     if len(time) < 2:
         raise LogError(f"{source}: a log has at least 2 rows; found {len(time)}")
     if not np.isfinite(time).all():
@@ -128,9 +128,9 @@ def check_time_order(time: FloatArray, source: str) -> None:
 
 
 def check_even(time: FloatArray, source: str) -> None:
-    """Raise LogError where an interval differs from the mean one by more than a fifth, and say how large a gap is.
+    """Raise LogError if an interval differs from the mean one by more than a fifth.
 
-    Every row is taken to last ``dt``: what counts is how far one interval is off, not how far the clock drifts.
+    Every row is taken to last ``dt``, so that single intervals matter, and the drift of the clock does not.
     """
     steps = np.diff(time)
     dt, usual = float(np.mean(steps)), float(np.median(steps))
@@ -147,9 +147,9 @@ def check_even(time: FloatArray, source: str) -> None:
 
 
 def check_clock(time: FloatArray, source: str) -> list[str]:
-    """Whether the usual interval tells of a time that is not in seconds, and the scale that would make it so.
+    """Sentence about a median interval that suggests another unit than seconds, with the factor to seconds.
 
-    Raises LogError: the interval is longer than any machine's log has.
+    Raises LogError: the interval is longer than 1000 s.
     """
     dt = float(np.median(np.diff(time)))
     if _SHORTEST <= dt <= _LONGEST * (1.0 + _ROUNDING):
@@ -164,8 +164,8 @@ def check_clock(time: FloatArray, source: str) -> list[str]:
     return [finding]
 
 
-def say_jitter(time: FloatArray) -> list[str]:
-    """How uneven the clock is, and where most, if it is worth a word."""
+def describe_jitter(time: FloatArray) -> list[str]:
+    """Sentence about the largest deviation from an even clock, if it exceeds 0.1 % of a sample."""
     steps = np.diff(time)
     jitter = np.abs(steps / steps.mean() - 1.0)
     if jitter.max() <= _SILENT_JITTER:

@@ -1,4 +1,4 @@
-"""Zero-phase low-pass filters of finite length, their derivatives, and the specification that a log carries of them.
+"""Zero-phase low-pass filters of finite length, their derivatives, and their specification as a field of a log.
 
 The filter is a windowed sinc, ``h(t) = 2 B sinc(2 B t) w(t)`` with Kaiser's window ``w`` over ``|t| <= 2.5 / B``.  It
 passes half at the bandwidth B, all but 1e-4 below B / 2, and 1e-4 above 3 B / 2.  As it is symmetric, it shifts no
@@ -82,14 +82,26 @@ class FilterSpecification:
 
 
 def half_length(bandwidth: float, dt: float) -> int:
-    """Samples that the filter looks at to either side."""
+    """Number of samples ``L`` of the filter to either side."""
     return max(1, int(np.ceil(REACH / (bandwidth * dt))))
 
 
 def kernels(bandwidth: float, dt: float) -> FloatArray:
-    """Impulse responses (3, 2 L + 1) of the filter and of its first and second derivatives, in 1, 1/s and 1/s^2.
+    """Impulse responses of the filter and of its first and second derivatives.
 
-    The filter leaves a ramp as it is, the first derivative is exact for a parabola, the second for a cubic.
+    The filter is exact for a ramp, the first derivative for a parabola, the second for a cubic.
+
+    Parameters
+    ----------
+    bandwidth : float
+        Hz.
+    dt : float
+        Sample interval, seconds.
+
+    Returns
+    -------
+    (3, 2 L + 1) array
+        In 1, 1/s and 1/s^2.
     """
     L = half_length(bandwidth, dt)
     t = np.arange(-L, L + 1) * dt
@@ -103,14 +115,14 @@ def kernels(bandwidth: float, dt: float) -> FloatArray:
 
 
 def _derivative(kernel: FloatArray, order: int, dt: float) -> FloatArray:
-    """The derivative of the band-limited function that runs through a kernel, at the kernel's samples."""
+    """Derivative of the band-limited interpolant of a kernel, at the kernel's samples."""
     n = 4 * len(kernel)
     spectrum = np.fft.rfft(kernel, n) * (2j * np.pi * np.fft.rfftfreq(n, dt)) ** order
     return np.asarray(np.fft.irfft(spectrum, n)[: len(kernel)])
 
 
 def convolve(values: FloatArray, kernel: FloatArray) -> FloatArray:
-    """``values (N, ...)`` filtered along the first axis, taken as zero outside; as many rows."""
+    """Convolution ``(N, ...)`` of values ``(N, ...)`` along the first axis, zero outside, with a kernel."""
     N, L = len(values), len(kernel) // 2
     n = 1 << (N + 2 * L).bit_length()
     response = np.fft.rfft(kernel, n).reshape(-1, *(1,) * (values.ndim - 1))

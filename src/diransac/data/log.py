@@ -1,4 +1,4 @@
-"""`Log`: named, uniformly sampled signals of one machine, with units and the story of how they came about."""
+"""`Log`: named, uniformly sampled signals of one machine, with units, filters and the history of their preparation."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ _ROUNDING = 1e-6
 
 
 class Frame(Protocol):
-    """What polars and pandas data frames share."""
+    """Common interface of polars and pandas data frames."""
 
     @property
     def columns(self) -> Iterable[str]:
-        """The columns' names."""
+        """Names of the columns."""
 
     def __getitem__(self, column: str, /) -> Series:
         """A column by name."""
 
 
 class Series(Protocol):
-    """What their columns share."""
+    """Common interface of their columns."""
 
     def to_numpy(self) -> npt.NDArray[Any]:
         """The column as an array (N,)."""
@@ -55,19 +55,32 @@ class Log:
 
     Parameters
     ----------
-    time : (N,)   seconds, strictly increasing, even to within 20 % of a sample
-    signals : name -> (N,) numbers; NaN is a missing sample
-    units : name -> unit, of those that are known
-    source : how messages name the log, such as ``log "flight.csv"``
-    history : preparation steps in order, each a mapping that JSON can hold
-    notes : what was found when the log was made, a sentence each
-    unusable : name -> why a column of the file is not among the signals
-    filter : filters of the signals and of the regression; None for signals as they were recorded
+    time : (N,) array
+        Seconds, strictly increasing, even to within 20 % of a sample.
+    signals : mapping of str to (N,) array
+        NaN is a missing sample.
+    units : mapping of str to str
+        Units of the signals whose unit is known.
+    source : str
+        Name of the log in messages, such as ``log "flight.csv"``.
+    history : tuple of dict
+        Preparation steps in order, each a mapping that JSON can hold.
+    notes : tuple of str
+        Findings about the samples and changes to them, a sentence each.
+    unusable : mapping of str to str
+        Columns of the file that are not among the signals, and why: ``is not numeric: row 0 holds 'a'``.
+    filter : FilterSpecification, optional
+        Filters that the signals have passed and that a regression needs; None for signals as they were recorded.
 
+    Raises
+    ------
+    LogError
+        Fewer than 2 rows; unequal lengths; a time that is not finite, increasing and even; a filter whose bandwidth is
+        less than 4e-7 of the rate.
+
+    Notes
+    -----
     The arrays are copies and read-only.  Rows count from 0.
-
-    Raises LogError: fewer than 2 rows, unequal lengths, a time that is not finite, increasing and even; a filter whose
-    bandwidth is less than 4e-7 of the rate.
     """
 
     time: FloatArray
@@ -96,7 +109,7 @@ class Log:
         object.__setattr__(self, "history", tuple(self.history))
         object.__setattr__(self, "notes", tuple(self.notes))
 
-    # ------------------------------------------------------------------ making one
+    # ------------------------------------------------------------------ construction
 
     @classmethod
     def from_arrays(
@@ -106,10 +119,22 @@ class Log:
         units: Mapping[str, str] | None = None,
         source: str = "log",
     ) -> Log:
-        """A log of arrays ``(N,)`` in memory; ``time`` in seconds.
+        """Log of arrays in memory.
 
-        Raises LogError: as `Log`; a column that does not hold real numbers; a unit for a signal that is not there;
-        rows so far apart that the time cannot be in seconds.
+        Parameters
+        ----------
+        time : (N,) array_like
+            Seconds.
+        signals : mapping of str to (N,) array_like
+        units : mapping of str to str, optional
+        source : str
+            Name of the log in messages.
+
+        Raises
+        ------
+        LogError
+            As `Log`; a column does not hold real numbers; a unit is given for no signal; rows are so far apart that the
+            time cannot be in seconds.
         """
         columns = {name: np.asarray(values) for name, values in signals.items()}
         return cls._from_columns(np.asarray(time), columns, units or {}, source)
@@ -118,11 +143,23 @@ class Log:
     def from_frame(
         cls, frame: Frame, units: Mapping[str, str] | None = None, time: str = "t", source: str = "log"
     ) -> Log:
-        """A log of a polars or pandas data frame: ``time`` names the column of seconds, every other one is a signal.
+        """Log of a polars or pandas data frame.
 
-        A column ``theta [deg]`` is the signal ``theta`` in degrees; one that does not hold numbers is left out, and
-        said in the notes.
-        Raises LogError: as `Log`; it is no data frame; there is no such time column.
+        Parameters
+        ----------
+        frame : polars.DataFrame or pandas.DataFrame
+            A column ``theta [deg]`` is the signal ``theta`` in degrees; a column that does not hold numbers is left
+            out, with a note.
+        units : mapping of str to str, optional
+        time : str
+            Name of the column of seconds; every other column is a signal.
+        source : str
+            Name of the log in messages.
+
+        Raises
+        ------
+        LogError
+            As `Log`; ``frame`` is no data frame; there is no such time column.
         """
         if not hasattr(frame, "columns"):
             raise LogError(f"{source}: frame is a {type(frame).__name__}; give a polars or pandas data frame")
@@ -155,11 +192,11 @@ class Log:
         return replace(log, notes=(*checks.check_clock(log.time, source), *log.findings()))
 
     def findings(self) -> tuple[str, ...]:
-        """What is worth saying: columns left out, an uneven clock, missing values, infinities; a sentence each."""
+        """Sentences about columns that are left out, an uneven clock, missing samples and infinities."""
         left_out = [f'column "{name}" is left out: it {why}' for name, why in self.unusable.items()]
-        return (*left_out, *checks.say_jitter(self.time), *checks.say_gaps(self.time, self.signals))
+        return (*left_out, *checks.describe_jitter(self.time), *checks.describe_gaps(self.time, self.signals))
 
-    # ------------------------------------------------------------------ looking at it
+    # ------------------------------------------------------------------ contents
 
     def __len__(self) -> int:
         return len(self.time)
@@ -181,12 +218,12 @@ class Log:
 
     @property
     def dt(self) -> float:
-        """Time from one sample to the next, seconds."""
+        """Mean time from each sample to the next, seconds."""
         return float((self.time[-1] - self.time[0]) / (len(self.time) - 1))
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 over names, time and samples, whatever the columns' order."""
+        """SHA-256 of names, time and samples, independent of the columns' order."""
         digest = hashlib.sha256()
         for name, values in [("t", self.time), *sorted(self.signals.items())]:
             digest.update(f"{name}\0{len(values)}\0".encode())
@@ -206,16 +243,19 @@ class Log:
             if np.abs(values[row]) > _LARGEST:
                 raise LogError(f'{self.source}: signal "{name}" is {values[row]:.3g} at {where}: its square overflows')
 
-    # ------------------------------------------------------------------ parts of it
+    # ------------------------------------------------------------------ parts
 
     @overload
     def __getitem__(self, key: str) -> FloatArray: ...
     @overload
     def __getitem__(self, key: slice) -> Log: ...
     def __getitem__(self, key: str | slice) -> FloatArray | Log:
-        """A signal ``(N,)`` by name (``"t"`` is the time), or the log of a range of rows.
+        """Signal ``(N,)`` of a name (``"t"`` is the time), or log of a range of rows.
 
-        Raises LogError: there is no such signal; fewer than 2 rows are left.
+        Raises
+        ------
+        LogError
+            There is no such signal; fewer than 2 rows are left.
         """
         if isinstance(key, slice):
             return self._cut(key)
@@ -238,9 +278,12 @@ class Log:
         return replace(self, time=time, signals=signals, history=(*self.history, step))
 
     def between(self, start: float, end: float) -> Log:
-        """The rows with ``start <= t <= end``, seconds.
+        """Log of the rows with ``start <= t <= end``, seconds.
 
-        Raises LogError: fewer than 2 rows lie there.
+        Raises
+        ------
+        LogError
+            Fewer than 2 rows lie there.
         """
         slack = _ROUNDING * self.dt
         first, last = np.searchsorted(self.time, [start - slack, end + slack])
@@ -252,9 +295,12 @@ class Log:
         return self[int(first) : int(last)]
 
     def split(self, fraction: float) -> tuple[Log, Log]:
-        """The log's first ``fraction`` of rows and the rest, such as for identifying and validating.
+        """Logs of the first ``fraction`` of the rows and of the rest, such as for identification and validation.
 
-        Raises LogError: it is no number between 0 and 1, or either part would have fewer than 2 rows.
+        Raises
+        ------
+        LogError
+            The fraction is not between 0 and 1, or either part would have fewer than 2 rows.
         """
         if not 0.0 < fraction < 1.0:
             raise LogError(f"{self.source}: fraction is {fraction}; give a number between 0 and 1")
@@ -270,7 +316,7 @@ class Log:
         units: Mapping[str, str] | None = None,
         notes: Sequence[str] = (),
     ) -> Log:
-        """The log with other contents, where they are given, and one more step in its history."""
+        """Log with one more step in its history, and with those contents replaced that are given."""
         return replace(
             self,
             time=self.time if time is None else time,
@@ -287,11 +333,24 @@ class Log:
         return (Log, (*state, dict(self.unusable), self.filter))
 
     def write(self, path: str | Path) -> None:
-        """Write time and signals to ``.csv``, ``.csv.gz``, ``.parquet`` or ``.npz``; every number reads back exactly.
+        """Write the log to a file from which `read_log` returns an equal log, to the last bit.
 
-        Units, filter, history, notes and the reasons for unusable columns are written beside them (see `data.files`),
-        so that `read_log` returns an equal log.  The file appears whole or not at all.
-        Raises LogError: another ending, or the file cannot be written.
+        Parameters
+        ----------
+        path : str or Path
+            Its ending is ``.csv``, ``.csv.gz``, ``.parquet`` or ``.npz``.
+
+        Raises
+        ------
+        LogError
+            Another ending; the file cannot be written; the history holds values that JSON cannot.
+
+        Notes
+        -----
+        The columns are the time ``t`` and the signals.  Units, filter, history, notes and the reasons for unusable
+        columns are metadata: a first line ``# diransac: {...}`` of CSV text, which other tools skip with
+        ``comment="#"``, a key of a Parquet file, or a member of an NPZ archive.  The file is written whole or not at
+        all.
         """
         facts = Metadata(self.units, self.filter, self.history, self.notes, self.unusable)
         write_columns(Path(path), {"t": self.time, **self.signals}, facts)

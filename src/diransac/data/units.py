@@ -1,4 +1,4 @@
-"""Units of measurement: whether two texts mean the same unit, and by which factor one becomes the other.
+"""Units of measurement: equality of units in different spellings, and factors between units.
 
 A text such as ``m/s^2``, ``m s^-2``, ``m·s⁻²`` or ``m/s**2`` is a product of powers of named units.  It is read from
 left to right (``N s/m`` is ``(N s)/m``) into a factor and powers of the SI base units.  An angle is dimensionless:
@@ -94,19 +94,19 @@ _NAMED = {
 
 
 def split_unit(header: str) -> tuple[str, str | None]:
-    """Name and unit of a column's header: ``theta [deg]`` is ``("theta", "deg")``; ``q[0]`` is a name as it stands."""
+    """Name and unit of a column's header: ``theta [deg]`` is ``("theta", "deg")``, ``q[0]`` is ``("q[0]", None)``."""
     match = _HEADER.match(header.strip())
     return (match["name"], match["unit"].strip()) if match else (header.strip(), None)
 
 
 def same_unit(a: str, b: str) -> bool:
-    """Whether two texts mean the same unit, however they are written; texts that cannot be read match literally."""
+    """True for two spellings of one unit, such as ``m/s^2`` and ``m s^-2``; unknown units match literally."""
     factor = conversion(a, b)
     return factor is not None and math.isclose(factor, 1.0, rel_tol=_NEGLIGIBLE)
 
 
 def conversion(a: str, b: str) -> float | None:
-    """The factor by which a number in unit ``a`` is multiplied to be in unit ``b``; None where there is no such factor.
+    """Factor from unit ``a`` to unit ``b``; None for units of different dimensions and for unknown units.
 
     ``g`` alone is a gram or the standard gravity, whichever fits the other unit.
     """
@@ -125,7 +125,7 @@ def _factor(a: _Unit, b: _Unit) -> float | None:
 
 
 def _meanings(text: str) -> list[_Unit]:
-    """Every unit that a text may mean; none where it cannot be read."""
+    """Units that a text can mean; none if it cannot be read."""
     units = [] if (unit := _parse(text)) is None else [unit]
     if text.strip() == "g":
         units.append(_si("m s-2", _STANDARD_GRAVITY))
@@ -133,7 +133,7 @@ def _meanings(text: str) -> list[_Unit]:
 
 
 def _parse(text: str) -> _Unit | None:
-    """The unit that a text means, or None."""
+    """Unit of a text, or None."""
     tokens = _tokens(text.translate(_SUPERSCRIPTS))
     if tokens is None:
         return None
@@ -145,7 +145,7 @@ def _parse(text: str) -> _Unit | None:
 
 
 def _tokens(text: str) -> list[str] | None:
-    """The parts of a text, every sign of multiplication as ``*``; None where a part is unknown."""
+    """Tokens of a text, every sign of multiplication as ``*``; None if a part is unknown."""
     text = re.sub(r"[·×⋅.](?!\d)", "*", text.replace("**", "^")).strip()
     tokens, end = [], 0
     while end < len(text):
@@ -158,7 +158,7 @@ def _tokens(text: str) -> list[str] | None:
 
 
 def _product(tokens: list[str], at: int) -> tuple[_Unit, int]:
-    """The product of factors that starts at a token, and where it ends."""
+    """Product of the factors that start at a token, and the index of its end."""
     unit, power = _Unit(), 1.0
     while at < len(tokens) and tokens[at] != ")":
         if tokens[at] in ("*", "/"):
@@ -210,7 +210,7 @@ def _symbol(text: str) -> _Unit:
 
 
 def _known(text: str) -> Iterator[_Unit]:
-    """Units that go by a symbol, whole names before prefixes."""
+    """Units of a symbol, whole names before prefixes."""
     if text in _PREFIXABLE:
         yield _PREFIXABLE[text]
     if text in _NAMED:

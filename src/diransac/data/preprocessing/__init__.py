@@ -1,19 +1,11 @@
-"""Preparation of a log, one explicit step after another: every function takes a `Log` and gives a new one.
+"""Preparation of a log in explicit steps: functions from a `Log` to a new `Log`.
 
-Each step adds one mapping to ``Log.history`` and, where it did something to the samples, a sentence to ``Log.notes``.
+Each step adds one mapping to ``Log.history`` and, where it changes samples, a sentence to ``Log.notes``.
 """
 
 from diransac.data.preprocessing.differentiation import acting_inputs, differentiate, filter_rows
-from diransac.data.preprocessing.steps import (
-    despike,
-    hampel,
-    rename,
-    resample,
-    running_deviation,
-    scale,
-    shift,
-    unwrap,
-)
+from diransac.data.preprocessing.spikes import despike, hampel, running_deviation
+from diransac.data.preprocessing.steps import rename, resample, scale, shift, unwrap
 
 __all__ = [
     "acting_inputs",

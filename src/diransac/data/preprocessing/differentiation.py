@@ -1,24 +1,24 @@
-"""Velocities and accelerations that a log lacks, and regression rows that their noise does not spoil.
+"""Velocities and accelerations from positions, and regression rows low-pass filtered against their noise.
 
-Two filters of one kind (see `filters`) share the work.  Signals are derived with four times the bandwidth: what is not
-linear in them, such as the sign of a velocity, then switches in time.  The regression's rows ``W p = b``, which hold at
-every instant, are filtered with the bandwidth itself, both sides alike: a weighted sum of true equations is a true
-equation, whatever ``W`` holds.  So the bandwidth decides which part of the motion is used, not what is made of it.
+Two zero-phase filters of one kind are used (see `diransac.data.filters`).  Signals are derived with four times the
+bandwidth, so that nonlinear terms, such as the sign of a velocity, switch at the right time.  The rows of the
+regression ``W p = b``, which holds at every instant, are filtered with the bandwidth itself, both sides alike: a
+weighted sum of true equations is a true equation, whatever ``W``.  So the bandwidth selects the part of the motion that
+is used, and does not distort the equations.
 
-Inputs are held from a sample to the next one, as in every simulation of this package.  Around a sample there acts, in
-the mean, half of the input before and half of the one after it: `acting_inputs` gives that for the regression.
+Inputs are held from each sample to the next, as in every simulation of this package.  The mean input around a sample is
+half of the input before it and half of the input after it: `acting_inputs`.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.data.filters import REACH, FilterSpecification, convolve, half_length, kernels
-from diransac.data.preprocessing.bandwidth import Bandwidth, choose_bandwidth
 from diransac.data.preprocessing.steps import unwrap
 from diransac.data.units import same_unit
 from diransac.errors import LogError, SettingsError
@@ -29,33 +29,52 @@ if TYPE_CHECKING:
     from diransac.data.log import Log
     from diransac.model import Model
 
-__all__ = ["acting_inputs", "differentiate", "filter_rows"]
+__all__ = ["Bandwidth", "acting_inputs", "choose_bandwidth", "differentiate", "filter_rows"]
 
 
 _DERIVATION = 4.0
-_HIGHEST = 1.0 / 3.0
+_HIGHEST_DERIVATION = 1.0 / 3.0
 _SHORTEST = 2.0 * REACH
 _NOTABLE_NOISE = 0.05
 _LONGEST_BRIDGE = 0.25
 _BESIDE = 2
 # Half a sample later, and the droop of a held input, to fourth order.
 _HOLD = (-1.0 / 24.0, 13.0 / 24.0, 13.0 / 24.0, -1.0 / 24.0)
+# Bandwidth times sample interval, and bandwidth times duration, that are chosen at most and at least.
+_HIGHEST, _LONGEST = 0.1, 10.0
+_SIGNAL_TO_NOISE = 10.0
+_SEGMENTS, _SMALLEST_SEGMENT = 8, 32
+_SMOOTHING = 1.2
 
 
 def differentiate(log: Log, model: Model, bandwidth: float | None = None) -> Log:
-    """The log with the velocities and accelerations that the model names and the log lacks, filtered with the rest.
+    """Log with the velocities and accelerations that the model needs and the log lacks, all signals filtered alike.
 
     Parameters
     ----------
-    bandwidth : Hz; None: chosen from the log, where its motion comes within a factor of ten of its noise (`bandwidth`)
+    log : Log
+    model : Model
+    bandwidth : float, optional
+        Bandwidth of the regression's rows, Hz.  None: `choose_bandwidth`.
 
-    Accelerations come from measured velocities where there are such, from coordinates otherwise.  All of the model's
-    signals and inputs pass the same zero-phase filter; rows at both ends that it cannot fill are cut.  NaN is bridged
-    by a cubic if it lasts no longer than a quarter of the bandwidth's period; a longer gap stays NaN, with what the
-    filter reaches around it.  Angles in rad are unwrapped.
+    Returns
+    -------
+    Log
+        With `Log.filter` set, fewer rows at both ends, and the model's signals and inputs filtered.
 
-    Raises LogError: a signal that the equations need is missing and cannot be derived, holds an infinity, or the log
-    is too short.  SettingsError: the bandwidth has no meaning for this log's rate.
+    Raises
+    ------
+    LogError
+        A signal that the equations need is missing and cannot be derived, or holds an infinity; the log is too short.
+    SettingsError
+        The bandwidth is not positive, or too high for the log's rate.
+
+    Notes
+    -----
+    Accelerations are derived from measured velocities where there are any, from coordinates otherwise.  All of the
+    model's signals and inputs pass the same zero-phase filter; rows at both ends that it cannot fill are cut.  Missing
+    samples are bridged by a cubic if they last no longer than a quarter of the bandwidth's period; a longer gap stays
+    NaN, with the samples within the filter's reach.  Angles in rad are unwrapped.
     """
     sources = _sources(log, model)
     if model.kinematics is None:
@@ -70,8 +89,8 @@ def differentiate(log: Log, model: Model, bandwidth: float | None = None) -> Log
     wide = _derivation_bandwidth(log, bandwidth)
     L = half_length(wide, log.dt)
     derived = {**{name: (name, 0) for name in names}, **sources}
-    spoilt = {name: _near_long_gaps(log[name], _LONGEST_BRIDGE / (bandwidth * log.dt), L) for name in names}
-    signals = {**log.signals, **_derived(bridged, derived, spoilt, kernels(wide, log.dt))}
+    blank = {name: _near_long_gaps(log[name], _LONGEST_BRIDGE / (bandwidth * log.dt), L) for name in names}
+    signals = {**log.signals, **_derived(bridged, derived, blank, kernels(wide, log.dt))}
     specification = FilterSpecification(bandwidth, wide, {name: source for name, (source, _) in sources.items()})
     filtered = log.with_step(
         _step(specification, chosen, names, L),
@@ -86,15 +105,15 @@ def differentiate(log: Log, model: Model, bandwidth: float | None = None) -> Log
 def _derived(
     bridged: Mapping[str, FloatArray],
     derived: Mapping[str, tuple[str, int]],
-    spoilt: Mapping[str, BoolArray],
+    blank: Mapping[str, BoolArray],
     responses: FloatArray,
 ) -> dict[str, FloatArray]:
-    """Derivatives, of order 0 to 2, of what the filter lets through; NaN where a source is spoilt."""
+    """Filtered derivatives of order 0 to 2; NaN in the rows where the source is blank."""
     signals = {}
     for name, (source, order) in derived.items():
         mean = bridged[source].mean()
         filtered = convolve(bridged[source] - mean, responses[order]) + (mean if order == 0 else 0.0)
-        signals[name] = np.where(spoilt[source], np.nan, filtered)
+        signals[name] = np.where(blank[source], np.nan, filtered)
     return signals
 
 
@@ -150,11 +169,11 @@ def acting_inputs(specification: FilterSpecification | None, inputs: FloatArray)
     return np.asarray(sum(weight * padded[i : i + n] for i, weight in enumerate(_HOLD)))
 
 
-# ---------------------------------------------------------------------- what comes from what
+# ---------------------------------------------------------------------- sources of derived signals
 
 
 def _sources(log: Log, model: Model) -> dict[str, tuple[str, int]]:
-    """Missing signal -> the measured signal that it is derived from, and how often."""
+    """Missing signal -> the measured signal that it is derived from, and the order of the derivative."""
     sources: dict[str, tuple[str, int]] = {}
     for i, (v, a) in enumerate(zip(model.velocities, model.accelerations, strict=True)):
         q = list(model.coordinates)[i] if model.kinematics is None else None
@@ -178,13 +197,13 @@ def _underivable(log: Log, model: Model, name: str, source: str | None) -> str:
 
 
 def _filtered(model: Model) -> Iterable[str]:
-    """Names that pass the filter; quaternions and the like do not, for they are no sums."""
+    """Names of the signals that pass the filter; quaternions and the like do not, as they form no vector space."""
     coordinates = model.coordinates if model.kinematics is None else ()
     return (*coordinates, *model.velocities, *model.accelerations, *model.inputs)
 
 
 def _motions(log: Log, model: Model) -> list[tuple[str, int]]:
-    """For every degree of freedom, the signal nearest to the coordinate, and its distance from the acceleration."""
+    """The lowest measured derivative of every degree of freedom, and the order from it to the acceleration."""
     coordinates = list(model.coordinates) if model.kinematics is None else [""] * len(model.velocities)
     chains = zip(coordinates, model.velocities, model.accelerations, strict=True)
     measured = [[(n, order) for n, order in zip(chain, (2, 1, 0), strict=True) if n in log] for chain in chains]
@@ -192,17 +211,97 @@ def _motions(log: Log, model: Model) -> list[tuple[str, int]]:
 
 
 def _units(log: Log, model: Model, sources: Mapping[str, tuple[str, int]]) -> dict[str, str]:
-    """Units of what is derived from signals that are known to be in the model's units."""
+    """Units of the signals that are derived from signals in the model's units."""
     known = {n for n, unit in log.units.items() if n in model.units and same_unit(unit, model.units[n])}
     return {name: model.units[name] for name, (source, _) in sources.items() if source in known}
 
 
-# ---------------------------------------------------------------------- bandwidth and gaps
+# ---------------------------------------------------------------------- bandwidth
+
+
+@dataclass(frozen=True)
+class Bandwidth:
+    """A bandwidth, Hz, and an upper bound of the noise's share in the acceleration's power below it."""
+
+    value: float
+    noise_share: float
+
+
+def choose_bandwidth(motions: list[tuple[FloatArray, int]], dt: float) -> Bandwidth:
+    """The lowest of the bandwidths in which a log's motions exceed their noise; rows of a regression mix all motions.
+
+    Differentiation amplifies a position's noise with frequency, while limited forces move a body less the higher the
+    frequency.  So the power spectrum ``A(f)`` of the acceleration falls, and rises again where noise prevails.  Its
+    lowest value at or above a frequency bounds the noise there from above, whatever the noise's colour (an encoder's
+    counts, a resolver, a filtered tachometer):
+
+        N(f) = min over f' >= f of A(f').
+
+    The bandwidth is the ``B`` that maximises the sum of ``A(f) - 10 N(f)`` over ``f <= B``: above it, the motion may be
+    less than ten times as strong as the noise.  The least error of the acceleration itself would take two instead of
+    ten, but noise in a regressor biases its parameter towards zero by the ratio of powers, and more so where regressors
+    are correlated.
+
+    Parameters
+    ----------
+    motions : list of (array (N,), int)
+        Each a signal and the number of differentiations that make it an acceleration.
+    dt : float
+        Seconds.
+
+    Returns
+    -------
+    Bandwidth
+        Signals that nowhere exceed their noise are left out; the highest bandwidth, if all are.
+    """
+    found = [x for values, order in motions if (x := _of_one_motion(values, order, dt)) is not None]
+    chosen = min(found, key=lambda x: x.value, default=Bandwidth(_HIGHEST / dt, 1.0))
+    n = max((len(values) for values, _ in motions), default=0)
+    lowest = min(_LONGEST / max(n * dt, dt), _HIGHEST / dt)
+    return Bandwidth(float(np.clip(chosen.value, lowest, _HIGHEST / dt)), chosen.noise_share)
+
+
+def _of_one_motion(values: FloatArray, order: int, dt: float) -> Bandwidth | None:
+    f, A = _acceleration_spectrum(values, order, dt)
+    if not len(f) or not A.all():
+        return None
+    noise = np.minimum.accumulate(A[::-1])[::-1]
+    gain = np.cumsum(A - _SIGNAL_TO_NOISE * noise)
+    best = int(gain.argmax())
+    if gain[best] <= 0.0:
+        return None
+    return Bandwidth(float(f[best]), float(noise[: best + 1].sum() / A[: best + 1].sum()))
+
+
+def _acceleration_spectrum(values: FloatArray, order: int, dt: float) -> tuple[FloatArray, FloatArray]:
+    """Frequencies, Hz, and relative power density of the acceleration, to twice the highest bandwidth, lines smoothed.
+
+    Welch's average over segments of the differences, which are nearly white, so that little leaks from low
+    frequencies to high ones; then a geometric mean over a fifth of the frequency to either side.
+    """
+    differences = np.diff(values - values.mean(), order) / dt**order
+    n = min(len(differences), max(_SMALLEST_SEGMENT, 2 * len(differences) // (_SEGMENTS + 1)))
+    segments = np.lib.stride_tricks.sliding_window_view(differences, n)[:: max(1, n // 2)]
+    spectra = np.abs(np.fft.rfft(np.hanning(n + 1)[:n] * segments, axis=1)) ** 2
+    f = np.fft.rfftfreq(n, dt).astype(np.float64)
+    inside = (f > 0.0) & (f <= 2.0 * _HIGHEST / dt)
+    f, power = f[inside], spectra.mean(axis=0)[inside]
+    response = (np.pi * f * dt / np.sin(np.pi * f * dt)) ** (2 * order)
+    return f, _smooth(f, power * response)
+
+
+def _smooth(f: FloatArray, power: FloatArray) -> FloatArray:
+    """The geometric mean of the power at ``f / 1.2`` to ``1.2 f``; 0 where there is none."""
+    low, high = np.searchsorted(f, f / _SMOOTHING, side="left"), np.searchsorted(f, f * _SMOOTHING, side="right")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        total = np.concatenate([[0.0], np.cumsum(np.log(power))])
+        mean = np.exp((total[high] - total[low]) / (high - low))
+    return np.where(np.isfinite(mean), mean, 0.0)
 
 
 def _derivation_bandwidth(log: Log, bandwidth: float) -> float:
-    """The bandwidth with which signals are derived.  Raises where the log cannot give the bandwidth that is asked."""
-    highest, duration = _HIGHEST / log.dt, len(log) * log.dt
+    """Bandwidth of the filter that derives signals, Hz.  Raises where the log is too short or too slow for it."""
+    highest, duration = _HIGHEST_DERIVATION / log.dt, len(log) * log.dt
     if not 0.0 < bandwidth <= highest * (1.0 + 1e-9):
         raise SettingsError(
             f"a bandwidth of {bandwidth:.4g} Hz has no meaning at {1.0 / log.dt:.6g} Hz; give up to {highest:.4g} Hz"
@@ -214,6 +313,9 @@ def _derivation_bandwidth(log: Log, bandwidth: float) -> float:
             f"{_SHORTEST / bandwidth:.4g} s; give a longer log or a higher bandwidth"
         )
     return wide
+
+
+# ---------------------------------------------------------------------- gaps
 
 
 def _bridge(values: FloatArray) -> FloatArray:
@@ -231,7 +333,7 @@ def _bridge(values: FloatArray) -> FloatArray:
 
 
 def _gaps(missing: BoolArray) -> list[tuple[int, int]]:
-    """Where each run of missing rows begins and ends."""
+    """Begin and end of each run of missing rows."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(int), [0]])))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
@@ -245,7 +347,7 @@ def _near_long_gaps(values: FloatArray, longest: float, reach: int) -> BoolArray
     return near
 
 
-# ---------------------------------------------------------------------- what is said
+# ---------------------------------------------------------------------- history and notes
 
 
 def _step(

@@ -1,4 +1,4 @@
-"""The steps that need a log alone: names, factors, rates, delays, spikes and wrapped angles."""
+"""Steps that need no model: names, factors, rates, delays and wrapped angles."""
 
 from __future__ import annotations
 
@@ -9,29 +9,25 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import FloatArray
 from diransac.data.units import conversion
 from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from diransac.data.log import Log
 
 __all__ = [
     "check_factor",
-    "despike",
-    "hampel",
     "origins_of",
     "rename",
     "rename_columns",
     "resample",
     "resample_columns",
-    "running_deviation",
     "scale",
     "shift",
     "unwrap",
-    "window_deviation",
 ]
 
 Column = TypeVar("Column")
@@ -39,8 +35,6 @@ Column = TypeVar("Column")
 _BRIDGED_INTERVALS = 3.5
 _MOST_ROWS = 10_000_000
 _ROUNDING = 1e-6
-_MAD_TO_STD, _MEAN_TO_STD = 1.4826, 1.2533
-_COUNT_ROUNDING, _USUAL = 1e-3, 0.01
 _WRAPPING = 0.75
 _FOLDING = 0.9
 
@@ -49,9 +43,18 @@ _FOLDING = 0.9
 
 
 def rename(log: Log, names: Mapping[str, str]) -> Log:
-    """The log with signals under other names; ``names`` maps a new name to the name that the log has.
+    """Log with signals under other names.
 
-    Raises LogError: the log has no such signal, or has the new name already.
+    Parameters
+    ----------
+    log : Log
+    names : mapping of str to str
+        New name -> present name.  A signal may be given several new names.
+
+    Raises
+    ------
+    LogError
+        The log has no such signal, or another signal has the new name.
     """
     signals = rename_columns(log.signals, names, log.source)
     origins = origins_of(log.signals, names)
@@ -61,7 +64,7 @@ def rename(log: Log, names: Mapping[str, str]) -> Log:
 
 
 def rename_columns(columns: Mapping[str, Column], names: Mapping[str, str], source: str) -> dict[str, Column]:
-    """The columns under their new names, ``names`` mapping new to old ones; others keep theirs.
+    """Columns under their new names, ``names`` mapping new to old ones; others keep theirs.
 
     Raises LogError: an old name is missing, or a new one belongs to another column.
     """
@@ -86,9 +89,25 @@ def origins_of(columns: Mapping[str, Any], names: Mapping[str, str]) -> dict[str
 
 
 def scale(log: Log, factors: Mapping[str, float]) -> Log:
-    """The log with signals multiplied by factors; a signal whose size changes loses its unit, for it no longer holds.
+    """Log with signals multiplied by factors.
 
-    Raises LogError: the log has no such signal.  SettingsError: a factor is zero or not finite.
+    Parameters
+    ----------
+    log : Log
+    factors : mapping of str to float
+        Signal -> factor.
+
+    Returns
+    -------
+    Log
+        A signal whose magnitude changes has no unit any more.
+
+    Raises
+    ------
+    LogError
+        The log has no such signal.
+    SettingsError
+        A factor is zero or not finite.
     """
     for name, factor in factors.items():
         check_factor(name, factor)
@@ -99,7 +118,7 @@ def scale(log: Log, factors: Mapping[str, float]) -> Log:
 
 
 def check_factor(name: str, factor: float) -> None:
-    """Raise SettingsError where a factor would wipe a signal out."""
+    """Raise SettingsError for a factor that is zero or not finite."""
     if not math.isfinite(factor) or factor == 0.0:
         raise SettingsError(f'the scale of "{name}" is {factor}; give a finite factor other than 0')
 
@@ -108,16 +127,30 @@ def check_factor(name: str, factor: float) -> None:
 
 
 def resample(log: Log, rate: float | str = "median") -> Log:
-    """The log at a uniform rate, interpolated linearly.
+    """Log at a uniform rate, by linear interpolation.
 
     Parameters
     ----------
-    rate : Hz, or ``"median"`` for one sample per median interval
+    log : Log
+    rate : float or "median"
+        Hz; ``"median"`` for one sample per median interval.
 
-    A signal is NaN where its samples are, and in gaps of the clock.  Nothing is filtered: at a lower rate, what moves
-    faster than half of it is folded to lower frequencies, and said.
-    Raises SettingsError: the rate has no meaning.  LogError: fewer than 2 samples are left, or
-    more than ten million are made.
+    Returns
+    -------
+    Log
+        Signals are NaN where their samples are NaN, and in gaps of the clock.
+
+    Raises
+    ------
+    SettingsError
+        The rate is not a positive number.
+    LogError
+        Fewer than 2 samples are left, or more than ten million would be made.
+
+    Notes
+    -----
+    There is no anti-aliasing filter: at a lower rate, components above half of it are folded to lower frequencies, and
+    a note says so.
     """
     time, signals, step, notes = resample_columns(log.time, log.signals, rate, log.source)
     return log.with_step(step, time=time, signals=signals, notes=notes)
@@ -126,10 +159,9 @@ def resample(log: Log, rate: float | str = "median") -> Log:
 def resample_columns(
     time: FloatArray, signals: Mapping[str, FloatArray], rate: float | str, source: str
 ) -> tuple[FloatArray, dict[str, FloatArray], dict[str, Any], list[str]]:
-    """Columns at a uniform rate, with the step for the history and what is to be said; ``time`` (N,) increases.
+    """Time, columns, step of the history and notes at a uniform rate; ``time`` (N,) increases.
 
-    An interval of more than three and a half usual ones (and more than one new sample) is a gap: no sample is made up
-    in it.
+    An interval of more than three and a half median ones (and more than one new sample) is a gap, which stays NaN.
     """
     steps = np.diff(time)
     usual = float(np.median(steps))
@@ -154,7 +186,7 @@ def _rate(rate: float | str, usual: float) -> float:
 
 
 def _new_rows(seconds: float, hertz: float, source: str) -> int:
-    """How many rows a rate makes.  Raises LogError: fewer than 2, or more than `_MOST_ROWS`."""
+    """Number of rows at a rate.  Raises LogError: fewer than 2, or more than `_MOST_ROWS`."""
     rows = seconds * hertz * (1.0 + 1e-12) + 1e-9
     if rows < 1.0:
         raise LogError(f"{source}: resampling at {hertz:.6g} Hz leaves 1 row of {seconds:.6g} s")
@@ -167,7 +199,7 @@ def _new_rows(seconds: float, hertz: float, source: str) -> int:
 
 
 def _between(values: FloatArray, left: npt.NDArray[np.intp], weight: FloatArray) -> FloatArray:
-    """Linear interpolation that looks at a neighbour only where it has weight, so that NaN does not spread."""
+    """Linear interpolation without neighbours of zero weight, so that NaN does not spread."""
     mixed = (1.0 - weight) * values[left] + weight * values[left + 1]
     return np.where(weight < _ROUNDING, values[left], np.where(weight > 1.0 - _ROUNDING, values[left + 1], mixed))
 
@@ -189,14 +221,29 @@ def _resampling_notes(
 
 
 def shift(log: Log, delays: Mapping[str, float]) -> Log:
-    """The log with signals moved later in time: the new signal at ``t`` is the old one at ``t - delay``.
+    """Log with delayed signals: the new signal at ``t`` is the old one at ``t - delay``.
 
     Parameters
     ----------
-    delays : name -> seconds; positive for a command that acts late, negative for a measurement that arrived late
+    log : Log
+    delays : mapping of str to float
+        Signal -> seconds; positive for a command that acts late, negative for a measurement that arrived late.
 
-    Fractions of a sample are interpolated linearly; rows at both ends that a moved signal no longer covers are cut.
-    Raises LogError: there is no such signal, or nothing is left.
+    Returns
+    -------
+    Log
+        Without the rows at both ends that a delayed signal does not cover.
+
+    Raises
+    ------
+    LogError
+        There is no such signal, or fewer than 2 rows are left.
+    SettingsError
+        A delay is not finite.
+
+    Notes
+    -----
+    Fractions of a sample are interpolated linearly.
     """
     n = np.arange(len(log), dtype=float)
     signals, covered = dict(log.signals), np.ones(len(log), dtype=bool)
@@ -216,152 +263,33 @@ def shift(log: Log, delays: Mapping[str, float]) -> Log:
     return log.with_step(step, time=log.time[covered], signals=kept, notes=[note] if not covered.all() else [])
 
 
-# ---------------------------------------------------------------------- spikes and angles
-
-
-def despike(log: Log, signals: Sequence[str] | None = None, window: int = 15, threshold: float = 8.0) -> Log:
-    """The log with isolated spikes replaced by the median around them (a Hampel filter).
-
-    Parameters
-    ----------
-    signals : names; None for all
-    window, threshold : as in `hampel`
-
-    Raises LogError: there is no such signal.  SettingsError: the window or the threshold has no meaning.
-    """
-    cleaned, replaced = dict(log.signals), {}
-    for name in log.names if signals is None else signals:
-        found, median = hampel(log[name], window, threshold)
-        replaced[name] = int(found.sum())
-        cleaned[name] = np.where(found, median, log[name])
-    step = {"step": "despike", "window": window, "threshold": float(threshold), "replaced": replaced}
-    notes = [f'{n} of {len(log)} samples of "{name}" were spikes and are replaced' for name, n in replaced.items() if n]
-    return log.with_step(step, signals=cleaned, notes=notes)
-
-
-def hampel(
-    values: FloatArray,
-    window: int = 15,
-    threshold: float = 8.0,
-    scale: Callable[[FloatArray, FloatArray, int], FloatArray] | None = None,
-) -> tuple[BoolArray, FloatArray]:
-    """Outliers from the running median, ``|x - median| > threshold * scale``, and that median.
-
-    Parameters
-    ----------
-    values : (N, ...) array
-        Filtered along the first axis, mirrored at both ends.  Samples that are not finite have no part in a median.
-    window : int
-        Samples around each that give its median, odd.
-    threshold : float
-        In standard deviations.
-    scale : callable, optional
-        ``scale(values, median, window) -> (N, ...)`` standard deviation around each sample.  None: `window_deviation`,
-        for a signal ``(N,)`` of any kind, as in `despike`; the method ``lo-diransac`` screens inputs ``(N, n_u)`` with
-        `running_deviation`.
-
-    Returns
-    -------
-    mask : (N, ...) bool array
-    median : (N, ...) array
-
-    Raises
-    ------
-    SettingsError
-        The window is even or below 3, or the threshold is not above 0.
-
-    References
-    ----------
-    Hampel 1974, "The influence curve and its role in robust estimation".
-    """
-    if window < 3 or window % 2 == 0 or not threshold > 0.0:
-        raise SettingsError(
-            f"window = {window}, threshold = {threshold}: give an odd window from 3, a threshold above 0"
-        )
-    median = _running_median(values, window)
-    deviation = (scale or window_deviation)(values, median, window)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.abs(values - median) > threshold * deviation), median
-
-
-def window_deviation(values: FloatArray, median: FloatArray, window: int) -> FloatArray:
-    """Standard deviation ``(N, ...)`` in each window, from the median absolute deviation about the window's median.
-
-    Where more than half of a window is constant, it comes from the mean absolute deviation instead, and it is at least
-    one count of an encoder: a signal at rest has no median deviation.
-
-    References
-    ----------
-    Iglewicz and Hoaglin 1993, "How to detect and handle outliers", for the mean absolute deviation.
-    """
-    off = np.abs(_windows(values, window) - median[..., None])
-    scale = _MAD_TO_STD * _of_finite(_middle, off)
-    scale = np.where(scale > 0.0, scale, _MEAN_TO_STD * _of_finite(np.mean, off))
-    return np.maximum(scale, np.apply_along_axis(_count, 0, values))
-
-
-def running_deviation(values: FloatArray, median: FloatArray, window: int) -> FloatArray:
-    """Standard deviation ``(N, ...)`` from the running median of ``|x - median|``, at least that of the whole signal.
-
-    Changes of the size that is usual over the whole signal, such as a controller's steps, are then no outliers.
-    """
-    whole = np.median(np.abs(values - np.median(values, axis=0)), axis=0)
-    return np.maximum(_MAD_TO_STD * _running_median(np.abs(values - median), window), _MAD_TO_STD * whole)
-
-
-def _running_median(values: FloatArray, window: int) -> FloatArray:
-    """Median ``(N, ...)`` of the finite samples in each window."""
-    return _of_finite(_middle, _windows(values, window))
-
-
-def _windows(values: FloatArray, window: int) -> FloatArray:
-    """The samples ``(N, ..., window)`` around each, mirrored at the ends."""
-    reach = min(window // 2, len(values) - 1)
-    padded = np.pad(values, [(reach, reach), *[(0, 0)] * (values.ndim - 1)], mode="reflect")
-    return np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
-
-
-def _middle(values: FloatArray, axis: int = -1) -> FloatArray:
-    """The median over the last axis; an odd number of samples needs no sorting, which is five times as fast."""
-    n = values.shape[axis]
-    return np.asarray(np.partition(values, n // 2)[..., n // 2] if n % 2 else np.median(values, axis))
-
-
-def _of_finite(statistic: Callable[..., Any], windows: FloatArray) -> FloatArray:
-    """A statistic ``(N, ...)`` of the finite numbers in each of ``(N, ..., window)``; NaN where there is none."""
-    missing = ~np.isfinite(windows)
-    with np.errstate(invalid="ignore"):
-        result = np.asarray(statistic(windows, axis=-1), dtype=float)
-    for at in zip(*np.nonzero(missing.any(axis=-1)), strict=True) if missing.any() else ():
-        finite = windows[at][~missing[at]]
-        result[at] = statistic(finite, axis=-1) if len(finite) else np.nan
-    return result
-
-
-def _count(values: FloatArray) -> float:
-    """One count of an encoder: the smallest change of the signal, if that is a usual one; 0 otherwise."""
-    changes = np.abs(np.diff(values))
-    changes = changes[np.isfinite(changes) & (changes > 0.0)]
-    if not len(changes):
-        return 0.0
-    smallest = float(changes.min())
-    usual = np.isclose(changes, smallest, rtol=_COUNT_ROUNDING).sum() > _USUAL * len(values)
-    return smallest if usual else 0.0
+# ---------------------------------------------------------------------- angles
 
 
 def unwrap(log: Log, names: Sequence[str]) -> Log:
-    """The log with the jumps by a turn taken out of the angles that are wrapped.
+    """Log with the jumps by one turn removed from wrapped angles.
 
+    Parameters
+    ----------
+    log : Log
+    names : sequence of str
+        Angles; the turn is 360 for a signal in degrees, 2 pi otherwise.
+
+    Raises
+    ------
+    LogError
+        There is no such signal.
+
+    Notes
+    -----
     An angle is wrapped if it lies within one turn and jumps by more than half of it, most often by three quarters and
-    more: outliers leave that range, or jump by less, and such a signal is left alone.  The turn is 360 for a signal in
-    degrees, 2 pi otherwise.
-    Raises LogError: there is no such signal.
+    more.  Outliers leave that range, or jump by less, and such a signal is not changed.
     """
     wrapped = {name: jumps for name in names if (jumps := _jumps(log[name], _turn(log, name)))}
     if not wrapped:
         return log
     signals = {**log.signals, **{name: _unwrapped(log[name], _turn(log, name)) for name in wrapped}}
-    notes = [f'"{name}" was wrapped to one turn; {n} jumps are taken out' for name, n in wrapped.items()]
+    notes = [f'"{name}" was wrapped to one turn; {n} jumps are removed' for name, n in wrapped.items()]
     return log.with_step({"step": "unwrap", "jumps": wrapped}, signals=signals, notes=notes)
 
 
@@ -371,7 +299,7 @@ def _turn(log: Log, name: str) -> float:
 
 
 def _jumps(values: FloatArray, turn: float) -> int:
-    """How often an angle that lies within one turn jumps by more than half of it, as wrapping does: mostly by all."""
+    """Number of jumps by more than half a turn in an angle that lies within one turn; 0 if it is not wrapped."""
     finite = values[np.isfinite(values)]
     if len(finite) < 2 or np.ptp(finite) > turn * (1.0 + _ROUNDING):
         return 0

@@ -1,4 +1,4 @@
-"""Reading logs: one file a format, and `read_log` for them all."""
+"""Readers of logs: one module per format, and `read_log` for all formats."""
 
 from __future__ import annotations
 
@@ -42,19 +42,35 @@ def read_log(
     scale: Mapping[str, float] | None = None,
     resample: float | str | None = None,
 ) -> Log:
-    """A log from a CSV (plain or gzip), Parquet, NPZ or MAT file.
+    """Log of a CSV (plain or gzip), Parquet, NPZ or MAT file.
 
     Parameters
     ----------
-    path : the file; its ending names the format
-    rename : new name -> the column's name in the file; ``{"t": "t_s"}`` names the time
-    scale : (new) name -> factor that its numbers are multiplied by; ``{"t": 0.001}`` for a time in milliseconds
-    resample : rate in Hz to interpolate at, or ``"median"`` for the clock's usual rate; None demands an even clock
+    path : str or Path
+        Its ending names the format.
+    rename : mapping of str to str, optional
+        New name -> name of the column in the file; ``{"t": "t_s"}`` names the time.
+    scale : mapping of str to float, optional
+        (New) name -> factor; ``{"t": 0.001}`` for a time in milliseconds.
+    resample : float or "median", optional
+        Rate in Hz for linear interpolation, or ``"median"`` for one row per median interval.  None: the time must be
+        even.
 
-    The time column is ``t``, in seconds; every other column is a signal, one that does not hold numbers is left out and
-    said.  A header ``theta [deg]`` is the signal ``theta`` in degrees.  Rows count from 0, lines of text from 1.
-    A file that `Log.write` has written gives its units, filter, history and notes back.
-    Raises LogError: the file cannot be read, or does not hold a log; one sentence says which, where, and what to try.
+    Returns
+    -------
+    Log
+        With the units, filter, history and notes of a log that `Log.write` has written.
+
+    Raises
+    ------
+    LogError
+        The file cannot be read, or does not hold a log; one sentence says where, and what to do.
+
+    Notes
+    -----
+    The time column is ``t``, in seconds.  Every other column is a signal; a column that does not hold numbers is left
+    out, with a note.  A header ``theta [deg]`` is the signal ``theta`` in degrees.  Rows count from 0, lines of text
+    from 1.
     """
     path = Path(path)
     source = f'log "{path}"'
@@ -114,7 +130,7 @@ def _renamed(table: Table, names: Mapping[str, str], source: str) -> Table:
 
 
 def _time(table: Table, factors: Mapping[str, float], source: str) -> FloatArray:
-    """The column ``t`` (N,), as it stands in the file.  Raises LogError: there is none, or it is not in seconds."""
+    """Column ``t`` (N,) of the file, not scaled.  Raises LogError: there is none, or it is not in seconds."""
     for name, factor in factors.items():
         check_factor(name, factor)
     if "t" not in table.columns:
@@ -137,7 +153,7 @@ def _time_hint(table: Table) -> str:
 
 
 def _signals(table: Table, n: int, source: str) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Columns that are as long as the time, and why the others are no signals."""
+    """Columns that are as long as the time, and for the others the reason why they are no signals."""
     columns = {name: column for name, column in table.columns.items() if name != "t"}
     check_names(columns, source)
     unusable = {name: column for name, column in columns.items() if isinstance(column, str)}

@@ -1,4 +1,4 @@
-"""CSV text, plain or packed by gzip: one header line, one line a row."""
+"""CSV text, plain or compressed by gzip: one header line, then one line per row."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MISSING = ("", "na", "n/a", "nan", "null", "none")
 
 
 def read_csv_gz(data: bytes, source: str) -> Table:
-    """The table that gzip packed.  Raises LogError: as `read_csv`; it is not gzip, or is cut off."""
+    """Table of gzip data.  Raises LogError: as `read_csv`; the data are not gzip, or are cut off."""
     try:
         return read_csv(gzip.decompress(data), source)
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
@@ -34,14 +34,14 @@ def read_csv_gz(data: bytes, source: str) -> Table:
 
 
 def read_csv(data: bytes, source: str) -> Table:
-    """The table that text holds.
+    """Table of CSV text.
 
-    Raises LogError: it is not UTF-8 text with a header line and as many fields in every line.
+    Raises LogError: the data are not UTF-8 text with a header line and as many fields in every line.
     """
     lines = _text(data, source).split("\n")
     metadata = lines.pop(0).strip('"').removeprefix(COMMENT) if _is_metadata(lines[0]) else None
     if not lines:
-        raise LogError(f"{source}: there is no header line after the metadata; give one, and one line a row")
+        raise LogError(f"{source}: there is no header line after the metadata; give one, and one line per row")
     line = 1 if metadata is None else 2
     separator = _separator(lines[0])
     headers = _header(lines[0], separator, source)
@@ -59,12 +59,12 @@ def read_csv(data: bytes, source: str) -> Table:
 
 
 def _is_metadata(line: str) -> bool:
-    """Whether a first line holds metadata; spreadsheets put it into quotation marks, and damage it."""
+    """True for a first line with metadata, also between the quotation marks that spreadsheets put around it."""
     return line.lstrip('"').startswith(COMMENT)
 
 
 def _text(data: bytes, source: str) -> str:
-    """The text, every line but the last ended by one line feed."""
+    """Decoded text whose lines are separated by single line feeds."""
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -75,12 +75,12 @@ def _text(data: bytes, source: str) -> str:
         raise LogError(f"{source}: it holds binary data, not text")
     text = text.replace("\r\n", "\n").replace("\r", "\n").strip("\n")
     if not text.strip():
-        raise LogError(f"{source}: it is empty; give a header line and one line a row")
+        raise LogError(f"{source}: it is empty; give a header line and one line per row")
     return text
 
 
 def _separator(header: str) -> str:
-    """The comma; a semicolon or a tab where the header has only that."""
+    """The semicolon or tab of a header that has no other separator; the comma otherwise."""
     found = [s for s in _SEPARATORS if s in header]
     return found[0] if len(found) == 1 else ","
 
@@ -104,7 +104,7 @@ def _is_number(text: str) -> bool:
 
 
 def _check_ragged(lines: list[str], first: int, separator: str, source: str) -> None:
-    """Raise LogError at the first line that has not as many fields as the header, which is line ``first``."""
+    """Raise LogError for the first line that has not as many fields as the header, which is line ``first``."""
     if any('"' in line for line in lines):
         counts = _quoted_counts(lines, first, separator, source)
     else:
@@ -120,7 +120,7 @@ def _check_ragged(lines: list[str], first: int, separator: str, source: str) -> 
 
 
 def _quoted_counts(lines: list[str], first: int, separator: str, source: str) -> list[tuple[int, int]]:
-    """Line number and number of fields of every record, quotation marks understood."""
+    """Line number and number of fields of every record; separators in quotation marks do not count."""
     reader = csv.reader((line + "\n" for line in lines), delimiter=separator, strict=True)
     try:
         return [(reader.line_num + first - 1, len(record)) for record in reader]
@@ -129,7 +129,7 @@ def _quoted_counts(lines: list[str], first: int, separator: str, source: str) ->
 
 
 def _frame(lines: list[str], separator: str, source: str) -> pl.DataFrame:
-    """Every field as text."""
+    """Data frame with every field as text."""
     import polars as pl
 
     data = io.BytesIO("\n".join(lines).encode())
@@ -140,7 +140,7 @@ def _frame(lines: list[str], separator: str, source: str) -> pl.DataFrame:
 
 
 def _numbers(fields: pl.Series, first: int, separator: str) -> FloatArray | str:
-    """A column of text, from line ``first``, as numbers, empty fields as NaN; or which field is none.
+    """Numbers of a column of text from line ``first``, empty fields as NaN, or the first field that is no number.
 
     Semicolons allow decimal commas.
     """

@@ -19,9 +19,9 @@ _DAMAGED = (
 
 
 def read_mat(data: bytes, source: str) -> Table:
-    """The table of a MAT file's arrays.
+    """Table of the arrays in a MAT file.
 
-    Raises LogError: it is of version 7.3 (HDF5), is no MAT file, or is damaged.
+    Raises LogError: the data are of version 7.3 (HDF5), are no MAT file, or are damaged.
     """
     from scipy.io import loadmat, whosmat
     from scipy.io.matlab import MatReadError

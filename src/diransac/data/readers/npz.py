@@ -19,9 +19,9 @@ _DAMAGED = (ValueError, EOFError, OSError, KeyError, NotImplementedError, Runtim
 
 
 def read_npz(data: bytes, source: str) -> Table:
-    """The table of an NPZ file.
+    """Table of an NPZ file.
 
-    Raises LogError: it is none, is cut off, or holds pickled objects.
+    Raises LogError: the data are no NPZ file, are cut off, or hold pickled objects.
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))

@@ -1,4 +1,4 @@
-"""Parquet: one column a signal."""
+"""Parquet: one column per signal."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _MAGIC = b"PAR1"
 
 
 def read_parquet(data: bytes, source: str) -> Table:
-    """The table of a Parquet file.
+    """Table of a Parquet file.
 
-    Raises LogError: it is none, is cut off, or is damaged.
+    Raises LogError: the data are no Parquet file, are cut off, or are damaged.
     """
     import polars as pl
 
@@ -44,7 +44,7 @@ def read_parquet(data: bytes, source: str) -> Table:
 
 
 def _numbers(series: pl.Series) -> FloatArray | str:
-    """A column as numbers, null as NaN; or its first value, which is none."""
+    """Numbers of a column, null as NaN, or its first value, which is no number."""
     import polars as pl
 
     if series.dtype.is_numeric() or series.dtype in (pl.Boolean, pl.Null):

@@ -1,4 +1,4 @@
-"""What a file holds before it is a log: columns of numbers by name, and why other columns are none."""
+"""`Table`: the contents of a file before they are checked as a log."""
 
 from __future__ import annotations
 
@@ -27,10 +27,14 @@ class Table:
 
     Parameters
     ----------
-    columns : name -> (n,) numbers, or why the column has none, such as ``is not numeric: line 3 holds "takeoff"``
-    units : name -> unit that the header states
-    notes : what was found while reading
-    history, filter : of the log that was written to the file, as `Log` has them
+    columns : mapping of str to (n,) array or str
+        Numbers, or the reason why a column has none, such as ``is not numeric: line 3 holds "takeoff"``.
+    units : mapping of str to str
+        Units in headers and metadata.
+    notes : tuple of str
+        Findings of the reader, a sentence each.
+    history, filter
+        Those of the log that was written to the file, as in `Log`.
     """
 
     columns: Mapping[str, FloatArray | str]
@@ -41,7 +45,7 @@ class Table:
 
 
 def with_metadata(table: Table, text: str | bytes, source: str, remedy: str = "write the log again") -> Table:
-    """The table with what the file's metadata add; units in headers, which an editor may have changed, prevail.
+    """Table completed by the metadata of its file; units in headers, which an editor may have changed, prevail.
 
     Raises LogError: the metadata are damaged.
     """
@@ -57,7 +61,7 @@ def with_metadata(table: Table, text: str | bytes, source: str, remedy: str = "w
 
 
 def check_unique(names: Sequence[str], source: str) -> None:
-    """Raise LogError where two columns have one name."""
+    """Raise LogError if two columns have one name."""
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         raise LogError(
@@ -66,9 +70,9 @@ def check_unique(names: Sequence[str], source: str) -> None:
 
 
 def table_of_arrays(arrays: Mapping[str, npt.NDArray[Any]], source: str) -> Table:
-    """Named arrays as a table: a row or column vector is a column, a matrix ``q (n, k)`` columns ``q_1`` to ``q_k``.
+    """Table of named arrays: a vector is one column, a matrix ``q (n, k)`` the columns ``q_1`` to ``q_k``.
 
-    Raises LogError: two columns come to have one name.
+    Raises LogError: two columns would have one name.
     """
     headers = [split_unit(name) for name in arrays]
     pieces = [piece for (name, _), x in zip(headers, arrays.values(), strict=True) for piece in _pieces(name, x)]
