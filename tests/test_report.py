@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from jinja2 import UndefinedError
 
 import diransac as dr
-from diransac.report import figures, rendering
+from diransac.report import figures, labelled, rendering
 from diransac.report.assessment import findings, verdict, worst
-from diransac.report.runs import bulk_range, labelled, simulate_on
+from diransac.report.runs import bulk_range, simulate_on
 from diransac.simulation import rollouts
 
 VOID = {"meta", "input", "link"}

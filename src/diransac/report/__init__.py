@@ -9,10 +9,10 @@ from typing import Any
 from diransac.data.log import Log
 from diransac.errors import ResultError
 from diransac.identification.result import Result
-from diransac.report import sections
+from diransac.report import provenance, sections
 from diransac.report.over_time import figures_of
-from diransac.report.rendering import write_page
-from diransac.report.runs import Entry, labelled, simulate_all
+from diransac.report.rendering import numbered, write_page
+from diransac.report.runs import Entry, simulate_all
 
 __all__ = ["write_report"]
 
@@ -43,6 +43,26 @@ def write_report(
     write_page(path, "report.html", ["page.css"], "page.js", **_content(entries, several))
 
 
+def labelled(results: Result | Sequence[Result] | Mapping[str, Result]) -> dict[str, Result]:
+    """Results by unique label: the mapping's keys, or the methods, numbered where they repeat.
+
+    Raises ResultError: there is no result, or an object of another type.
+    """
+    if isinstance(results, Mapping):
+        pairs: list[tuple[str, object]] = [(str(label), result) for label, result in results.items()]
+    else:
+        several = results if isinstance(results, list | tuple) else [results]
+        pairs = [(getattr(result, "method", ""), result) for result in several]
+    named: dict[str, Result] = {}
+    for label, (_, result) in zip(numbered(label for label, _ in pairs), pairs, strict=True):
+        if not isinstance(result, Result):
+            raise ResultError(f"a report shows results of diransac.identify; found a {type(result).__name__}")
+        named[label] = result
+    if not named:
+        raise ResultError("a report shows results of diransac.identify; found none")
+    return named
+
+
 def _as_list(logs: object) -> list[Log]:
     """The logs as a list.  Raises ResultError: there is none, or an object of another type."""
     several: list[Log] = []
@@ -57,7 +77,7 @@ def _as_list(logs: object) -> list[Log]:
 
 def _content(entries: Sequence[Entry], logs: Sequence[Log]) -> dict[str, Any]:
     """Values of the template."""
-    models = sections.unique_models(entries)
+    models = provenance.unique_models(entries)
     by_log = list(zip(*(entry.runs for entry in entries), strict=True))
     return {
         "title": f"{models[0].name}: {', '.join(entry.label for entry in entries)}",
@@ -74,11 +94,11 @@ def _content(entries: Sequence[Entry], logs: Sequence[Log]) -> dict[str, Any]:
             (runs[0].log_name, sections.short_term_scores(runs), [sections.scores(run) for run in runs])
             for runs in by_log
         ],
-        "equations": [sections.model_text(model) for model in models],
-        "provenance": sections.provenance(entries),
-        "log_facts": sections.log_facts(entries, logs),
-        "preparation": sections.preparation(entries),
-        "notes": sections.notes(entries),
-        "snippet": sections.snippet(entries),
-        "versions": sections.versions(),
+        "equations": [provenance.model_text(model) for model in models],
+        "settings": provenance.settings(entries),
+        "log_facts": provenance.log_facts(entries, logs),
+        "preparation": provenance.preparation(entries),
+        "notes": provenance.notes(entries),
+        "snippet": provenance.snippet(entries),
+        "versions": provenance.versions(),
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,7 +17,7 @@ from diransac.errors import ResultError
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["Table", "encodable", "environment", "number", "percent", "plural", "share", "write_page"]
+__all__ = ["Table", "encodable", "environment", "number", "numbered", "percent", "plural", "share", "write_page"]
 
 _LEAST_PERCENT = 0.01
 _TIMES = 3.0
@@ -96,7 +96,7 @@ def _policy(script: str) -> str:
     return f"{allowed}; script-src 'sha256-{digest}'"
 
 
-# ---------------------------------------------------------------------- numbers
+# ---------------------------------------------------------------------- numbers and names
 
 
 def number(x: float, digits: int = 4) -> str:
@@ -131,3 +131,12 @@ def share(x: float, whole: str) -> str:
 def plural(count: int, noun: str) -> str:
     """A count with its noun: ``1 row``, ``2,501 rows``."""
     return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+
+
+def numbered(names: Iterable[str]) -> list[str]:
+    """Unique names: the second and later occurrences get a number."""
+    found: list[str] = []
+    for name in names:
+        repeats = sum(other.split(" #")[0] == name for other in found)
+        found.append(f"{name} #{repeats + 1}" if repeats else name)
+    return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -19,6 +19,7 @@ from diransac.identification.evaluation import as_diagnosed, choose_scoring, jud
 from diransac.identification.result import LogSummary, Result
 from diransac.identification.settings import Settings
 from diransac.identification.validation import Validation, validate
+from diransac.report.rendering import numbered
 from diransac.simulation import Rollouts, inlier_mask, rollouts
 
 __all__ = [
@@ -26,9 +27,7 @@ __all__ = [
     "LogView",
     "Run",
     "bulk_range",
-    "labelled",
     "log_view",
-    "numbered",
     "simulate_all",
     "simulate_on",
     "summaries",
@@ -253,36 +252,7 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
 
 
-# ---------------------------------------------------------------------- the page's results and logs
-
-
-def labelled(results: Result | Sequence[Result] | Mapping[str, Result]) -> dict[str, Result]:
-    """Results by unique label: the mapping's keys, or the methods, numbered where they repeat.
-
-    Raises ResultError: there is no result, or an object of another type.
-    """
-    if isinstance(results, Mapping):
-        pairs: list[tuple[str, object]] = [(str(label), result) for label, result in results.items()]
-    else:
-        several = results if isinstance(results, list | tuple) else [results]
-        pairs = [(getattr(result, "method", ""), result) for result in several]
-    named: dict[str, Result] = {}
-    for label, (_, result) in zip(numbered(label for label, _ in pairs), pairs, strict=True):
-        if not isinstance(result, Result):
-            raise ResultError(f"a report shows results of diransac.identify; found a {type(result).__name__}")
-        named[label] = result
-    if not named:
-        raise ResultError("a report shows results of diransac.identify; found none")
-    return named
-
-
-def numbered(names: Iterable[str]) -> list[str]:
-    """Unique names: the second and later occurrences get a number."""
-    found: list[str] = []
-    for name in names:
-        repeats = sum(other.split(" #")[0] == name for other in found)
-        found.append(f"{name} #{repeats + 1}" if repeats else name)
-    return found
+# ---------------------------------------------------------------------- simulations
 
 
 def simulate_all(results: Mapping[str, Result], logs: Sequence[Log]) -> list[Entry]:
