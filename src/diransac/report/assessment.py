@@ -187,7 +187,8 @@ def _diagnosis(runs: Sequence[Run]) -> Iterator[Finding]:
         run = max(having, key=lambda run: max(run.unmodelled_fraction.values()))
         name = max(run.unmodelled_fraction, key=lambda n: run.unmodelled_fraction[n])
         left = run.unmodelled_fraction[name]
-        text = f"The RMS unmodelled acceleration is {percent(left)} of the modelled one in {name}, less in others"
+        others = ", less in the others" if len(run.unmodelled_fraction) > 1 else ""
+        text = f"The RMS unmodelled acceleration is {percent(left)} of the modelled one in {name}{others}"
         yield Finding("good" if left <= _NEAR else "care", f"{text}{_where(run, runs)}.")
     if found.input_delay_significant:
         late = f"Inputs act {number(1e3 * found.input_delay, 3)} ms after their time stamps"

@@ -110,18 +110,20 @@ def log_tables(entries: Sequence[Entry], logs: Sequence[Log]) -> list[Table]:
 
 def _log_table(entry: Entry, logs: Sequence[Log], several: bool) -> Table:
     own = list(dict.fromkeys(name for run in entry.runs for name in run.view.per_log))
-    units = entry.result.units
-    header = ("Log", "Duration, s", "Rate, Hz", "Rows", "Inliers", "Fit error", "Remark")
+    remarks = ["held out" if run.held_out else run.view.remark for run in entry.runs]
+    header = ["Log", "Duration, s", "Rate, Hz", "Rows", "Inliers", "Fit error"]
+    header += [f"{name}, {entry.result.units[name]}" for name in own]
     rows = []
     for log, run in zip(logs, entry.runs, strict=True):
         duration, rate = number(log.dt * (len(log) - 1)), number(1.0 / log.dt)
         measures = (percent(run.inlier_fraction), number(run.view.fit_error))
-        remark = "held out" if run.held_out else run.view.remark
         values = (number(run.view.parameters[name], 6) if name in run.view.per_log else "–" for name in own)
-        rows.append((run.log_name, duration, rate, f"{len(log):,}", *measures, remark, *values))
+        rows.append((run.log_name, duration, rate, f"{len(log):,}", *measures, *values))
+    if any(remarks):
+        header.append("Remark")
+        rows = [(*row, remark) for row, remark in zip(rows, remarks, strict=True)]
     caption = "Inliers: fraction of the valid rows that agree with the simulation."
-    names = (f"{name}, {units[name]}" for name in own)
-    return Table((*header, *names), rows, f"By {entry.label}. {caption}" if several else caption)
+    return Table(header, rows, f"By {entry.label}. {caption}" if several else caption)
 
 
 # ---------------------------------------------------------------------- parameters
@@ -184,8 +186,8 @@ def _parameter_ticks(scale: Scale) -> list[tuple[float, str]]:
     found = ticks(scale.low, scale.high, 4)
     if max(len(text) for _, text in found) <= _LONG:
         return found
-    margin = 0.15 * (scale.high - scale.low)
-    return [(x, text) for x, text in found[1::2] if scale.low + margin < x < scale.high - margin]
+    margin = 0.1 * (scale.high - scale.low)
+    return [x for x in ticks(scale.low, scale.high, 2) if scale.low + margin < x[0] < scale.high - margin]
 
 
 def _parameter_scale(name: str, entries: Sequence[Entry]) -> Scale:
