@@ -15,7 +15,7 @@ from diransac.data.dataset import Observations, observe
 from diransac.data.log import Log
 from diransac.errors import LogError, ResultError, SettingsError
 from diransac.identification.diagnosis import Diagnosis
-from diransac.identification.evaluation import as_diagnosed, choose_scoring, judged_signals
+from diransac.identification.evaluation import Scoring, as_diagnosed, choose_scoring, judged_signals
 from diransac.identification.result import LogSummary, Result
 from diransac.identification.settings import Settings
 from diransac.identification.validation import Validation, validate
@@ -320,10 +320,9 @@ def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | 
     open_loop, errors = _simulated(engine, parameters, observations, start, len(observations))
     inliers = view.inliers
     if inliers is None:
-        finite = np.where(np.isnan(errors), np.inf, errors)
-        near = inlier_mask(finite, observations.valid, scoring.thresholds, scoring.min_inlier_signals)
+        inliers = _close_rows(errors, observations, scoring)
     else:
-        near = inliers[first_row : first_row + len(observations)]
+        inliers = inliers[first_row : first_row + len(observations)]
     simulated, period = open_loop, np.inf
     if diagnosis is not None and set(model.state) <= set(diagnosis.smoothed_states):
         states, n_rows = _restarts(diagnosis, observations)
@@ -344,9 +343,15 @@ def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | 
         open_loop=open_loop[:, columns],
         accelerations=dict(zip(model.accelerations, simulated[:, len(model.state) :].T, strict=True)),
         thresholds=scoring.thresholds,
-        inliers=near,
+        inliers=inliers,
         validation=_validation(result, log, result.settings),
     )
+
+
+def _close_rows(errors: FloatArray, observations: Observations, scoring: Scoring) -> BoolArray:
+    """Inliers (N,) of a held-out log by the thresholds of its scoring."""
+    finite = np.where(np.isnan(errors), np.inf, errors)
+    return inlier_mask(finite, observations.valid, scoring.thresholds, scoring.min_inlier_signals)
 
 
 def _prepared(result: Result, view: LogView, log: Log) -> Log:
