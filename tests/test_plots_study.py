@@ -277,7 +277,7 @@ def test_the_page_holds_figures_numbers_and_failures_and_loads_nothing(store_wit
     assert text.count("<svg") == 2, "errors and paths"
     for figure in re.findall(r"<svg.*?</svg>", text, re.DOTALL):
         ElementTree.fromstring(figure)
-    assert "default-src &#x27;none&#x27;" in text
+    assert "default-src &#39;none&#39;" in text
     assert "<script" not in text
     assert not re.findall(r'(?:src|href)="(?!#)', text), "only references into the page"
     assert "1 of 5 (20 %)" in text

@@ -1,87 +1,104 @@
-"""One HTML page that shows what was identified and how far it can be trusted: self-contained, without any network."""
+"""Self-contained HTML page of identification results: parameters, verdict, figures, provenance."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
-from diransac.atomic import write_text
 from diransac.data.log import Log
 from diransac.errors import ResultError
 from diransac.identification.result import Result
-from diransac.report import sections
-from diransac.report.diagnosed import diagnoses
-from diransac.report.figures import Timeline
-from diransac.report.markup import Html, tag
-from diransac.report.over_time import inliers_over_time, signals_over_time
-from diransac.report.parameters import parameters
-from diransac.report.runs import Run, diagnosis_of, labelled, simulate_on
+from diransac.report import provenance, sections
+from diransac.report.over_time import figures_of
+from diransac.report.rendering import numbered, write_page
+from diransac.report.runs import Entry, simulate_all
 
 __all__ = ["write_report"]
 
-# Detail of the figures: a page of many results has less of each, so that it stays light.
-_CELLS, _FEWEST_CELLS = 500, 110
 
-
-def write_report(results: Result | Sequence[Result] | Mapping[str, Result], log: Log, path: str | Path) -> None:
-    """Write a page about one result, or several side by side, and the log that they are looked at with.
+def write_report(
+    results: Result | Sequence[Result] | Mapping[str, Result], logs: Log | Sequence[Log], path: str | Path
+) -> None:
+    """Write one HTML page about one or several results, evaluated on one or several logs.
 
     Parameters
     ----------
-    results : a result, several, or several by the names that the page shall call them
-    log : the log that was given to `identify`; with another one the page is a held-out validation, and says so
-    path : of the page; it appears whole or not at all
+    results : one result, several, or several by label
+    logs : the logs that were given to `identify`, or others: the page is then a held-out validation
+    path : file of the page, written whole or not at all
 
-    The page needs nothing else and loads nothing: figures are SVG, its script is its own and the only one that a
-    browser will run.  The same results and log give the same page.
-    Raises ResultError: there is no result, the log cannot be simulated by its model, or the page cannot be written.
+    Raises
+    ------
+    ResultError
+        There is no result or no log, a log cannot be simulated by a model, or the page cannot be written.
+
+    Notes
+    -----
+    The page loads nothing: figures are SVG, and its content security policy admits its own script only.  The same
+    results and logs give the same page.
     """
-    named = labelled(results)
-    diagnosis = diagnosis_of(named, log)
-    runs = [simulate_on(label, result, log, diagnosis) for label, result in named.items()]
-    try:
-        write_text(path, _page(runs, log))
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
+    named, several = labelled(results), _as_list(logs)
+    entries = simulate_all(named, several)
+    write_page(path, "report.html", ["page.css"], "page.js", **_content(entries, several))
 
 
-def _page(runs: Sequence[Run], log: Log) -> str:
-    timeline = Timeline(len(log), float(log.time[0]), log.dt, max(_FEWEST_CELLS, _CELLS // len(runs)))
-    title = f"{runs[0].result.model.name}: {', '.join(run.label for run in runs)}"
-    body = [
-        sections.heading(runs, log),
-        tag(
-            "main",
-            sections.short(runs),
-            parameters(runs),
-            *diagnoses(runs, timeline),
-            signals_over_time(runs, timeline),
-            inliers_over_time(runs, timeline),
-            sections.scores(runs),
-            sections.equations(runs),
-            sections.making(runs, log),
-        ),
-    ]
-    script = _asset("page.js")
-    head = [
-        tag("meta", charset="utf-8"),
-        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        tag("meta", http_equiv="Content-Security-Policy", content=_policy(script)),
-        tag("title", title),
-        tag("style", Html(_asset("page.css"))),
-    ]
-    page = tag("html", tag("head", *head), tag("body", *body, tag("script", Html(script))), lang="en")
-    return f"<!DOCTYPE html>\n{page}\n"
+def labelled(results: Result | Sequence[Result] | Mapping[str, Result]) -> dict[str, Result]:
+    """Results by unique label: the mapping's keys, or the methods, numbered where they repeat.
+
+    Raises ResultError: there is no result, or an object of another type.
+    """
+    if isinstance(results, Mapping):
+        pairs: list[tuple[str, object]] = [(str(label), result) for label, result in results.items()]
+    else:
+        several = results if isinstance(results, list | tuple) else [results]
+        pairs = [(getattr(result, "method", ""), result) for result in several]
+    named: dict[str, Result] = {}
+    for label, (_, result) in zip(numbered(label for label, _ in pairs), pairs, strict=True):
+        if not isinstance(result, Result):
+            raise ResultError(f"a report shows results of diransac.identify; found a {type(result).__name__}")
+        named[label] = result
+    if not named:
+        raise ResultError("a report shows results of diransac.identify; found none")
+    return named
 
 
-def _policy(script: str) -> str:
-    """What a browser may do with the page: apply its styles, run its one script, load nothing."""
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    return f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+def _as_list(logs: object) -> list[Log]:
+    """The logs as a list.  Raises ResultError: there is none, or an object of another type."""
+    several: list[Log] = []
+    for log in logs if isinstance(logs, list | tuple) else [logs]:
+        if not isinstance(log, Log):
+            raise ResultError(f"a report shows logs; found a {type(log).__name__}; give a diransac.Log or several")
+        several.append(log)
+    if not several:
+        raise ResultError("a report shows logs; found none; give the log that was given to identify")
+    return several
 
 
-def _asset(name: str) -> str:
-    return (files("diransac.report") / name).read_text(encoding="utf-8")
+def _content(entries: Sequence[Entry], logs: Sequence[Log]) -> dict[str, Any]:
+    """Values of the template."""
+    models = provenance.unique_models(entries)
+    by_log = list(zip(*(entry.runs for entry in entries), strict=True))
+    return {
+        "title": f"{models[0].name}: {', '.join(entry.label for entry in entries)}",
+        "models": models,
+        "lead": sections.lead(entries, logs),
+        "differences": sections.differences(entries),
+        "cards": [sections.card(entry) for entry in entries],
+        "log_tables": sections.log_tables(entries, logs),
+        "parameters": sections.parameters(entries),
+        "sensitivity": sections.sensitivity(entries),
+        "diagnosis": sections.diagnosis(entries),
+        "logs": [figures_of(log, runs, len(logs)) for log, runs in zip(logs, by_log, strict=True)],
+        "scores": [
+            (runs[0].log_name, sections.short_term_scores(runs), [sections.scores(run) for run in runs])
+            for runs in by_log
+        ],
+        "equations": [provenance.model_text(model) for model in models],
+        "settings": provenance.settings(entries),
+        "log_facts": provenance.log_facts(entries, logs),
+        "preparation": provenance.preparation(entries),
+        "notes": provenance.notes(entries),
+        "snippet": provenance.snippet(entries),
+        "versions": provenance.versions(),
+    }

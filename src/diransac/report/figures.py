@@ -1,7 +1,7 @@
-"""Figures as SVG: every vertex is a sample, x is the log's row, y thousandths of the range that is shown.
+"""Geometry of the SVG figures: every vertex is a sample, x is the log's row, y is in thousandths of the shown range.
 
-A long signal keeps the smallest and the largest sample of each of some hundred stretches, so no peak is lost, and where
-it is drawn as dots every n-th one, so that it looks as dense as it is.
+A long signal is reduced to the smallest and largest sample of each of several hundred cells, so that no peak is lost;
+dots additionally keep every n-th sample, so that their density is preserved.
 """
 
 from __future__ import annotations
@@ -15,10 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray, IntArray
-from diransac.report.markup import Html, tag
 
 __all__ = [
+    "Figure",
+    "Panel",
+    "Plot",
     "Scale",
+    "Tick",
     "Timeline",
     "Trace",
     "extremes",
@@ -30,6 +33,8 @@ __all__ = [
     "time_plot",
 ]
 
+Tick = tuple[str, str]
+"""Position in percent of an axis, and text."""
 
 _HEIGHT = 1000
 _FARTHEST = 10**6
@@ -39,13 +44,13 @@ _MARGIN = 0.06
 
 @dataclass(frozen=True)
 class Timeline:
-    """The log's rows in time.
+    """Time axis of a log.
 
     Parameters
     ----------
-    n_rows : how many
-    start, dt : time of the first, and from one to the next, s
-    cells : stretches of which a figure keeps the extremes
+    n_rows : number of rows
+    start, dt : time of the first row and sampling time, s
+    cells : number of cells of which a figure keeps the extremes
     """
 
     n_rows: int
@@ -56,28 +61,28 @@ class Timeline:
 
 @dataclass(frozen=True)
 class Scale:
-    """The range of values that a plot shows."""
+    """Range of values of a plot."""
 
     low: float
     high: float
 
     def height(self, values: npt.ArrayLike) -> IntArray:
-        """Thousandths of the range from its top, as the figures count; what is far outside is brought nearer."""
+        """Thousandths of the range from its top; values far outside are clipped."""
         part = (self.high - np.asarray(values, dtype=float)) / (self.high - self.low)
         return np.rint(np.clip(_HEIGHT * part, -_FARTHEST, _FARTHEST)).astype(np.int64)
 
 
 @dataclass(frozen=True)
 class Trace:
-    """A series in a plot.
+    """One series of a plot.
 
     Parameters
     ----------
-    name : what the reader is told at the pointer
+    name : shown beside the value under the pointer
     look : CSS classes
     kind : ``line`` joins neighbouring rows, ``dots`` does not
     rows : (n,)   rows of the log, increasing
-    values : (n,)   NaN is left out
+    values : (n,)   NaN is omitted
     """
 
     name: str
@@ -91,7 +96,7 @@ class Trace:
 
 
 def padded(low: float, high: float) -> Scale:
-    """The scale that shows a range with a margin; a range of no width gets one."""
+    """Scale of a range with a margin; a range of zero width is widened."""
     width = high - low
     if not width > 1e-12 * max(abs(low), abs(high), 1e-300):
         width = max(abs(low), abs(high), 1e-12)
@@ -99,7 +104,7 @@ def padded(low: float, high: float) -> Scale:
 
 
 def ticks(low: float, high: float, about: int = 4) -> list[tuple[float, str]]:
-    """Round values within a range and how they are written, about so many."""
+    """Round values within a range, about as many as requested, and their texts."""
     step = (high - low) / about
     decade = 10.0 ** math.floor(math.log10(step))
     step = next(x * decade for x in (1.0, 2.0, 5.0, 10.0) if x * decade >= step * 0.7)
@@ -108,9 +113,9 @@ def ticks(low: float, high: float, about: int = 4) -> list[tuple[float, str]]:
 
 
 def tick_text(x: float, step: float) -> str:
-    """A tick's value to the digits that its step needs."""
+    """Value of a tick with the digits that resolve the step."""
     magnitude = math.floor(math.log10(step) + 1e-9)
-    if magnitude >= -4 and abs(x) < 1e5:
+    if magnitude >= -6 and abs(x) < 1e5:
         return f"{x:.{max(0, -magnitude)}f}".replace("-", "−")
     if not x:
         return "0"
@@ -123,14 +128,14 @@ def tick_text(x: float, step: float) -> str:
 
 
 def extremes(values: FloatArray, cells: IntArray) -> IntArray:
-    """Indices, ascending, of the smallest and the largest value in each cell; ``cells (n,)`` numbers them."""
+    """Ascending indices of the smallest and largest value of each cell; ``cells (n,)`` holds cell numbers."""
     order = np.lexsort((values, cells))
     ends = np.append(np.flatnonzero(np.diff(cells[order])), len(order) - 1)
     return np.unique(np.concatenate([order[np.append(0, ends[:-1] + 1)], order[ends]]))
 
 
 def _kept(trace: Trace, timeline: Timeline) -> IntArray:
-    """Indices of the samples that are drawn: all if few, else each cell's extremes, of dots some more."""
+    """Indices of the drawn samples: all if few, else the extremes of each cell, and for dots every n-th sample."""
     finite = np.flatnonzero(np.isfinite(trace.values))
     if len(finite) <= 2 * timeline.cells:
         return finite
@@ -141,7 +146,7 @@ def _kept(trace: Trace, timeline: Timeline) -> IntArray:
 
 
 def path_data(trace: Trace, scale: Scale, timeline: Timeline) -> str:
-    """The ``d`` of a path: a relative line or move from each sample to the next, ``h0`` making a dot after a move."""
+    """Attribute ``d`` of a path: a relative line or move from sample to sample, and ``h0`` after a move for a dot."""
     kept = _kept(trace, timeline)
     if not len(kept):
         return ""
@@ -157,6 +162,62 @@ def path_data(trace: Trace, scale: Scale, timeline: Timeline) -> str:
 # ---------------------------------------------------------------------- plots
 
 
+@dataclass(frozen=True)
+class Plot:
+    """One SVG plot over time; the script of the page zooms and reads it.
+
+    Parameters
+    ----------
+    label : description for readers who cannot see the plot
+    look : CSS classes of its panel
+    width : x of the last row
+    start, dt : time of the first row and sampling time, s
+    paths : ``(CSS classes, name, d)`` of each path; the name is empty for paths without values
+    scale : range of values; None for a strip
+    y_ticks : texts of the values
+    full : y of the highest and lowest measured sample, if outside of the scale
+    """
+
+    label: str
+    look: str
+    width: int
+    start: float
+    dt: float
+    paths: tuple[tuple[str, str, str], ...]
+    scale: Scale | None = None
+    y_ticks: tuple[Tick, ...] = ()
+    full: str = ""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A plot with the text above it."""
+
+    plot: Plot
+    heading: str = ""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Panels one above the other on one time axis.
+
+    Parameters
+    ----------
+    title, unit : heading
+    facts : captions
+    panels : from top to bottom
+    time_ticks : texts of the times
+    beyond : caption about samples outside of the scale, empty if there are none
+    """
+
+    title: str
+    unit: str
+    facts: tuple[str, ...]
+    panels: tuple[Panel, ...]
+    time_ticks: tuple[Tick, ...]
+    beyond: str = ""
+
+
 def time_plot(
     traces: Iterable[Trace],
     scale: Scale,
@@ -166,60 +227,52 @@ def time_plot(
     look: str = "",
     levels: Sequence[float] = (),
     full: tuple[float, float] | None = None,
-) -> Html:
-    """A plot over time that page.js lets zoom and read.
+) -> Plot:
+    """Plot of several traces over time.
 
     Parameters
     ----------
-    label : what it shows, for those who cannot see it
+    traces, scale, timeline : series and their axes
+    label : description for readers who cannot see the plot
     look : CSS classes of the panel
-    levels : values to mark by a horizontal line
-    full : the range of everything that was measured, where it is more than the scale shows
+    levels : values marked by a horizontal line
+    full : range of all measured samples, where it exceeds the scale
     """
     marks = ticks(scale.low, scale.high)
     heights = [int(y) for y in scale.height([x for x, _ in marks])]
-    names = [
-        tag("span", text, class_="tick y", style=f"top:{y / 10:.1f}%")
-        for y, (_, text) in zip(heights, marks, strict=True)
-    ]
     width = max(1, timeline.n_rows - 1)
-    lines = [tag("path", class_="grid", d="".join(f"M0 {y}h{width}" for y in heights))]
+    paths = [("grid", "", "".join(f"M0 {y}h{width}" for y in heights))]
     if levels:
-        lines.append(tag("path", class_="level", d="".join(f"M0 {y}h{width}" for y in scale.height(levels))))
+        paths.append(("level", "", "".join(f"M0 {y}h{width}" for y in scale.height(levels))))
     drawn = [(trace, path_data(trace, scale, timeline)) for trace in traces]
-    lines += [tag("path", class_=f"trace {t.kind} {t.look}", data_name=t.name, d=d) for t, d in drawn if d]
-    reach = None if full is None else " ".join(str(y) for y in scale.height([full[1], full[0]]))
-    svg = _svg(lines, timeline, label, data_low=scale.low, data_high=scale.high, data_full=reach)
-    return tag("div", tag("div", *names, class_="ticks"), svg, class_=f"panel {look}".strip())
-
-
-def _svg(lines: list[Html], timeline: Timeline, label: str, **attributes: str | float | None) -> Html:
-    return tag(
-        "svg",
-        *lines,
-        class_="plot",
-        viewBox=f"0 0 {max(1, timeline.n_rows - 1)} {_HEIGHT}",
-        preserveAspectRatio="none",
-        role="img",
-        aria_label=label,
-        tabindex="0",
-        data_start=timeline.start,
-        data_dt=timeline.dt,
-        **attributes,
+    paths += [(f"trace {trace.kind} {trace.look}", trace.name, d) for trace, d in drawn if d]
+    return Plot(
+        label=label,
+        look=look,
+        width=width,
+        start=timeline.start,
+        dt=timeline.dt,
+        paths=tuple(paths),
+        scale=scale,
+        y_ticks=tuple((f"{y / 10:.1f}%", text) for y, (_, text) in zip(heights, marks, strict=True)),
+        full="" if full is None else " ".join(str(y) for y in scale.height([full[1], full[0]])),
     )
 
 
-def strip(layers: Iterable[tuple[FloatArray, str]], timeline: Timeline, label: str) -> Html:
-    """A strip over time, each layer ``(fractions (n_rows,), CSS classes)`` filled to each row's fraction from below.
+def strip(layers: Iterable[tuple[FloatArray, str]], timeline: Timeline, label: str) -> Plot:
+    """Strip of bars over time; of a long log, a bar is the mean over several rows.
 
-    Of a long log, a bar stands for a stretch of rows.
+    Parameters
+    ----------
+    layers : ``(fractions (n_rows,), CSS classes)`` of each layer; each row's bar is as high as its fraction
+    timeline, label : as of `time_plot`
     """
-    bars = [tag("path", class_=look, d=_bars(fractions)) for fractions, look in layers if fractions.any()]
-    return tag("div", tag("div", class_="ticks"), _svg(bars, timeline, label), class_="panel strip")
+    paths = tuple((look, "", _bars(fractions)) for fractions, look in layers if fractions.any())
+    return Plot(label, "strip", max(1, timeline.n_rows - 1), timeline.start, timeline.dt, paths)
 
 
 def _bars(fractions: FloatArray) -> str:
-    """The ``d`` of bars as high as the fractions, neighbours of one height joined."""
+    """Attribute ``d`` of bars as high as the fractions; neighbours of equal height are joined."""
     edges = np.unique(np.linspace(0, len(fractions), min(len(fractions), _STRIP_CELLS) + 1).astype(int))
     heights = np.rint(_HEIGHT * np.add.reduceat(fractions, edges[:-1]) / np.diff(edges)).astype(int)
     changes = np.concatenate([[0], np.flatnonzero(np.diff(heights)) + 1, [len(heights)]])
@@ -228,12 +281,8 @@ def _bars(fractions: FloatArray) -> str:
     return "".join(f"M{x} {_HEIGHT}v-{height}h{end - x}v{height}z" for x, end, height in bars if height)
 
 
-def time_axis(timeline: Timeline) -> Html:
-    """The names of the times below a plot."""
+def time_axis(timeline: Timeline) -> tuple[Tick, ...]:
+    """Ticks of a time axis."""
     span = timeline.dt * max(1, timeline.n_rows - 1)
     marks = ticks(timeline.start, timeline.start + span, 5)
-    names = [
-        tag("span", text, class_="tick x", style=f"left:{100.0 * (t - timeline.start) / span:.2f}%")
-        for t, text in marks
-    ]
-    return tag("div", tag("div", *names, class_="times"), class_="axis", aria_hidden="true")
+    return tuple((f"{100.0 * (t - timeline.start) / span:.2f}%", text) for t, text in marks)

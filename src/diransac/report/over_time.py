@@ -1,143 +1,159 @@
-"""What is shown over time: measured against simulated, residuals, inliers."""
+"""Figures over time of one log: measured and simulated signals, residuals, unmodelled forces, inliers."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from diransac.arrays import FloatArray
-from diransac.report.figures import Scale, Timeline, Trace, padded, strip, time_axis, time_plot
-from diransac.report.judgement import windows
-from diransac.report.markup import Html, number, plural, share, tag
-from diransac.report.runs import Run, bulk
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.log import Log
+from diransac.identification.diagnosis import Diagnosis
+from diransac.report.assessment import windows
+from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, strip, time_axis, time_plot
+from diransac.report.rendering import number, percent, plural, share
+from diransac.report.runs import Run, bulk_range
 
-__all__ = ["inliers_over_time", "signals_over_time"]
+__all__ = ["LogFigures", "figures_of"]
 
-
+# Cells of the figures: fewer on a page of many results, which keeps it small.
+_CELLS, _FEWEST_CELLS = 500, 110
 _BEYOND_MEASURED = 0.4
 _BEYOND_REFERENCE = 2.0
 _VISIBLE = 0.01
 _MOST = 0.5
 _NOISE = 3.0
-_HOW_TO_ZOOM = (
-    "Drag across a figure to zoom into all of them, drag a box to zoom into one, double-click to see everything again; "
-    "keys ←, →, +, −, 0."
-)
+_FORCES = {"m/s^2": "N", "rad/s^2": "N m"}
 
 
-def signals_over_time(runs: Sequence[Run], timeline: Timeline) -> Html:
-    """Every measured signal against every simulation, and the residuals below it."""
+@dataclass(frozen=True)
+class LogFigures:
+    """Everything over time of one log.
+
+    Parameters
+    ----------
+    name, size : of the log
+    method : description of the simulations
+    legend : ``(CSS class, text)`` of each series
+    signals : a figure per signal
+    unmodelled_about, unmodelled : description and figures of unmodelled forces; empty without a diagnosis
+    inliers : figure of the rows that agree
+    """
+
+    name: str
+    size: str
+    method: str
+    legend: tuple[tuple[str, str], ...]
+    signals: tuple[Figure, ...]
+    unmodelled_about: str
+    unmodelled: tuple[Figure, ...]
+    inliers: Figure
+
+
+def figures_of(log: Log, runs: Sequence[Run], n_logs: int) -> LogFigures:
+    """Figures of one log.
+
+    Parameters
+    ----------
+    log : the log
+    runs : every result of the page over this log
+    n_logs : number of logs on the page
+    """
+    cells = max(_FEWEST_CELLS, _CELLS // (len(runs) * n_logs))
+    timeline = Timeline(len(log), float(log.time[0]), log.dt, cells)
     marking = max(runs, key=lambda run: run.inlier_fraction)
     names = dict.fromkeys(name for run in runs for name in run.observations.signals)
-    figures = [_signal(name, runs, marking, timeline) for name in names]
-    return tag(
-        "section",
-        tag("h2", "Measured against simulated"),
-        tag("p", f"{_how_simulated(runs)} {_HOW_TO_ZOOM}", class_="how"),
-        _legend(runs, marking),
-        tag("div", *figures, class_="figures"),
-        id="signals",
+    diagnosed = [(i, run, run.view.diagnosis) for i, run in enumerate(runs) if run.view.diagnosis is not None]
+    return LogFigures(
+        name=runs[0].log_name,
+        size=f"{number(log.dt * (len(log) - 1))} s at {number(1.0 / log.dt)} Hz, {plural(len(log), 'row')}",
+        method=_method(runs),
+        legend=tuple(_legend(runs, marking)),
+        signals=tuple(_signal(name, runs, marking, timeline) for name in names),
+        unmodelled_about=_unmodelled_about(diagnosed[0][2]) if diagnosed else "",
+        unmodelled=tuple(figure for i, run, found in diagnosed for figure in _unmodelled(run, found, i, timeline)),
+        inliers=_inliers(runs, timeline),
     )
 
 
-def _how_simulated(runs: Sequence[Run]) -> str:
-    """Where the simulations that are drawn begin."""
-    periods = [run.period for run in runs if np.isfinite(run.period)]
+# ---------------------------------------------------------------------- measured and simulated
+
+
+def _method(runs: Sequence[Run]) -> str:
+    """Starting points of the simulations."""
+    periods = [run.restart_period for run in runs if np.isfinite(run.restart_period)]
     if not periods:
-        return "Each simulation starts at the first row and sees the inputs alone."
+        return "Each simulation starts at the first row and depends on the inputs alone."
     text = (
-        f"Each simulation sees the inputs alone, and begins anew every {number(periods[0])} s where the machine most "
-        "probably was: forces that the model lacks would otherwise add up over the log."
+        f"Each simulation depends on the inputs alone and restarts every {number(periods[0])} s from the smoothed "
+        "state, so that the effect of unmodelled forces does not accumulate."
     )
     if len(runs) > 1:
         return text
-    return f"{text} The faint line is one simulation of the whole log, which decides on the rows that agree."
+    return f"{text} The faint line is one simulation of the whole log; the inliers are the rows that agree with it."
 
 
-def _legend(runs: Sequence[Run], marking: Run) -> Html:
-    of = f" with {marking.label}" if len(runs) > 1 else ""
-    marks = [_key("outlier", f"in a row that does not agree{of} (outlier)")]
+def _legend(runs: Sequence[Run], marking: Run) -> list[tuple[str, str]]:
+    keys = [("measured", "measured")]
     if marking.diagnosis is not None:
-        whole = f" of {marking.label}" if len(runs) > 1 else ""
-        marks = [
-            _key("fault", "outlier: a sensor's fault"),
-            _key("outlier", f"in a row that does not agree with the whole log's simulation{whole}"),
-        ]
-    keys = [
-        _key("measured", "measured"),
-        *marks,
-        *(_key(f"m{i}", f"simulated, {run.label}") for i, run in enumerate(runs)),
-    ]
-    if _shows_both(runs):
-        keys.append(_key("long", "through the whole log"))
-    reset = tag("button", "Show all of the log", type="button", id="reset", hidden=True)
-    return tag("div", *keys, reset, class_="legend")
+        of = f" of {marking.label}" if len(runs) > 1 else ""
+        keys += [("fault", "outlier"), ("outlier", f"row that disagrees with the whole-log simulation{of}")]
+    else:
+        of = f" with {marking.label}" if len(runs) > 1 else ""
+        keys.append(("outlier", f"row that disagrees{of} (outlier)"))
+    keys += [(f"m{i}", f"simulated, {run.label}") for i, run in enumerate(runs)]
+    return [*keys, ("long", "whole-log simulation")] if _shows_both(runs) else keys
 
 
-def _key(look: str, text: str) -> Html:
-    box = tag("input", type="checkbox", checked=True, data_shows=look, hidden=True)
-    return tag("label", box, tag("span", class_=f"swatch {look}"), text)
+def _shows_both(runs: Sequence[Run]) -> bool:
+    """True if the whole-log simulation is drawn too, which is readable for a single result only."""
+    return len(runs) == 1 and bool(np.isfinite(runs[0].restart_period))
 
 
-def _signal(name: str, runs: Sequence[Run], marking: Run, timeline: Timeline) -> Html:
-    """The figure of one signal."""
+def _signal(name: str, runs: Sequence[Run], marking: Run, timeline: Timeline) -> Figure:
+    """Figure of one signal and its residuals."""
     having = [(i, run) for i, run in enumerate(runs) if name in run.observations.signals]
     shown = marking if name in marking.observations.signals else having[0][1]
     unit = shown.observations.model.units[name]
-    measured = shown.observations.column(name)
     scale = _signal_scale(name, shown, [run for _, run in having])
-    beyond = _beyond(measured, scale)
     traces = _signal_traces(name, having, shown)
     if _shows_both(runs):
-        whole = _column(shown.throughout, shown, name)
-        traces.append(Trace("through the whole log", "m0 long", "line", shown.rows, whole))
+        whole = _column(shown.open_loop, shown, name)
+        traces.append(Trace("whole-log simulation", "m0 long", "line", shown.rows, whole))
+    facts = [_median_error(name, run, unit, label=f"{run.label} " * (len(runs) > 1)) for _, run in having]
+    beyond = _beyond(shown.observations.column(name), scale)
     about = f"{name} in {unit}, measured and simulated over {number(timeline.dt * (timeline.n_rows - 1))} s"
-    facts = [_typical_error(name, run, unit, label=f"{run.label} " * (len(runs) > 1)) for _, run in having]
-    caption = [
-        tag("h3", name, " ", tag("span", unit, class_="unit")),
-        tag("p", f"typical error{':' * (len(runs) > 1)} {'; '.join(facts)}"),
-    ]
-    if beyond is not None:
-        low, high, n_beyond = beyond
-        where = f"{plural(n_beyond, 'sample')} beyond, from {number(low)} to {number(high)} "
-        caption.append(
-            tag("p", where, tag("button", "Show", type="button", class_="full", hidden=True), class_="beyond")
-        )
-    return tag(
-        "figure",
-        tag("figcaption", *caption),
-        time_plot(traces, scale, timeline, about, full=beyond and beyond[:2]),
-        _residuals(name, having, shown, timeline),
-        time_axis(timeline),
+    plot = time_plot(traces, scale, timeline, about, full=beyond and beyond[:2])
+    return Figure(
+        title=name,
+        unit=unit,
+        facts=(f"median error{':' * (len(runs) > 1)} {'; '.join(facts)}",),
+        panels=(Panel(plot), _residuals(name, having, shown, timeline)),
+        time_ticks=time_axis(timeline),
+        beyond=_beyond_text(beyond),
     )
 
 
-def _typical_error(name: str, run: Run, unit: str, label: str) -> str:
-    error, (low, high) = run.typical_errors[name], run.ranges[name]
+def _median_error(name: str, run: Run, unit: str, label: str) -> str:
+    error, (low, high) = run.median_errors[name], run.ranges[name]
     part = f" ({share(error / (high - low), 'its range')})" if high > low and np.isfinite(error) else ""
     return f"{label}{number(error, 3)} {unit}{part}"
 
 
 def _signal_traces(name: str, having: Sequence[tuple[int, Run]], shown: Run) -> list[Trace]:
-    measured, faulty = shown.observations.column(name), shown.faults[name]
-    outlying = shown.observations.valid & ~shown.inliers & ~faulty
-    rejected = "measured (row does not agree)" if shown.diagnosis is not None else "measured (outlier)"
+    measured, outliers = shown.observations.column(name), shown.outliers[name]
+    disagreeing = shown.observations.valid & ~shown.inliers & ~outliers
+    rejected = "measured (row disagrees)" if shown.diagnosis is not None else "measured (outlier)"
     return [
-        _dots("measured", "measured", shown, measured, ~outlying & ~faulty),
-        _dots(rejected, "outlier", shown, measured, outlying),
-        _dots("measured (outlier)", "fault", shown, measured, faulty),
+        _dots("measured", "measured", shown, measured, ~disagreeing & ~outliers),
+        _dots(rejected, "outlier", shown, measured, disagreeing),
+        _dots("measured (outlier)", "fault", shown, measured, outliers),
         *(Trace(run.label, f"m{i}", "line", run.rows, _column(run.simulated, run, name)) for i, run in having),
     ]
 
 
-def _shows_both(runs: Sequence[Run]) -> bool:
-    """Whether the simulation of the whole log is drawn besides: of several results that would be too many lines."""
-    return len(runs) == 1 and np.isfinite(runs[0].period)
-
-
-def _dots(name: str, look: str, run: Run, values: FloatArray, chosen: npt.NDArray[np.bool_]) -> Trace:
+def _dots(name: str, look: str, run: Run, values: FloatArray, chosen: BoolArray) -> Trace:
     return Trace(name, look, "dots", run.rows[chosen], values[chosen])
 
 
@@ -146,7 +162,7 @@ def _column(values: FloatArray, run: Run, name: str) -> FloatArray:
 
 
 def _signal_scale(name: str, shown: Run, runs: Sequence[Run]) -> Scale:
-    """The measured range, and of the simulations what does not dwarf it."""
+    """The measured range, widened by simulations up to a limit."""
     low, high = shown.ranges[name]
     reach = _BEYOND_MEASURED * (high - low)
     for run in runs:
@@ -158,14 +174,24 @@ def _signal_scale(name: str, shown: Run, runs: Sequence[Run]) -> Scale:
 
 
 def _beyond(measured: FloatArray, scale: Scale) -> tuple[float, float, int] | None:
-    """Lowest and highest sample, and how many lie outside the scale; None if none does."""
+    """Lowest and highest sample, and the number outside of the scale; None if none is."""
     finite = measured[np.isfinite(measured)]
     n_beyond = int(((finite < scale.low) | (finite > scale.high)).sum())
     return (float(finite.min()), float(finite.max()), n_beyond) if n_beyond else None
 
 
-def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timeline: Timeline) -> Html:
-    """Simulated less measured, with the inlier threshold, or with the noise where it is known."""
+def _beyond_text(beyond: tuple[float, float, int] | None) -> str:
+    if beyond is None:
+        return ""
+    low, high, n_beyond = beyond
+    return f"{plural(n_beyond, 'sample')} outside of this range, from {number(low)} to {number(high)}"
+
+
+# ---------------------------------------------------------------------- residuals
+
+
+def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timeline: Timeline) -> Panel:
+    """Simulated minus measured, with the inlier threshold, or with three standard deviations of the noise."""
     traces, ranges = [], []
     for i, run in having:
         errors = _column(run.errors, run, name)
@@ -173,77 +199,109 @@ def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timelin
         if run is shown:
             traces.append(_dots(f"{run.label} (outlier)", look, run, errors, apart))
         traces.append(_dots(run.label, f"m{i}", run, errors, ~apart))
-        ranges.append(bulk(errors[~apart] if np.mean(apart) < _MOST else errors))
+        ranges.append(bulk_range(errors[~apart] if np.mean(apart) < _MOST else errors))
     level, meaning = _level(name, shown)
     levels = (-level, level) if level > 0.0 else ()
     low, high = shown.ranges[name]
     scale = _residual_scale(ranges, [run is shown for _, run in having], _VISIBLE * (high - low))
-    note = f"; the dashed lines are {meaning}, {number(level, 3)}" if levels else ""
-    label = f"Residuals of {name}, simulated less measured{note}"
-    heading = tag("p", f"simulated − measured{note}", class_="residual-title")
-    return tag("div", heading, time_plot(traces, scale, timeline, label, look="residual", levels=levels))
+    note = f"; dashed: {meaning}, ±{number(level, 3)}" if levels else ""
+    label = f"Residuals of {name}, simulated minus measured{note}"
+    plot = time_plot(traces, scale, timeline, label, look="residual", levels=levels)
+    return Panel(plot, f"simulated − measured{note}")
 
 
-def _set_apart(name: str, run: Run, *, is_shown: bool) -> tuple[str, npt.NDArray[np.bool_]]:
-    """How residuals (N,) that are marked look, and which are: faults if they are known, else rows that don't agree."""
+def _set_apart(name: str, run: Run, *, is_shown: bool) -> tuple[str, BoolArray]:
+    """CSS class and mask (N,) of marked residuals: diagnosed outliers if known, else rows that disagree."""
     if run.diagnosis is not None:
-        return "fault", run.faults[name]
+        return "fault", run.outliers[name]
     return "outlier", run.observations.valid & ~run.inliers & is_shown
 
 
 def _level(name: str, run: Run) -> tuple[float, str]:
-    """What residuals are to be measured by, 0 if nothing is, and what it is."""
+    """Reference value of the residuals, 0 without one, and its name."""
     if run.diagnosis is not None:
-        return _NOISE * run.diagnosis.noise_std.get(name, 0.0), "three times the noise"
+        return _NOISE * run.diagnosis.noise_std.get(name, 0.0), "three standard deviations of the noise"
     return float(run.thresholds[run.observations.signals.index(name)]), "the inlier threshold"
 
 
 def _residual_scale(ranges: Sequence[tuple[float, float]], is_shown: Sequence[bool], visible: float) -> Scale:
-    """The marking run's range, and the others' as far as they do not dwarf it, or are no larger than ``visible``."""
+    """The marking run's range, widened by the other runs' up to twice its width or to ``visible``."""
     low, high = ranges[is_shown.index(True)]
     reach = max(_BEYOND_REFERENCE * (high - low), visible)
     lowest, highest = min(a for a, _ in ranges), max(b for _, b in ranges)
     return padded(max(lowest, low - reach), min(highest, high + reach))
 
 
+# ---------------------------------------------------------------------- unmodelled forces
+
+
+def _unmodelled_about(found: Diagnosis) -> str:
+    """Description of the figures."""
+    time = found.smoothed_time
+    window = f"{number(float(time[1] - time[0]), 3)} s" if len(time) > 1 else "the log"
+    what = "Unmodelled generalised forces" if found.unmodelled_forces else "Unmodelled accelerations"
+    return f"{what}: zero where the model explains the motion. Each step is the mean over {window}."
+
+
+def _unmodelled(run: Run, found: Diagnosis, i: int, timeline: Timeline) -> list[Figure]:
+    """A figure of each unmodelled force, or of each acceleration if the model has no balance of forces."""
+    series = found.unmodelled_forces or found.unmodelled_accelerations
+    return [_unmodelled_figure(run, name, values, found, i, timeline) for name, values in series.items()]
+
+
+def _unmodelled_figure(run: Run, name: str, values: FloatArray, found: Diagnosis, i: int, timeline: Timeline) -> Figure:
+    model = run.result.model
+    unit = _FORCES.get(model.units[name], "") if found.unmodelled_forces else model.units[name]
+    coordinate = model.rate_names[list(model.accelerations).index(name)]
+    what = f"force on {coordinate}" if found.unmodelled_forces else name
+    rms, fraction = float(np.sqrt(np.mean(np.square(values)))), run.unmodelled_fraction.get(name)
+    relative = "no modelled motion" if fraction is None else f"{percent(fraction)} of the modelled"
+    least = _VISIBLE * rms / fraction if fraction else 0.0
+    scale = padded(min(-least, float(values.min())), max(least, float(values.max())))
+    trace = Trace(what, f"m{i}", "line", *_steps(found, values, timeline))
+    label = f"Unmodelled {what}{f' in {unit}' if unit else ''}"
+    plot = time_plot([trace], scale, timeline, label, levels=(0.0,))
+    return Figure(
+        what, unit, (f"RMS {number(rms, 2)} {unit}".strip() + f", {relative}",), (Panel(plot),), time_axis(timeline)
+    )
+
+
+def _steps(found: Diagnosis, values: FloatArray, timeline: Timeline) -> tuple[IntArray, FloatArray]:
+    """Rows and values of a line that is constant over each window."""
+    begins = np.rint((found.smoothed_time - timeline.start) / timeline.dt).astype(np.int64)
+    ends = np.append(begins[1:] - 1, timeline.n_rows - 1)
+    return np.column_stack([begins, ends]).ravel(), np.repeat(values, 2)
+
+
 # ---------------------------------------------------------------------- inliers
 
 
-def inliers_over_time(runs: Sequence[Run], timeline: Timeline) -> Html:
-    """How many rows agree with each simulation, and which do not."""
+def _inliers(runs: Sequence[Run], timeline: Timeline) -> Figure:
+    """Fraction of rows that agree with each simulation over time, and a strip of those that do not."""
     traces = [_fraction_trace(run, i) for i, run in enumerate(runs)]
     label = "Percentage of rows that agree with the simulation, in windows over the log"
-    strips = [_rejected(run, i, timeline) for i, run in enumerate(runs)]
-    caption = tag(
-        "figcaption",
-        tag("h3", "Rows that agree ", tag("span", "%", class_="unit")),
-        tag(
-            "p", "Below: the rows that do not, one strip a simulation; grey rows do not count, for a signal is missing."
-        ),
-    )
     fractions = time_plot(traces, Scale(-3.0, 103.0), timeline, label)
-    return tag(
-        "section",
-        tag("h2", "Inliers over time"),
-        tag("figure", caption, fractions, *strips, time_axis(timeline)),
-        id="inliers",
+    return Figure(
+        title="Rows that agree",
+        unit="%",
+        facts=("Below: rows that disagree, one strip per simulation; grey rows are excluded (missing signals).",),
+        panels=(Panel(fractions), *(_rejected(run, i, timeline) for i, run in enumerate(runs))),
+        time_ticks=time_axis(timeline),
     )
 
 
 def _fraction_trace(run: Run, i: int) -> Trace:
     """The inlier fraction as steps over the log's rows."""
     edges, fractions = windows(run)
-    rows = run.first + np.column_stack([edges[:-1], edges[1:] - 1]).ravel()
+    rows = run.first_row + np.column_stack([edges[:-1], edges[1:] - 1]).ravel()
     return Trace(run.label, f"m{i}", "line", rows, np.repeat(100.0 * fractions, 2))
 
 
-def _rejected(run: Run, i: int, timeline: Timeline) -> Html:
-    rejected, uncounted = np.zeros(timeline.n_rows), np.zeros(timeline.n_rows)
+def _rejected(run: Run, i: int, timeline: Timeline) -> Panel:
+    rejected, excluded = np.zeros(timeline.n_rows), np.zeros(timeline.n_rows)
     rejected[run.rows] = run.observations.valid & ~run.inliers
-    uncounted[run.rows] = ~run.observations.valid
-    uncounted[: run.first] = 1.0
-    uncounted[run.rows[-1] + 1 :] = 1.0
-    n_rejected = int(rejected.sum())
-    text = f"{run.label}: {plural(n_rejected, 'row')} of {run.observations.n_rows:,} do not agree"
-    bars = strip([(rejected, f"bar m{i}"), (uncounted, "bar uncounted")], timeline, text)
-    return tag("div", tag("p", text, class_="residual-title"), bars)
+    excluded[run.rows] = ~run.observations.valid
+    excluded[: run.first_row] = 1.0
+    excluded[run.rows[-1] + 1 :] = 1.0
+    text = f"{run.label}: {plural(int(rejected.sum()), 'row')} of {run.observations.n_rows:,} disagree"
+    return Panel(strip([(rejected, f"bar m{i}"), (excluded, "bar uncounted")], timeline, text), text)

@@ -1,33 +1,111 @@
-"""A result beside the log it is to be looked at with: simulated, compared, scored."""
+"""Results simulated over the logs of a page: the numbers behind every section."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
 from diransac.data.dataset import Observations, observe
 from diransac.data.log import Log
 from diransac.errors import LogError, ResultError, SettingsError
 from diransac.identification.diagnosis import Diagnosis
-from diransac.identification.evaluation import as_diagnosed, choose_scoring, judged_signals
-from diransac.identification.result import Result
+from diransac.identification.evaluation import Scoring, as_diagnosed, choose_scoring, judged_signals
+from diransac.identification.result import LogSummary, Result
 from diransac.identification.settings import Settings
 from diransac.identification.validation import Validation, validate
-from diransac.simulation import Measurements, RolloutBatch, Rollouts, inlier_mask, rollouts
+from diransac.report.rendering import numbered
+from diransac.simulation import Rollouts, inlier_mask, rollouts
 
-__all__ = ["Run", "bulk", "diagnosis_of", "labelled", "simulate_on"]
-
+__all__ = [
+    "Entry",
+    "LogView",
+    "Run",
+    "bulk_range",
+    "log_view",
+    "simulate_all",
+    "simulate_on",
+    "summaries",
+]
 
 _MET = 0.5
 _N_RESTARTS = 12
 _MEDIAN = 0.6745  # of the absolute value of Gaussian noise, in standard deviations
+
+
+# ---------------------------------------------------------------------- a result restricted to one log
+
+
+@dataclass(frozen=True)
+class LogView:
+    """A result restricted to one log: every attribute that differs between logs.
+
+    Parameters
+    ----------
+    index : number of the log among the result's logs; None for a held-out log
+    parameters : name -> value that holds in this log
+    per_log : the parameters among these that have one value per log
+    inliers : (N,)   over the rows of the log; None for a held-out log
+    preparation : preprocessing steps of the log, in order; of a held-out log, those to repeat
+    diagnosis : restricted to the rows and windows of this log; None if there is none, and for a held-out log
+    fit_error : of this log; NaN for a held-out log
+    remark : disagreement with the other logs, empty if there is none
+    """
+
+    index: int | None
+    parameters: Mapping[str, float]
+    per_log: tuple[str, ...]
+    inliers: BoolArray | None
+    preparation: Sequence[Mapping[str, Any]]
+    diagnosis: Diagnosis | None
+    fit_error: float
+    remark: str
+
+    @property
+    def held_out(self) -> bool:
+        """True if the result was identified from other logs."""
+        return self.index is None
+
+
+def summaries(result: Result) -> tuple[LogSummary, ...]:
+    """Summary of every log that the result was identified from."""
+    return (result.log,)
+
+
+def log_view(result: Result, log: Log) -> LogView:
+    """The part of a result that belongs to one log.
+
+    This function and `summaries` alone read the attributes of a result that have one entry per log.
+    """
+    own = (i for i, summary in enumerate(summaries(result)) if summary.fingerprint == log.fingerprint)
+    index = next(own, None)
+    if index is None:
+        return LogView(None, result.parameters, (), None, result.preparation, None, np.nan, "")
+    rows = windows = slice(None)
+    diagnosis = None if result.diagnosis is None else _restricted(result.diagnosis, rows, windows)
+    inliers = result.inliers[rows]
+    return LogView(index, result.parameters, (), inliers, result.preparation, diagnosis, result.fit_error, "")
+
+
+def _restricted(diagnosis: Diagnosis, rows: slice, windows: slice | BoolArray) -> Diagnosis:
+    """The diagnosis of some rows and windows."""
+    return replace(
+        diagnosis,
+        outliers={name: mask[rows] for name, mask in diagnosis.outliers.items()},
+        unmodelled_time=diagnosis.unmodelled_time[windows],
+        unmodelled_accelerations={n: x[windows] for n, x in diagnosis.unmodelled_accelerations.items()},
+        unmodelled_forces={n: x[windows] for n, x in diagnosis.unmodelled_forces.items()},
+        smoothed_time=diagnosis.smoothed_time[windows],
+        smoothed_states={n: x[windows] for n, x in diagnosis.smoothed_states.items()},
+    )
+
+
+# ---------------------------------------------------------------------- runs
 
 
 @dataclass(frozen=True)
@@ -36,50 +114,58 @@ class Run:
 
     Parameters
     ----------
-    label : how the page calls it
-    held_out : whether the log is another one than the result was made from
+    label : name of the result on the page
+    log_name : name of the log on the page
+    result : the result
+    view : the result restricted to this log
     observations : the model over the log, ``N`` rows
-    first : row of the log that is row 0 here
-    diagnosis : what is known of this log, by whichever result of the page found it; None if none did
-    period : s after which the shown simulation begins anew, where the machine most probably was; infinite: never
-    simulated : (N, n_s)   the observations' signals, NaN from a divergence on
-    errors : (N, n_s)   simulated less measured, NaN where either is missing
-    throughout : (N, n_s)   simulated through the whole log from its first row, which decides on inliers
+    first_row : row of the log that is row 0 here
+    diagnosis : of this log, from whichever result of the page has one; None if none has
+    restart_period : s   time after which the simulation restarts from the smoothed state; infinite without a diagnosis
+    simulated : (N, n_s)   the observations' signals, NaN after a divergence
+    errors : (N, n_s)   simulated minus measured, NaN where either is missing
+    open_loop : (N, n_s)   simulated through the whole log from its first row; the inliers are defined by it
     accelerations : acceleration -> (N,)   simulated, measured or not
-    thresholds : (n_s,)   an error is near below it; 0 where the signal judges nothing
-    inliers : (N,)   rows that agree with the simulation
-    validation : open-loop scores at several horizons, or why there are none
+    thresholds : (n_s,)   inlier thresholds; 0 for a signal without one
+    inliers : (N,)   rows that agree with the open-loop simulation
+    validation : open-loop scores at several horizons, or the reason why there are none
     """
 
     label: str
+    log_name: str
     result: Result
-    held_out: bool
+    view: LogView
     observations: Observations
-    first: int
+    first_row: int
     diagnosis: Diagnosis | None
-    period: float
+    restart_period: float
     simulated: FloatArray
     errors: FloatArray
-    throughout: FloatArray
+    open_loop: FloatArray
     accelerations: Mapping[str, FloatArray]
     thresholds: FloatArray
     inliers: BoolArray
     validation: Validation | str
 
     @property
-    def rows(self) -> npt.NDArray[np.int64]:
+    def held_out(self) -> bool:
+        """True if the result was identified from other logs."""
+        return self.view.held_out
+
+    @property
+    def rows(self) -> IntArray:
         """Rows of the log (N,)."""
-        return np.arange(self.first, self.first + len(self.observations))
+        return np.arange(self.first_row, self.first_row + len(self.observations))
 
     @property
     def inlier_fraction(self) -> float:
-        """Of the rows that count."""
+        """Inliers over the valid rows."""
         return float(self.inliers.sum() / self.observations.n_rows)
 
-    def tells(self, name: str) -> bool:
-        """Whether the result has a parameter, and its log could tell it."""
-        diagnosis = self.result.diagnosis
-        return name in self.result.parameters and (diagnosis is None or name not in diagnosis.unidentifiable)
+    @property
+    def n_excluded(self) -> int:
+        """Number of rows in which a required signal is missing."""
+        return len(self.observations) - self.observations.n_rows + self.observations.offset
 
     @property
     def divergence(self) -> float | None:
@@ -88,57 +174,71 @@ class Run:
         return float(self.observations.log.time[self.observations.offset + np.argmax(lost)]) if lost.any() else None
 
     @cached_property
-    def faults(self) -> dict[str, BoolArray]:
-        """Samples (N,) of each signal that are known to be outliers."""
+    def outliers(self) -> dict[str, BoolArray]:
+        """Diagnosed outliers (N,) of each signal."""
         known = {} if self.diagnosis is None else self.diagnosis.outliers
         none = np.zeros(len(self.observations), dtype=bool)
         return {n: known[n][self.rows] if n in known else none for n in self.observations.signals}
 
     @cached_property
-    def sound_errors(self) -> dict[str, FloatArray]:
-        """Absolute errors of each signal, but for faults, in rows that count; infinite after a divergence."""
+    def regular_errors(self) -> dict[str, FloatArray]:
+        """Absolute errors of each signal over valid rows without outliers; infinite after a divergence."""
         error = np.where(np.isnan(self.simulated), np.inf, np.abs(self.errors))
-        columns = zip(self.faults.items(), error.T, strict=True)
-        return {n: x[self.observations.valid & ~faults & ~np.isnan(x)] for (n, faults), x in columns}
+        columns = zip(self.outliers.items(), error.T, strict=True)
+        return {n: x[self.observations.valid & ~outliers & ~np.isnan(x)] for (n, outliers), x in columns}
 
     @cached_property
-    def typical_errors(self) -> dict[str, float]:
-        """Median of those of each signal, in its unit; NaN of none."""
-        return {n: float(np.median(x)) if len(x) else np.nan for n, x in self.sound_errors.items()}
+    def median_errors(self) -> dict[str, float]:
+        """Median of the regular errors of each signal, in its unit; NaN without samples."""
+        return {n: float(np.median(x)) if len(x) else np.nan for n, x in self.regular_errors.items()}
 
     @cached_property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Lowest and highest of each measured signal, of its bulk and of the samples that the simulation meets."""
+        """Range of each measured signal: of its bulk, and of samples close to the simulation."""
         found = {}
         for name, measured, error in zip(
             self.observations.signals, self.observations.measured.T, self.errors.T, strict=True
         ):
-            low, high = bulk(measured)
+            low, high = bulk_range(measured)
             met = measured[np.abs(error) <= _MET * (high - low)]
             found[name] = float(met.min(initial=low)), float(met.max(initial=high))
         return found
 
     @property
     def relative_errors(self) -> dict[str, float]:
-        """Typical errors of the signals that judge, less what noise makes if it is known, over the signal's range."""
+        """Median error of each signal with a threshold, minus the noise's if known, over the signal's range."""
         widths = {n: high - low for n, (low, high) in self.ranges.items()}
-        judging = [n for n, x in zip(self.observations.signals, self.thresholds, strict=True) if x > 0.0]
+        scored = [n for n, x in zip(self.observations.signals, self.thresholds, strict=True) if x > 0.0]
         noise = {} if self.diagnosis is None else self.diagnosis.noise_std
-        excess = {n: max(0.0, self.typical_errors[n] - _MEDIAN * noise.get(n, 0.0)) for n in judging}
-        return {n: excess[n] / widths[n] for n in judging if widths[n] > 0.0}
+        excess = {n: max(0.0, self.median_errors[n] - _MEDIAN * noise.get(n, 0.0)) for n in scored}
+        return {n: excess[n] / widths[n] for n in scored if widths[n] > 0.0}
 
     @property
-    def unexplained(self) -> dict[str, float]:
-        """RMS of what the model does not explain of each acceleration, over the RMS of what it does; {} if unknown."""
-        if self.result.diagnosis is None or self.held_out:
+    def unmodelled_fraction(self) -> dict[str, float]:
+        """RMS unmodelled acceleration over RMS modelled acceleration, of each coordinate; empty if unknown."""
+        if self.view.diagnosis is None:
             return {}
-        latent = {n: _rms(x) for n, x in self.result.diagnosis.unmodelled_accelerations.items()}
-        explained = {n: _rms(x[np.isfinite(x)]) for n, x in self.accelerations.items()}
-        return {n: x / explained[n] for n, x in latent.items() if explained[n] > 0.0}
+        unmodelled = {n: _rms(x) for n, x in self.view.diagnosis.unmodelled_accelerations.items()}
+        modelled = {n: _rms(x[np.isfinite(x)]) for n, x in self.accelerations.items()}
+        return {n: x / modelled[n] for n, x in unmodelled.items() if modelled[n] > 0.0}
 
 
-def bulk(values: FloatArray) -> tuple[float, float]:
-    """Lowest and highest of the values that are no further from the central 80 % than its width; (0, 0) of none."""
+@dataclass(frozen=True)
+class Entry:
+    """One result of the page and its simulations, one run per log."""
+
+    label: str
+    result: Result
+    runs: tuple[Run, ...]
+
+    def identifies(self, name: str) -> bool:
+        """True if the result has the parameter and the parameter is identifiable."""
+        diagnosis = self.result.diagnosis
+        return name in self.result.parameters and (diagnosis is None or name not in diagnosis.unidentifiable)
+
+
+def bulk_range(values: FloatArray) -> tuple[float, float]:
+    """Range of the values no further from the central 80 % than its width; (0, 0) without finite values."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 0.0, 0.0
@@ -152,52 +252,111 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
 
 
-def labelled(results: Result | Sequence[Result] | Mapping[str, Result]) -> dict[str, Result]:
-    """The results by a name of their own: their method's, numbered where methods repeat.
+# ---------------------------------------------------------------------- simulations
 
-    Raises ResultError: there is none, or something else among them.
+
+def simulate_all(results: Mapping[str, Result], logs: Sequence[Log]) -> list[Entry]:
+    """Every result simulated over every log.
+
+    A diagnosis is a property of the log and the machine: the first one of a log restarts the simulations of every
+    result over that log.
+
+    Raises ResultError: a log cannot be simulated by a model.
     """
-    if isinstance(results, Mapping):
-        pairs: list[tuple[str, object]] = [(str(label), result) for label, result in results.items()]
-    else:
-        several = results if isinstance(results, list | tuple) else [results]
-        pairs = [(getattr(result, "method", ""), result) for result in several]
-    named: dict[str, Result] = {}
-    for label, result in pairs:
-        if not isinstance(result, Result):
-            raise ResultError(f"a report shows results of diransac.identify; found a {type(result).__name__}")
-        repeats = sum(other.split(" #")[0] == label for other in named)
-        named[f"{label} #{repeats + 1}" if repeats else label] = result
-    if not named:
-        raise ResultError("a report shows results of diransac.identify; found none")
-    return named
+    names = numbered(log.source for log in logs)
+    diagnoses = [_diagnosis_of(results, log) for log in logs]
+    return [
+        Entry(
+            label, result, tuple(simulate_on(label, result, *one) for one in zip(logs, diagnoses, names, strict=True))
+        )
+        for label, result in results.items()
+    ]
 
 
-def diagnosis_of(results: Mapping[str, Result], log: Log) -> Diagnosis | None:
-    """The first diagnosis of this log among the results; it is the log's and the machine's, not a method's."""
-    own = (result.diagnosis for result in results.values() if result.log.fingerprint == log.fingerprint)
+def _diagnosis_of(results: Mapping[str, Result], log: Log) -> Diagnosis | None:
+    """First diagnosis of the log among the results."""
+    own = (log_view(result, log).diagnosis for result in results.values())
     return next((diagnosis for diagnosis in own if diagnosis is not None), None)
 
 
-def simulate_on(label: str, result: Result, log: Log, diagnosis: Diagnosis | None = None) -> Run:
-    """The result simulated over the log, which is prepared as its own was.
+def simulate_on(
+    label: str, result: Result, log: Log, diagnosis: Diagnosis | None = None, log_name: str | None = None
+) -> Run:
+    """A result simulated over a log, which is preprocessed as the result's own was.
 
     Parameters
     ----------
-    diagnosis : of this log; with it, simulations begin anew every now and then where the machine most probably was, so
-        that what acts on it unknown to the model does not add up
+    label : name of the result on the page
+    result : the result
+    log : the log
+    diagnosis : of this log; with it, the simulation restarts periodically from the smoothed state, so that the effect
+        of unmodelled forces does not accumulate
+    log_name : name of the log on the page; its source by default
 
-    Raises ResultError: the log cannot be simulated by this model; it says why.
+    Raises
+    ------
+    ResultError
+        The log cannot be simulated by the model; the message says why.
     """
+    view = log_view(result, log)
     try:
-        return _simulate(label, result, _prepared(result, log), log, diagnosis)
+        run = _simulate(result, view, log, diagnosis)
     except (LogError, SettingsError) as error:
         raise ResultError(f'no report: model "{result.model.name}" cannot be simulated on this log: {error}') from error
+    return replace(run, label=label, log_name=log.source if log_name is None else log_name)
 
 
-def _prepared(result: Result, log: Log) -> Log:
-    """The log with velocities and accelerations derived, where the result's log was and this one is not."""
-    derived = _last_step(result.preparation)
+def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | None) -> Run:
+    """The run, without names."""
+    settings, model, log = result.settings, result.model, _prepared(result, view, given)
+    observations = _observations(result, log)
+    scoring = choose_scoring(observations, settings)
+    if view.diagnosis is not None:
+        observations, settings = as_diagnosed(observations, settings, view.diagnosis)
+    engine = rollouts(model, observations.signals, integrator=settings.integrator, substeps=settings.substeps)
+    start = observations.initial_state(settings.initial_state)[None]
+    first_row = round(float(log.time[observations.offset] - given.time[0]) / given.dt)
+    parameters = model.parameter_vector(view.parameters)
+    open_loop, errors = _simulated(engine, parameters, observations, start, len(observations))
+    inliers = view.inliers
+    if inliers is None:
+        inliers = _close_rows(errors, observations, scoring)
+    else:
+        inliers = inliers[first_row : first_row + len(observations)]
+    simulated, period = open_loop, np.inf
+    if diagnosis is not None and set(model.state) <= set(diagnosis.smoothed_states):
+        states, n_rows = _restarts(diagnosis, observations)
+        simulated, errors = _simulated(engine, parameters, observations, states, n_rows)
+        period = n_rows * log.dt
+    columns = [model.signals.index(name) for name in observations.signals]
+    return Run(
+        label="",
+        log_name="",
+        result=result,
+        view=view,
+        observations=observations,
+        first_row=first_row,
+        diagnosis=diagnosis,
+        restart_period=period,
+        simulated=simulated[:, columns],
+        errors=errors,
+        open_loop=open_loop[:, columns],
+        accelerations=dict(zip(model.accelerations, simulated[:, len(model.state) :].T, strict=True)),
+        thresholds=scoring.thresholds,
+        inliers=inliers,
+        validation=_validation(result, log, result.settings),
+    )
+
+
+def _close_rows(errors: FloatArray, observations: Observations, scoring: Scoring) -> BoolArray:
+    """Inliers (N,) of a held-out log by the thresholds of its scoring."""
+    finite = np.where(np.isnan(errors), np.inf, errors)
+    return inlier_mask(finite, observations.valid, scoring.thresholds, scoring.min_inlier_signals)
+
+
+def _prepared(result: Result, view: LogView, log: Log) -> Log:
+    """The log with derived velocities and accelerations, if the result's log had them and this one does not."""
+    derived = _last_step(view.preparation)
     if derived.get("step") != "differentiate" or _last_step(log.history).get("step") == "differentiate":
         return log
     return preprocessing.differentiate(log, result.model, float(derived["bandwidth"]))
@@ -207,45 +366,8 @@ def _last_step(history: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
     return history[-1] if history else {}
 
 
-def _simulate(label: str, result: Result, log: Log, given: Log, diagnosis: Diagnosis | None) -> Run:
-    settings, model = result.settings, result.model
-    held_out = given.fingerprint != result.log.fingerprint
-    observations = _observations(result, log)
-    scoring = choose_scoring(observations, settings)
-    if result.diagnosis is not None and not held_out:
-        observations, settings = as_diagnosed(observations, settings, result.diagnosis)
-    engine = rollouts(model, observations.signals, integrator=settings.integrator, substeps=settings.substeps)
-    start = observations.initial_state(settings.initial_state)[None]
-    first = round(float(log.time[observations.offset] - given.time[0]) / given.dt)
-    throughout, errors = _simulated(engine, result, observations, start, len(observations))
-    apart = np.where(np.isnan(errors), np.inf, errors)
-    near = inlier_mask(apart, observations.valid, scoring.thresholds, scoring.min_inlier_signals)
-    simulated, period = throughout, np.inf
-    if diagnosis is not None and set(model.state) <= set(diagnosis.smoothed_states):
-        states, n_rows = _restarts(diagnosis, observations)
-        simulated, errors = _simulated(engine, result, observations, states, n_rows)
-        period = n_rows * log.dt
-    columns = [model.signals.index(name) for name in observations.signals]
-    return Run(
-        label=label,
-        result=result,
-        held_out=held_out,
-        observations=observations,
-        first=first,
-        diagnosis=diagnosis,
-        period=period,
-        simulated=simulated[:, columns],
-        errors=errors,
-        throughout=throughout[:, columns],
-        accelerations=dict(zip(model.accelerations, simulated[:, len(model.state) :].T, strict=True)),
-        thresholds=scoring.thresholds,
-        inliers=near if held_out else result.inliers[first : first + len(observations)],
-        validation=_validation(result, log, result.settings),
-    )
-
-
 def _restarts(diagnosis: Diagnosis, observations: Observations) -> tuple[FloatArray, int]:
-    """States (K, n_x) from which simulations begin anew, and the rows between them."""
+    """Smoothed states (K, n_x) at which the simulation restarts, and the number of rows between them."""
     time, names = diagnosis.smoothed_time, observations.model.state
     every = max(1, round(len(time) / _N_RESTARTS))
     dt, start = observations.log.dt, observations.log.time[observations.offset]
@@ -255,23 +377,24 @@ def _restarts(diagnosis: Diagnosis, observations: Observations) -> tuple[FloatAr
 
 
 def _simulated(
-    engine: Rollouts, result: Result, observations: Observations, states: FloatArray, n_rows: int
+    engine: Rollouts, values: FloatArray, observations: Observations, states: FloatArray, n_rows: int
 ) -> tuple[FloatArray, FloatArray]:
-    """All signals simulated (N, n), and that less measured (N, n_s), begun in each state for so many rows."""
-    model, n = result.model, len(observations)
+    """All signals (N, n) simulated from each state for ``n_rows`` rows, and their errors (N, n_s)."""
+    n = len(observations)
     more = ((0, len(states) * n_rows - n), (0, 0))
     inputs, measured = (np.pad(x, more, mode="edge") for x in (observations.inputs, observations.measured))
-    parameters = np.tile(model.parameter_vector(result.parameters), (len(states), 1))
+    parameters = np.tile(values, (len(states), 1))
     rows, dt, every = n_rows * np.arange(len(states)), observations.log.dt, np.ones(len(inputs), dtype=bool)
-    batch = RolloutBatch(parameters, states, inputs, dt, start_rows=rows, n_rows=n_rows)
-    everything = engine.trajectories(batch)
-    errors = engine.errors(batch, Measurements(np.nan_to_num(measured), every))
+    everything = engine.trajectories(parameters, states, inputs, dt, start_rows=rows, n_rows=n_rows)
+    errors = engine.errors(
+        parameters, states, inputs, np.nan_to_num(measured), every, dt, start_rows=rows, n_rows=n_rows
+    )
     missing = ~np.isfinite(observations.measured)
     return everything.reshape(len(inputs), -1)[:n], np.where(missing, np.nan, errors.reshape(len(inputs), -1)[:n])
 
 
 def _observations(result: Result, log: Log) -> Observations:
-    """As `identify` makes them; from a held-out log that lacks signals, with those that a simulation needs."""
+    """Observations as `identify` makes them; of a held-out log without all signals, those that a simulation needs."""
     try:
         return observe(result.model, log, judged_signals(result.model, log, result.settings))
     except LogError:
@@ -279,6 +402,7 @@ def _observations(result: Result, log: Log) -> Observations:
 
 
 def _validation(result: Result, log: Log, settings: Settings) -> Validation | str:
+    """Open-loop scores, or the reason why there are none."""
     try:
         return validate(result, log, integrator=settings.integrator, substeps=settings.substeps)
     except (LogError, SettingsError) as error:

@@ -1,299 +1,345 @@
-"""The page's sections that are read: what was found, how sure it is, and how it was made."""
+"""Tables and texts of the page: summary, logs, parameters, diagnosis, scores."""
 
 from __future__ import annotations
 
-import dataclasses
-import platform
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from diransac.data.log import Log
-from diransac.identification.settings import Settings
-from diransac.identification.validation import Scores, Validation
-from diransac.model import Model
-from diransac.report.judgement import findings, verdict, worst
-from diransac.report.markup import Html, join, number, percent, plural, table, tag
-from diransac.report.runs import Run
+from diransac.identification.validation import Validation
+from diransac.report.assessment import Finding, Level, bounds_text, findings, verdict, worst
+from diransac.report.figures import Scale, Tick, padded, ticks
+from diransac.report.rendering import Table, number, percent, plural
+from diransac.report.runs import Entry, Run, summaries
+from diransac.text_table import telling_digits
 
-__all__ = ["equations", "heading", "making", "scores", "short"]
+__all__ = [
+    "card",
+    "diagnosis",
+    "differences",
+    "lead",
+    "log_tables",
+    "parameters",
+    "scores",
+    "sensitivity",
+    "short_term_scores",
+]
 
-_PACKAGES = ("diransac", "numpy", "scipy", "casadi", "llvmlite")
-_DEFAULT_ESTIMATORS = ("OrdinaryLeastSquares", "NonlinearLeastSquares")
-_SYMBOLS = {"good": "✓", "care": "!", "bad": "✗", "note": "i"}
-
-
-# ---------------------------------------------------------------------- what was found
-
-
-def heading(runs: Sequence[Run], log: Log) -> Html:
-    """Which model, from which log."""
-    models = " and ".join(dict.fromkeys(run.result.model.name for run in runs))
-    sources = dict.fromkeys(run.result.log.source for run in runs)
-    methods = f"by {runs[0].label}" if len(runs) == 1 else f"in {len(runs)} ways ({', '.join(r.label for r in runs)})"
-    seconds, rate = number(log.dt * (len(log) - 1)), number(1.0 / log.dt)
-    size = f"{seconds} s at {rate} Hz, {plural(len(log), 'row')}"
-    lead = f"Identified {methods} from {' and '.join(sources)}"
-    if any(run.held_out for run in runs):
-        lead = f"Held-out validation. {lead}; shown here on a log that it was not made from, {log.source}"
-    descriptions = dict.fromkeys(run.result.model.description for run in runs if run.result.model.description)
-    about = [tag("p", text, class_="about") for text in descriptions]
-    diagnosed = any(run.result.diagnosis is not None for run in runs)
-    found = (("short", "In short"), ("parameters", "Parameters"), *((("diagnosis", "Diagnosis"),) if diagnosed else ()))
-    links = (*found, ("signals", "Simulation"), ("inliers", "Inliers"))
-    more = (("scores", "Scores"), ("equations", "Equations"), ("making", "How it was made"))
-    menu = tag("nav", *(tag("a", text, href=f"#{key}") for key, text in links + more), aria_label="Sections")
-    return tag("header", tag("h1", models), *about, tag("p", f"{lead} ({size})."), menu)
+_WIDEST = 2.0
+_LONG = 6
 
 
-def short(runs: Sequence[Run]) -> Html:
-    """The verdict on every result, and what it rests on."""
-    cards = [_card(run) for run in runs]
-    comparison = [_differences(runs)] if len(runs) > 1 else []
-    return tag(
-        "section", tag("h2", "In short"), *comparison, tag("div", *cards, class_="cards"), id="short", class_="short"
+# ---------------------------------------------------------------------- summary
+
+
+def lead(entries: Sequence[Entry], logs: Sequence[Log]) -> str:
+    """First sentence of the page: methods, logs and their size."""
+    labels = [entry.label for entry in entries]
+    methods = f"by {labels[0]}" if len(labels) == 1 else f"in {len(labels)} ways ({', '.join(labels)})"
+    text = f"Identified {methods} from {_sources(entries)}"
+    runs = [run for entry in entries for run in entry.runs]
+    held_out = dict.fromkeys(run.log_name for run in runs if run.held_out)
+    if held_out and all(run.held_out for run in runs):
+        text = f"Held-out validation. {text}; evaluated on {', '.join(held_out)}, not used for identification"
+    elif held_out:
+        text = f"{text}; held-out validation on {', '.join(held_out)}"
+    return f"{text} ({_size(logs)})."
+
+
+def _sources(entries: Sequence[Entry]) -> str:
+    """Names of the logs of every result."""
+    groups = dict.fromkeys(tuple(s.source for s in summaries(entry.result)) for entry in entries)
+    return " and ".join(
+        sources[0] if len(sources) == 1 else f"{len(sources)} logs ({', '.join(sources)})" for sources in groups
     )
 
 
-def _card(run: Run) -> Html:
-    found = findings(run)
+def _size(logs: Sequence[Log]) -> str:
+    rows = plural(sum(len(log) for log in logs), "row")
+    seconds = number(sum(log.dt * (len(log) - 1) for log in logs))
+    return f"{seconds} s at {number(1.0 / logs[0].dt)} Hz, {rows}" if len(logs) == 1 else f"{seconds} s in all, {rows}"
+
+
+@dataclass(frozen=True)
+class Card:
+    """The verdict on one result and the findings behind it."""
+
+    label: str
+    level: Level
+    verdict: str
+    findings: tuple[Finding, ...]
+
+
+def card(entry: Entry) -> Card:
+    """The verdict on one result."""
+    found = findings(entry.runs)
     level = worst(found)
-    items = [
-        tag("li", tag("span", _SYMBOLS[f.level], class_="sign", title=f.level), " ", f.text, class_=f.level)
-        for f in found
-    ]
-    title = tag("h3", tag("span", run.label, class_="method"), " ", verdict(level))
-    return tag("article", title, tag("ul", *items), class_=f"card {level}")
+    return Card(entry.label, level, verdict(level), tuple(found))
 
 
-def _differences(runs: Sequence[Run]) -> Html:
-    """In which parameter the results differ most."""
+def differences(entries: Sequence[Entry]) -> str:
+    """The parameter in which several results differ most; empty for one result."""
     spread = {}
-    for name in runs[0].result.parameters:
-        values = {run.label: run.result.parameters[name] for run in runs if run.tells(name)}
+    for name in entries[0].result.parameters:
+        values = {entry.label: entry.result.parameters[name] for entry in entries if entry.identifies(name)}
         if not values:
             continue
         low, high = min(values, key=lambda k: values[k]), max(values, key=lambda k: values[k])
         middle = abs(float(np.median(list(values.values()))))
         if middle > 0.0:
-            spread[name] = ((values[high] - values[low]) / middle, low, high)
-    if not spread:
-        return join([])
+            spread[name] = ((values[high] - values[low]) / middle, values[low], low, values[high], high)
+    if len(entries) == 1 or not spread:
+        return ""
     name = max(spread, key=lambda n: spread[n][0])
-    difference, low, high = spread[name]
+    difference, low_value, low, high_value, high = spread[name]
     if difference < 1e-3:
-        return tag("p", "The results agree to 0.1 % in every parameter.")
-    by_label = {run.label: number(run.result.parameters[name]) for run in runs if run.tells(name)}
-    unit = runs[0].result.units[name]
-    return tag("p", f"They differ most in {name}: {by_label[low]} {unit} ({low}) to {by_label[high]} {unit} ({high}).")
+        return "The results agree to 0.1 % in every parameter."
+    unit = entries[0].result.units[name]
+    return f"Largest difference: {name}, {number(low_value)} {unit} ({low}) to {number(high_value)} {unit} ({high})."
 
 
-# ---------------------------------------------------------------------- scores
+# ---------------------------------------------------------------------- logs
 
 
-def scores(runs: Sequence[Run]) -> Html:
-    """Open-loop scores at several horizons."""
-    about = (
-        "The simulation restarts from the measured state after each horizon. Outliers count in full here, as samples "
-        "and as states to start from: on a log that has them, these scores judge the log as much as the model."
+def log_tables(entries: Sequence[Entry], logs: Sequence[Log]) -> list[Table]:
+    """Every log with its inliers, fit error and own parameters, a table per result; none for a single log."""
+    return [] if len(logs) == 1 else [_log_table(entry, logs, len(entries) > 1) for entry in entries]
+
+
+def _log_table(entry: Entry, logs: Sequence[Log], several: bool) -> Table:
+    own = list(dict.fromkeys(name for run in entry.runs for name in run.view.per_log))
+    remarks = ["held out" if run.held_out else run.view.remark for run in entry.runs]
+    header = ["Log", "Duration, s", "Rate, Hz", "Rows", "Inliers", "Fit error"]
+    header += [f"{name}, {entry.result.units[name]}" for name in own]
+    rows = []
+    for log, run in zip(logs, entry.runs, strict=True):
+        duration, rate = number(log.dt * (len(log) - 1)), number(1.0 / log.dt)
+        measures = (percent(run.inlier_fraction), number(run.view.fit_error))
+        values = (number(run.view.parameters[name], 6) if name in run.view.per_log else "–" for name in own)
+        rows.append((run.log_name, duration, rate, f"{len(log):,}", *measures, *values))
+    if any(remarks):
+        header.append("Remark")
+        rows = [(*row, remark) for row, remark in zip(rows, remarks, strict=True)]
+    caption = "Inliers: fraction of the valid rows that agree with the simulation."
+    return Table(header, rows, f"By {entry.label}. {caption}" if several else caption)
+
+
+# ---------------------------------------------------------------------- parameters
+
+
+@dataclass(frozen=True)
+class Whisker:
+    """An estimate and its interval drawn on a scale; positions are CSS percentages."""
+
+    look: str
+    forbidden: tuple[tuple[str, str], ...]
+    left: str
+    right: str
+    at: str
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter as one result has it, as text; ``whisker`` is None where it is not identifiable."""
+
+    label: str
+    look: str
+    value: str = ""
+    interval: str = ""
+    width: str = ""
+    is_outside: bool = False
+    whisker: Whisker | None = None
+
+
+@dataclass(frozen=True)
+class ParameterGroup:
+    """A parameter by every result."""
+
+    name: str
+    about: str
+    estimates: tuple[Estimate, ...]
+    ticks: tuple[Tick, ...]
+
+
+def parameters(entries: Sequence[Entry]) -> list[ParameterGroup]:
+    """Every parameter by every result that has it."""
+    names = dict.fromkeys(name for entry in entries for name in entry.result.parameters)
+    return [_group(name, [x for x in enumerate(entries) if name in x[1].result.parameters]) for name in names]
+
+
+def _group(name: str, having: Sequence[tuple[int, Entry]]) -> ParameterGroup:
+    parameter = having[0][1].result.model.parameters[name]
+    scale = _parameter_scale(name, [entry for _, entry in having])
+    shown = _parameter_ticks(scale) if any(entry.identifies(name) for _, entry in having) else []
+    return ParameterGroup(
+        name=name,
+        about=", ".join(text for text in (parameter.unit, bounds_text(parameter)) if text),
+        estimates=tuple(_estimate(name, entry, f"m{i}", scale) for i, entry in having),
+        ticks=tuple((_at(x, scale), text) for x, text in shown),
     )
-    return tag(
-        "section",
-        tag("h2", "Open-loop scores"),
-        *_short_term(runs),
-        tag("p", about, class_="how"),
-        *(_scores(run) for run in runs),
-        id="scores",
+
+
+def _parameter_ticks(scale: Scale) -> list[tuple[float, str]]:
+    """Ticks; long ones are fewer, with a margin to the edges."""
+    found = ticks(scale.low, scale.high, 4)
+    if max(len(text) for _, text in found) <= _LONG:
+        return found
+    margin = 0.1 * (scale.high - scale.low)
+    return [x for x in ticks(scale.low, scale.high, 2) if scale.low + margin < x[0] < scale.high - margin]
+
+
+def _parameter_scale(name: str, entries: Sequence[Entry]) -> Scale:
+    """All estimates, and the intervals up to a multiple of the narrowest."""
+    entries = [entry for entry in entries if entry.identifies(name)]
+    if not entries:
+        return Scale(-1.0, 1.0)
+    intervals = np.array([entry.result.intervals()[name] for entry in entries])
+    estimates = np.array([entry.result.parameters[name] for entry in entries])
+    widths = intervals[:, 1] - intervals[:, 0]
+    sharpest = int(np.argmin(np.where(np.isfinite(widths), widths, np.inf)))
+    core = np.append(estimates, intervals[sharpest][np.isfinite(intervals[sharpest])])
+    low, high = float(core.min()), float(core.max())
+    reach = _WIDEST * (high - low)
+    edges = np.clip(intervals[np.isfinite(intervals)], low - reach, high + reach)
+    if high - low <= 1e-9 * abs(high):
+        low, high = low - 1e-3 * abs(low), high + 1e-3 * abs(high)
+    return padded(float(edges.min(initial=low)), float(edges.max(initial=high)))
+
+
+def _estimate(name: str, entry: Entry, look: str, scale: Scale) -> Estimate:
+    result = entry.result
+    if not entry.identifies(name):
+        return Estimate(entry.label, look)
+    value, (low, high) = result.parameters[name], result.intervals()[name]
+    known = np.isfinite(high - low)
+    digits = telling_digits(low, high)
+    width = "includes 0" if low <= 0.0 <= high else percent(0.5 * (high - low) / abs(value))
+    return Estimate(
+        label=entry.label,
+        look=look,
+        value=number(value, 6),
+        interval=f"{number(low, digits)} … {number(high, digits)}" if known else "unknown",
+        width=width if known else "–",
+        is_outside=name in result.violations,
+        whisker=_whisker(name, entry, look, scale),
     )
 
 
-def _short_term(runs: Sequence[Run]) -> list[Html]:
-    """How well each predicts from where the machine was, where that is known."""
-    having = [run for run in runs if np.isfinite(run.period)]
+def _whisker(name: str, entry: Entry, look: str, scale: Scale) -> Whisker:
+    bounds, (low, high) = entry.result.model.parameters[name], entry.result.intervals()[name]
+    low, high = (low, high) if np.isfinite(high - low) else (-np.inf, np.inf)
+    lower = max(bounds.lower, 0.0) if bounds.positive else bounds.lower
+    forbidden = [("0%", _at(lower, scale))] if lower > scale.low else []
+    if bounds.upper < scale.high:
+        forbidden.append((_at(bounds.upper, scale), "100%"))
+    cut = " cut-low" * bool(low < scale.low) + " cut-high" * bool(high > scale.high)
+    at = _at(entry.result.parameters[name], scale)
+    return Whisker(f"{look}{cut}", tuple(forbidden), _at(low, scale), _at(high, scale), at)
+
+
+def _at(value: float, scale: Scale) -> str:
+    """Position on a scale, clipped to its ends, for CSS."""
+    return f"{np.clip(100.0 * (value - scale.low) / (scale.high - scale.low), 0.0, 100.0):.2f}%"
+
+
+def sensitivity(entries: Sequence[Entry]) -> Table | None:
+    """Relative change of each parameter at other bandwidths of the differentiating filter."""
+    rows = [
+        (name, entry.label, percent(half), percent(twice))
+        for entry in entries
+        for name, (half, twice) in (entry.result.bandwidth_sensitivity or {}).items()
+    ]
+    caption = "Change of each parameter at half and at twice the bandwidth of the differentiating filter."
+    return Table(("Parameter", "By", "at half", "at twice"), rows, caption) if rows else None
+
+
+# ---------------------------------------------------------------------- diagnosis and scores
+
+
+def diagnosis(entries: Sequence[Entry]) -> list[tuple[Table, str]]:
+    """Noise, outliers and unmodelled acceleration of each signal, and the input delay, by each result that has them."""
+    return [(_signal_table(e, len(entries) > 1), _delay(e)) for e in entries if e.result.diagnosis is not None]
+
+
+def _signal_table(entry: Entry, several: bool) -> Table:
+    found, units = entry.result.diagnosis, entry.result.model.units
+    assert found is not None
+    rows = []
+    for name in dict.fromkeys((*found.noise_std, *found.unmodelled_accelerations)):
+        measured = name in found.noise_std
+        noise = number(found.noise_std[name], 2) if measured else "not measured"
+        outliers = percent(found.outlier_fraction[name]) if measured else "–"
+        values = found.unmodelled_accelerations.get(name)
+        unmodelled = "" if values is None else number(float(np.sqrt(np.mean(np.square(values)))), 2)
+        rows.append((name, units[name], noise, outliers, unmodelled))
+    caption = f"By {entry.label}" if several else "By signal"
+    return Table(("Signal", "Unit", "Noise", "Outliers", "Unmodelled"), rows, caption)
+
+
+def _delay(entry: Entry) -> str:
+    found = entry.result.diagnosis
+    assert found is not None
+    if not found.input_delay_significant:
+        return ""
+    delay, error = number(1e3 * found.input_delay, 3), number(1e3 * found.input_delay_error, 2)
+    return f"Input delay: {delay} ± {error} ms (standard error). The estimate and the simulations shown include it."
+
+
+def short_term_scores(runs: Sequence[Run]) -> Table | None:
+    """RMS error of the restarted simulations over one log; None without a diagnosis of it."""
+    having = [run for run in runs if np.isfinite(run.restart_period)]
     if not having:
-        return []
+        return None
     names = dict.fromkeys(name for run in having for name in run.observations.signals)
     noise = having[0].diagnosis.noise_std if having[0].diagnosis is not None else {}
     units = having[0].result.model.units
     rows = [
-        (name, units[name], number(noise.get(name, np.nan), 3), *(_sound_rms(run, name) for run in having))
+        (name, units[name], number(noise.get(name, np.nan), 3), *(_regular_rms(run, name) for run in having))
         for name in names
     ]
-    period = number(having[0].period)
-    caption = (
-        f"RMS error but for outliers, simulated for {period} s at a time from where the machine most probably was."
-    )
-    return [table(("Signal", "Unit", "Noise", *(run.label for run in having)), rows, caption)]
+    period = number(having[0].restart_period)
+    caption = f"RMS error without outliers; simulations restart every {period} s from the smoothed state."
+    return Table(("Signal", "Unit", "Noise", *(run.label for run in having)), rows, caption)
 
 
-def _sound_rms(run: Run, name: str) -> str:
-    errors = run.sound_errors.get(name, np.empty(0))
+def _regular_rms(run: Run, name: str) -> str:
+    errors = run.regular_errors.get(name, np.empty(0))
     with np.errstate(over="ignore"):
         return number(float(np.sqrt(np.mean(np.square(errors)))) if len(errors) else np.nan, 3)
 
 
-def _scores(run: Run) -> Html:
+@dataclass(frozen=True)
+class ScoreTable:
+    """Open-loop scores of one run at several horizons, or the reason why there are none."""
+
+    label: str
+    reason: str = ""
+    horizons: tuple[str, ...] = ()
+    rows: tuple[tuple[str, str, tuple[str, ...]], ...] = ()
+
+
+def scores(run: Run) -> ScoreTable:
+    """Open-loop scores of one run."""
     validation = run.validation
     if isinstance(validation, str):
-        return tag("p", f"{run.label}: no scores: {validation}")
-    figures = ("RMSE", "fit %", "R²")
-    top = [tag("th", _horizon(s), scope="colgroup", colspan=len(figures)) for s in validation.horizons]
-    second = [tag("th", text, scope="col") for _ in validation.horizons for text in figures]
-    names = [tag("th", text, scope="col", rowspan=2) for text in ("Signal", "Unit")]
-    body = [_score_row(name, validation) for name in validation.rmse]
-    head = tag("thead", tag("tr", *names, *top), tag("tr", *second))
-    inner = tag("table", tag("caption", run.label), head, tag("tbody", *body), class_="scores")
-    return tag("div", inner, class_="scroll")
+        return ScoreTable(run.label, reason=validation)
+    horizons = []
+    for at in validation.horizons:
+        name = "whole log" if np.isinf(at.horizon) else f"{number(at.horizon)} s ({plural(at.windows, 'window')})"
+        horizons.append(f"{name}, {at.diverged} diverged" if at.diverged else name)
+    rows = [(name, validation.units[name], _score_cells(name, validation)) for name in validation.rmse]
+    return ScoreTable(run.label, "", tuple(horizons), tuple(rows))
 
 
-def _horizon(at: Scores) -> str:
-    name = "whole log" if np.isinf(at.horizon) else f"{number(at.horizon)} s ({plural(at.windows, 'window')})"
-    return f"{name}, {at.diverged} diverged" if at.diverged else name
-
-
-def _score_row(name: str, validation: Validation) -> Html:
-    cells = [
+def _score_cells(name: str, validation: Validation) -> tuple[str, ...]:
+    return tuple(
         text
         for at in validation.horizons
         for text in (number(at.rmse[name]), number(at.fit_percent[name], 3), _r_squared(at.r_squared[name]))
-    ]
-    numbers = [tag("td", text, class_="number") for text in cells]
-    return tag("tr", tag("th", name, scope="row"), tag("td", validation.units[name]), *numbers)
+    )
 
 
 def _r_squared(x: float) -> str:
     return f"{x:.4f}".replace("-", "−") if abs(x) < 10.0 else number(x, 3)
-
-
-# ---------------------------------------------------------------------- equations
-
-
-def equations(runs: Sequence[Run]) -> Html:
-    """The residuals of every model."""
-    models = {run.result.model.fingerprint: run.result.model for run in runs}
-    return tag("section", tag("h2", "Equations"), *(_model(model) for model in models.values()), id="equations")
-
-
-def _model(model: Model) -> Html:
-    text = "\n".join(model.equations_text())
-    groups = (("coordinates", model.coordinates), ("velocities", model.velocities), ("inputs", model.inputs))
-    named = "; ".join(f"{kind} " + ", ".join(f"{n} ({u})" for n, u in units.items()) for kind, units in groups if units)
-    return join([tag("h3", model.name), tag("p", f"With {named}."), tag("pre", tag("code", text))])
-
-
-# ---------------------------------------------------------------------- how it was made
-
-
-def making(runs: Sequence[Run], log: Log) -> Html:
-    """Everything that is needed to repeat it."""
-    return tag(
-        "section",
-        tag("h2", "How it was made"),
-        _provenance(runs),
-        tag("h3", "The log"),
-        _log(runs, log),
-        tag("h3", "To repeat it"),
-        tag("pre", tag("code", _snippet(runs))),
-        tag("p", "Page written with ", _versions(), "."),
-        id="making",
-    )
-
-
-def _provenance(runs: Sequence[Run]) -> Html:
-    """Each result's search and settings, a column a result."""
-    columns = [_facts(run) for run in runs]
-    rows = [(key, *(column[key] for column in columns)) for key in columns[0]]
-    return table(
-        ("", *(run.label for run in runs)), rows, "Search and settings; what differs from the default is bold."
-    )
-
-
-def _facts(run: Run) -> dict[str, str]:
-    result, default = run.result, Settings().to_dict()
-    skipped = ", ".join(f"{n:,} {reason}" for reason, n in result.rejected.items()) or "none"
-    squares = " (sum of squares)" if result.method == "diransac" else ""
-    facts = {
-        "method": result.method,
-        "estimator": result.estimator,
-        "seed": str(result.seed),
-        "fit error": number(result.fit_error, 6) + squares,
-        "inliers": f"{percent(result.inlier_fraction)} of the rows that count",
-        "samples drawn": f"{result.iterations:,}",
-        "hypotheses evaluated": f"{result.n_hypotheses:,}",
-        "went no further": skipped,
-        "ended because": result.stop_reason,
-    }
-    chosen = result.settings.to_dict()
-    return facts | {k: _value(x) if x == default[k] else tag("strong", _value(x)) for k, x in chosen.items()}
-
-
-def _value(x: Any) -> str:
-    """A setting or a step's detail as text."""
-    if isinstance(x, Mapping):
-        return ", ".join(f"{key}: {_value(value)}" for key, value in x.items()) or "none"
-    if isinstance(x, list | tuple):
-        return ", ".join(_value(value) for value in x) or "none"
-    if x is None:
-        return "automatic"
-    return number(x, 6) if isinstance(x, float) else str(x)
-
-
-def _log(runs: Sequence[Run], log: Log) -> Html:
-    """Where the samples came from, and what was done to them."""
-    summaries = dict.fromkeys(run.result.log for run in runs)
-    items = [tag("li", f"{s.source}: {_rows(s.n_rows, s.start, s.dt)}", tag("code", s.fingerprint)) for s in summaries]
-    if any(run.held_out for run in runs):
-        shown = f"Shown here: {log.source}: {_rows(len(log), float(log.time[0]), log.dt)}"
-        items.append(tag("li", shown, tag("code", log.fingerprint)))
-    steps = dict.fromkeys(_step(step) for run in runs for step in run.result.preparation)
-    notes = dict.fromkeys(note for run in runs for note in (*run.result.notes, *run.observations.notes))
-    parts = [tag("ul", *items)]
-    if steps:
-        parts += [tag("p", "Prepared in this order:"), tag("ol", *(tag("li", text) for text in steps))]
-    if notes:
-        parts += [tag("p", "Found on the way:"), tag("ul", *(tag("li", text) for text in notes))]
-    return join(parts)
-
-
-def _rows(n_rows: int, start: float, dt: float) -> str:
-    return f"{plural(n_rows, 'row')} from t = {number(start, 6)} s, {number(dt, 6)} s apart; SHA-256 "
-
-
-def _step(step: Mapping[str, Any]) -> str:
-    details = ", ".join(f"{key} {_value(value)}" for key, value in step.items() if key != "step")
-    return f"{step.get('step', 'step')}: {details}" if details else str(step.get("step"))
-
-
-def _snippet(runs: Sequence[Run]) -> str:
-    """Python that asks the same questions again."""
-    lines = ["import diransac as dr", ""]
-    for source in dict.fromkeys(run.result.log.source for run in runs):
-        lines.append(f"log = dr.read_log(...)  # {' '.join(source.split())}, prepared as above")
-    for model in {run.result.model.fingerprint: run.result.model for run in runs}.values():
-        lines.append(f"model = ...  # {' '.join(model.name.split())}")
-    return "\n".join([*lines, *(_call(run) for run in runs)])
-
-
-def _call(run: Run) -> str:
-    result = run.result
-    arguments = [f"method={result.method!r}", f"seed={result.seed}"]
-    default = Settings()
-    names = [field.name for field in dataclasses.fields(Settings)]
-    chosen = [(n, getattr(result.settings, n)) for n in names if getattr(result.settings, n) != getattr(default, n)]
-    if chosen:
-        arguments.append(f"settings=dr.Settings({', '.join(f'{name}={value!r}' for name, value in chosen)})")
-    if result.iterations and result.diagnosis is None and result.estimator not in _DEFAULT_ESTIMATORS:
-        arguments.append(f"estimator={result.estimator}(...)")
-    if result.diagnosis is not None and not set(result.model.required_signals) <= set(result.diagnosis.noise_std):
-        arguments.append("differentiate=True")
-    elif result.preparation and result.preparation[-1].get("step") == "differentiate":
-        arguments.append(f"differentiate=True, bandwidth={result.preparation[-1]['bandwidth']!r}")
-    return f"result = dr.identify(model, log, {', '.join(arguments)})"
-
-
-def _versions() -> str:
-    from importlib.metadata import version
-
-    packages = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
-    return f"{packages}, Python {platform.python_version()} on {platform.system()} {platform.machine()}"

@@ -2,11 +2,14 @@
 // Zooming and reading of the figures. A plot's x is the log's row, its y thousandths of the range in data-low, data-high.
 (() => {
   const HEIGHT = 1000;
+  const group = (element) => element.closest("[data-log]") || document.querySelector("[data-log]");
   const plots = [...document.querySelectorAll("svg.plot")].map((svg) => {
     const [x, y, width, height] = svg.getAttribute("viewBox").split(" ").map(Number);
     const { low, high, start, dt } = svg.dataset;
-    return { svg, home: { x, y, width, height }, box: { x, y, width, height }, low: +low, high: +high, start: +start, dt: +dt };
+    const home = { x, y, width, height }, box = { x, y, width, height };
+    return { svg, log: group(svg), home, box, low: +low, high: +high, start: +start, dt: +dt };
   });
+  const beside = (log) => plots.filter((plot) => plot.log === log); // the plots of one log, which zoom together
   const make = (name, parent) => {
     const element = document.createElement("div");
     element.className = name;
@@ -15,7 +18,6 @@
     return element;
   };
   const readout = make("readout", document.body);
-  const reset = document.getElementById("reset");
   plots.forEach((plot) => { plot.pointer = make("pointer", plot.svg.parentNode); });
 
   // ---- axes
@@ -29,7 +31,7 @@
     return found.map((x) => [x, text(x, magnitude)]);
   };
   const text = (x, magnitude) => {
-    if (magnitude >= -4 && Math.abs(x) < 1e5) return x.toFixed(Math.max(0, -magnitude)).replace("-", "−");
+    if (magnitude >= -6 && Math.abs(x) < 1e5) return x.toFixed(Math.max(0, -magnitude)).replace("-", "−");
     if (x === 0) return "0";
     const digits = Math.max(0, Math.floor(Math.log10(Math.abs(x)) + 1e-9) - magnitude);
     return x.toExponential(Math.min(digits, 20)).replace("+", "").replace(/-/g, "−");
@@ -58,16 +60,17 @@
     const from = plot.start + plot.dt * box.x, span = plot.dt * box.width;
     label(axis, "x", ticks(from, from + span, 5).map(([t, words]) => [(t - from) / span, words]));
   };
-  const show = (x, width) => {
-    const home = plots[0].home;
+  const show = (log, x, width) => {
+    const together = beside(log), { home } = together[0];
     const wide = Math.min(Math.max(width, 4), home.width);
     const left = Math.min(Math.max(x, 0), home.width - wide);
-    plots.forEach((plot) => { Object.assign(plot.box, { x: left, width: wide }); draw(plot); });
-    reset.hidden = wide === home.width && plots.every(({ box, home: all }) => box.height === all.height);
+    together.forEach((plot) => { Object.assign(plot.box, { x: left, width: wide }); draw(plot); });
+    const isWhole = wide === home.width && together.every(({ box, home: all }) => box.height === all.height);
+    log.querySelector(".reset").hidden = isWhole;
   };
-  const showAll = () => {
-    plots.forEach((plot) => { Object.assign(plot.box, plot.home); });
-    show(0, plots[0].home.width);
+  const showAll = (log) => {
+    beside(log).forEach((plot) => { Object.assign(plot.box, plot.home); });
+    show(log, 0, beside(log)[0].home.width);
   };
 
   // ---- reading
@@ -118,7 +121,7 @@
     const left = event.clientX + 16 + readout.offsetWidth > window.innerWidth;
     readout.style.left = `${event.clientX + (left ? -16 - readout.offsetWidth : 16)}px`;
     readout.style.top = `${Math.min(event.clientY + 16, window.innerHeight - readout.offsetHeight - 4)}px`;
-    plots.forEach(({ svg, pointer }) => {
+    beside(plot.log).forEach(({ svg, pointer }) => {
       const panel = svg.parentNode.getBoundingClientRect(), frame = svg.getBoundingClientRect();
       pointer.style.left = `${frame.left - panel.left + along * frame.width}px`;
       pointer.hidden = false;
@@ -139,7 +142,7 @@
       Object.assign(box, { y: box.y + top * box.height, height: (bottom - top) * box.height });
     }
     const wide = (right - left) * frame.width > 8;
-    show(box.x + (wide ? left * box.width : 0), wide ? (right - left) * box.width : box.width);
+    show(plot.log, box.x + (wide ? left * box.width : 0), wide ? (right - left) * box.width : box.width);
   };
   const outline = (choice, plot, from, to) => {
     const panel = plot.svg.parentNode.getBoundingClientRect(), frame = plot.svg.getBoundingClientRect();
@@ -179,10 +182,10 @@
       from = null;
     });
     svg.addEventListener("pointerleave", leave);
-    svg.addEventListener("dblclick", showAll);
+    svg.addEventListener("dblclick", () => showAll(plot.log));
     svg.addEventListener("keydown", (event) => {
-      if (event.key === "0" || event.key === "Escape") showAll();
-      else if (keys[event.key]) show(...keys[event.key](plot.box));
+      if (event.key === "0" || event.key === "Escape") showAll(plot.log);
+      else if (keys[event.key]) show(plot.log, ...keys[event.key](plot.box));
       else return;
       event.preventDefault();
     });
@@ -192,7 +195,7 @@
   document.querySelectorAll("input[data-shows]").forEach((input) => {
     input.hidden = false;
     input.addEventListener("change", () => {
-      const paths = document.querySelectorAll(`.plot .${input.dataset.shows}`);
+      const paths = group(input).querySelectorAll(`.plot .${input.dataset.shows}`);
       paths.forEach((path) => path.classList.toggle("off", !input.checked));
     });
   });
@@ -206,8 +209,16 @@
       const whole = plot.box.height === plot.home.height;
       const { y, height } = whole ? { y: top - margin, height: bottom - top + 2 * margin } : plot.home;
       Object.assign(plot.box, { y, height });
-      show(plot.box.x, plot.box.width);
+      show(plot.log, plot.box.x, plot.box.width);
     });
   });
-  reset.addEventListener("click", showAll);
+  document.querySelectorAll(".reset").forEach((button) => button.addEventListener("click", () => showAll(group(button))));
+
+  // ---- printing: every log is opened, then closed again
+  let closed = [];
+  window.addEventListener("beforeprint", () => {
+    closed = [...document.querySelectorAll("details:not([open])")];
+    closed.forEach((details) => { details.open = true; });
+  });
+  window.addEventListener("afterprint", () => { closed.forEach((details) => { details.open = false; }); });
 })();

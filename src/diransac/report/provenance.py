@@ -1,0 +1,143 @@
+"""Equations and provenance: settings, data and the code that repeats the identifications."""
+
+from __future__ import annotations
+
+import dataclasses
+import platform
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from diransac.data.log import Log
+from diransac.identification.settings import Settings
+from diransac.model import Model
+from diransac.report.rendering import number, numbered, percent, plural
+from diransac.report.runs import Entry, summaries
+
+__all__ = ["log_facts", "model_text", "notes", "preparation", "settings", "snippet", "unique_models", "versions"]
+
+_PACKAGES = ("diransac", "numpy", "scipy", "casadi", "llvmlite")
+_DEFAULT_ESTIMATORS = ("OrdinaryLeastSquares", "NonlinearLeastSquares")
+
+
+def unique_models(entries: Sequence[Entry]) -> list[Model]:
+    """The models of the page."""
+    return list({entry.result.model.fingerprint: entry.result.model for entry in entries}.values())
+
+
+def model_text(model: Model) -> tuple[str, str, str]:
+    """Name, variables and equations of a model."""
+    groups = (("coordinates", model.coordinates), ("velocities", model.velocities), ("inputs", model.inputs))
+    named = (f"{kind} " + ", ".join(f"{n} ({u})" for n, u in units.items()) for kind, units in groups if units)
+    return model.name, "; ".join(named), "\n".join(model.equations_text())
+
+
+def settings(entries: Sequence[Entry]) -> list[tuple[str, list[tuple[str, bool]]]]:
+    """Facts and settings, each with its text by every result and whether that differs from the default."""
+    columns = [_facts(entry) for entry in entries]
+    return [(key, [column[key] for column in columns]) for key in columns[0]]
+
+
+def _facts(entry: Entry) -> dict[str, tuple[str, bool]]:
+    result, default = entry.result, Settings().to_dict()
+    squares = " (sum of squares)" if result.method == "diransac" else ""
+    facts = {
+        "method": result.method,
+        "estimator": result.estimator,
+        "seed": str(result.seed),
+        "fit error": number(result.fit_error, 6) + squares,
+        "inliers": f"{percent(result.inlier_fraction)} of the valid rows",
+        "samples": f"{result.iterations:,}",
+        "hypotheses": f"{result.n_hypotheses:,}",
+        "rejected hypotheses": ", ".join(f"{n:,} {reason}" for reason, n in result.rejected.items()) or "none",
+        "stop reason": result.stop_reason,
+    }
+    chosen = {key: (_value(x), x != default[key]) for key, x in result.settings.to_dict().items()}
+    return {key: (text, False) for key, text in facts.items()} | chosen
+
+
+def _value(x: Any) -> str:
+    """Text of a setting or of a preprocessing step's detail."""
+    if isinstance(x, Mapping):
+        return ", ".join(f"{key}: {_value(value)}" for key, value in x.items()) or "none"
+    if isinstance(x, list | tuple):
+        return ", ".join(_value(value) for value in x) or "none"
+    if x is None:
+        return "automatic"
+    return number(x, 6) if isinstance(x, float) else str(x)
+
+
+def log_facts(entries: Sequence[Entry], logs: Sequence[Log]) -> list[tuple[str, str]]:
+    """Description and fingerprint of every log that was used for identification, or is shown."""
+    used = dict.fromkeys(summary for entry in entries for summary in summaries(entry.result))
+    facts = [(f"{s.source}: {_rows(s.n_rows, s.start, s.dt)}", s.fingerprint) for s in used]
+    names = numbered(log.source for log in logs)
+    return facts + [
+        (f"Held out: {name}: {_rows(len(log), float(log.time[0]), log.dt)}", log.fingerprint)
+        for i, (name, log) in enumerate(zip(names, logs, strict=True))
+        if any(entry.runs[i].held_out for entry in entries)
+    ]
+
+
+def _rows(n_rows: int, start: float, dt: float) -> str:
+    return f"{plural(n_rows, 'row')} from t = {number(start, 6)} s, sampling time {number(dt, 6)} s; SHA-256 "
+
+
+def preparation(entries: Sequence[Entry]) -> list[str]:
+    """Preprocessing steps, in order."""
+    steps = (step for entry in entries for run in entry.runs for step in run.view.preparation)
+    return list(dict.fromkeys(_step(step) for step in steps))
+
+
+def _step(step: Mapping[str, Any]) -> str:
+    details = ", ".join(f"{key} {_value(value)}" for key, value in step.items() if key != "step")
+    return f"{step.get('step', 'step')}: {details}" if details else str(step.get("step"))
+
+
+def notes(entries: Sequence[Entry]) -> list[str]:
+    """Notes on the identification and on the logs."""
+    found = (note for e in entries for run in e.runs for note in (*e.result.notes, *run.observations.notes))
+    return list(dict.fromkeys(found))
+
+
+def snippet(entries: Sequence[Entry]) -> str:
+    """Python that repeats the identifications."""
+    lines = ["import diransac as dr", ""]
+    groups = dict.fromkeys(tuple(s.source for s in summaries(entry.result)) for entry in entries)
+    for sources in groups:
+        if len(sources) == 1:
+            lines.append(f"log = dr.read_log(...)  # {_one_line(sources[0])}, prepared as above")
+        else:
+            reads = [f"    dr.read_log(...),  # {_one_line(source)}" for source in sources]
+            lines += ["log = [  # prepared as above", *reads, "]"]
+    lines += [f"model = ...  # {_one_line(model.name)}" for model in unique_models(entries)]
+    return "\n".join([*lines, *(_call(entry) for entry in entries)])
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _call(entry: Entry) -> str:
+    """The call of `identify` that gave a result."""
+    result, steps = entry.result, entry.runs[0].view.preparation
+    arguments = [f"method={result.method!r}", f"seed={result.seed}"]
+    default = Settings()
+    names = [field.name for field in dataclasses.fields(Settings)]
+    chosen = [(n, getattr(result.settings, n)) for n in names if getattr(result.settings, n) != getattr(default, n)]
+    if chosen:
+        arguments.append(f"settings=dr.Settings({', '.join(f'{name}={value!r}' for name, value in chosen)})")
+    if result.iterations and result.diagnosis is None and result.estimator not in _DEFAULT_ESTIMATORS:
+        arguments.append(f"estimator={result.estimator}(...)")
+    if result.diagnosis is not None and not set(result.model.required_signals) <= set(result.diagnosis.noise_std):
+        arguments.append("differentiate=True")
+    elif steps and steps[-1].get("step") == "differentiate":
+        arguments.append(f"differentiate=True, bandwidth={steps[-1]['bandwidth']!r}")
+    return f"result = dr.identify(model, log, {', '.join(arguments)})"
+
+
+def versions() -> str:
+    """Versions of the packages and the platform."""
+    from importlib.metadata import version
+
+    packages = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
+    return f"{packages}, Python {platform.python_version()} on {platform.system()} {platform.machine()}"

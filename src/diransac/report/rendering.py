@@ -1,0 +1,142 @@
+"""Jinja templates of the pages, and numbers as text."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from diransac.atomic import write_text
+from diransac.errors import ResultError
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+__all__ = ["Table", "encodable", "environment", "number", "numbered", "percent", "plural", "share", "write_page"]
+
+_LEAST_PERCENT = 0.01
+_TIMES = 3.0
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text; the first cell of each row is its heading."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str
+
+
+# ---------------------------------------------------------------------- pages
+
+
+@cache
+def environment() -> Environment:
+    """Template environment: every value is escaped, and an undefined name is an error.
+
+    Jinja is imported here, when the first page is written.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    loader = PackageLoader("diransac.report")
+    found = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    found.filters.update(number=number, percent=percent, plural=plural)
+    return found
+
+
+def write_page(path: str | Path, template: str, style: Sequence[str], script: str = "", **content: Any) -> None:
+    """Write a template as one self-contained page, whole or not at all.
+
+    Parameters
+    ----------
+    path : file of the page
+    template : name of the template
+    style, script : names of the style sheets and of the only script that a browser may run
+    content : values of the template
+
+    Raises
+    ------
+    ResultError
+        The file cannot be written.
+    """
+    code = _asset(script) if script else ""
+    text = (
+        environment()
+        .get_template(template)
+        .render(style="".join(_asset(name) for name in style), script=code, policy=_policy(code), **content)
+    )
+    try:
+        write_text(path, f"{encodable(text)}\n")
+    except OSError as error:
+        raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def encodable(text: str) -> str:
+    """Text with every character that is not Unicode (from undecodable file names) replaced by ``?``."""
+    return text.encode(errors="replace").decode()
+
+
+def _asset(name: str) -> str:
+    """Text of a style sheet or script beside the templates."""
+    return (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
+
+
+def _policy(script: str) -> str:
+    """Content security policy: inline styles and this one script; nothing is loaded."""
+    allowed = "default-src 'none'; style-src 'unsafe-inline'"
+    if not script:
+        return allowed
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return f"{allowed}; script-src 'sha256-{digest}'"
+
+
+# ---------------------------------------------------------------------- numbers and names
+
+
+def number(x: float, digits: int = 4) -> str:
+    """A number to significant digits: ``−1.5``, ``1.2×10⁻⁶``, ``∞``, ``–`` for NaN."""
+    if math.isnan(x):
+        return "–"
+    if math.isinf(x):
+        return "∞" if x > 0 else "−∞"
+    mantissa, _, exponent = f"{x:.{digits}g}".partition("e")
+    power = f"×10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if exponent else ""
+    return mantissa.replace("-", "−") + power
+
+
+def percent(fraction: float) -> str:
+    """A fraction in percent to about two digits: ``0.42 %``, ``13 %``, ``< 0.01 %``."""
+    x = 100.0 * fraction
+    if 0.0 < abs(x) < _LEAST_PERCENT:
+        return f"{'< ' if x > 0.0 else '> −'}{_LEAST_PERCENT} %"
+    if 99.0 < x < 100.0:
+        return f"{min(x, 99.9):.1f} %"
+    rounded = f"{x:.0f}" if math.isfinite(x) and 10.0 <= abs(x) < 1e5 else number(x, 2)
+    return f"{rounded.replace('-', '−')} %"
+
+
+def share(x: float, whole: str) -> str:
+    """A ratio to a whole: ``2 % of its range``, ``19 times its range``."""
+    if math.isfinite(x) and x >= _TIMES:
+        return f"{number(x, 2)} times {whole}"
+    return f"{percent(x)} of {whole}"
+
+
+def plural(count: int, noun: str) -> str:
+    """A count with its noun: ``1 row``, ``2,501 rows``."""
+    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+
+
+def numbered(names: Iterable[str]) -> list[str]:
+    """Unique names: the second and later occurrences get a number."""
+    found: list[str] = []
+    for name in names:
+        repeats = sum(other.split(" #")[0] == name for other in found)
+        found.append(f"{name} #{repeats + 1}" if repeats else name)
+    return found
