@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diransac.identification.diagnosis import Diagnosis
 
 import diransac as dr
+from diransac.identification.estimate import Diagnosis
 
 DT, N = 0.01, 1500
 MASS, DRAG, EXTRA = 1.5, 2.0, 0.3

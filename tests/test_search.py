@@ -7,14 +7,14 @@ from hashlib import sha256
 
 import numpy as np
 import pytest
+from diransac.identification.methods.consensus import Diransac, InlierBiasedDiransac, Score
+from diransac.identification.methods.search import Outcome, search
 
 from algorithm1 import Choices, Problem, Story, algorithm1
 from diransac.data.dataset import observe
 from diransac.errors import IdentificationError
 from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.evaluation import Simulation, choose_scoring, judged_signals
-from diransac.identification.methods.consensus import Diransac, InlierBiasedDiransac, Score
-from diransac.identification.methods.search import Outcome, search
 from diransac.identification.settings import Settings
 from diransac.model.library import builtin
 from diransac.simulation import RolloutBatch, rollouts

@@ -9,7 +9,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.log import Log
-from diransac.identification.diagnosis import Diagnosis
+from diransac.identification.estimate import Diagnosis
 from diransac.report.assessment import windows
 from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, strip, time_axis, time_plot
 from diransac.report.rendering import number, percent, plural, share

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from diransac.data.log import Log
+from diransac.identification.methods import default_options
 from diransac.identification.settings import Settings
 from diransac.model import Model
 from diransac.report.rendering import number, numbered, percent, plural
@@ -34,11 +35,12 @@ def model_text(model: Model) -> tuple[str, str, str]:
 def settings(entries: Sequence[Entry]) -> list[tuple[str, list[tuple[str, bool]]]]:
     """Facts and settings, each with its text by every result and whether that differs from the default."""
     columns = [_facts(entry) for entry in entries]
-    return [(key, [column[key] for column in columns]) for key in columns[0]]
+    keys = dict.fromkeys(key for column in columns for key in column)
+    return [(key, [column.get(key, ("", False)) for column in columns]) for key in keys]
 
 
 def _facts(entry: Entry) -> dict[str, tuple[str, bool]]:
-    result, default = entry.result, Settings().to_dict()
+    result, default, defaults = entry.result, Settings().to_dict(), default_options(entry.result.method)
     squares = " (sum of squares)" if result.method == "diransac" else ""
     facts = {
         "method": result.method,
@@ -52,7 +54,8 @@ def _facts(entry: Entry) -> dict[str, tuple[str, bool]]:
         "stop reason": result.stop_reason,
     }
     chosen = {key: (_value(x), x != default[key]) for key, x in result.settings.to_dict().items()}
-    return {key: (text, False) for key, text in facts.items()} | chosen
+    own = {key: (_value(x), x != defaults.get(key)) for key, x in result.options.items()}
+    return {key: (text, False) for key, text in facts.items()} | chosen | own
 
 
 def _value(x: Any) -> str:
@@ -68,8 +71,8 @@ def _value(x: Any) -> str:
 
 def log_facts(entries: Sequence[Entry], logs: Sequence[Log]) -> list[tuple[str, str]]:
     """Description and fingerprint of every log that was used for identification, or is shown."""
-    used = dict.fromkeys(summary for entry in entries for summary in summaries(entry.result))
-    facts = [(f"{s.source}: {_rows(s.n_rows, s.start, s.dt)}", s.fingerprint) for s in used]
+    used = {s.fingerprint: s for entry in entries for s in summaries(entry.result)}
+    facts = [(f"{s.source}: {_rows(s.n_rows, s.start, s.dt)}", s.fingerprint) for s in used.values()]
     names = numbered(log.source for log in logs)
     return facts + [
         (f"Held out: {name}: {_rows(len(log), float(log.time[0]), log.dt)}", log.fingerprint)
@@ -124,7 +127,11 @@ def _call(entry: Entry) -> str:
     default = Settings()
     names = [field.name for field in dataclasses.fields(Settings)]
     chosen = [(n, getattr(result.settings, n)) for n in names if getattr(result.settings, n) != getattr(default, n)]
-    if chosen:
+    own = {n: x for n, x in result.options.items() if x != default_options(result.method).get(n)}
+    if own:
+        criteria = f"dr.Settings({', '.join(f'{name}={value!r}' for name, value in chosen)}), " if chosen else ""
+        arguments[0] = f"dr.LoDiransac({criteria}{', '.join(f'{name}={value!r}' for name, value in own.items())})"
+    elif chosen:
         arguments.append(f"settings=dr.Settings({', '.join(f'{name}={value!r}' for name, value in chosen)})")
     if result.iterations and result.diagnosis is None and result.estimator not in _DEFAULT_ESTIMATORS:
         arguments.append(f"estimator={result.estimator}(...)")

@@ -11,16 +11,16 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
-from diransac.data.dataset import Observations, observe
+from diransac.data.dataset import Dataset, Segment
 from diransac.data.log import Log
 from diransac.errors import LogError, ResultError, SettingsError
-from diransac.identification.diagnosis import Diagnosis
-from diransac.identification.evaluation import Scoring, as_diagnosed, choose_scoring, judged_signals
-from diransac.identification.result import LogSummary, Result
-from diransac.identification.settings import Settings
+from diransac.identification.estimate import Diagnosis, LogSummary
+from diransac.identification.evaluation import Scoring, Simulation, as_estimated, choose_scoring, judged_signals
+from diransac.identification.result import Result
 from diransac.identification.validation import Validation, validate
+from diransac.model import Plant
 from diransac.report.rendering import numbered
-from diransac.simulation import Rollouts, inlier_mask, rollouts
+from diransac.simulation import inlier_mask
 
 __all__ = [
     "Entry",
@@ -74,7 +74,7 @@ class LogView:
 
 def summaries(result: Result) -> tuple[LogSummary, ...]:
     """Summary of every log that the result was identified from."""
-    return (result.log,)
+    return result.logs
 
 
 def log_view(result: Result, log: Log) -> LogView:
@@ -82,21 +82,27 @@ def log_view(result: Result, log: Log) -> LogView:
 
     This function and `summaries` alone read the attributes of a result that have one entry per log.
     """
-    own = (i for i, summary in enumerate(summaries(result)) if summary.fingerprint == log.fingerprint)
+    own = (i for i, summary in enumerate(result.logs) if summary.fingerprint == log.fingerprint)
     index = next(own, None)
     if index is None:
-        return LogView(None, result.parameters, (), None, result.preparation, None, np.nan, "")
-    rows = windows = slice(None)
-    diagnosis = None if result.diagnosis is None else _restricted(result.diagnosis, rows, windows)
+        return LogView(None, result.parameters, (), None, result.logs[0].preparation, None, np.nan, "")
+    summary, rows = result.logs[index], result.log_rows(index)
+    parameters = {**result.parameters, **{name: values[index] for name, values in result.per_log.items()}}
+    diagnosis = None if result.diagnosis is None else _restricted(result.diagnosis, rows, index)
     inliers = result.inliers[rows]
-    return LogView(index, result.parameters, (), inliers, result.preparation, diagnosis, result.fit_error, "")
+    steps = summary.preparation
+    return LogView(
+        index, parameters, tuple(result.per_log), inliers, steps, diagnosis, summary.fit_error, summary.remark
+    )
 
 
-def _restricted(diagnosis: Diagnosis, rows: slice, windows: slice | BoolArray) -> Diagnosis:
-    """The diagnosis of some rows and windows."""
+def _restricted(diagnosis: Diagnosis, rows: slice, log: int) -> Diagnosis:
+    """The diagnosis of one log, whose rows are given."""
+    windows = diagnosis.windows_of(log)
     return replace(
         diagnosis,
         outliers={name: mask[rows] for name, mask in diagnosis.outliers.items()},
+        window_log=np.zeros_like(windows),
         unmodelled_time=diagnosis.unmodelled_time[windows],
         unmodelled_accelerations={n: x[windows] for n, x in diagnosis.unmodelled_accelerations.items()},
         unmodelled_forces={n: x[windows] for n, x in diagnosis.unmodelled_forces.items()},
@@ -135,7 +141,7 @@ class Run:
     log_name: str
     result: Result
     view: LogView
-    observations: Observations
+    observations: Segment
     first_row: int
     diagnosis: Diagnosis | None
     restart_period: float
@@ -309,15 +315,14 @@ def simulate_on(
 def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | None) -> Run:
     """The run, without names."""
     settings, model, log = result.settings, result.model, _prepared(result, view, given)
-    observations = _observations(result, log)
-    scoring = choose_scoring(observations, settings)
-    if view.diagnosis is not None:
-        observations, settings = as_diagnosed(observations, settings, view.diagnosis)
-    engine = rollouts(model, observations.signals, integrator=settings.integrator, substeps=settings.substeps)
-    start = observations.initial_state(settings.initial_state)[None]
+    dataset = _dataset(result, log, given)
+    scoring = choose_scoring(dataset, settings)
+    dataset, rules = as_estimated(dataset, view.diagnosis, settings)
+    simulation = Simulation(dataset, resolution=result.estimate.resolution, rules=rules, threads=1)
+    observations = dataset.segments[0]
     first_row = round(float(log.time[observations.offset] - given.time[0]) / given.dt)
     parameters = model.parameter_vector(view.parameters)
-    open_loop, errors = _simulated(engine, parameters, observations, start, len(observations))
+    open_loop, errors = _simulated(simulation, parameters, observations, simulation.starts[0][None], len(observations))
     inliers = view.inliers
     if inliers is None:
         inliers = _close_rows(errors, observations, scoring)
@@ -326,7 +331,7 @@ def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | 
     simulated, period = open_loop, np.inf
     if diagnosis is not None and set(model.state) <= set(diagnosis.smoothed_states):
         states, n_rows = _restarts(diagnosis, observations)
-        simulated, errors = _simulated(engine, parameters, observations, states, n_rows)
+        simulated, errors = _simulated(simulation, parameters, observations, states, n_rows)
         period = n_rows * log.dt
     columns = [model.signals.index(name) for name in observations.signals]
     return Run(
@@ -344,11 +349,11 @@ def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | 
         accelerations=dict(zip(model.accelerations, simulated[:, len(model.state) :].T, strict=True)),
         thresholds=scoring.thresholds,
         inliers=inliers,
-        validation=_validation(result, log, result.settings),
+        validation=_validation(result, view, log),
     )
 
 
-def _close_rows(errors: FloatArray, observations: Observations, scoring: Scoring) -> BoolArray:
+def _close_rows(errors: FloatArray, observations: Segment, scoring: Scoring) -> BoolArray:
     """Inliers (N,) of a held-out log by the thresholds of its scoring."""
     finite = np.where(np.isnan(errors), np.inf, errors)
     return inlier_mask(finite, observations.valid, scoring.thresholds, scoring.min_inlier_signals)
@@ -366,7 +371,7 @@ def _last_step(history: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
     return history[-1] if history else {}
 
 
-def _restarts(diagnosis: Diagnosis, observations: Observations) -> tuple[FloatArray, int]:
+def _restarts(diagnosis: Diagnosis, observations: Segment) -> tuple[FloatArray, int]:
     """Smoothed states (K, n_x) at which the simulation restarts, and the number of rows between them."""
     time, names = diagnosis.smoothed_time, observations.model.state
     every = max(1, round(len(time) / _N_RESTARTS))
@@ -377,33 +382,29 @@ def _restarts(diagnosis: Diagnosis, observations: Observations) -> tuple[FloatAr
 
 
 def _simulated(
-    engine: Rollouts, values: FloatArray, observations: Observations, states: FloatArray, n_rows: int
+    simulation: Simulation, parameters: FloatArray, observations: Segment, states: FloatArray, n_rows: int
 ) -> tuple[FloatArray, FloatArray]:
     """All signals (N, n) simulated from each state for ``n_rows`` rows, and their errors (N, n_s)."""
-    n = len(observations)
-    more = ((0, len(states) * n_rows - n), (0, 0))
-    inputs, measured = (np.pad(x, more, mode="edge") for x in (observations.inputs, observations.measured))
-    parameters = np.tile(values, (len(states), 1))
-    rows, dt, every = n_rows * np.arange(len(states)), observations.log.dt, np.ones(len(inputs), dtype=bool)
-    everything = engine.trajectories(parameters, states, inputs, dt, start_rows=rows, n_rows=n_rows)
-    errors = engine.errors(
-        parameters, states, inputs, np.nan_to_num(measured), every, dt, start_rows=rows, n_rows=n_rows
-    )
-    missing = ~np.isfinite(observations.measured)
-    return everything.reshape(len(inputs), -1)[:n], np.where(missing, np.nan, errors.reshape(len(inputs), -1)[:n])
+    n, starts = len(observations), n_rows * np.arange(len(states))
+    signals = simulation.trajectories(0, parameters, states, starts, n_rows)
+    errors = simulation.errors(0, parameters, states, starts, n_rows)
+    signals, errors = (x.reshape(-1, x.shape[2])[:n] for x in (signals, errors))
+    return signals, np.where(np.isfinite(observations.measured), errors, np.nan)
 
 
-def _observations(result: Result, log: Log) -> Observations:
-    """Observations as `identify` makes them; of a held-out log without all signals, those that a simulation needs."""
+def _dataset(result: Result, log: Log, given: Log) -> Dataset:
+    """The dataset as `identify` makes it; of a held-out log without all signals, with those that a simulation needs."""
     try:
-        return observe(result.model, log, judged_signals(result.model, log, result.settings))
+        return Dataset.of(result.model, log, judged_signals(result.model, [log], result.settings), given=[given])
     except LogError:
-        return observe(result.model, log, pointwise=False)
+        return Dataset.of(result.model, log, pointwise=False, given=[given])
 
 
-def _validation(result: Result, log: Log, settings: Settings) -> Validation | str:
+def _validation(result: Result, view: LogView, log: Log) -> Validation | str:
     """Open-loop scores, or the reason why there are none."""
+    fitted = result.estimate.resolution
     try:
-        return validate(result, log, integrator=settings.integrator, substeps=settings.substeps)
+        plant = Plant(result.model, view.parameters)
+        return validate(plant, log, integrator=fitted.integrator, substeps=fitted.substeps)
     except (LogError, SettingsError) as error:
         return str(error)

@@ -6,15 +6,16 @@ A new method is a file here and a line in the registry: its name, and the functi
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from diransac.errors import SettingsError
+from diransac.identification.settings import Settings
 
 if TYPE_CHECKING:
     from diransac.identification.method import Method
 
-__all__ = ["DEFAULT", "METHODS", "WITH_ESTIMATOR", "factory"]
+__all__ = ["DEFAULT", "METHODS", "WITH_ESTIMATOR", "default_options", "factory"]
 
 _REGISTRY = {
     "ols": "least_squares:ordinary",
@@ -45,3 +46,8 @@ def factory(name: str) -> Callable[..., Method]:
     module, _, attribute = _REGISTRY[name].partition(":")
     found: Any = getattr(importlib.import_module(f"diransac.identification.methods.{module}"), attribute)
     return found  # type: ignore[no-any-return]
+
+
+def default_options(name: str) -> Mapping[str, Any]:
+    """The default values of a method's own settings; none of a method that is not in the registry."""
+    return factory(name)(Settings()).options() if name in _REGISTRY else {}
