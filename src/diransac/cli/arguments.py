@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from diransac.errors import ModelError, SettingsError
+from diransac.identification.method import Method
+from diransac.identification.methods import configured, setting_names
 from diransac.identification.settings import Settings
 from diransac.model import Model
 from diransac.user_files import definitions, file_and_name
 
-__all__ = ["load_model", "load_settings", "model_file", "names", "numbers", "pairs", "toml_value"]
+__all__ = ["load_methods", "load_model", "load_settings", "model_file", "names", "numbers", "pairs", "toml_value"]
 
 
 # ---------------------------------------------------------------------- lists of pairs
@@ -57,15 +59,15 @@ def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
 # ---------------------------------------------------------------------- settings
 
 
-def load_settings(file: Path | None, assignments: Sequence[str]) -> Settings:
-    """Settings of a TOML file, with ``key=value`` assignments laid over them in order.
+def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, Any]:
+    """Settings by name from a TOML file, with ``key=value`` assignments laid over them in order.
 
     Raises
     ------
     SettingsError
-        the file cannot be read or has an unknown setting, or a value has no meaning.
+        The file cannot be read.
     typer.BadParameter
-        an assignment is not ``key=value``, or its key is no setting.
+        An assignment is not ``key=value``.
     """
     table = {} if file is None else {key.replace("-", "_"): value for key, value in _read_toml(file).items()}
     for text in assignments:
@@ -73,16 +75,27 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> Settings:
         keys = [part.strip() for part in key.split(".")]
         if not equals or not all(keys):
             raise typer.BadParameter(f"--set: {text!r} is not key=value")
-        _assign(table, [_known_setting(keys[0]), *keys[1:]], toml_value(value.strip()))
-    return Settings.from_dict({key: _none_where_meant(key, value) for key, value in table.items()})
+        _assign(table, [keys[0].replace("-", "_"), *keys[1:]], toml_value(value.strip()))
+    return {key: _none_where_meant(key, value) for key, value in table.items()}
 
 
-def _known_setting(key: str) -> str:
-    name = key.replace("-", "_")
-    known = [field.name for field in dataclasses.fields(Settings)]
-    if name not in known:
-        raise typer.BadParameter(f'--set: there is no setting "{key}"; there are {", ".join(known)}')
-    return name
+def load_methods(names: Sequence[str], settings: Mapping[str, Any]) -> list[Method]:
+    """Methods by name, each with those of the settings that it has; every setting is one of at least one of them.
+
+    Raises
+    ------
+    typer.BadParameter
+        A setting belongs to none of the methods.
+    SettingsError
+        A value has no meaning.
+    """
+    known = {name: setting_names(name) for name in names}
+    for key in settings:
+        if not any(key in own for own in known.values()):
+            of_one = f'method "{names[0]}" has' if len(names) == 1 else "none of the methods has"
+            own = ", ".join(dict.fromkeys(x for own in known.values() for x in own))
+            raise typer.BadParameter(f'{of_one} no setting "{key}"; there are {own}')
+    return [configured(name, {key: value for key, value in settings.items() if key in known[name]}) for name in names]
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

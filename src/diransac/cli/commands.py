@@ -23,6 +23,7 @@ from diransac.cli.options import (
     Derivation,
     JsonFlag,
     LogFile,
+    LogFiles,
     MethodName,
     ModelName,
     OptionalModelName,
@@ -35,10 +36,11 @@ from diransac.cli.options import (
 )
 from diransac.cli.outputs import staged
 from diransac.cli.views import Equations, ModelList, compare_methods
-from diransac.identification.identify import METHODS, identify
+from diransac.identification.identify import identify
 from diransac.identification.inspection import inspect
+from diransac.identification.methods import DEFAULT, METHODS
 from diransac.identification.result import Result
-from diransac.identification.validation import validate
+from diransac.identification.validation import cross_validate, validate
 
 __all__ = ["app"]
 
@@ -70,35 +72,35 @@ def _diransac(
 @app.command("identify")
 @grouped
 def _identify(
-    file: LogFile,
+    files: LogFiles,
     model: ModelName,
     search: Search,
     derivation: Derivation,
     preparation: Preparation,
-    method: MethodName = METHODS[-1],
+    method: MethodName = DEFAULT,
     output: Output = None,
     report: Report = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Identify the parameters of a model from a log."""
-    arguments = search.arguments() | derivation.arguments()
-    with staged([output, report], [file, model_file(model), search.settings]) as (saved, page):
-        plant, log = load_model(model), preparation.read(file)
+    """Identify the parameters of a model from one log, or from several logs of one machine."""
+    (chosen,), derived = search.methods([method]), derivation.arguments()
+    with staged([output, report], [*files, model_file(model), search.settings]) as (saved, page):
+        plant, logs = load_model(model), preparation.read_all(files)
         with screen.bar(method) as progress:
-            result = identify(plant, log, method, progress=progress, **arguments)
+            result = identify(plant, logs, chosen, seed=search.seed, progress=progress, **derived)
         if output:
             result.save(saved)
         if report:
             from diransac.report import write_report
 
-            write_report(result, log, page)
+            write_report(result, logs, page)
         screen.show(result, as_json)
 
 
 @app.command("compare")
 @grouped
 def _compare(
-    file: LogFile,
+    files: LogFiles,
     model: ModelName,
     search: Search,
     derivation: Derivation,
@@ -107,16 +109,16 @@ def _compare(
     report: Report = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Identify by every method from one log, side by side."""
-    wanted = known_methods(methods)
-    arguments = search.arguments() | derivation.arguments()
-    with staged([report], [file, model_file(model), search.settings]) as (page,):
-        plant, log = load_model(model), preparation.read(file)
-        comparison = compare_methods(plant, log, wanted, arguments)
+    """Identify by every method from the same logs, side by side."""
+    wanted = search.methods(known_methods(methods))
+    arguments = {"seed": search.seed, **derivation.arguments()}
+    with staged([report], [*files, model_file(model), search.settings]) as (page,):
+        plant, logs = load_model(model), preparation.read_all(files)
+        comparison = compare_methods(plant, logs, wanted, arguments)
         if report:
             from diransac.report import write_report
 
-            write_report(comparison.results, log, page)
+            write_report(comparison.results, logs, page)
         screen.show(comparison, as_json)
 
 
@@ -124,16 +126,36 @@ def _compare(
 @grouped
 def _validate(
     model: ResultFile,
-    file: LogFile,
+    files: LogFiles,
     derivation: Derivation,
     preparation: Preparation,
     horizon: Annotated[float | None, typer.Option(metavar="S", help="Restart the simulation after so long.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Predict another log with an identified model, open loop."""
+    """Predict other logs with an identified model, open loop."""
     result = Result.load(model)
-    log = derivation.derive(preparation.read(file), result.model)
-    screen.show(validate(result, log, horizon), as_json)
+    logs = [derivation.derive(log, result.model) for log in preparation.read_all(files)]
+    screen.show(validate(result, logs, horizon), as_json)
+
+
+@app.command("cross-validate")
+@grouped
+def _cross_validate(
+    files: LogFiles,
+    model: ModelName,
+    search: Search,
+    derivation: Derivation,
+    preparation: Preparation,
+    method: MethodName = DEFAULT,
+    horizon: Annotated[float | None, typer.Option(metavar="S", help="Restart the simulation after so long.")] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Identify from all logs but one, and predict that one, for each in turn."""
+    (chosen,), derived = search.methods([method]), derivation.arguments()
+    plant, logs = load_model(model), preparation.read_all(files)
+    with screen.bar(f"{method}, leaving one log out") as progress:
+        found = cross_validate(plant, logs, chosen, horizon=horizon, seed=search.seed, progress=progress, **derived)
+    screen.show(found, as_json)
 
 
 @app.command("inspect")

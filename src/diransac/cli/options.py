@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, isnan
 from pathlib import Path
@@ -9,18 +10,20 @@ from typing import Annotated, Any
 
 import typer
 
-from diransac.cli.arguments import load_settings, names, numbers, pairs
+from diransac.cli.arguments import load_methods, load_settings, names, numbers, pairs
 from diransac.data import preprocessing
 from diransac.data.log import Log
 from diransac.data.readers import read_log
 from diransac.errors import LogError, SettingsError
-from diransac.identification.identify import METHODS
+from diransac.identification.method import Method
+from diransac.identification.methods import METHODS
 from diransac.model import Model
 
 __all__ = [
     "Derivation",
     "JsonFlag",
     "LogFile",
+    "LogFiles",
     "MethodName",
     "ModelName",
     "OptionalModelName",
@@ -77,6 +80,7 @@ _LOG_HELP = "CSV(.gz), Parquet, NPZ or MAT: time t in seconds and one column a s
 _MODEL = typer.Option("--model", metavar="NAME|FILE.py[:NAME]", help="A built-in model, or one of yours.")
 
 LogFile = Annotated[Path, typer.Argument(metavar="LOG", help=_LOG_HELP)]
+LogFiles = Annotated[list[Path], typer.Argument(metavar="LOG...", help=f"{_LOG_HELP} Several are used together.")]
 ResultFile = Annotated[Path, typer.Argument(metavar="MODEL.json", help="What identify saved.")]
 ModelName = Annotated[str, _MODEL]
 OptionalModelName = Annotated[str | None, _MODEL]
@@ -108,9 +112,9 @@ class Search:
         typer.Option("--set", metavar="KEY=VALUE", help="One setting, such as sample_size=50; repeatable."),
     ] = None
 
-    def arguments(self) -> dict[str, Any]:
-        """What `diransac.identify` is called with.  Raises SettingsError: a setting is unknown or has no meaning."""
-        return {"seed": self.seed, "settings": load_settings(self.settings, self.assignments or ())}
+    def methods(self, names: Sequence[str]) -> list[Method]:
+        """The methods with these settings.  Raises SettingsError: a setting has no meaning."""
+        return load_methods(names, load_settings(self.settings, self.assignments or ()))
 
 
 @dataclass(frozen=True)
@@ -167,6 +171,10 @@ class Preparation:
     shift: Annotated[
         list[str] | None, _option("--shift", metavar="NAME=S,...", help="Signals to move later in time: thrust=0.02.")
     ] = None
+
+    def read_all(self, files: Sequence[Path]) -> list[Log]:
+        """The logs of several files, all prepared alike."""
+        return [self.read(file) for file in files]
 
     def read(self, file: Path) -> Log:
         """The log of a file, prepared.  Raises LogError: it cannot be read, or not be prepared like that."""

@@ -6,16 +6,19 @@ import json
 import math
 import os
 import sys
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Protocol
 
 import typer
 
-from diransac.identification.methods.consensus import Score
-from diransac.identification.methods.search import Progress
+from diransac.identification.method import Callback, Progress
 
 __all__ = ["bar", "show"]
+
+_FIRST_LINE, _LINE_EVERY = 5.0, 10.0
+"""Seconds until the first line of progress without a terminal, and between lines."""
 
 
 class Showable(Protocol):
@@ -46,20 +49,41 @@ def _finite(data: object) -> object:
 
 
 @contextmanager
-def bar(label: str) -> Iterator[Progress | None]:
-    """What a search reports its progress to: a bar on a terminal's stderr, nothing elsewhere."""
+def bar(label: str) -> Iterator[Callback]:
+    """The callback of a long piece of work: a bar on a terminal's stderr, a line now and then elsewhere."""
     if sys.stderr is None or not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
-        yield None
+        yield _Lines(label)
         return
     from rich import progress
     from rich.console import Console
 
-    console = Console(stderr=True)
-    with progress.Progress(console=console, transient=True) as shown:
-        task = shown.add_task(label, total=None)
+    columns = (
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.TaskProgressColumn(),
+        progress.TimeRemainingColumn(),
+    )
+    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task(label, total=1.0)
 
-        def update(done: int, total: int, score: Score) -> None:
-            found = f"{label}: {score.inlier_fraction:.0%} inliers"
-            shown.update(task, completed=done, total=total, description=found)
+        def update(found: Progress) -> None:
+            note = f" ({found.note})" if found.note else ""
+            shown.update(task, completed=found.fraction, description=f"{label}: {found.stage}{note}")
 
         yield update
+
+
+class _Lines:
+    """Progress where there is no terminal: nothing of short work, a line on stderr every ten seconds of long work."""
+
+    def __init__(self, label: str) -> None:
+        self._label, self._begin = label, time.monotonic()
+        self._next = _FIRST_LINE
+
+    def __call__(self, found: Progress) -> None:
+        elapsed = time.monotonic() - self._begin
+        if elapsed < self._next or sys.stderr is None:
+            return
+        self._next = elapsed + _LINE_EVERY
+        left = f", about {elapsed * (1.0 / found.fraction - 1.0):.0f} s left" if found.fraction > 0.0 else ""
+        typer.echo(f"{self._label}: {found.stage}, {found.fraction:.0%} after {elapsed:.0f} s{left}", err=True)

@@ -12,6 +12,7 @@ from diransac.cli.screen import bar
 from diransac.data.log import Log
 from diransac.errors import DiransacError
 from diransac.identification.identify import identify
+from diransac.identification.method import Method
 from diransac.identification.result import Result
 from diransac.model import Model, Parameter
 from diransac.model.library import BUILTIN
@@ -25,31 +26,35 @@ class Comparison:
     """Several methods on one log: what each found and how long it took (s), or why it refused."""
 
     model: Model
-    log: Log
+    logs: Sequence[Log]
     results: Mapping[str, Result]
     seconds: Mapping[str, float]
     refusals: Mapping[str, str]
+
+    @property
+    def _source(self) -> str:
+        return ", ".join(dict.fromkeys(log.source for log in self.logs))
 
     def to_dict(self) -> dict[str, Any]:
         """Results and refusals by method."""
         found = {name: result.to_dict() | {"seconds": self.seconds[name]} for name, result in self.results.items()}
         refused = {name: {"refused": reason} for name, reason in self.refusals.items()}
-        return {"model": self.model.name, "log": self.log.source, "methods": found | refused}
+        return {"model": self.model.name, "log": self._source, "methods": found | refused}
 
     def __str__(self) -> str:
         units = [f"{name} [{parameter.unit}]" for name, parameter in self.model.parameters.items()]
         rows = [["method", *units, "fit error", "inliers", "samples", "seconds"]]
         rows += [self._row(name, result) for name, result in self.results.items()]
-        lines = [f"{self.model.name} from {self.log.source}", *aligned(rows)]
+        lines = [f"{self.model.name} from {self._source}", *aligned(rows)]
         lines += [f"{name}: {reason}" for name, reason in self.refusals.items()]
         return "\n".join([*lines, *self._remarks()])
 
     def _remarks(self) -> Iterator[str]:
-        """What figures mean that do not compare, and what a diagnosis warns of."""
+        """Sentences on figures that do not compare, and on findings of a diagnosis."""
         if "diransac" in self.results:
             yield "diransac's fit error is a mean square, the others' a root mean square, eq. (2)"
         diagnosed = {name: result for name, result in self.results.items() if result.diagnosis is not None}
-        preparations = {json.dumps([dict(step) for step in x.preparation]) for x in self.results.values()}
+        preparations = {json.dumps([log.preparation for log in x.logs]) for x in self.results.values()}
         if diagnosed and len(preparations) > 1:
             yield f"{', '.join(diagnosed)} is judged by what was measured, the others by what was derived, too"
         elif diagnosed and len(self.results) > 1:
@@ -58,9 +63,9 @@ class Comparison:
             found = result.diagnosis
             assert found is not None
             if found.unidentifiable:
-                yield f"{name}: the log cannot tell {', '.join(found.unidentifiable)}"
+                yield f"{name}: not identifiable from this log: {', '.join(found.unidentifiable)}"
             if found.input_delay_significant:
-                yield f"{name}: inputs act {1e3 * found.input_delay:.3g} ms later than the log says; others miss that"
+                yield f"{name}: inputs act {1e3 * found.input_delay:.3g} ms late; the other methods assume no delay"
 
     def _row(self, name: str, result: Result) -> list[str]:
         errors = result.standard_errors
@@ -80,25 +85,30 @@ class Comparison:
         ]
 
 
-def compare_methods(model: Model, log: Log, methods: Sequence[str], arguments: Mapping[str, Any]) -> Comparison:
-    """Identify by each method with the same arguments.
+def compare_methods(
+    model: Model, logs: Sequence[Log], methods: Sequence[Method], arguments: Mapping[str, Any]
+) -> Comparison:
+    """Results of each method from the same logs, with the same arguments of `identify`.
 
-    Raises DiransacError: the first refusal, where every method refuses.
+    Raises
+    ------
+    DiransacError
+        The first refusal, where every method refuses.
     """
     results, seconds, refusals = {}, {}, {}
     first: DiransacError | None = None
     for method in methods:
         begin = time.perf_counter()
         try:
-            with bar(method) as progress:
-                results[method] = identify(model, log, method, progress=progress, **arguments)
+            with bar(method.name) as progress:
+                results[method.name] = identify(model, logs, method, progress=progress, **arguments)
         except DiransacError as error:
-            refusals[method] = str(error)
+            refusals[method.name] = str(error)
             first = first or error
-        seconds[method] = time.perf_counter() - begin
+        seconds[method.name] = time.perf_counter() - begin
     if first is not None and not results:
         raise first
-    return Comparison(model, log, results, seconds, refusals)
+    return Comparison(model, logs, results, seconds, refusals)
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ class Segment:
     @cached_property
     def present(self) -> tuple[str, ...]:
         """Signals of which this log has at least one sample."""
-        some = np.isfinite(self.measured).any(axis=0)
+        some: BoolArray = np.asarray(np.isfinite(self.measured).any(axis=0))
         return tuple(n for n, x in zip(self.signals, some, strict=True) if x)
 
     def state_arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:

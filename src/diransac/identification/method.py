@@ -48,6 +48,10 @@ class Method(Protocol):
     def needs_all_signals(self) -> bool:
         """Whether the method evaluates the equations at each row, so that every signal in them must be there."""
 
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """Names of the criteria that the method, or its evaluation, depends on."""
+
     def options(self) -> Mapping[str, Any]:
         """The method's own settings, ready for JSON."""
 

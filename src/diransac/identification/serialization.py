@@ -116,9 +116,10 @@ Masks = Annotated[Mapping[str, BoolArray], _MASK.by_name()]
 """Masks by name."""
 
 
-def dump(value: object) -> Any:
+def dump(value: Any) -> Any:
     """A dataclass as a mapping that JSON can hold; `load` reads it back."""
-    return _adapter(type(value)).dump_python(value, mode="json")
+    adapter: Any = _adapter(type(value))  # type: ignore[arg-type]  # a class is hashable
+    return adapter.dump_python(value, mode="json")
 
 
 def load(kind: type[T], data: Mapping[str, Any]) -> T:
@@ -132,8 +133,9 @@ def load(kind: type[T], data: Mapping[str, Any]) -> T:
     from pydantic import ValidationError
 
     own = {f.name: data[f.name] for f in dataclasses.fields(kind) if f.name in data}  # type: ignore[arg-type]
+    adapter: Any = _adapter(kind)  # type: ignore[arg-type]  # a class is hashable
     try:
-        found: T = _adapter(kind).validate_python(own)
+        found: T = adapter.validate_python(own)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(x) for x in first["loc"])

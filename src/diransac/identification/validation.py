@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.data.dataset import Dataset, Segment, as_logs
 from diransac.data.log import Log
 from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.identification.estimate import Resolution
 from diransac.identification.evaluation import Simulation
 from diransac.identification.identify import identify
+from diransac.identification.method import Callback, Method, within
+from diransac.identification.methods import DEFAULT
 from diransac.model.plant import ModelWithParameters, Plant, as_plant
 from diransac.text_table import aligned
 
@@ -161,7 +163,7 @@ class _OpenLoop:
         self._simulation = Simulation(dataset, resolution=resolution)
         self._parameters = plant.model.parameter_vector(plant.parameters)
         self._states = _states(self._segment)
-        self._complete = np.asarray(np.isfinite(self._states).all(axis=1))
+        self._complete: BoolArray = np.asarray(np.isfinite(self._states).all(axis=1))
         self._n_steps = len(self._states) - 1 - int(np.argmax(self._complete))
 
     @property
@@ -236,7 +238,8 @@ def _states(segment: Segment) -> FloatArray:
     for i, name in enumerate(model.state):
         if name in segment.present and name in matter:
             states[:, i] = segment.column(name)
-    if not np.isfinite(states).all(axis=1)[:-1].any():
+    complete: BoolArray = np.asarray(np.isfinite(states).all(axis=1))
+    if not complete[:-1].any():
         raise LogError(f"{segment.log.source}: no row has a complete state ({', '.join(matter)}) to start from")
     return states
 
@@ -304,7 +307,13 @@ class CrossValidation:
 
 
 def cross_validate(
-    model: Model, logs: Iterable[Log], method: Any = "lo-diransac", *, horizon: float | None = None, **arguments: Any
+    model: Model,
+    logs: Iterable[Log],
+    method: str | Method = DEFAULT,
+    *,
+    horizon: float | None = None,
+    progress: Callback | None = None,
+    **arguments: Any,
 ) -> CrossValidation:
     """Leave-one-log-out cross-validation: identify from all logs but one, and predict that one, for each in turn.
 
@@ -313,7 +322,7 @@ def cross_validate(
     Parameters
     ----------
     logs : two or more
-    method, arguments : as `identify` has them
+    method, progress, arguments : as `identify` has them
     horizon : s, as `validate` has it
 
     Raises
@@ -327,7 +336,9 @@ def cross_validate(
     results, validations = list[Any](), list[Any]()
     for i, left_out in enumerate(several):
         try:
-            results.append(identify(model, [*several[:i], *several[i + 1 :]], method, **arguments))
+            others = [*several[:i], *several[i + 1 :]]
+            part = within(progress, i / len(several), (i + 1) / len(several), f"without log {i + 1}: ")
+            results.append(identify(model, others, method, progress=part, **arguments))
         except SettingsError:
             raise
         except DiransacError as error:

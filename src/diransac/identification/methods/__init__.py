@@ -10,12 +10,12 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from diransac.errors import SettingsError
-from diransac.identification.settings import Settings
+from diransac.identification.settings import EXECUTION, Settings
 
 if TYPE_CHECKING:
     from diransac.identification.method import Method
 
-__all__ = ["DEFAULT", "METHODS", "WITH_ESTIMATOR", "default_options", "factory"]
+__all__ = ["DEFAULT", "METHODS", "WITH_ESTIMATOR", "configured", "default_options", "factory", "setting_names"]
 
 _REGISTRY = {
     "ols": "least_squares:ordinary",
@@ -51,3 +51,23 @@ def factory(name: str) -> Callable[..., Method]:
 def default_options(name: str) -> Mapping[str, Any]:
     """The default values of a method's own settings; none of a method that is not in the registry."""
     return factory(name)(Settings()).options() if name in _REGISTRY else {}
+
+
+def setting_names(name: str) -> tuple[str, ...]:
+    """Names of all settings of a method: its own, and those of `Settings` that it uses."""
+    method = factory(name)(Settings())
+    return tuple(dict.fromkeys((*method.options(), *method.uses, *EXECUTION)))
+
+
+def configured(name: str, values: Mapping[str, Any], **of_search: Any) -> Method:
+    """A method with settings by name, its own or those of `Settings`.
+
+    Raises
+    ------
+    SettingsError
+        There is no such method or setting, or a value has no meaning.
+    """
+    own = default_options(name)
+    options = {key: value for key, value in values.items() if key in own}
+    rest = {key: value for key, value in values.items() if key not in own}
+    return factory(name)(Settings.from_dict(rest), **options, **of_search)

@@ -52,10 +52,11 @@ class LeastSquares:
     estimator: object = field(default_factory=OrdinaryLeastSquares)
     criteria: Settings = field(default_factory=Settings)
     needs_all_signals = True
+    uses = (*JUDGING, *SIMULATION)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "estimator", as_estimator(self.estimator))
-        check_used(self.criteria, (*JUDGING, *SIMULATION), self.name)
+        check_used(self.criteria, self.uses, self.name)
 
     @property
     def name(self) -> str:

@@ -161,10 +161,10 @@ class IDiransac(_Ransac):
     """
 
     name = "i-diransac"
+    uses = (*_SEARCH, "stop_inlier_fraction", "acceptance_weights", *JUDGING, *SIMULATION)
 
     def __post_init__(self) -> None:
-        used = (*_SEARCH, "stop_inlier_fraction", "acceptance_weights", *JUDGING, *SIMULATION)
-        check_used(self.criteria, used, self.name)
+        check_used(self.criteria, self.uses, self.name)
 
     def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
         """The best hypothesis of the search.
@@ -219,13 +219,12 @@ class Diransac(_Ransac):
     """
 
     name = "diransac"
+    uses = (*_SEARCH, *JUDGING, *SIMULATION)
 
     def __post_init__(self) -> None:
         # It never ends early, which is what stop_inlier_fraction = None says.
-        used = (*_SEARCH, *JUDGING, *SIMULATION)
-        check_used(
-            self.criteria, used if self.criteria.stop_inlier_fraction else (*used, "stop_inlier_fraction"), self.name
-        )
+        early = () if self.criteria.stop_inlier_fraction else ("stop_inlier_fraction",)
+        check_used(self.criteria, (*self.uses, *early), self.name)
 
     def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
         """The best hypothesis of the search; raises as `IDiransac.fit`."""

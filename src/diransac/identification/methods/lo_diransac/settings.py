@@ -98,9 +98,10 @@ class LoDiransac:
 
     name = "lo-diransac"
     needs_all_signals = False
+    uses = (*JUDGING, "initial_state")
 
     def __post_init__(self) -> None:
-        check_used(self.criteria, (*JUDGING, "initial_state"), self.name)
+        check_used(self.criteria, self.uses, self.name)
         for f in dataclasses.fields(self):
             value = getattr(self, f.name)
             if f.name != "criteria":
@@ -129,9 +130,9 @@ class LoDiransac:
             return estimate(self, dataset, int(seed), callback)
 
 
-def configured(settings: Settings) -> LoDiransac:
-    """The method with its defaults, evaluated by the given settings."""
-    return LoDiransac(settings)
+def configured(settings: Settings, **options: Any) -> LoDiransac:
+    """The method with these options, evaluated by the given settings."""
+    return LoDiransac(settings, **options)
 
 
 _MAY_BE_ZERO = ("n_samples", "max_delay_shifts", "max_steps", "prior_model_error", "prior_discrepancy", "prior_delay")

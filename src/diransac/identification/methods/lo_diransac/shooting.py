@@ -65,9 +65,8 @@ class ShootingIntervals:
     ) -> ShootingIntervals:
         """Intervals of logs, each given as measured, known (N, n_s) and inputs (N, n_u)."""
         missing = [-len(inputs) % length for _, _, inputs in logs]
-        measured, inputs = (
-            np.concatenate([_filled_up(log[k], more) for log, more in zip(logs, missing, strict=True)]) for k in (0, 2)
-        )
+        measured = np.concatenate([_filled_up(log[0], more) for log, more in zip(logs, missing, strict=True)])
+        inputs = np.concatenate([_filled_up(log[2], more) for log, more in zip(logs, missing, strict=True)])
         known = np.concatenate([np.pad(log[1], ((0, n), (0, 0))) for log, n in zip(logs, missing, strict=True)])
         sizes = [len(inputs) for _, _, inputs in logs]
         is_logged = np.concatenate([np.arange(n + more) < n for n, more in zip(sizes, missing, strict=True)])

@@ -212,7 +212,7 @@ def running_median(measured: FloatArray, known: BoolArray, window: int) -> Float
 
 def _medians(columns: FloatArray, window: int) -> FloatArray:
     """Running median of each column; one dimension at a time, for which SciPy has the faster algorithm."""
-    return np.column_stack([median_filter(x, size=window, mode="mirror") for x in columns.T])
+    return np.asarray(np.column_stack([median_filter(x, size=window, mode="mirror") for x in columns.T]))
 
 
 def _basis(t: FloatArray, unit: float) -> FloatArray:
