@@ -245,7 +245,7 @@ def _fit(
         residuals = values - fitted
         scale = np.maximum(np.maximum(_scale(residuals, known), floor), _SHRINK * scale)
         width = 3.0 * scale
-    return fitted
+    return np.asarray(fitted)
 
 
 def _scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
