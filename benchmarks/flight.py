@@ -58,8 +58,8 @@ def plan(plant: dr.Plant, guess: dr.Trajectory | None = None, solver: str = "ipo
     route = {name: partial(np.interp, xp=times, fp=[place[j] for place in PLANES]) for j, name in enumerate(("x", "z"))}
     return dr.plan(
         plant, waypoints=[{"x": x, "z": z} for x, z in PLANES], times=times.tolist(), reference=route,
-        tracking={"x": ROUTE_WEIGHT, "z": ROUTE_WEIGHT}, input_limits=ROTORCRAFT_LIMITS, input_share=PLANNED_SHARE,
-        guess=guess, solver=solver,
+        state_weights={"x": ROUTE_WEIGHT, "z": ROUTE_WEIGHT}, input_limits=ROTORCRAFT_LIMITS,
+        input_limit_fraction=PLANNED_SHARE, guess=guess, solver=solver,
     )  # fmt: skip
 
 

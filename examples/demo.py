@@ -29,7 +29,7 @@ def record() -> dr.Log:
     flight = dr.fly(MACHINE, trajectory, dr.tvlqr(MACHINE, trajectory))
     error = dr.tracking_error(trajectory, flight)
     log = dr.corrupt(flight, NOISE, seed=1)
-    spoilt = sum(int(mask.sum()) for mask in log.planted.values())
+    spoilt = sum(int(mask.sum()) for mask in log.fault_mask.values())
     print(
         f"A star: {len(log)} rows at {1 / log.dt:.0f} Hz, off by {error['x']:.3f} m in x and {error['z']:.3f} m in z;"
     )

@@ -79,7 +79,11 @@ def test_trim_may_be_given_where_there_is_none():
                       lambda q, v, a, u, p: [a.x - u.push, a.y + p.g])  # fmt: skip
     start, end = {"x": 0.0, "x_dot": 0.0, "y": 0.0, "y_dot": 9.81}, {"x": 1.0}
     found = dr.plan(
-        dr.Plant(thrown, {"g": 9.81}), waypoints=[start, end], times=[0.0, 2.0], trim={"push": 0.0}, rest=False
+        dr.Plant(thrown, {"g": 9.81}),
+        waypoints=[start, end],
+        times=[0.0, 2.0],
+        trim={"push": 0.0},
+        start_end_at_rest=False,
     )
     assert found["y"].max() == pytest.approx(9.81 / 2, rel=1e-6)
 
@@ -117,12 +121,12 @@ SENSELESS = {
     "unknown reference": ({"reference": {"x": np.sin}, "duration": 1.0}, 'reference: there is no state "x"'),
     "NaN reference": ({"reference": {"y": lambda t: t * np.nan}, "duration": 1.0}, "NaN"),
     "one sample": ({"reference": {"y": [1.0]}, "duration": 1.0}, "at least 2 samples"),
-    "weight without reference": ({"waypoints": TWO, "times": [0, 1], "tracking": {"y": 1.0}}, "has no reference"),
-    "negative weight": ({"waypoints": TWO, "times": [0, 1], "effort": {"force": -1.0}}, "at least 0"),
+    "weight without reference": ({"waypoints": TWO, "times": [0, 1], "state_weights": {"y": 1.0}}, "has no reference"),
+    "negative weight": ({"waypoints": TWO, "times": [0, 1], "input_weights": {"force": -1.0}}, "at least 0"),
     "unknown input": ({"waypoints": TWO, "input_limits": {"push": (0, 1)}}, 'there is no input "push"'),
     "limits upside down": ({"waypoints": TWO, "input_limits": {"force": (1, 0)}}, "must be .lowest, highest."),
     "waypoint out of limits": ({"waypoints": TWO, "state_limits": {"y": (0, 0.5)}}, "move the waypoint or the limits"),
-    "no share": ({"waypoints": TWO, "input_share": 0.0}, "above 0 and at most 1"),
+    "no share": ({"waypoints": TWO, "input_limit_fraction": 0.0}, "above 0 and at most 1"),
     "unknown solver": ({"waypoints": TWO, "solver": "best"}, "choose one of ipopt, fatrop, snopt"),
     "negative time weight": ({"waypoints": TWO, "time_weight": -1.0}, "time_weight"),
     "unknown trim": ({"waypoints": TWO, "trim": {"push": 1.0}}, 'there is no input "push"'),

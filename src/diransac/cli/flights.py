@@ -93,17 +93,17 @@ class Recording:
             "rate": 1.0 / self.log.dt,
             "units": self.log.units,
             **self.flight.to_dict(),
-            "spoilt": {name: int(mask.sum()) for name, mask in self.log.planted.items()},
+            "faults": {name: int(mask.sum()) for name, mask in self.log.fault_mask.items()},
             "noise": self.log.history[-1]["noise"],
         }
 
     def __str__(self) -> str:
         errors, limits = self.flight.errors, self.flight.at_limit
-        rows = [["signal", "unit", "tracking error", "spoilt values", "at a limit"]]
+        rows = [["signal", "unit", "tracking error", "faults", "at a limit"]]
         for name in self.log.names:
             error = f"{errors[name]:.4g}" if name in errors else ""
-            spoilt = str(self.log.planted[name].sum()) if name in self.log.planted else ""
-            rows.append([name, self.log.units[name], error, spoilt, _percent(limits[name]) if name in limits else ""])
+            faults = str(self.log.fault_mask[name].sum()) if name in self.log.fault_mask else ""
+            rows.append([name, self.log.units[name], error, faults, _percent(limits[name]) if name in limits else ""])
         return "\n".join([f"{self.shape} of {_size(self.plant, self.log)}, seed {self.seed}", *aligned(rows)])
 
 

@@ -263,8 +263,8 @@ class Recorder:
     first_row: Annotated[
         str | None,
         _noise_option(
-            metavar="clean|hit",
-            callback=_one_of("clean", "hit"),
+            metavar="clean|corrupted",
+            callback=_one_of("clean", "corrupted"),
             show_default="clean",
             help="Spare the first row, or none.",
         ),
@@ -273,17 +273,18 @@ class Recorder:
         float | None, _share("--bursts", help="That a run of outliers starts; with --magnitude.")
     ] = None
     burst_length: Annotated[float | None, _length("--burst-length", show_default="10", help="Mean.")] = None
-    freeze_probability: Annotated[float | None, _share("--freezes", help="That a value freezes.")] = None
-    freeze_length: Annotated[float | None, _length("--freeze-length", show_default="10", help="Mean.")] = None
+    stuck_probability: Annotated[
+        float | None, _share("--stuck", help="Probability that a run of repeated values starts.")
+    ] = None
+    stuck_length: Annotated[float | None, _length("--stuck-length", show_default="10", help="Mean.")] = None
     dropout_probability: Annotated[float | None, _share("--dropouts", help="That values go missing.")] = None
     dropout_length: Annotated[float | None, _length("--dropout-length", show_default="10", help="Mean.")] = None
-    runs: Annotated[
-        str | None,
+    correlated: Annotated[
+        bool | None,
         _noise_option(
-            metavar="independent|together",
-            callback=_one_of("independent", "together"),
-            show_default="independent",
-            help="Bursts, freezes and dropouts strike each signal alone, or all at once.",
+            "--correlated",
+            help="Bursts, stuck values and dropouts occur in the same rows of all signals.",
+            show_default=False,
         ),
     ] = None
     leverage_probability: Annotated[
@@ -325,9 +326,9 @@ _COMPANY = {
     "outlier_magnitude": ("outlier_probability", "burst_probability"),
     "burst_probability": ("outlier_magnitude",),
     "burst_length": ("burst_probability",),
-    "freeze_length": ("freeze_probability",),
+    "stuck_length": ("stuck_probability",),
     "dropout_length": ("dropout_probability",),
-    "runs": ("burst_probability", "freeze_probability", "dropout_probability"),
+    "correlated": ("burst_probability", "stuck_probability", "dropout_probability"),
     "leverage_probability": ("leverage_offset",),
     "leverage_offset": ("leverage_signal",),
     "leverage_signal": ("leverage_probability",),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from diransac.errors import SettingsError
-from diransac.flight.planning import places, sine, sines, square, star
+from diransac.flight.planning import multisine, random_waypoints, sine, square, star
 from diransac.flight.planning.excitations import LONGEST, check_fully_actuated
 from diransac.flight.planning.flights import check_plane
 from diransac.flight.trajectory import Trajectory
@@ -21,7 +21,7 @@ __all__ = ["MISSIONS", "TRAJECTORIES", "Flight", "check_flown"]
 MISSIONS: dict[str, Callable[..., Trajectory]] = {"square": square, "star": star, "sine": sine}
 """What identified models are judged by."""
 
-TRAJECTORIES: dict[str, Callable[..., Trajectory]] = {**MISSIONS, "places": places, "sines": sines}
+TRAJECTORIES: dict[str, Callable[..., Trajectory]] = {**MISSIONS, "places": random_waypoints, "sines": multisine}
 """What may be flown for data."""
 
 

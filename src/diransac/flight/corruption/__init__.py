@@ -39,8 +39,8 @@ def corrupt(log: Log, noise: Noise, seed: int = 0, *, signals: Sequence[str] | N
         ``_ddot``, and those that these are derivatives of, such as ``x, x_dot, x_ddot`` or ``wx, wx_dot``.  Inputs have
         no such partners and stay as they are; a coordinate without any, such as a quaternion's, must be named
 
-    Returns the log with ``.planted``, name -> (N,) Boolean, one more step in its history and a note.  A delay cuts the
-    rows at the start that no delayed sample covers; fractions of a sample are interpolated linearly.  With a clean
+    Returns the log with ``.fault_mask``, name -> (N,) Boolean, one more step in its history and a note.  A delay cuts
+    the rows at the start that no delayed sample covers; fractions of a sample are interpolated linearly.  With a clean
     first row that row is only delayed and quantised.  A log that is corrupted already keeps its masks and gets more;
     give another seed then, or the same numbers are drawn again.
 
@@ -54,9 +54,9 @@ def corrupt(log: Log, noise: Noise, seed: int = 0, *, signals: Sequence[str] | N
     >>> t = np.arange(1000) / 100
     >>> log = Log.from_arrays(t, {"x": np.sin(t), "x_dot": np.cos(t), "force": -np.sin(t)})
     >>> noisy = corrupt(log, Noise(outlier_probability=0.1, outlier_magnitude=80.0), seed=1)
-    >>> sorted(noisy.planted), np.array_equal(noisy["force"], log["force"])
+    >>> sorted(noisy.fault_mask), np.array_equal(noisy["force"], log["force"])
     (['x', 'x_dot'], True)
-    >>> np.array_equal(noisy["x"] != log["x"], noisy.planted["x"])
+    >>> np.array_equal(noisy["x"] != log["x"], noisy.fault_mask["x"])
     True
     """
     names = _check_arguments(log, noise, seed, signals)
@@ -67,17 +67,17 @@ def corrupt(log: Log, noise: Noise, seed: int = 0, *, signals: Sequence[str] | N
     strong = leverage_rows(late, noise)
     recorded = {name: with_faults(measured[name], name, noise, draws, strong) for name in names}
 
-    planted = _masks_of(log, delays)
+    fault_mask = _masks_of(log, delays)
     for name in names:
         wrong = _differ(recorded[name], measured[name])
-        planted[name] = planted[name] | wrong if name in planted else wrong
-    n_wrong = {name: int(planted[name].sum()) for name in names}
-    step = {"step": "corrupt", "seed": int(seed), "noise": noise.changed, "signals": names, "planted": n_wrong}
+        fault_mask[name] = fault_mask[name] | wrong if name in fault_mask else wrong
+    n_wrong = {name: int(fault_mask[name].sum()) for name in names}
+    step = {"step": "corrupt", "seed": int(seed), "noise": noise.changed, "signals": names, "faults": n_wrong}
     note = (
         f"corrupted on purpose (seed {seed}): {sum(n_wrong.values())} of {len(names) * len(late)} samples have faults"
     )
     corrupted = late.with_step(step, signals={**late.signals, **recorded}, notes=[note] if noise.changed else [])
-    return CorruptedLog.of(corrupted, planted)
+    return CorruptedLog.of(corrupted, fault_mask)
 
 
 def _check_arguments(log: object, noise: object, seed: object, signals: Sequence[str] | None) -> list[str]:
@@ -132,9 +132,9 @@ def _masks_of(log: Log, delays: Mapping[str, float]) -> dict[str, BoolArray]:
     if not isinstance(log, CorruptedLog):
         return {}
     none = np.zeros(len(log), dtype=bool)
-    masks = Log(log.time, {name: log.planted.get(name, none).astype(float) for name in log.names})
+    masks = Log(log.time, {name: log.fault_mask.get(name, none).astype(float) for name in log.names})
     late = shift(masks, delays)
-    return {name: late[name] > 0.0 for name in log.planted}
+    return {name: late[name] > 0.0 for name in log.fault_mask}
 
 
 def _differ(a: FloatArray, b: FloatArray) -> BoolArray:

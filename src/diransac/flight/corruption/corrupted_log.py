@@ -18,11 +18,11 @@ __all__ = ["CorruptedLog"]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CorruptedLog(Log):
-    """A `Log` with the mask of what was planted in it.
+    """A `Log` with the mask of its faulty samples.
 
     Parameters
     ----------
-    planted : name -> (N,) Boolean, True where the recorded value is not what it would be without faults: outliers,
+    fault_mask : name -> (N,) Boolean, True where the recorded value is not what it would be without faults: outliers,
         bursts, frozen values, one-sided offsets, dropouts.  Gaussian noise, delay and quantisation are no faults, nor
         is a fault that leaves the value as it is, such as a frozen sample of a signal that rests
 
@@ -33,12 +33,12 @@ class CorruptedLog(Log):
     Raises LogError: as `Log`; a mask that is not (N,) Boolean, or of no signal.
     """
 
-    planted: Mapping[str, BoolArray] = field(default_factory=dict)
+    fault_mask: Mapping[str, BoolArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         masks = {}
-        for name, mask in self.planted.items():
+        for name, mask in self.fault_mask.items():
             copy = np.array(mask)
             if name not in self.signals or copy.shape != self.time.shape or copy.dtype != np.bool_:
                 raise LogError(
@@ -47,20 +47,20 @@ class CorruptedLog(Log):
                 )
             copy.flags.writeable = False
             masks[name] = copy
-        object.__setattr__(self, "planted", MappingProxyType(masks))
+        object.__setattr__(self, "fault_mask", MappingProxyType(masks))
 
     @classmethod
-    def of(cls, log: Log, planted: Mapping[str, BoolArray]) -> CorruptedLog:
+    def of(cls, log: Log, fault_mask: Mapping[str, BoolArray]) -> CorruptedLog:
         """A log with masks."""
         rows = (log.time, log.signals, log.units, log.source, log.history, log.notes, log.unusable)
-        return cls(*rows, planted)
+        return cls(*rows, fault_mask)
 
     def without_masks(self) -> Log:
         """The plain log."""
         return Log(self.time, self.signals, self.units, self.source, self.history, self.notes, self.unusable)
 
     def _cut(self, rows: slice) -> Log:
-        return CorruptedLog.of(self.without_masks()[rows], {name: mask[rows] for name, mask in self.planted.items()})
+        return CorruptedLog.of(self.without_masks()[rows], {name: mask[rows] for name, mask in self.fault_mask.items()})
 
     def with_step(
         self,
@@ -73,12 +73,12 @@ class CorruptedLog(Log):
     ) -> Log:
         """As `Log.with_step`, with the masks of signals whose samples stay as they are."""
         # A step hands on the very arrays that it does not touch, so a mask is found again by its samples.
-        masks = {id(self.signals[name]): mask for name, mask in self.planted.items()}
+        masks = {id(self.signals[name]): mask for name, mask in self.fault_mask.items()}
         kept = self.signals if signals is None else signals
-        planted = {name: masks[id(values)] for name, values in kept.items() if id(values) in masks}
+        fault_mask = {name: masks[id(values)] for name, values in kept.items() if id(values) in masks}
         log = self.without_masks().with_step(step, time=time, signals=kept, units=units, notes=notes)
-        return log if time is not None or not planted else CorruptedLog.of(log, planted)
+        return log if time is not None or not fault_mask else CorruptedLog.of(log, fault_mask)
 
     def __reduce__(self) -> tuple[Any, ...]:
         _, rows = super().__reduce__()
-        return (CorruptedLog, (*rows, dict(self.planted)))
+        return (CorruptedLog, (*rows, dict(self.fault_mask)))

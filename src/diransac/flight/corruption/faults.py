@@ -1,4 +1,4 @@
-"""What recording and transmission do to samples: steps of a converter, frozen values, outliers, dropouts."""
+"""What recording and transmission do to samples: steps of a converter, stuck values, outliers, dropouts."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from diransac.flight.corruption.specification import Noise
 
 __all__ = ["leverage_rows", "quantised", "with_faults"]
+
+_STREAMS = {"stuck": "freeze"}
+"""Fault -> key of its random stream where that is not its name: another key gives other numbers for the same seed."""
 
 
 def quantised(values: FloatArray, name: str, noise: Noise) -> FloatArray:
@@ -39,10 +42,10 @@ def leverage_rows(log: Log, noise: Noise) -> BoolArray:
 
 
 def with_faults(values: FloatArray, name: str, noise: Noise, draws: Draws, strong: BoolArray) -> FloatArray:
-    """Samples (N,) with frozen runs, outliers, one-sided offsets in ``strong`` rows and dropouts, in this order."""
+    """Samples (N,) with stuck runs, outliers, one-sided offsets in ``strong`` rows and dropouts, in this order."""
     spared = np.arange(len(values)) < (noise.first_row == "clean")
-    frozen = _runs("freeze", name, noise, draws) & ~spared
-    recorded = values[np.maximum.accumulate(np.where(frozen, 0, np.arange(len(values))))]
+    stuck = _runs("stuck", name, noise, draws) & ~spared
+    recorded = values[np.maximum.accumulate(np.where(stuck, 0, np.arange(len(values))))]
 
     hit = draws.uniform("outlier", name) < noise.outlier_probability
     hit |= _runs("burst", name, noise, draws)
@@ -56,6 +59,8 @@ def with_faults(values: FloatArray, name: str, noise: Noise, draws: Draws, stron
     return np.where(_runs("dropout", name, noise, draws) & ~spared, np.nan, recorded)
 
 
-def _runs(effect: str, name: str, noise: Noise, draws: Draws) -> BoolArray:
-    signal = name if noise.runs == "independent" else ""
-    return draws.runs(effect, signal, getattr(noise, f"{effect}_probability"), getattr(noise, f"{effect}_length"))
+def _runs(fault: str, name: str, noise: Noise, draws: Draws) -> BoolArray:
+    """Rows (N,) in runs of a fault: burst, stuck or dropout."""
+    stream = _STREAMS.get(fault, fault)
+    signal = "" if noise.correlated else name
+    return draws.runs(stream, signal, getattr(noise, f"{fault}_probability"), getattr(noise, f"{fault}_length"))

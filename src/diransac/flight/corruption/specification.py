@@ -14,9 +14,8 @@ from diransac.errors import SettingsError
 
 __all__ = ["Noise"]
 
-FIRST_ROWS = ("clean", "hit")
+FIRST_ROWS = ("clean", "corrupted")
 INTEGRATED = ("white", "random-walk")
-RUNS = ("independent", "together")
 
 
 @dataclass(frozen=True)
@@ -32,12 +31,13 @@ class Noise:
     angular_acceleration_std : rad/s^2; None: ``rate_std / dt``, see below.  0 for none
     integrated : "white" or "random-walk", what the Gaussian noise of lower orders is, see below
     first_row : "clean" spares the first row, which simulations start from, Gaussian noise and faults (the paper's
-        studies); "hit" spares no row
+        studies); "corrupted" spares no row
     burst_probability : that a run of consecutive outliers starts, per sample
     burst_length : mean length of such runs, samples
-    freeze_probability, freeze_length : the same, of runs that repeat the sample before them
+    stuck_probability, stuck_length : the same, of runs that repeat the sample before them
     dropout_probability, dropout_length : the same, of runs that are NaN
-    runs : "independent", each signal has runs of its own; "together", all signals have them in the same rows
+    correlated : True: bursts, stuck runs and dropouts occur in the same rows of all signals; False: in rows of
+        their own for each signal
     leverage_probability : that a sample gets a one-sided offset, in the rows where ``leverage_signal`` is largest
     leverage_offset : such a sample gets uniform(0, leverage_offset), each signal's unit, either sign
     leverage_signal : the signal or input that decides, such as ``"thrust"``
@@ -87,11 +87,11 @@ class Noise:
     first_row: str = "clean"
     burst_probability: float = 0.0
     burst_length: float = 10.0
-    freeze_probability: float = 0.0
-    freeze_length: float = 10.0
+    stuck_probability: float = 0.0
+    stuck_length: float = 10.0
     dropout_probability: float = 0.0
     dropout_length: float = 10.0
-    runs: str = "independent"
+    correlated: bool = False
     leverage_probability: float = 0.0
     leverage_offset: float = 0.0
     leverage_signal: str | None = None
@@ -103,7 +103,7 @@ class Noise:
         fractions = [f.name for f in fields(self) if f.name.endswith(("_probability", "_quantile"))]
         self._check(fractions, 0.0, 1.0, "a number from 0 to 1")
         self._check(
-            ["burst_length", "freeze_length", "dropout_length"], 1.0, math.inf, "a finite number from 1, samples"
+            ["burst_length", "stuck_length", "dropout_length"], 1.0, math.inf, "a finite number from 1, samples"
         )
         self._check(["leverage_offset"], -math.inf, math.inf, "a finite number")
         sizes = ["outlier_magnitude", "acceleration_std", "rate_std", "delay"]
@@ -112,9 +112,11 @@ class Noise:
         if not isinstance(self.quantisation, Mapping):
             sizes.append("quantisation")
         self._check(sizes, 0.0, math.inf, "a finite number from 0")
-        for name, choices in (("integrated", INTEGRATED), ("first_row", FIRST_ROWS), ("runs", RUNS)):
+        for name, choices in (("integrated", INTEGRATED), ("first_row", FIRST_ROWS)):
             if getattr(self, name) not in choices:
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose {' or '.join(map(repr, choices))}")
+        if not isinstance(self.correlated, bool):
+            raise SettingsError(f"correlated is {self.correlated!r:.60}; give True or False")
         self._check_leverage_signal()
         if isinstance(self.quantisation, Mapping):
             steps = {str(name): _number(f"quantisation of {name!r}", x) for name, x in self.quantisation.items()}

@@ -13,8 +13,8 @@
 | `diagnosis.py` | why there is no plan |
 """
 
-from diransac.flight.planning.excitations import places, sines
+from diransac.flight.planning.excitations import multisine, random_waypoints
 from diransac.flight.planning.flights import sine, square, star
 from diransac.flight.planning.planner import plan
 
-__all__ = ["places", "plan", "sine", "sines", "square", "star"]
+__all__ = ["multisine", "plan", "random_waypoints", "sine", "square", "star"]

@@ -65,7 +65,7 @@ def _relaxed(task: Task, rows: tuple[int, ...]) -> Program:
     relaxed = replace(
         task,
         waypoints=(task.waypoints[0], *(nowhere for _ in task.waypoints[1:])),
-        tracking=np.zeros_like(task.tracking),
+        state_weights=np.zeros_like(task.state_weights),
     )
     program = fixed_program(relaxed, rows)
     costs = program.numbers.costs

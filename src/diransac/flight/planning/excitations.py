@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from diransac.model.plant import ModelWithParameters
 
 
-__all__ = ["LONGEST", "check_fully_actuated", "places", "sines"]
+__all__ = ["LONGEST", "check_fully_actuated", "multisine", "random_waypoints"]
 
 LONGEST = 3600.0
 """s: 360 000 rows; a longer flight is a slip of the pen, and would only fill the memory."""
@@ -35,11 +35,11 @@ SHORTEST_LEG = 1.0
 SMOOTHED_ROWS = 11
 """Rows over which inputs are averaged: a plan holds them for ten, and would hardly show that they arrive late."""
 
-SINES = 5
+_SINES = 5
 """Of each coordinate."""
 
 
-def places(
+def random_waypoints(
     plant: ModelWithParameters,
     *,
     seed: int = 0,
@@ -99,7 +99,7 @@ def _random_way(seed: int, speed: float, reach: float, duration: float) -> tuple
     return way, TIME_STEP * np.rint(np.array(times) / TIME_STEP)
 
 
-def sines(
+def multisine(
     plant: ModelWithParameters, *, seed: int = 0, amplitude: float = 0.5, frequency: float = 1.0, duration: float = 25.0
 ) -> Trajectory:
     """Every coordinate a sum of five sines, with the inputs that inverse dynamics gives: a multisine.
@@ -125,7 +125,7 @@ def sines(
     _check(seed, duration, amplitude=amplitude, frequency=frequency)
     rng = np.random.default_rng(seed)
     time = np.arange(round(duration / TIME_STEP) + 1, dtype=np.float64) * TIME_STEP
-    shape = (SINES, model.n_q, 1)
+    shape = (_SINES, model.n_q, 1)
     w, phase = 2 * np.pi * frequency * rng.uniform(0.2, 1.0, shape), rng.uniform(0.0, 2 * np.pi, shape)
     size = amplitude * rng.uniform(0.2, 0.6, shape)
 

@@ -127,7 +127,7 @@ def sine(plant: ModelWithParameters, *, input_limits: Limits | None = None, **op
     fixed: dict[str, Any] = {
         "reference": {"x": along, "z": height},
         "duration": SINE_DURATION,
-        "tracking": {"x": POSITION_WEIGHT, "z": POSITION_WEIGHT},
+        "state_weights": {"x": POSITION_WEIGHT, "z": POSITION_WEIGHT},
     }
     return plan(plant, **fixed, **_limits(plant.model, input_limits), **options)
 
@@ -161,7 +161,7 @@ def through(
         "waypoints": [{"x": float(x), "z": float(z)} for x, z in places],
         "times": times.tolist(),
         "reference": {name: _route(times, [place[j] for place in places]) for j, name in enumerate(("x", "z"))},
-        "tracking": {"x": ROUTE_WEIGHT, "z": ROUTE_WEIGHT},
+        "state_weights": {"x": ROUTE_WEIGHT, "z": ROUTE_WEIGHT},
     }
     return plan(plant, **fixed, **_limits(plant.model, input_limits), **options)
 
@@ -178,7 +178,7 @@ def _route(times: FloatArray, values: Sequence[float]) -> Callable[[FloatArray],
 def _limits(model: Model, given: Limits | None) -> dict[str, Any]:
     if given is None:
         given = ROTORCRAFT_LIMITS if set(ROTORCRAFT_LIMITS) <= set(model.inputs) else {}
-    return {"input_limits": given, "input_share": PLANNED_SHARE}
+    return {"input_limits": given, "input_limit_fraction": PLANNED_SHARE}
 
 
 def check_plane(model: Model) -> None:
@@ -186,6 +186,7 @@ def check_plane(model: Model) -> None:
     missing = [name for name in ("x", "z") if name not in model.coordinates]
     if missing:
         raise SettingsError(
-            f'square, star, sine and places are flown in x and z; model "{model.name}" has no coordinate {missing[0]}: '
+            "square, star, sine and random_waypoints are flown in x and z; "
+            f'model "{model.name}" has no coordinate {missing[0]}: '
             f"it has {', '.join(model.coordinates)}. Use plan(plant, waypoints=...)"
         )

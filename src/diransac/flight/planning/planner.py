@@ -66,13 +66,13 @@ def plan(
     reference: Mapping[str, Signal | ArrayLike] | None = None,
     duration: float | None = None,
     input_limits: Mapping[str, tuple[float, float]] | None = None,
-    input_share: float = 1.0,
+    input_limit_fraction: float = 1.0,
     state_limits: Mapping[str, tuple[float, float]] | None = None,
-    effort: Mapping[str, float] | None = None,
-    tracking: Mapping[str, float] | None = None,
+    input_weights: Mapping[str, float] | None = None,
+    state_weights: Mapping[str, float] | None = None,
     time_weight: float = 1.0,
     trim: Mapping[str, float] | None = None,
-    rest: bool = True,
+    start_end_at_rest: bool = True,
     guess: Trajectory | None = None,
     solver: str = "ipopt",
     max_iterations: int = 200,
@@ -80,8 +80,8 @@ def plan(
 ) -> Trajectory:
     """The cheapest trajectory through waypoints or along a reference, by direct transcription.
 
-    What it costs: the integral of ``sum_i effort_i ((u_i - trim_i) / half_range_i)^2``, half the range of the input's
-    limits (1 where it has none), plus ``sum_j tracking_j (x_j - reference_j)^2``; where time is free,
+    What it costs: the integral of ``sum_i input_weight_i ((u_i - trim_i) / half_range_i)^2``, half the range of
+    the input's limits (1 where it has none), plus ``sum_j state_weight_j (x_j - reference_j)^2``; where time is free,
     plus `time_weight` for every second: by default a second costs what an input does that is fully used for a second.
 
     Inputs are held over intervals of 0.1 s or a little less, each a whole number of rows. From row to row goes one
@@ -96,12 +96,14 @@ def plan(
     reference : state -> function of time (s from the start, an array), or samples evenly spread over the duration
     duration : s, of a plan along a reference without waypoints: it starts and ends on the reference
     input_limits, state_limits : name -> (lowest, highest), each input's or state's unit
-    input_share : share of the way from trim to each of an input's limits that the plan uses; feedback keeps the rest
-    effort : input -> weight, per s; 1 by default
-    tracking : state -> weight of its squared distance from the reference, one over its unit squared and s; 1 by default
+    input_limit_fraction : share of the way from trim to each of an input's limits that the plan uses; feedback keeps
+        the rest
+    input_weights : input -> weight, per s; 1 by default
+    state_weights : state -> weight of its squared distance from the reference, one over its unit squared and s;
+        1 by default
     time_weight : per s, where time is free
     trim : input -> value that costs nothing, 0 where not named; by default what holds the plant at rest at the start
-    rest : what the first and the last waypoint don't name is zero there; otherwise free
+    start_end_at_rest : what the first and the last waypoint don't name is zero there; otherwise free
     guess : a trajectory of the same model to start the search from
     solver : ``ipopt``; ``fatrop``, which takes two thirds of the time, but now and then searches for ever, beyond the
         reach of time_limit and Ctrl-C, where parameters are far off; or ``snopt``, with ``pip install diransac[snopt]``
@@ -121,8 +123,8 @@ def plan(
     if solver not in SOLVERS:
         raise SettingsError(f'solver "{solver}" is unknown; choose one of {", ".join(SOLVERS)}')
     model, limits = plant.model, limits_of("input", input_limits, tuple(plant.model.inputs))
-    way = _way(model, waypoints, times, reference, duration, rest)
-    _check_weights(tracking, way, input_share)
+    way = _way(model, waypoints, times, reference, duration, start_end_at_rest)
+    _check_weights(state_weights, way, input_limit_fraction)
     _check_search(time_weight, max_iterations, time_limit)
     parameters = model.parameter_vector(plant.parameters)
     at_rest = _trim(model, parameters, way.waypoints[0], limits, trim)
@@ -133,11 +135,12 @@ def plan(
         parameters=parameters,
         waypoints=way.waypoints,
         reference=way.reference,
-        tracking=_tracking(model, way.reference, tracking),
-        effort=weights_of("effort", "input", effort, tuple(model.inputs), np.ones(model.n_u)) / limits.half_ranges**2,
+        state_weights=_state_weights(model, way.reference, state_weights),
+        input_weights=weights_of("input_weights", "input", input_weights, tuple(model.inputs), np.ones(model.n_u))
+        / limits.half_ranges**2,
         trim=at_rest,
         time_weight=float(time_weight) if way.rows is None else 0.0,
-        inputs=limits.around(at_rest, input_share),
+        inputs=limits.around(at_rest, input_limit_fraction),
         states=states,
         dt=TIME_STEP,
     )
@@ -163,7 +166,7 @@ def _way(
     times: Sequence[float] | None,
     reference: Mapping[str, Signal | ArrayLike] | None,
     duration: float | None,
-    rest: bool,
+    start_end_at_rest: bool,
 ) -> _Way:
     followed = Reference(dict(reference or {}))
     unknown = [name for name in followed.signals if name not in model.state]
@@ -177,23 +180,23 @@ def _way(
         rows = rows_of((0.0, duration), 2, TIME_STEP)
         ends = followed.at(np.array([0.0, rows[0] * TIME_STEP]))
         places = [{name: float(values[k]) for name, values in ends.items()} for k in (0, 1)]
-        return _Way(waypoints_of(model, places, rest), rows, 0.0, followed)
+        return _Way(waypoints_of(model, places, start_end_at_rest), rows, 0.0, followed)
     if duration is not None:
         raise SettingsError("waypoints have times=; duration= belongs to a reference without waypoints")
     if times is None and reference is not None:
         raise SettingsError("a reference is a function of time: waypoints that are to lie on it need times=")
-    places_ = waypoints_of(model, waypoints, rest)
+    places_ = waypoints_of(model, waypoints, start_end_at_rest)
     if times is None:
         return _Way(places_, None, 0.0, followed)
     return _Way(places_, rows_of(times, len(places_), TIME_STEP), float(times[0]), followed)
 
 
-def _check_weights(tracking: Mapping[str, float] | None, way: _Way, input_share: float) -> None:
-    stray = [name for name in tracking or {} if name not in way.reference.signals]
+def _check_weights(state_weights: Mapping[str, float] | None, way: _Way, input_limit_fraction: float) -> None:
+    stray = [name for name in state_weights or {} if name not in way.reference.signals]
     if stray:
-        raise SettingsError(f'tracking: "{stray[0]}" has no reference; give one, or leave its weight out')
-    if not 0.0 < input_share <= 1.0:
-        raise SettingsError(f"input_share is {input_share}; it must be above 0 and at most 1")
+        raise SettingsError(f'state_weights: "{stray[0]}" has no reference; give one, or leave its weight out')
+    if not 0.0 < input_limit_fraction <= 1.0:
+        raise SettingsError(f"input_limit_fraction is {input_limit_fraction}; it must be above 0 and at most 1")
 
 
 def _check_search(time_weight: float, max_iterations: int, time_limit: float) -> None:
@@ -215,9 +218,9 @@ def _check_within(model: Model, waypoints: Sequence[Waypoint], limits: Limits) -
                 )
 
 
-def _tracking(model: Model, reference: Reference, weights: Mapping[str, float] | None) -> FloatArray:
+def _state_weights(model: Model, reference: Reference, weights: Mapping[str, float] | None) -> FloatArray:
     default = np.array([1.0 if name in reference.signals else 0.0 for name in model.state])
-    return weights_of("tracking", "state", weights, model.state, default)
+    return weights_of("state_weights", "state", weights, model.state, default)
 
 
 def _trim(

@@ -42,8 +42,8 @@ class Task:
     ----------
     model, parameters : the plant; parameters (n_p,)
     waypoints : at least a start and an end
-    reference, tracking : what is followed, and the weight (n_x,) of each state's squared error, per s
-    effort : (n_u,)   cost of an input's squared distance from trim, per s
+    reference, state_weights : what is followed, and the weight (n_x,) of each state's squared error, per s
+    input_weights : (n_u,)   cost of an input's squared distance from trim, per s
     trim : (n_u,)   inputs that cost nothing
     time_weight : cost of a second; 0 where time is given
     inputs, states : their limits
@@ -54,8 +54,8 @@ class Task:
     parameters: FloatArray
     waypoints: tuple[Waypoint, ...]
     reference: Reference
-    tracking: FloatArray
-    effort: FloatArray
+    state_weights: FloatArray
+    input_weights: FloatArray
     trim: FloatArray
     time_weight: float
     inputs: Limits
@@ -93,7 +93,7 @@ def fixed_program(task: Task, rows: tuple[int, ...]) -> Program:
     steps = np.where(np.arange(INTERVAL_STEPS) < counts[:, None], task.dt, 0.0)
     lengths = task.dt * counts
     time = np.concatenate([[0.0], np.cumsum(lengths)])
-    weights = np.outer(np.append(lengths, 0.0) + np.append(0.0, lengths), 0.5 * task.tracking)
+    weights = np.outer(np.append(lengths, 0.0) + np.append(0.0, lengths), 0.5 * task.state_weights)
     return _program(task, intervals, steps, _reference(task, time), weights, free_time=False)
 
 
@@ -117,7 +117,7 @@ def _program(
     model = task.model
     pinned = tuple(waypoint.states for waypoint in task.waypoints)
     layout = Layout(len(model.state), model.n_u, intervals, pinned, free_time)
-    costs = Costs(reference, weights, task.effort, task.trim, task.time_weight)
+    costs = Costs(reference, weights, task.input_weights, task.trim, task.time_weight)
     lower, upper = (np.full(layout.n_unknowns, end) for end in (-np.inf, np.inf))
     lower[layout.inputs], upper[layout.inputs] = task.inputs.lower, task.inputs.upper
     knots = layout.states[:, : layout.n_x]

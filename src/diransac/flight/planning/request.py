@@ -105,8 +105,10 @@ def _sampled(name: str, signal: Signal | ArrayLike, time: FloatArray) -> FloatAr
     return np.broadcast_to(values, time.shape).astype(np.float64)
 
 
-def waypoints_of(model: Model, waypoints: Sequence[Mapping[str, float]], rest: bool) -> tuple[Waypoint, ...]:
-    """Checked waypoints; with `rest`, what the first and the last don't name is zero.
+def waypoints_of(
+    model: Model, waypoints: Sequence[Mapping[str, float]], start_end_at_rest: bool
+) -> tuple[Waypoint, ...]:
+    """Checked waypoints; with `start_end_at_rest`, what the first and the last don't name is zero.
 
     Raises SettingsError: fewer than two, an unknown state, a value that isn't finite, a quaternion that isn't one.
     """
@@ -116,8 +118,8 @@ def waypoints_of(model: Model, waypoints: Sequence[Mapping[str, float]], rest: b
     for k, waypoint in enumerate(waypoints):
         at_end = k in (0, len(waypoints) - 1)
         values = named_values(f"waypoint {k}", "state", waypoint, model.state)
-        _check_quaternions(model, k, values, rest and at_end)
-        if rest and at_end:
+        _check_quaternions(model, k, values, start_end_at_rest and at_end)
+        if start_end_at_rest and at_end:
             values = dict.fromkeys(model.state, 0.0) | values
         states = tuple(j for j, name in enumerate(model.state) if name in values)
         found.append(Waypoint(states, _normalised(model, states, values)))
@@ -130,7 +132,8 @@ def _check_quaternions(model: Model, k: int, values: Mapping[str, float], all_fi
         given = [values[n] for n in names if n in values]
         if all_fixed and len(given) < 4:
             raise SettingsError(
-                f"waypoint {k} must say which way the plant points: name {', '.join(names)}, or pass rest=False"
+                f"waypoint {k} must say which way the plant points: name {', '.join(names)}, "
+                "or pass start_end_at_rest=False"
             )
         if len(given) == 4 and abs(np.linalg.norm(given) - 1.0) > _UNIT_LENGTH:
             raise SettingsError(

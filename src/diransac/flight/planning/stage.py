@@ -36,14 +36,14 @@ class Costs:
     Parameters
     ----------
     reference, weights : (n_knots, n_x)   ref, and w with the length of time that a knot stands for
-    effort : (n_u,)   e, one over each input's unit squared
+    input_weights : (n_u,)   e, one over each input's unit squared
     trim : (n_u,)   inputs that cost nothing
     time : w_t, one over seconds
     """
 
     reference: FloatArray
     weights: FloatArray
-    effort: FloatArray
+    input_weights: FloatArray
     trim: FloatArray
     time: float
 
@@ -129,7 +129,7 @@ class Stage:
         lengths : (n_knots,)   of each knot's interval: s, or a share of the duration where time is free
         """
         values, gradients, curvatures = self._cost(
-            states, inputs, _column(lengths), costs.reference, costs.weights, costs.effort, costs.trim,
+            states, inputs, _column(lengths), costs.reference, costs.weights, costs.input_weights, costs.trim,
             np.array([costs.time]),
         )  # fmt: skip
         return values[:, 0], gradients, curvatures.reshape(-1, self.n_z, self.n_z)
@@ -200,12 +200,12 @@ def _cost_of(n_x: int, s: ca.SX, u: ca.SX, free_time: bool) -> tuple[list[ca.SX]
     """Arguments and results of the cost of a knot and its interval."""
     length, time = ca.SX.sym("tau"), ca.SX.sym("w_t")
     reference, weights = ca.SX.sym("ref", n_x), ca.SX.sym("w", n_x)
-    effort, trim = ca.SX.sym("e", u.numel()), ca.SX.sym("trim", u.numel())
+    input_weights, trim = ca.SX.sym("e", u.numel()), ca.SX.sym("trim", u.numel())
     tau = length * s[n_x] if free_time else length
     x = s[:n_x]
-    cost = tau * (time + ca.dot(effort, (u - trim) ** 2)) + ca.dot(weights, (x - reference) ** 2)
+    cost = tau * (time + ca.dot(input_weights, (u - trim) ** 2)) + ca.dot(weights, (x - reference) ** 2)
     curved, gradient = ca.hessian(cost, ca.vertcat(s, u))
-    return [s, u, length, reference, weights, effort, trim, time], [cost, gradient, curved]
+    return [s, u, length, reference, weights, input_weights, trim, time], [cost, gradient, curved]
 
 
 def _function(name: str, arguments: Sequence[ca.SX], results: Sequence[ca.SX]) -> ca.Function:
