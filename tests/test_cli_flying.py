@@ -8,7 +8,7 @@ import pytest
 
 import diransac as dr
 from command_line import contents, run
-from diransac.cli.flying import Recorder
+from diransac.cli.flight_options import Recorder
 
 IMBALANCE = ["--plant", "extended-rotorcraft", "--aerodynamic-imbalance", 1.4e-6, "--mass-imbalance", 0]
 OUTLIERS = ["--outliers", 0.1, "--magnitude", 80]
@@ -362,7 +362,7 @@ def test_interrupt_ends_with_130_and_writes_nothing(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("diransac.cli.flights.fly", interrupt)
+    monkeypatch.setattr("diransac.cli.flight_runs.fly", interrupt)
     before = contents(folder)
     done = run(*words)
     assert (done.exit_code, done.stderr) == (130, "interrupted\n")
@@ -380,7 +380,7 @@ def test_interrupt_ends_with_130_and_writes_nothing(
 def test_outputs_are_checked_before_the_work(
     result: dr.Result, folder: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], message: str
 ):
-    monkeypatch.setattr("diransac.cli.flights.tvlqr", lambda *_, **__: pytest.fail("the work has begun"))
+    monkeypatch.setattr("diransac.cli.flight_runs.tvlqr", lambda *_, **__: pytest.fail("the work has begun"))
     Path("folder.csv").mkdir()
     Path("link.png").symlink_to("model.json")
     before = contents(folder)

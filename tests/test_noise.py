@@ -12,7 +12,8 @@ from diransac.data import preprocessing as prepare
 from diransac.data.log import Log
 from diransac.data.readers import read_log
 from diransac.errors import LogError, SettingsError
-from diransac.flight.corruption import CorruptedLog, Noise, corrupt
+from diransac.flight.corruption import CorruptedLog, corrupt
+from diransac.flight.noise import Noise
 from diransac.model.library import planar_rotorcraft
 
 N, DT = 4000, 0.01
@@ -126,7 +127,7 @@ def test_history_and_notes_tell_what_was_done():
     assert step["signals"] == list(SIGNALS)
     assert step["faults"]["x"] == corrupted.fault_mask["x"].sum()
     total = sum(int(mask.sum()) for mask in corrupted.fault_mask.values())
-    assert corrupted.notes[-1] == f"corrupted on purpose (seed 3): {total} of {6 * N} samples have faults"
+    assert corrupted.notes[-1] == f"corrupted by simulation (seed 3): {total} of {6 * N} samples have faults"
 
 
 # ---------------------------------------------------------------------- which signals
@@ -148,7 +149,7 @@ def test_signals_can_be_named():
 
 def test_a_log_without_derivatives_asks_for_names():
     log = Log.from_arrays(T, {"position": T, "force": T}, source="log 7")
-    with pytest.raises(LogError, match=r"log 7: no name ends in _dot .* found position, force: .* signals="):
+    with pytest.raises(LogError, match=r"log 7: no name ends in _dot .* found position, force; .* signals="):
         corrupt(log, OUTLIERS)
     assert set(corrupt(log, OUTLIERS, signals=["position"]).fault_mask) == {"position"}
 

@@ -7,7 +7,7 @@ import pytest
 
 import diransac as dr
 import diransac.flight.planning.solvers
-from diransac.flight.planning.flights import CORNERS, ROTORCRAFT_LIMITS
+from diransac.flight.planning.trajectories import CORNERS, ROTORCRAFT_LIMITS
 from diransac.simulation import rollouts
 from planned import LIMITS, ROTORCRAFT, across, defects, mass, rotorcraft
 from rolling import BODY, plain_step

@@ -5,7 +5,7 @@ import pytest
 from casadi import cos
 
 import diransac as dr
-from diransac.flight.planning.flights import ROTORCRAFT_LIMITS
+from diransac.flight.planning.trajectories import ROTORCRAFT_LIMITS
 from planned import ROTORCRAFT, mass
 from rolling import BODY
 
@@ -138,7 +138,7 @@ def weak(equation):
     ids=["fewer inputs", "quaternion", "square of an input", "an input of no effect"],
 )
 def test_sines_are_refused_where_inputs_cannot_push_every_coordinate(plant):
-    with pytest.raises(dr.SettingsError, match=r'model ".*" is not fully actuated: its inputs \(.*plan a flight'):
+    with pytest.raises(dr.SettingsError, match=r'model ".*" is not fully actuated: its inputs \(.*diransac\.plan'):
         dr.multisine(plant)
 
 
@@ -149,7 +149,10 @@ def test_sines_are_refused_where_inputs_cannot_push_every_coordinate(plant):
         ({"reach": -1.0}, "reach is -1.0"),
         ({"duration": np.inf}, "duration is inf; give 0.01 to 3600 s"),
         ({"seed": -1}, "seed is -1; give a whole number of at least 0"),
-        ({"duration": 1.0, "seed": 1}, "first place is 1.* s away at 1.6 m/s, and the flight lasts 1 s; give more"),
+        (
+            {"duration": 1.0, "seed": 1},
+            "first waypoint is 1.* s away at 1.6 m/s, and the trajectory lasts 1 s; give more",
+        ),
         ({"reach": 0.5}, "within a reach of 0.5 m are too near for a speed of 1.6 m/s.*give a reach of 1.6 m or more"),
     ],
 )
@@ -160,7 +163,7 @@ def test_random_flights_that_make_no_sense_are_refused(wrong, message):
 
 def test_random_places_are_refused_where_there_is_no_plane():
     with pytest.raises(
-        dr.SettingsError, match=r'random_waypoints are flown in x and z; model "mass" has no coordinate x'
+        dr.SettingsError, match=r'random_waypoints are planned in x and z; model "mass" has no coordinate x'
     ):
         dr.random_waypoints(mass())
 

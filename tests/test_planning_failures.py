@@ -70,7 +70,9 @@ def test_parameters_that_are_odd_end_in_a_plan_or_a_sentence(changes):
 
 def test_no_input_holds_a_falling_body():
     falling = dr.Model("stone", {"y": "m"}, {"spin": "N"}, {"g": dr.Parameter()}, lambda q, v, a, u, p: [a.y + p.g])
-    with pytest.raises(PlanningError, match="no inputs make y_ddot zero; start elsewhere, or say with trim="):
+    with pytest.raises(
+        PlanningError, match="no inputs make y_ddot zero; start elsewhere, or give the inputs of zero cost with trim="
+    ):
         dr.plan(dr.Plant(falling, {"g": 9.81}), waypoints=[{}, {"y": 1.0}], times=[0.0, 1.0])
 
 
@@ -141,7 +143,7 @@ def test_senseless_arguments_are_refused_by_name(options, words):
 
 
 @pytest.mark.parametrize(
-    ("first", "words"), [({}, "which way the plant points"), ({**HOME, "q0": 0.5}, "its length is 0.5, not 1")]
+    ("first", "words"), [({}, "leaves the attitude open"), ({**HOME, "q0": 0.5}, "its norm is 0.5, not 1")]
 )
 def test_quaternions_must_be_said_and_be_ones(first, words):
     plant = dr.Plant(BODY, {"p0": 1.0, "p1": 1.5, "p2": 2.0})

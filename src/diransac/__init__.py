@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from diransac.data.preprocessing import despike, differentiate, rename, resample, scale, shift
     from diransac.data.readers import read_log
     from diransac.flight.closed_loop import fly, fly_batch, tracking_error
-    from diransac.flight.corruption import CorruptedLog, Noise, corrupt
+    from diransac.flight.corruption import CorruptedLog, corrupt
+    from diransac.flight.noise import Noise
     from diransac.flight.planning import multisine, plan, random_waypoints, sine, square, star
     from diransac.flight.trajectory import Trajectory
     from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
@@ -99,7 +100,8 @@ _FOUND_IN = {
     "identification.estimators": ("OrdinaryLeastSquares", "ScikitLearnEstimator", "TotalLeastSquares"),
     "identification.identify": ("METHODS", "identify"),
     "data.log": ("Log",),
-    "flight.corruption": ("CorruptedLog", "Noise", "corrupt"),
+    "flight.corruption": ("CorruptedLog", "corrupt"),
+    "flight.noise": ("Noise",),
     "identification.nonlinear": ("NonlinearLeastSquares",),
     "flight.planning": ("multisine", "plan", "random_waypoints", "sine", "square", "star"),
     "plots": ("plot_flight",),

@@ -8,7 +8,7 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import load_model, model_file
-from diransac.cli.flying import (
+from diransac.cli.flight_options import (
     FlightPicture,
     FlightSeed,
     LogOutput,
@@ -162,7 +162,7 @@ def _simulate(
     as_json: JsonFlag = False,
 ) -> None:
     """Plan a trajectory, fly it, and write the log that a bad recorder would have kept."""
-    from diransac.cli.flights import record
+    from diransac.cli.flight_runs import record
 
     noise = recorder.noise()
     with staged([output, plot], [model_file(model)]) as (written, picture):
@@ -186,7 +186,7 @@ def _fly(
     as_json: JsonFlag = False,
 ) -> None:
     """Plan and steer by an identified model, fly the true machine, and say how far it strays."""
-    from diransac.cli.flights import try_out
+    from diransac.cli.flight_runs import try_out
 
     with staged([output, plot], [model]) as (written, picture):
         result = Result.load(model)

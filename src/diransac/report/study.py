@@ -14,9 +14,9 @@ import numpy.typing as npt
 from diransac.atomic import write_text
 from diransac.errors import ResultError
 from diransac.plots.estimates import LEAST, methods_and_errors, plot_estimates
+from diransac.plots.figure import svg
 from diransac.plots.paths import levels_with_paths, plot_paths
 from diransac.plots.study import axis_label, level_labels, plot_study, title_of
-from diransac.plots.writing import svg
 from diransac.report.markup import Html, join, number, percent, plural, table, tag
 from diransac.study.summary import Estimates, Flights, Summary, summarise
 

@@ -14,7 +14,7 @@ from diransac.cli.arguments import numbers
 from diransac.cli.options import output_file
 from diransac.data.writing import ENDINGS
 from diransac.errors import ModelError
-from diransac.flight.corruption import Noise
+from diransac.flight.noise import Noise
 from diransac.model import Model
 from diransac.model.library import TABLE_I, extended_rotorcraft, planar_rotorcraft
 from diransac.model.plant import Plant

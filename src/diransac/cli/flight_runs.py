@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from diransac.cli.flying import SHAPES, same_equations
+from diransac.cli.flight_options import SHAPES, same_equations
 from diransac.data.log import Log
 from diransac.errors import DiransacError, PlanningError, SettingsError
 from diransac.flight.closed_loop import fly, tracking_error
-from diransac.flight.corruption import CorruptedLog, Noise, corrupt
+from diransac.flight.corruption import CorruptedLog, corrupt
+from diransac.flight.noise import Noise
 from diransac.flight.planning import sine, square, star
 from diransac.flight.trajectory import Trajectory
 from diransac.flight.tvlqr import Controller, tvlqr
