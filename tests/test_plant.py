@@ -192,7 +192,7 @@ STATE = {"states": {"s": "m"}, "rates": lambda *_: {"s": 0.0}}
         ({"constants": {"t": 1.0}}, "a name is used twice"),
         ({"constants": {"k": np.inf}}, "k is inf; give a finite number"),
         ({"highest_frequency": -1.0}, "highest_frequency is -1"),
-        ({"name": "a b"}, "give letters, digits and hyphens"),
+        ({"name": "a b"}, "use letters, digits and hyphens"),
     ],
 )
 def test_a_disturbance_that_makes_no_sense_is_refused(arguments, says):

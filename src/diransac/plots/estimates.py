@@ -20,20 +20,20 @@ from diransac.study.summary import Estimates, Summary, summarise
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["LEAST", "judges_parameters", "methods_and_errors", "plot_estimates"]
+__all__ = ["LEAST", "evaluates_parameters", "methods_and_errors", "plot_estimates"]
 
 
 LEAST = -3
 """Power of ten, %, below which errors are not resolved."""
 
-OF_OWN = "against the plant’s own"
+_TO_TRUE = "relative to the true ones"
 
 # Inches: name of the panel with the values above its rows, values below, a line of the caption.
 _ABOVE, _BELOW, _LINE = 0.42, 0.3, 0.155
 _CAPTION = (
-    "Marks are medians over {trials} of a level, lines end at the largest. Errors are relative to the best "
-    "parameters that the model can reach in the",
-    "very flight; where those differ from the plant’s own, a second row has the errors against the latter.",
+    "Marks are medians over {trials} of a level, lines end at the largest. Errors are relative to the pseudo-true "
+    "parameters, the best of the",
+    "model in that flight; where those differ from the true ones, a second row has the errors relative to the latter.",
 )
 _NONE = " none: no estimate, counted as an infinite error."
 
@@ -65,9 +65,9 @@ def plot_estimates(store: str | Path, path: str | Path | None = None, *, title: 
     Notes
     -----
     Marks are medians over the trials of a level; a line runs from each to the largest value. Errors are relative to the
-    best parameters of the model in that flight. Where these differ from the plant's own by more than 0.2 %, a second
-    row has the errors relative to the latter. A trial without an estimate has an infinite error. The method ``true``
-    has a mark where its parameters are not the best ones.
+    pseudo-true parameters, the best of the model in that flight. Where these differ from the true ones by more than
+    0.2 %, a second row has the errors relative to the latter. A trial without an estimate has an infinite error. The
+    method ``true`` has a mark where its parameters are not the pseudo-true ones.
     """
     if path is not None:
         check_ending(Path(path))
@@ -78,36 +78,36 @@ def plot_estimates(store: str | Path, path: str | Path | None = None, *, title: 
     return figure
 
 
-def judges_parameters(store: str | Path) -> bool:
-    """Whether a store's study judges parameters.  Raises StudyError: there is no such store."""
+def evaluates_parameters(store: str | Path) -> bool:
+    """True if a store's study evaluates parameters.  Raises StudyError: there is no such store."""
     with Store.existing(store) as kept:
         return bool(kept.configuration["study"].get("evaluation.parameters"))
 
 
 def methods_and_errors(summary: Summary, parameter: str | None = None) -> tuple[list[str], list[MarkRow]]:
-    """The methods that have errors worth showing, and their errors at each level, in %.
+    """Methods and rows of their errors at each level, %.
 
-    What ``true`` has found is no news but where the best parameters are others; where it is alone, nothing is shown.
+    The method ``true`` is left out where its parameters are the pseudo-true ones, unless it is the only one.
 
     Parameters
     ----------
-    parameter : whose errors; None: of the worst
+    parameter : its errors; None: the largest over all parameters
 
-    Raises SettingsError: the study judges no parameters.
+    Raises SettingsError: the study evaluates no parameters.
     """
     estimates = summary.estimates
     if estimates is None:
-        raise SettingsError("the study judges no parameters; run one with evaluation.parameters = true")
+        raise SettingsError("the study evaluates no parameters; run one with evaluation.parameters = true")
     best = estimates.worst if parameter is None else estimates.errors[parameter]
     own = estimates.worst_of_own if parameter is None else estimates.errors_of_own[parameter]
-    is_news = estimates.differs.any() or summary.methods == (TRUE,)
-    kept = [k for k, label in enumerate(summary.methods) if label != TRUE or is_news]
+    shows_true = estimates.differs.any() or summary.methods == (TRUE,)
+    kept = [k for k, label in enumerate(summary.methods) if label != TRUE or shows_true]
     is_true = np.array([summary.methods[k] == TRUE for k in kept])
     rows = []
     for i, name in enumerate(level_labels(summary)):
         rows.append(_row(name, best[i, kept], is_true & ~estimates.differs[i]))
         if estimates.differs[i]:
-            rows.append(_row(OF_OWN, own[i, kept], is_true, quiet=True))
+            rows.append(_row(_TO_TRUE, own[i, kept], is_true, quiet=True))
     return [summary.methods[k] for k in kept], rows
 
 
