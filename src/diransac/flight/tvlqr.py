@@ -22,7 +22,7 @@ __all__ = ["Controller", "tvlqr", "tvlqr_batch"]
 Weights: TypeAlias = "npt.ArrayLike | Mapping[str, float]"
 """Matrix, diagonal, one number for the whole diagonal, or diagonal by name."""
 
-Limits: TypeAlias = Mapping[str, tuple[float, float]]
+InputLimits: TypeAlias = Mapping[str, tuple[float, float]]
 """Name of an input -> smallest and largest value."""
 
 COORDINATE_ERROR = 0.5
@@ -161,7 +161,7 @@ def tvlqr(
     R: Weights | None = None,
     Qf: Weights | None = None,
     *,
-    limits: Limits | None = None,
+    limits: InputLimits | None = None,
 ) -> Controller:
     """Time-varying LQR: minimum of ``integral of e'Q e + d'R d dt + e_K'Qf e_K`` to first order along a trajectory.
 
@@ -227,7 +227,7 @@ def tvlqr_batch(
     R: Weights | None = None,
     Qf: Weights | None = None,
     *,
-    limits: Limits | None = None,
+    limits: InputLimits | None = None,
     threads: int = 1,
 ) -> list[Controller]:
     """Controllers of `tvlqr` for many plants of one model, each along its own trajectory, in less time.
@@ -266,10 +266,10 @@ def tvlqr_batch(
         raise SettingsError("the plants have different models; call tvlqr_batch for each model's own")
     for trajectory in trajectories:
         _check_columns(model, trajectory)
-    weights = _Weights(model, Q, R, Qf)
+    costs = _CostMatrices(model, Q, R, Qf)
     limits_of_each = [_limits_of(model, trajectory, limits) for trajectory in trajectories]
     problems = [
-        Problem(np.array(list(plant.parameters.values())), trajectory, weights.Q, weights.R(low, high), weights.Qf)
+        Problem(np.array(list(plant.parameters.values())), trajectory, costs.Q, costs.R(low, high), costs.Qf)
         for plant, trajectory, (low, high) in zip(known, trajectories, limits_of_each, strict=True)
     ]
     names = (model.state, tuple(model.inputs))
@@ -298,7 +298,7 @@ def _check_columns(model: Model, trajectory: Trajectory) -> None:
             )
 
 
-def _limits_of(model: Model, trajectory: Trajectory, limits: Limits | None) -> tuple[FloatArray, FloatArray]:
+def _limits_of(model: Model, trajectory: Trajectory, limits: InputLimits | None) -> tuple[FloatArray, FloatArray]:
     """Smallest and largest inputs (n_u,).
 
     Raises SettingsError: an unknown name, or limits that are not a pair in increasing order.
@@ -314,7 +314,7 @@ def _limits_of(model: Model, trajectory: Trajectory, limits: Limits | None) -> t
     return low, high
 
 
-class _Weights:
+class _CostMatrices:
     """Matrices Q, Qf and R."""
 
     def __init__(self, model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None) -> None:

@@ -11,13 +11,13 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import PlanningError, SettingsError
 from diransac.flight.planning.problem import (
-    Path,
+    InitialGuess,
     Task,
-    first_path,
     fixed_program,
     free_program,
-    path_along,
-    path_of,
+    guess_along,
+    straight_guess,
+    stretched_guess,
     trajectory_of,
     unknowns_of,
 )
@@ -164,8 +164,8 @@ def plan(
         dt=TIME_STEP,
     )
     search = _Search(task, solver, SearchLimits(int(max_iterations), float(time_limit)), route.start, limits)
-    path = None if guess is None else path_along(model, guess)
-    return search.free(path) if route.rows is None else search.fixed(route.rows, path)
+    initial = None if guess is None else guess_along(model, guess)
+    return search.free(initial) if route.rows is None else search.fixed(route.rows, initial)
 
 
 # Search --------------------------------------------------------------------------------------------------------------
@@ -179,22 +179,22 @@ class _Search:
     start: float
     limits: Limits
 
-    def fixed(self, rows: tuple[int, ...], path: Path | None) -> Trajectory:
+    def fixed(self, rows: tuple[int, ...], guess: InitialGuess | None) -> Trajectory:
         """Plan whose segments have these numbers of rows."""
         program = fixed_program(self.task, rows)
-        solution = self._solved(program, rows, path)
+        solution = self._solved(program, rows, guess)
         if not solution.success:
             raise PlanningError(_explanation(self.task, rows, solution, self.search_limits))
         return self._trajectory(program, solution)
 
-    def free(self, path: Path | None) -> Trajectory:
+    def free(self, guess: InitialGuess | None) -> Trajectory:
         """Plan of optimal durations, rounded up to whole rows for which there is a plan, too."""
         task, program = self.task, free_program(self.task)
         n = len(program.layout.intervals)
-        durations = None if path is None else np.full(n, path.time[-1] / n)
-        straight = first_path(task, np.ones(n) if durations is None else durations)
-        strategy: Strategy = "line search" if path is None else "warm start"
-        solution = self._search(program, unknowns_of(program, path or straight, durations), strategy)
+        durations = None if guess is None else np.full(n, guess.time[-1] / n)
+        straight = straight_guess(task, np.ones(n) if durations is None else durations)
+        strategy: Strategy = "line search" if guess is None else "warm start"
+        solution = self._search(program, unknowns_of(program, guess or straight, durations), strategy)
         if not solution.success:
             raise PlanningError(
                 f"no durations were found for which the plan works: {solution.summary}; "
@@ -205,22 +205,22 @@ class _Search:
         for more in _MORE_ROWS:
             rows = tuple(int(k) + more for k in shortest)
             whole = fixed_program(task, rows)
-            along = path_of(program, solution.unknowns, task.dt * np.array(rows))
+            along = stretched_guess(program, solution.unknowns, task.dt * np.array(rows))
             rounded = self._search(whole, unknowns_of(whole, along), "warm start")
             if rounded.success:
                 return self._trajectory(whole, rounded)
         raise PlanningError(_explanation(task, rows, rounded, self.search_limits))
 
-    def _solved(self, program: Program, rows: tuple[int, ...], path: Path | None) -> Solution:
+    def _solved(self, program: Program, rows: tuple[int, ...], guess: InitialGuess | None) -> Solution:
         """Solution from the guess, if there is one, else from straight lines, else by full Newton steps.
 
         Parameters far from plausible ones, such as an inertia of a fiftieth of the true one, make the constraints so
         curved that line searches stall; full steps converge.
         """
-        straight = unknowns_of(program, first_path(self.task, self.task.dt * np.array(rows)))
+        straight = unknowns_of(program, straight_guess(self.task, self.task.dt * np.array(rows)))
         attempts: list[tuple[FloatArray, Strategy]] = [(straight, "line search")]
-        if path is not None:
-            attempts.insert(0, (unknowns_of(program, path), "warm start"))
+        if guess is not None:
+            attempts.insert(0, (unknowns_of(program, guess), "warm start"))
         if self.solver == "ipopt":
             attempts.append((straight, "full steps"))
         whole = self.search_limits
@@ -270,7 +270,7 @@ def _explanation(task: Task, rows: tuple[int, ...], solution: Solution, limits: 
     if solution.status == TIME_LIMIT:
         return f"no plan was found within {limits.seconds:g} s; raise time_limit=, or give a guess="
     program = _relaxed(task, rows)
-    guess = unknowns_of(program, first_path(task, task.dt * np.array(rows)))
+    guess = unknowns_of(program, straight_guess(task, task.dt * np.array(rows)))
     nearest = interior_point("ipopt", program, guess, SearchLimits(_EXPLANATION_ITERATIONS, limits.seconds))
     if not nearest.success:
         return (

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "Path",
+    "InitialGuess",
     "Task",
-    "first_path",
     "fixed_program",
     "free_program",
-    "path_along",
-    "path_of",
+    "guess_along",
+    "straight_guess",
+    "stretched_guess",
     "trajectory_of",
     "unknowns_of",
 ]
@@ -73,7 +73,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Path:
+class InitialGuess:
     """Approximate trajectory from which a search starts.
 
     Parameters
@@ -151,8 +151,8 @@ def _reference(task: Task, time: FloatArray) -> FloatArray:
 
 
 # Guesses -------------------------------------------------------------------------------------------------------------
-def first_path(task: Task, durations: FloatArray) -> Path:
-    """Path of straight lines between waypoints, or along the reference, with trim inputs.
+def straight_guess(task: Task, durations: FloatArray) -> InitialGuess:
+    """Guess of straight lines between waypoints, or along the reference, with trim inputs.
 
     Velocities are slopes of the coordinates where neither a waypoint nor the reference gives them.
     """
@@ -172,11 +172,11 @@ def first_path(task: Task, durations: FloatArray) -> Path:
     for four in task.model.quaternions:
         lengths = np.linalg.norm(states[:, list(four)], axis=1, keepdims=True)
         states[:, list(four)] /= np.where(lengths > 0.0, lengths, 1.0)
-    return Path(time, states, np.broadcast_to(task.trim, (len(time), len(task.trim))))
+    return InitialGuess(time, states, np.broadcast_to(task.trim, (len(time), len(task.trim))))
 
 
-def path_along(model: Model, guess: Trajectory) -> Path:
-    """Path along a trajectory of the same model.
+def guess_along(model: Model, guess: Trajectory) -> InitialGuess:
+    """Guess along a trajectory of the same model.
 
     Raises SettingsError: the trajectory has other states or inputs.
     """
@@ -185,7 +185,7 @@ def path_along(model: Model, guess: Trajectory) -> Path:
             f"guess= is a trajectory of {', '.join((*guess.state_names, *guess.input_names))}, but model "
             f'"{model.name}" has {", ".join((*model.state, *model.inputs))}'
         )
-    return Path(guess.time - guess.time[0], guess.states, guess.inputs)
+    return InitialGuess(guess.time - guess.time[0], guess.states, guess.inputs)
 
 
 def _fixed(task: Task, at_waypoints: FloatArray, j: int) -> tuple[FloatArray, FloatArray]:
@@ -195,8 +195,8 @@ def _fixed(task: Task, at_waypoints: FloatArray, j: int) -> tuple[FloatArray, Fl
     return at_waypoints[there], np.array(values)
 
 
-def unknowns_of(program: Program, path: Path, durations: FloatArray | None = None) -> FloatArray:
-    """Unknowns along a path, clipped to the limits; with free time also the durations of the segments."""
+def unknowns_of(program: Program, guess: InitialGuess, durations: FloatArray | None = None) -> FloatArray:
+    """Unknowns along a guess, clipped to the limits; with free time also the durations of the segments."""
     layout, numbers = program.layout, program.numbers
     lengths = numbers.steps.sum(axis=1)
     unknowns = np.zeros(layout.n_unknowns)
@@ -205,19 +205,19 @@ def unknowns_of(program: Program, path: Path, durations: FloatArray | None = Non
         lengths = lengths * guessed[layout.segment_of]
         unknowns[layout.states[:, -1]] = np.append(guessed[layout.segment_of], guessed[-1])
         unknowns[layout.next_durations] = guessed[1:]
-    states, inputs = path.at(np.concatenate([[0.0], np.cumsum(lengths)]))
+    states, inputs = guess.at(np.concatenate([[0.0], np.cumsum(lengths)]))
     unknowns[layout.states[:, : layout.n_x]] = states
     unknowns[layout.inputs] = inputs[:-1]
     return np.clip(unknowns, numbers.lower, numbers.upper)
 
 
-def path_of(program: Program, unknowns: FloatArray, durations: FloatArray) -> Path:
-    """Path of a solution, with its segments stretched to other durations."""
+def stretched_guess(program: Program, unknowns: FloatArray, durations: FloatArray) -> InitialGuess:
+    """Guess from a solution, with its segments stretched to other durations."""
     layout = program.layout
     lengths = (durations / np.array(layout.intervals))[layout.segment_of]
     states, inputs = program.split(unknowns)
     time = np.concatenate([[0.0], np.cumsum(lengths)])
-    return Path(time, states[:, : layout.n_x], np.concatenate([inputs, inputs[-1:]]))
+    return InitialGuess(time, states[:, : layout.n_x], np.concatenate([inputs, inputs[-1:]]))
 
 
 # Solutions -----------------------------------------------------------------------------------------------------------

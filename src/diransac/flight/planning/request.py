@@ -123,7 +123,7 @@ def _sampled(name: str, signal: Signal | ArrayLike, time: FloatArray) -> FloatAr
     return np.broadcast_to(values, time.shape).astype(np.float64)
 
 
-def waypoints_of(
+def _waypoints_of(
     model: Model, waypoints: Sequence[Mapping[str, float]], start_end_at_rest: bool
 ) -> tuple[Waypoint, ...]:
     """Checked waypoints; with `start_end_at_rest`, states that the first and last do not name are zero.
@@ -135,7 +135,7 @@ def waypoints_of(
     found = []
     for k, waypoint in enumerate(waypoints):
         at_end = k in (0, len(waypoints) - 1)
-        values = named_values(f"waypoint {k}", "state", waypoint, model.state)
+        values = _named_values(f"waypoint {k}", "state", waypoint, model.state)
         _check_quaternions(model, k, values, start_end_at_rest and at_end)
         if start_end_at_rest and at_end:
             values = dict.fromkeys(model.state, 0.0) | values
@@ -190,14 +190,14 @@ def weights_of(
     Raises SettingsError: an unknown name, or a weight that is negative or not finite.
     """
     values = default.copy()
-    for name, weight in named_values(what, kind, weights or {}, names).items():
+    for name, weight in _named_values(what, kind, weights or {}, names).items():
         if weight < 0.0:
             raise SettingsError(f'{what} of "{name}" is {weight:g}; a weight is at least 0')
         values[names.index(name)] = weight
     return values
 
 
-def rows_of(times: Sequence[float], n_waypoints: int, dt: float) -> tuple[int, ...]:
+def _rows_of(times: Sequence[float], n_waypoints: int, dt: float) -> tuple[int, ...]:
     """Number of rows of each segment, of times rounded to the time step.
 
     Raises SettingsError: not one time per waypoint, or times that increase by less than a time step.
@@ -217,7 +217,7 @@ def rows_of(times: Sequence[float], n_waypoints: int, dt: float) -> tuple[int, .
     return tuple(int(n) for n in steps)
 
 
-def named_values(what: str, kind: str, values: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
+def _named_values(what: str, kind: str, values: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
     """Values by name as finite floats.
 
     Raises SettingsError: an unknown name, or a value that is not a finite number.
@@ -269,25 +269,25 @@ def route_of(
             raise SettingsError("a plan needs waypoints=, or reference= with duration=")
         if duration is None or times is not None or not np.isfinite(duration):
             raise SettingsError("a reference without waypoints needs duration=, in s, and no times=")
-        rows = rows_of((0.0, duration), 2, TIME_STEP)
+        rows = _rows_of((0.0, duration), 2, TIME_STEP)
         ends = followed.at(np.array([0.0, rows[0] * TIME_STEP]))
-        ends_ = [{name: float(values[k]) for name, values in ends.items()} for k in (0, 1)]
-        return Route(waypoints_of(model, ends_, start_end_at_rest), rows, 0.0, followed)
+        end_points = [{name: float(values[k]) for name, values in ends.items()} for k in (0, 1)]
+        return Route(_waypoints_of(model, end_points, start_end_at_rest), rows, 0.0, followed)
     if duration is not None:
         raise SettingsError("waypoints have times=; duration= belongs to a reference without waypoints")
     if times is None and reference is not None:
         raise SettingsError("a reference is a function of time: waypoints along a reference need times=")
-    checked = waypoints_of(model, waypoints, start_end_at_rest)
+    checked = _waypoints_of(model, waypoints, start_end_at_rest)
     if times is None:
         return Route(checked, None, 0.0, followed)
-    return Route(checked, rows_of(times, len(checked), TIME_STEP), float(times[0]), followed)
+    return Route(checked, _rows_of(times, len(checked), TIME_STEP), float(times[0]), followed)
 
 
 def check_weights(state_weights: Mapping[str, float] | None, route: Route, input_limit_fraction: float) -> None:
     """Raise SettingsError for a weight without reference, or an input_limit_fraction that is not in (0, 1]."""
-    stray = [name for name in state_weights or {} if name not in route.reference.signals]
-    if stray:
-        raise SettingsError(f'state_weights: "{stray[0]}" has no reference; give one, or leave its weight out')
+    unknown = [name for name in state_weights or {} if name not in route.reference.signals]
+    if unknown:
+        raise SettingsError(f'state_weights: "{unknown[0]}" has no reference; give one, or leave its weight out')
     if not 0.0 < input_limit_fraction <= 1.0:
         raise SettingsError(f"input_limit_fraction is {input_limit_fraction}; it must be above 0 and at most 1")
 
@@ -327,7 +327,7 @@ def trim_at(
     Raises PlanningError: as `_rest_inputs`.
     """
     if given is not None:
-        values = named_values("trim", "input", given, tuple(model.inputs))
+        values = _named_values("trim", "input", given, tuple(model.inputs))
         return np.array([values.get(name, 0.0) for name in model.inputs])
     coordinates = np.zeros(model.n_q)
     for j, value in zip(start.states, start.values, strict=True):
