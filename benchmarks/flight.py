@@ -17,7 +17,13 @@ import numpy as np
 from kernel import timed
 
 import diransac as dr
-from diransac.flight.planning.flights import CORNERS, MEAN_SPEED, PLANNED_SHARE, ROTORCRAFT_LIMITS, ROUTE_WEIGHT
+from diransac.flight.planning.trajectories import (
+    CORNERS,
+    INPUT_LIMIT_FRACTION,
+    MEAN_SPEED,
+    ROTORCRAFT_LIMITS,
+    ROUTE_WEIGHT,
+)
 from diransac.simulation import LinearFeedback, RolloutBatch, rollouts
 
 Array = np.ndarray[Any, Any]
@@ -58,8 +64,8 @@ def plan(plant: dr.Plant, guess: dr.Trajectory | None = None, solver: str = "ipo
     route = {name: partial(np.interp, xp=times, fp=[place[j] for place in PLANES]) for j, name in enumerate(("x", "z"))}
     return dr.plan(
         plant, waypoints=[{"x": x, "z": z} for x, z in PLANES], times=times.tolist(), reference=route,
-        tracking={"x": ROUTE_WEIGHT, "z": ROUTE_WEIGHT}, input_limits=ROTORCRAFT_LIMITS, input_share=PLANNED_SHARE,
-        guess=guess, solver=solver,
+        state_weights={"x": ROUTE_WEIGHT, "z": ROUTE_WEIGHT}, input_limits=ROTORCRAFT_LIMITS,
+        input_limit_fraction=INPUT_LIMIT_FRACTION, guess=guess, solver=solver,
     )  # fmt: skip
 
 
@@ -69,7 +75,7 @@ def square_in_numbers() -> drake_ways.Square:
     knots = STEP * np.arange(1 + round(times[-1] / STEP))
     low, high = np.array(list(ROTORCRAFT_LIMITS.values())).T
     middle, half = (low + high) / 2, (high - low) / 2
-    usable = PLANNED_SHARE * half
+    usable = INPUT_LIMIT_FRACTION * half
     return drake_ways.Square(
         step=STEP,
         corners={round(t / STEP): place for t, place in zip(times, PLANES, strict=True)},

@@ -168,7 +168,7 @@ def cramer_rao(plant: dr.Plant, clean: dr.Log, noise: dr.Noise) -> dict[str, flo
     measured = np.column_stack([clean[name] for name in model.signals])
     inputs = np.column_stack([clean[name] for name in model.inputs])
     weights = np.column_stack(
-        [_weights(noisy[n] - clean[n], noisy.planted[n], np.std(clean[n])) for n in model.signals]
+        [_weights(noisy[n] - clean[n], noisy.fault_mask[n], np.std(clean[n])) for n in model.signals]
     )
     sums = rollouts(model, substeps=4).gauss_newton(
         RolloutBatch(p[None], measured[0, : len(model.state)], inputs, clean.dt),

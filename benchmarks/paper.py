@@ -198,7 +198,7 @@ def show_excitation() -> None:
     true = dr.Plant(dr.models.planar_rotorcraft(), TABLE_I)
     rows = []
     for effort in (1.0, 10.0, 100.0, 1000.0):
-        star = dr.star(true, effort={"moment": effort, "thrust": 1.0})
+        star = dr.star(true, input_weights={"moment": effort, "thrust": 1.0})
         for words, imbalances in {"gamma 1.8e-6": (1.8e-6, 0.0), "delta_m 1.4e-4": (0.0, 1.4e-4)}.items():
             plant = dr.models.extended_rotorcraft(*imbalances, convention="printed")
             log = dr.fly(plant, star, dr.tvlqr(true, star))

@@ -1,7 +1,7 @@
-"""Thrust of a Crazyflie's rotors from its accelerometer and its motor commands alone.
+"""Model of a Crazyflie's rotor thrust, identifiable from accelerometer and motor commands alone.
 
-The accelerometer's body-z reading times the mass is the thrust of four rotors, each ``k1 w + k2 w^2`` in its command w
-(0 to 1; the log has it as 0 to 65535).  Nothing depends on the state, so no position or velocity is needed.
+The body-z acceleration times the mass equals the thrust of four rotors, each ``k1 w + k2 w^2`` with the command w (0 to
+1; 0 to 65535 in the log). The equation has no states, so that no position or velocity is needed.
 """
 
 from diransac import Model, Parameter

@@ -1,4 +1,4 @@
-"""A user's own model, for ``diransac identify LOG --model examples/my_axis.py``."""
+"""Example of a user-defined model, for ``diransac identify LOG --model examples/my_axis.py``."""
 
 from casadi import sign
 

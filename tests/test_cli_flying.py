@@ -8,7 +8,7 @@ import pytest
 
 import diransac as dr
 from command_line import contents, run
-from diransac.cli.flying import Recorder
+from diransac.cli.flight_options import NoiseOptions
 
 IMBALANCE = ["--plant", "extended-rotorcraft", "--aerodynamic-imbalance", 1.4e-6, "--mass-imbalance", 0]
 OUTLIERS = ["--outliers", 0.1, "--magnitude", 80]
@@ -69,12 +69,12 @@ def test_simulate_writes_the_flight_with_the_planted_outliers(folder: Path, plan
     assert said["rate"] == pytest.approx(100.0)
     for name in signals:
         error = log[name] - true[name]
-        assert said["spoilt"][name] == np.count_nonzero(error)
+        assert said["faults"][name] == np.count_nonzero(error)
         assert np.count_nonzero(error) == pytest.approx(0.1 * len(log), abs=6 * np.sqrt(0.09 * len(log)))
         assert 70 < np.abs(error).max() <= 80
         assert error[0] == 0.0
     assert np.array_equal(log["thrust"], true["thrust"])
-    assert not any(json.loads(clean.stdout)["spoilt"].values())
+    assert not any(json.loads(clean.stdout)["faults"].values())
 
 
 def test_simulate_flies_what_the_library_flies(folder: Path):
@@ -87,16 +87,16 @@ def test_simulate_flies_what_the_library_flies(folder: Path):
     assert all(np.array_equal(found[name], expected[name]) for name in expected.names)
 
 
-def test_simulate_shows_tracking_errors_and_spoilt_values_by_signal(folder: Path):
+def test_simulate_shows_tracking_errors_and_faults_by_signal(folder: Path):
     words = ("simulate", "square", *IMBALANCE, "--dropouts", 0.01, "-o", "flight.csv")
     shown, said = run(*words).stdout.splitlines(), json.loads(run(*words, "--json").stdout)
     rows = {line.split()[0]: line.split()[1:] for line in shown[2:]}
     assert "100 Hz" in shown[0]
     assert "seed 0" in shown[0]
-    assert rows["x_dot"] == ["m/s", f"{said['tracking_error']['x_dot']:.4g}", str(said["spoilt"]["x_dot"])]
+    assert rows["x_dot"] == ["m/s", f"{said['tracking_error']['x_dot']:.4g}", str(said["faults"]["x_dot"])]
     assert rows["thrust"][0] == "N"
     assert set(said["tracking_error"]) == {"x", "z", "theta", "x_dot", "z_dot", "theta_dot"}
-    assert said["spoilt"]["x_dot"] == np.isnan(dr.read_log("flight.csv")["x_dot"]).sum() > 0
+    assert said["faults"]["x_dot"] == np.isnan(dr.read_log("flight.csv")["x_dot"]).sum() > 0
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.csv.gz", "a.parquet", "a.npz", "A.CSV"])
@@ -114,14 +114,15 @@ def test_simulate_gives_the_same_bytes_for_the_same_seed(folder: Path, name: str
 def test_simulate_takes_every_field_of_the_noise(folder: Path):
     told = {
         "--outliers": 0.1, "--magnitude": 5, "--acceleration-noise": 0.5, "--rate-noise": 0.1,
-        "--angular-acceleration-noise": 2, "--integrated-noise": "random-walk", "--first-row": "hit", "--bursts": 0.01,
-        "--burst-length": 4, "--freezes": 0.02, "--freeze-length": 5, "--dropouts": 0.03, "--dropout-length": 6,
-        "--runs": "together", "--leverage": 0.2, "--leverage-offset": 3, "--leverage-signal": "thrust",
+        "--angular-acceleration-noise": 2, "--integrated-noise": "random-walk", "--first-row": "corrupted",
+        "--bursts": 0.01, "--burst-length": 4, "--stuck": 0.02, "--stuck-length": 5,
+        "--dropouts": 0.03, "--dropout-length": 6,
+        "--leverage": 0.2, "--leverage-offset": 3, "--leverage-signal": "thrust",
         "--leverage-quantile": 0.8, "--delay": 0.02, "--quantisation": "x=0.001",
     }  # fmt: skip
     words = [word for pair in told.items() for word in pair]
-    done = run("simulate", "square", *words, "--seed", 2, "-o", "flight.csv", "--json")
-    noise = dr.Noise(0.1, 5, 0.5, 0.1, 2, "random-walk", "hit", 0.01, 4, 0.02, 5, 0.03, 6, "together", 0.2, 3, "thrust",
+    done = run("simulate", "square", *words, "--correlated", "--seed", 2, "-o", "flight.csv", "--json")
+    noise = dr.Noise(0.1, 5, 0.5, 0.1, 2, "random-walk", "corrupted", 0.01, 4, 0.02, 5, 0.03, 6, True, 0.2, 3, "thrust",
                      0.8, 0.02, {"x": 0.001})  # fmt: skip
     run("simulate", "square", "--seed", 2, "-o", "clean.csv")
     flown = dr.read_log("clean.csv")
@@ -131,7 +132,7 @@ def test_simulate_takes_every_field_of_the_noise(folder: Path):
     found = dr.read_log("flight.csv")
     assert done.exit_code == 0
     assert json.loads(done.stdout)["noise"] == noise.changed
-    assert set(noise.changed) == set(vars(noise)) == set(vars(Recorder()))
+    assert set(noise.changed) == set(vars(noise)) == set(vars(NoiseOptions()))
     assert all(np.array_equal(found[name], expected[name], equal_nan=True) for name in expected.names)
 
 
@@ -211,7 +212,7 @@ def test_fly_says_when_the_true_parameters_cannot_fly_themselves(result: dr.Resu
     done = run("fly", "model.json", "--trajectory", "square", *too_heavy)
     said = json.loads(run("fly", "model.json", "--trajectory", "square", *too_heavy, "--json").stdout)
     assert done.exit_code == 0
-    assert "! the true parameters don't fly" in done.stdout
+    assert "! the flight with the true parameters failed" in done.stdout
     assert "thrust" in said["true"]["refused"]
 
 
@@ -278,7 +279,7 @@ FLY = ["fly", "model.json", "--trajectory", "square"]
         [*SIMULATE, "--outliers", "0.1"],
         [*SIMULATE, "--magnitude", "80"],
         [*SIMULATE, "--bursts", "0.1"],
-        [*SIMULATE, "--runs", "together"],
+        [*SIMULATE, "--correlated"],
         [*SIMULATE, "--leverage", "0.1", "--leverage-offset", "3"],
         [*SIMULATE, "--first-row", "dirty"],
         [*SIMULATE, "--quantisation", "x"],
@@ -297,9 +298,9 @@ def test_wrong_usage_ends_with_2(result: dr.Result, folder: Path, words: list[st
 
 
 def test_an_option_without_its_company_is_refused_in_the_command_line_s_words(folder: Path):
-    assert "--outliers means nothing without --magnitude" in run(*SIMULATE, "--outliers", 0.1).stderr
-    assert "--magnitude means nothing without --outliers or --bursts" in run(*SIMULATE, "--magnitude", 8).stderr
-    assert "--mass-imbalance is that of --plant extended-rotorcraft" in run(*SIMULATE, "--mass-imbalance", 1e-4).stderr
+    assert "--outliers needs --magnitude" in run(*SIMULATE, "--outliers", 0.1).stderr
+    assert "--magnitude needs --outliers or --bursts" in run(*SIMULATE, "--magnitude", 8).stderr
+    assert "--mass-imbalance needs --plant extended-rotorcraft" in run(*SIMULATE, "--mass-imbalance", 1e-4).stderr
 
 
 @pytest.mark.parametrize(
@@ -361,7 +362,7 @@ def test_interrupt_ends_with_130_and_writes_nothing(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("diransac.cli.flights.fly", interrupt)
+    monkeypatch.setattr("diransac.cli.flight_runs.fly", interrupt)
     before = contents(folder)
     done = run(*words)
     assert (done.exit_code, done.stderr) == (130, "interrupted\n")
@@ -379,7 +380,7 @@ def test_interrupt_ends_with_130_and_writes_nothing(
 def test_outputs_are_checked_before_the_work(
     result: dr.Result, folder: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], message: str
 ):
-    monkeypatch.setattr("diransac.cli.flights.tvlqr", lambda *_, **__: pytest.fail("the work has begun"))
+    monkeypatch.setattr("diransac.cli.flight_runs.tvlqr", lambda *_, **__: pytest.fail("the work has begun"))
     Path("folder.csv").mkdir()
     Path("link.png").symlink_to("model.json")
     before = contents(folder)

@@ -120,7 +120,7 @@ def test_a_controller_stays_what_it_is_before_its_start_and_after_its_end(how):
 
 def test_a_time_grid_that_makes_no_sense_is_refused():
     controller = controller_of()
-    with pytest.raises(SettingsError, match="how is 'cubic'; a controller can \"hold\""):
+    with pytest.raises(SettingsError, match="how is 'cubic'; choose \"hold\""):
         controller.at(controller.time, "cubic")
     for time in ([0.3, 0.2], [0.0, 0.1, 0.3], [0.1], [[0.0, 0.1]], [0.0, np.nan]):
         with pytest.raises(SettingsError, match="time must increase evenly"):
@@ -160,19 +160,19 @@ def test_the_final_weight_is_a_second_of_the_running_one_by_default():
 @pytest.mark.parametrize(
     ("weights", "message"),
     [
-        ({"Q": {"y": 1.0}}, 'Q weighs "y", which is none of x, z, theta, x_dot, z_dot, theta_dot'),
+        ({"Q": {"y": 1.0}}, 'Q weighs "y"; there are x, z, theta, x_dot, z_dot, theta_dot'),
         ({"R": {"thrust": 1.0}}, "R must be positive definite: each input needs a positive weight"),
         ({"R": 0.0}, "R must be positive definite"),
-        ({"R": [[1.0, 2.0], [2.0, 1.0]]}, "R must weigh no direction negatively; its smallest eigenvalue is -1"),
-        ({"Q": -1.0}, "Q must weigh no direction negatively; its smallest eigenvalue is -1"),
-        ({"Qf": [1.0, 1, 1, 1, 1, -0.5]}, "Qf must weigh no direction negatively"),
+        ({"R": [[1.0, 2.0], [2.0, 1.0]]}, "R must be positive semidefinite; its smallest eigenvalue is -1"),
+        ({"Q": -1.0}, "Q must be positive semidefinite; its smallest eigenvalue is -1"),
+        ({"Qf": [1.0, 1, 1, 1, 1, -0.5]}, "Qf must be positive semidefinite"),
         ({"Q": np.eye(5)}, r"Q must be a matrix \(6, 6\), its diagonal \(6,\), one number.*found shape \(5, 5\)"),
         ({"R": np.ones(3)}, r"R must be a matrix \(2, 2\)"),
         ({"R": [[1.0, 0.5], [0.0, 1.0]]}, "R must be finite and symmetric"),
         ({"Q": np.full(6, np.nan)}, "Q must be finite and symmetric"),
         ({"Q": {"x": np.inf}}, "Q must be finite and symmetric"),
-        ({"Q": "heavy"}, "Q is 'heavy', which is no array of numbers"),
-        ({"Q": [[1.0], [1.0, 2.0]]}, "which is no array of numbers"),
+        ({"Q": "heavy"}, "Q is 'heavy', which is not an array of numbers"),
+        ({"Q": [[1.0], [1.0, 2.0]]}, "which is not an array of numbers"),
         ({"limits": {"lift": (0.0, 1.0)}}, 'limits name "lift"; inputs are thrust, moment'),
         ({"limits": {"thrust": (2.0, 1.0)}}, r"each must be \(lowest, highest\)"),
         ({"limits": {"thrust": 2.0}}, r"each must be \(lowest, highest\)"),
@@ -244,7 +244,7 @@ def test_a_trajectory_of_another_model_is_refused():
 def test_a_model_without_inputs_cannot_be_steered():
     falling = dr.Model("falling", {"z": "m"}, {}, {"g": dr.Parameter()}, lambda q, v, a, u, p: [a.z + p.g])
     trajectory = dr.Trajectory(np.arange(5), np.zeros((5, 2)), np.zeros((5, 0)))
-    with pytest.raises(SettingsError, match='"falling" has no inputs; there is nothing to steer it with'):
+    with pytest.raises(SettingsError, match='"falling" has no inputs; a controller needs at least one'):
         dr.tvlqr(Plant(falling, {"g": 9.81}), trajectory)
 
 

@@ -186,9 +186,9 @@ def test_what_does_not_fit_together_is_refused():
         fly(MODEL, REFERENCE, STEERING)
     with pytest.raises(SettingsError, match="the plants' equations differ"):
         fly_batch([extended_rotorcraft(phase="instantaneous"), DISTURBED], [STEERING, STEERING])
-    with pytest.raises(SettingsError, match="of different lengths, steps or limits"):
+    with pytest.raises(SettingsError, match="controllers differ in length, time step or limits"):
         fly_batch([TRUE, TRUE], [STEERING, STEERING.at(REFERENCE.time[:100])])
-    with pytest.raises(SettingsError, match="2 plants, 1 controllers and 2 seeds do not make flights"):
+    with pytest.raises(SettingsError, match="2 plants, 1 controllers and 2 seeds do not match"):
         fly_batch([TRUE, TRUE], [STEERING])
     with pytest.raises(SettingsError, match='initial_state names "y"; states are x, z'):
         fly(TRUE, REFERENCE, STEERING, initial_state={"y": 1.0})

@@ -82,7 +82,7 @@ def test_scipy_serves_models_that_are_not_affine_in_their_parameters(method):
 
 def test_output_error_leaves_out_what_is_missing_and_bears_some_outliers():
     plant = studies.study_of("pendulum").plant.plant
-    swinging = dr.sines(plant, seed=5, amplitude=0.8, frequency=0.7)
+    swinging = dr.multisine(plant, seed=5, amplitude=0.8, frequency=0.7)
     log = dr.fly(plant, swinging, dr.tvlqr(plant, swinging), substeps=20)
     noise = dr.Noise(outlier_probability=0.02, outlier_magnitude=5.0, dropout_probability=0.01)
     spoilt = dr.corrupt(log, noise, 1)

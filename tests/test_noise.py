@@ -12,7 +12,8 @@ from diransac.data import preprocessing as prepare
 from diransac.data.log import Log
 from diransac.data.readers import read_log
 from diransac.errors import LogError, SettingsError
-from diransac.flight.corruption import CorruptedLog, Noise, corrupt
+from diransac.flight.corruption import CorruptedLog, corrupt
+from diransac.flight.noise import Noise
 from diransac.model.library import planar_rotorcraft
 
 N, DT = 4000, 0.01
@@ -31,15 +32,15 @@ OUTLIERS = Noise(outlier_probability=0.1, outlier_magnitude=80.0)
 FAULTS = {
     "outliers": OUTLIERS,
     "bursts": Noise(burst_probability=0.01, outlier_magnitude=3.0),
-    "frozen": Noise(freeze_probability=0.02),
+    "frozen": Noise(stuck_probability=0.02),
     "dropouts": Noise(dropout_probability=0.01, dropout_length=5.0),
     "leverage": Noise(leverage_probability=0.5, leverage_offset=4.0, leverage_signal="thrust"),
-    "no first row spared": Noise(outlier_probability=0.5, outlier_magnitude=1.0, first_row="hit"),
+    "no first row spared": Noise(outlier_probability=0.5, outlier_magnitude=1.0, first_row="corrupted"),
     "all": Noise(
         outlier_probability=0.05,
         outlier_magnitude=10.0,
         burst_probability=0.003,
-        freeze_probability=0.003,
+        stuck_probability=0.003,
         dropout_probability=0.003,
         leverage_probability=0.2,
         leverage_offset=-2.0,
@@ -74,7 +75,7 @@ def differs(a, b):
 
 def errors(log, noise, seed=0, signals=None):
     corrupted = corrupt(log, noise, seed, signals=signals)
-    return {name: corrupted[name] - log[name] for name in corrupted.planted}
+    return {name: corrupted[name] - log[name] for name in corrupted.fault_mask}
 
 
 def in_binomial_interval(count, n, p):
@@ -95,8 +96,8 @@ def test_no_noise_leaves_every_sample_as_it_is():
     clean = corrupt(log, Noise(), seed=5)
     assert all(np.array_equal(clean[name], log[name]) for name in log.names)
     assert np.array_equal(clean.time, log.time)
-    assert set(clean.planted) == set(SIGNALS)
-    assert not any(mask.any() for mask in clean.planted.values())
+    assert set(clean.fault_mask) == set(SIGNALS)
+    assert not any(mask.any() for mask in clean.fault_mask.values())
     assert clean.notes == log.notes
 
 
@@ -114,7 +115,7 @@ def test_inputs_and_time_are_never_touched(noise):
     corrupted = corrupt(log, noise)
     assert np.array_equal(corrupted["thrust"], log["thrust"])
     assert np.array_equal(corrupted.time, log.time)
-    assert "thrust" not in corrupted.planted
+    assert "thrust" not in corrupted.fault_mask
 
 
 def test_history_and_notes_tell_what_was_done():
@@ -124,9 +125,9 @@ def test_history_and_notes_tell_what_was_done():
     assert step["seed"] == 3
     assert step["noise"] == {"outlier_probability": 0.1, "outlier_magnitude": 80.0}
     assert step["signals"] == list(SIGNALS)
-    assert step["planted"]["x"] == corrupted.planted["x"].sum()
-    total = sum(int(mask.sum()) for mask in corrupted.planted.values())
-    assert corrupted.notes[-1] == f"corrupted on purpose (seed 3): {total} of {6 * N} samples have faults"
+    assert step["faults"]["x"] == corrupted.fault_mask["x"].sum()
+    total = sum(int(mask.sum()) for mask in corrupted.fault_mask.values())
+    assert corrupted.notes[-1] == f"corrupted by simulation (seed 3): {total} of {6 * N} samples have faults"
 
 
 # ---------------------------------------------------------------------- which signals
@@ -135,22 +136,22 @@ def test_history_and_notes_tell_what_was_done():
 def test_signals_are_told_from_inputs_by_their_names():
     columns = {"qw": T, "wx": T, "wx_dot": T, "x": T, "x_ddot": T, "z_dot": T, "torque": T, "rotor_speed": T}
     corrupted = corrupt(Log.from_arrays(T, columns), OUTLIERS)
-    assert set(corrupted.planted) == {"wx", "wx_dot", "x", "x_ddot", "z_dot"}
+    assert set(corrupted.fault_mask) == {"wx", "wx_dot", "x", "x_ddot", "z_dot"}
 
 
 def test_signals_can_be_named():
     log = flight()
     corrupted = corrupt(log, OUTLIERS, signals=["thrust", "x"])
-    assert set(corrupted.planted) == {"thrust", "x"}
-    assert corrupted.planted["thrust"].any()
+    assert set(corrupted.fault_mask) == {"thrust", "x"}
+    assert corrupted.fault_mask["thrust"].any()
     assert np.array_equal(corrupted["x_dot"], log["x_dot"])
 
 
 def test_a_log_without_derivatives_asks_for_names():
     log = Log.from_arrays(T, {"position": T, "force": T}, source="log 7")
-    with pytest.raises(LogError, match=r"log 7: no name ends in _dot .* found position, force: .* signals="):
+    with pytest.raises(LogError, match=r"log 7: no name ends in _dot .* found position, force; .* signals="):
         corrupt(log, OUTLIERS)
-    assert set(corrupt(log, OUTLIERS, signals=["position"]).planted) == {"position"}
+    assert set(corrupt(log, OUTLIERS, signals=["position"]).fault_mask) == {"position"}
 
 
 # ---------------------------------------------------------------------- Gaussian noise
@@ -160,7 +161,7 @@ def test_a_log_without_derivatives_asks_for_names():
 def test_gaussian_noise_has_the_stated_variance_at_every_order(dt):
     n = 20_000
     zero = Log.from_arrays(np.arange(n) * dt, dict.fromkeys(UNITS, np.zeros(n)), UNITS)
-    found = errors(zero, Noise(acceleration_std=2.5, rate_std=0.4, first_row="hit"), seed=1)
+    found = errors(zero, Noise(acceleration_std=2.5, rate_std=0.4, first_row="corrupted"), seed=1)
     stds = {
         "x_ddot": 2.5,
         "x_dot": 2.5 * dt,
@@ -179,7 +180,7 @@ def test_gaussian_noise_has_the_stated_variance_at_every_order(dt):
 
 def test_gaussian_noise_is_no_fault():
     corrupted = corrupt(flight(), Noise(acceleration_std=1.0, rate_std=1.0, quantisation=0.01))
-    assert not any(mask.any() for mask in corrupted.planted.values())
+    assert not any(mask.any() for mask in corrupted.fault_mask.values())
 
 
 def test_acceleration_and_rate_noise_keep_to_their_signals():
@@ -189,7 +190,7 @@ def test_acceleration_and_rate_noise_keep_to_their_signals():
     assert {name for name, error in only_angular.items() if error.any()} == {"theta", "theta_dot", "theta_ddot"}
     no_angular_acceleration = errors(flight(), Noise(rate_std=1.0, angular_acceleration_std=0.0))
     assert {name for name, error in no_angular_acceleration.items() if error.any()} == {"theta", "theta_dot"}
-    given = errors(flight(), Noise(angular_acceleration_std=3.0, first_row="hit"))
+    given = errors(flight(), Noise(angular_acceleration_std=3.0, first_row="corrupted"))
     assert {name for name, error in given.items() if error.any()} == {"theta_ddot"}
     assert has_variance(given["theta_ddot"], 9.0)
 
@@ -210,12 +211,14 @@ def test_gaussian_noise_needs_units_and_says_where_from():
         corrupt(flight(units={**UNITS, "x": "V"}), Noise(rate_std=1.0))
     with_units = dataclasses.replace(log, units=planar_rotorcraft().units)
     assert errors(with_units, Noise(acceleration_std=1.0))["x_ddot"].any()
-    assert corrupt(log, OUTLIERS).planted["x"].any()  # outliers need none
+    assert corrupt(log, OUTLIERS).fault_mask["x"].any()  # outliers need none
 
 
 def test_random_walk_integrates_the_very_errors_of_the_acceleration():
     log = Log.from_arrays(T, dict.fromkeys(UNITS, np.zeros(N)), UNITS)
-    found = errors(log, Noise(acceleration_std=2.0, rate_std=0.3, integrated="random-walk", first_row="hit"), seed=2)
+    found = errors(
+        log, Noise(acceleration_std=2.0, rate_std=0.3, integrated="random-walk", first_row="corrupted"), seed=2
+    )
     walked = np.zeros((N, 3))
     v, x, angle = 0.0, 0.0, 0.0
     for k in range(N):
@@ -240,28 +243,28 @@ def test_random_walk_spreads_with_the_square_root_of_time():
 
 
 @pytest.mark.parametrize("noise", FAULTS.values(), ids=FAULTS)
-def test_planted_is_exactly_where_the_log_differs_from_the_clean_one(noise):
+def test_the_fault_mask_is_exactly_where_the_log_differs_from_the_clean_one(noise):
     log = flight()
     corrupted = corrupt(log, noise, seed=11)
     for name in SIGNALS:
-        assert np.array_equal(corrupted.planted[name], differs(corrupted[name], log[name])), name
-        assert corrupted.planted[name].any(), name
+        assert np.array_equal(corrupted.fault_mask[name], differs(corrupted[name], log[name])), name
+        assert corrupted.fault_mask[name].any(), name
 
 
-def test_planted_compares_with_what_would_have_been_recorded_without_faults():
+def test_the_fault_mask_compares_with_what_would_have_been_recorded_without_faults():
     measuring = Noise(acceleration_std=0.3, rate_std=0.1, quantisation=0.001, delay=0.025)
     faults = dataclasses.asdict(FAULTS["all"])
     both = dataclasses.replace(FAULTS["all"], **measuring.changed)
     assert {**faults, **measuring.changed} == dataclasses.asdict(both)
     without, with_faults = corrupt(flight(), measuring), corrupt(flight(), both)
     for name in SIGNALS:
-        assert np.array_equal(with_faults.planted[name], differs(with_faults[name], without[name]))
+        assert np.array_equal(with_faults.fault_mask[name], differs(with_faults[name], without[name]))
 
 
 @pytest.mark.parametrize("probability", [0.05, 0.1, 0.5])
 def test_outliers_strike_each_sample_with_the_stated_probability(probability):
     corrupted = corrupt(flight(), Noise(outlier_probability=probability, outlier_magnitude=80.0), seed=4)
-    masks = np.array([corrupted.planted[name] for name in SIGNALS])
+    masks = np.array([corrupted.fault_mask[name] for name in SIGNALS])
     for mask in masks:
         assert in_binomial_interval(mask[1:].sum(), N - 1, probability)
         assert in_binomial_interval((mask[1:-1] & mask[2:]).sum(), N - 2, probability**2)
@@ -273,13 +276,13 @@ def test_outliers_are_uniform_between_plus_and_minus_the_magnitude():
     log = flight(20_000)
     corrupted = corrupt(log, OUTLIERS, seed=6)
     for name in SIGNALS:
-        added = (corrupted[name] - log[name])[corrupted.planted[name]]
+        added = (corrupted[name] - log[name])[corrupted.fault_mask[name]]
         assert stats.kstest(added, stats.uniform(-80.0, 160.0).cdf).pvalue > ALPHA
 
 
 def test_outliers_of_no_size_are_no_faults():
     corrupted = corrupt(flight(), Noise(outlier_probability=0.5, outlier_magnitude=0.0))
-    assert not any(mask.any() for mask in corrupted.planted.values())
+    assert not any(mask.any() for mask in corrupted.fault_mask.values())
 
 
 def in_a_run(probability, length, row):
@@ -293,7 +296,7 @@ def test_runs_start_and_last_as_stated(probability, length):
     noise = Noise(dropout_probability=probability, dropout_length=length)
     rows = [300, 1200, 2100, 3000]
     log = flight()
-    hits = np.array([corrupt(log, noise, seed, signals=["x"]).planted["x"] for seed in range(150)])
+    hits = np.array([corrupt(log, noise, seed, signals=["x"]).fault_mask["x"] for seed in range(150)])
     assert not hits[:, 0].any()
     # Rows that far apart share no run but by a chance of exp(-9).
     for row in rows:
@@ -313,7 +316,7 @@ def test_runs_start_and_last_as_stated(probability, length):
 def test_bursts_are_runs_of_outliers_each_of_its_own_size():
     log = flight(20_000)
     corrupted = corrupt(log, Noise(burst_probability=0.002, burst_length=30.0, outlier_magnitude=5.0), seed=1)
-    mask = corrupted.planted["x"]
+    mask = corrupted.fault_mask["x"]
     added = (corrupted["x"] - log["x"])[mask]
     assert mask.sum() > 500
     assert stats.kstest(added, stats.uniform(-5.0, 10.0).cdf).pvalue > ALPHA
@@ -322,8 +325,8 @@ def test_bursts_are_runs_of_outliers_each_of_its_own_size():
 
 def test_frozen_samples_repeat_the_last_good_one():
     log = flight()
-    corrupted = corrupt(log, Noise(freeze_probability=0.02, freeze_length=8.0))
-    values, mask = corrupted["x"], corrupted.planted["x"]
+    corrupted = corrupt(log, Noise(stuck_probability=0.02, stuck_length=8.0))
+    values, mask = corrupted["x"], corrupted.fault_mask["x"]
     last = log["x"][0]
     for k in range(N):
         if not mask[k]:
@@ -335,25 +338,25 @@ def test_frozen_samples_repeat_the_last_good_one():
 def test_a_frozen_sample_of_a_signal_that_rests_is_right_and_unmarked():
     staircase = np.floor(T)
     log = Log.from_arrays(T, {"x_dot": staircase})
-    corrupted = corrupt(log, Noise(freeze_probability=0.05, freeze_length=20.0))
-    mask = corrupted.planted["x_dot"]
+    corrupted = corrupt(log, Noise(stuck_probability=0.05, stuck_length=20.0))
+    mask = corrupted.fault_mask["x_dot"]
     assert np.array_equal(mask, corrupted["x_dot"] != staircase)
     assert 0 < mask.sum() < 0.3 * N  # of the rows, 63 % lie in runs
 
 
-def test_dropouts_are_nan_and_those_that_were_missing_already_are_not_planted():
+def test_dropouts_are_nan_and_those_that_were_missing_already_are_no_faults():
     holes = np.where(np.arange(N) % 10 == 3, np.nan, T)
     corrupted = corrupt(Log.from_arrays(T, {"x_dot": holes}), Noise(dropout_probability=0.02))
-    mask = corrupted.planted["x_dot"]
+    mask = corrupted.fault_mask["x_dot"]
     assert mask.any()
     assert np.array_equal(np.isnan(corrupted["x_dot"]), np.isnan(holes) | mask)
     assert not (mask & np.isnan(holes)).any()
 
 
-def test_runs_strike_together_or_each_signal_on_its_own():
+def test_runs_are_correlated_or_each_signal_has_its_own():
     noise = Noise(dropout_probability=0.01)
-    apart = corrupt(flight(), noise).planted
-    together = corrupt(flight(), dataclasses.replace(noise, runs="together")).planted
+    apart = corrupt(flight(), noise).fault_mask
+    together = corrupt(flight(), dataclasses.replace(noise, correlated=True)).fault_mask
     assert all(np.array_equal(together[name], together["x"]) for name in SIGNALS)
     assert len({apart[name].tobytes() for name in SIGNALS}) == len(SIGNALS)
 
@@ -366,12 +369,12 @@ def test_leverage_strikes_high_inputs_only_and_to_one_side(offset):
         leverage_offset=offset,
         leverage_signal="thrust",
         leverage_quantile=0.8,
-        first_row="hit",
+        first_row="corrupted",
     )
     corrupted = corrupt(log, noise)
     high = log["thrust"] > np.sort(log["thrust"])[int(0.8 * 20_000)]
     for name in SIGNALS:
-        mask = corrupted.planted[name]
+        mask = corrupted.fault_mask[name]
         assert not mask[log["thrust"] < np.sort(log["thrust"])[int(0.8 * 20_000) - 1]].any()
         assert in_binomial_interval(mask[high].sum(), high.sum(), 0.5)
         share = (corrupted[name] - log[name])[mask] / offset
@@ -381,7 +384,9 @@ def test_leverage_strikes_high_inputs_only_and_to_one_side(offset):
 
 def test_leverage_counts_an_input_by_its_size():
     log = Log.from_arrays(T, {"x_dot": T, "moment": np.where(np.arange(N) % 2, -3.0, 1.0) + T / 1000.0})
-    mask = corrupt(log, Noise(leverage_probability=1.0, leverage_offset=1.0, leverage_signal="moment")).planted["x_dot"]
+    mask = corrupt(log, Noise(leverage_probability=1.0, leverage_offset=1.0, leverage_signal="moment")).fault_mask[
+        "x_dot"
+    ]
     assert mask.any()
     assert (log["moment"][mask] < 0.0).all()
 
@@ -389,7 +394,7 @@ def test_leverage_counts_an_input_by_its_size():
 # ---------------------------------------------------------------------- the first row
 
 
-def test_a_clean_first_row_is_spared_and_a_hit_one_is_not():
+def test_a_clean_first_row_is_spared_and_a_corrupted_one_is_not():
     everything = FAULTS["all"].changed | {
         "outlier_probability": 0.9,
         "acceleration_std": 1.0,
@@ -400,18 +405,18 @@ def test_a_clean_first_row_is_spared_and_a_hit_one_is_not():
     for seed in range(20):
         corrupted = corrupt(log, Noise(**everything, first_row="clean"), seed)
         assert all(corrupted[name][0] == log[name][0] for name in SIGNALS)
-        assert not any(corrupted.planted[name][0] for name in SIGNALS)
+        assert not any(corrupted.fault_mask[name][0] for name in SIGNALS)
     first = [
-        corrupt(log, Noise(outlier_probability=0.5, outlier_magnitude=1.0, first_row="hit"), seed)
+        corrupt(log, Noise(outlier_probability=0.5, outlier_magnitude=1.0, first_row="corrupted"), seed)
         for seed in range(200)
     ]
-    assert in_binomial_interval(sum(log.planted["x"][0] for log in first), 200, 0.5)
+    assert in_binomial_interval(sum(log.fault_mask["x"][0] for log in first), 200, 0.5)
 
 
 def test_the_first_row_rule_changes_no_other_row():
-    noise = dataclasses.replace(FAULTS["all"], acceleration_std=1.0, rate_std=0.1, freeze_probability=0.0)
+    noise = dataclasses.replace(FAULTS["all"], acceleration_std=1.0, rate_std=0.1, stuck_probability=0.0)
     clean = corrupt(flight(), noise)
-    hit = corrupt(flight(), dataclasses.replace(noise, first_row="hit"))
+    hit = corrupt(flight(), dataclasses.replace(noise, first_row="corrupted"))
     assert all(same(clean[name][1:], hit[name][1:]) for name in SIGNALS)
 
 
@@ -427,7 +432,7 @@ def test_delayed_signals_are_the_sine_of_an_earlier_time(delay):
     whole = abs(delay / DT - round(delay / DT)) < 1e-9
     assert abs(late["x"] - np.sin(2.0 * (late.time - delay))).max() < (1e-12 if whole else 4.0 * DT**2 / 8.0)
     assert np.array_equal(late["thrust"], log["thrust"][-len(late) :])
-    assert not any(mask.any() for mask in late.planted.values())
+    assert not any(mask.any() for mask in late.fault_mask.values())
 
 
 def test_a_delay_longer_than_the_log_says_so():
@@ -456,8 +461,8 @@ def test_quantisation_by_one_number_is_a_fraction_of_each_range():
 def test_outliers_come_after_quantisation():
     corrupted = corrupt(flight(), Noise(quantisation={"x": 0.1}, outlier_probability=0.2, outlier_magnitude=1.0))
     on_step = np.isclose(corrupted["x"] / 0.1, np.rint(corrupted["x"] / 0.1), atol=1e-9)
-    assert on_step[~corrupted.planted["x"]].all()
-    assert not on_step[corrupted.planted["x"]].any()
+    assert on_step[~corrupted.fault_mask["x"]].all()
+    assert not on_step[corrupted.fault_mask["x"]].any()
 
 
 # ---------------------------------------------------------------------- seeds
@@ -474,7 +479,7 @@ def test_an_effect_that_is_switched_on_leaves_the_others_draws_alone():
     added = {name: alone[name] - flight()[name] for name in SIGNALS}
     for other in (
         Noise(acceleration_std=1e-3, rate_std=1e-3),
-        Noise(freeze_probability=0.01),
+        Noise(stuck_probability=0.01),
         Noise(dropout_probability=0.01),
         Noise(burst_probability=0.01, outlier_magnitude=80.0),
         Noise(leverage_probability=0.5, leverage_offset=1.0, leverage_signal="thrust"),
@@ -483,7 +488,7 @@ def test_an_effect_that_is_switched_on_leaves_the_others_draws_alone():
         without = corrupt(flight(), other)
         both = corrupt(flight(), dataclasses.replace(other, **OUTLIERS.changed))
         for name in SIGNALS:
-            untouched = ~without.planted[name]
+            untouched = ~without.fault_mask[name]
             difference = (both[name] - without[name])[untouched]
             assert np.allclose(difference, added[name][untouched], rtol=1e-9, atol=1e-12), (other, name)
 
@@ -515,18 +520,18 @@ def test_parts_of_the_log_have_the_masks_of_their_rows():
         (corrupted.split(0.25)[1], slice(1000, None)),
     ):
         assert isinstance(part, CorruptedLog)
-        assert all(np.array_equal(part.planted[name], corrupted.planted[name][rows]) for name in SIGNALS)
+        assert all(np.array_equal(part.fault_mask[name], corrupted.fault_mask[name][rows]) for name in SIGNALS)
 
 
 def test_a_mask_follows_its_samples_through_preparation():
     corrupted = corrupt(flight(), OUTLIERS)
     scaled = prepare.scale(corrupted, {"x": 2.0})
     assert isinstance(scaled, CorruptedLog)
-    assert set(scaled.planted) == set(SIGNALS) - {"x"}
+    assert set(scaled.fault_mask) == set(SIGNALS) - {"x"}
     swapped = prepare.rename(corrupted, {"x": "theta", "theta": "x", "q": "x_dot"})
     assert isinstance(swapped, CorruptedLog)
     for new, old in (("x", "theta"), ("theta", "x"), ("q", "x_dot")):
-        assert np.array_equal(swapped.planted[new], corrupted.planted[old])
+        assert np.array_equal(swapped.fault_mask[new], corrupted.fault_mask[old])
     for other_rows in (prepare.resample(corrupted, 50.0), prepare.shift(corrupted, {"thrust": 0.02})):
         assert type(other_rows) is Log
     assert type(prepare.despike(corrupted, SIGNALS)) is Log
@@ -536,16 +541,16 @@ def test_a_mask_follows_its_samples_through_preparation():
 def test_the_masks_are_read_only_copies():
     corrupted = corrupt(flight(), OUTLIERS)
     with pytest.raises(ValueError, match="read-only"):
-        corrupted.planted["x"][0] = True
+        corrupted.fault_mask["x"][0] = True
     with pytest.raises(TypeError):
-        corrupted.planted["x"] = np.zeros(N, dtype=bool)
+        corrupted.fault_mask["x"] = np.zeros(N, dtype=bool)
 
 
 def test_masks_that_fit_no_signal_are_refused():
     log = flight()
-    for planted in ({"y": np.zeros(N, bool)}, {"x": np.zeros(3, bool)}, {"x": np.zeros(N)}):
+    for fault_mask in ({"y": np.zeros(N, bool)}, {"x": np.zeros(3, bool)}, {"x": np.zeros(N)}):
         with pytest.raises(LogError, match='the mask "'):
-            CorruptedLog.of(log, planted)
+            CorruptedLog.of(log, fault_mask)
 
 
 def test_pickling_keeps_everything():
@@ -558,7 +563,7 @@ def test_pickling_keeps_everything():
         corrupted.notes,
         dict(corrupted.units),
     )
-    assert all(np.array_equal(again.planted[name], corrupted.planted[name]) for name in SIGNALS)
+    assert all(np.array_equal(again.fault_mask[name], corrupted.fault_mask[name]) for name in SIGNALS)
 
 
 def test_writing_writes_what_a_recorder_would_have(tmp_path):
@@ -572,19 +577,19 @@ def test_writing_writes_what_a_recorder_would_have(tmp_path):
 def test_corrupting_again_joins_the_masks():
     once = corrupt(flight(), OUTLIERS, seed=1, signals=["x"])
     twice = corrupt(once, Noise(dropout_probability=0.01), seed=2, signals=["x", "x_dot"])
-    assert np.array_equal(twice.planted["x"], differs(twice["x"], flight()["x"]))
-    assert np.array_equal(twice.planted["x_dot"], differs(twice["x_dot"], flight()["x_dot"]))
+    assert np.array_equal(twice.fault_mask["x"], differs(twice["x"], flight()["x"]))
+    assert np.array_equal(twice.fault_mask["x_dot"], differs(twice["x_dot"], flight()["x_dot"]))
     assert [step["seed"] for step in twice.history] == [1, 2]
 
 
 def test_a_delay_carries_masks_along_and_spreads_them_where_it_mixes_samples():
     once = corrupt(flight(), OUTLIERS, signals=["x", "theta"])
     whole = corrupt(once, Noise(delay=0.03), signals=["x"])
-    assert np.array_equal(whole.planted["x"], once.planted["x"][:-3])
-    assert np.array_equal(whole.planted["theta"], once.planted["theta"][3:])
+    assert np.array_equal(whole.fault_mask["x"], once.fault_mask["x"][:-3])
+    assert np.array_equal(whole.fault_mask["theta"], once.fault_mask["theta"][3:])
     half = corrupt(once, Noise(delay=0.025), signals=["x"])
-    mask = once.planted["x"]
-    assert np.array_equal(half.planted["x"], mask[1:-2] | mask[:-3])
+    mask = once.fault_mask["x"]
+    assert np.array_equal(half.fault_mask["x"], mask[1:-2] | mask[:-3])
 
 
 # ---------------------------------------------------------------------- senseless arguments
@@ -604,13 +609,13 @@ def test_a_delay_carries_masks_along_and_spreads_them_where_it_mixes_samples():
         ({"rate_std": "0.1"}, "rate_std is '0.1'"),
         ({"outlier_probability": True}, "outlier_probability is True"),
         ({"angular_acceleration_std": np.inf}, "angular_acceleration_std is inf"),
-        ({"freeze_length": 0.5}, "freeze_length is 0.5; give a finite number from 1, samples"),
+        ({"stuck_length": 0.5}, "stuck_length is 0.5; give a finite number from 1, samples"),
         ({"delay": -0.01}, "delay is -0.01"),
         ({"quantisation": -1.0}, "quantisation is -1.0"),
         ({"quantisation": {"x": -1.0}}, "quantisation of 'x' is -1.0"),
-        ({"first_row": "spared"}, "first_row is 'spared'; choose 'clean' or 'hit'"),
+        ({"first_row": "spared"}, "first_row is 'spared'; choose 'clean' or 'corrupted'"),
         ({"integrated": "pink"}, "integrated is 'pink'; choose 'white' or 'random-walk'"),
-        ({"runs": "both"}, "runs is 'both'"),
+        ({"correlated": "both"}, "correlated is 'both'; give True or False"),
         ({"leverage_probability": 0.1}, "no leverage_signal is named"),
         ({"leverage_signal": 3}, "leverage_signal is 3"),
     ],

@@ -7,7 +7,7 @@ import pytest
 
 import diransac as dr
 import diransac.flight.planning.solvers
-from diransac.flight.planning.flights import CORNERS, ROTORCRAFT_LIMITS
+from diransac.flight.planning.trajectories import CORNERS, ROTORCRAFT_LIMITS
 from diransac.simulation import RolloutBatch, rollouts
 from planned import LIMITS, ROTORCRAFT, across, defects, mass, rotorcraft
 from rolling import BODY, plain_step
@@ -43,7 +43,7 @@ def test_fastest_move_of_a_mass_is_bang_bang(distance, solver):
         mass(kilograms),
         waypoints=[{}, {"y": distance}],
         input_limits={"force": (-force, force)},
-        effort={"force": 0.0},
+        input_weights={"force": 0.0},
         solver=solver,
     )
     fastest = 2 * np.sqrt(distance * kilograms / force)
@@ -66,7 +66,12 @@ def test_following_a_reference_is_linear_least_squares():
         return np.sin(3.0 * t)
 
     found = dr.plan(
-        mass(1.0), reference={"y": wanted}, duration=duration, tracking={"y": weight}, effort={"force": 0.5}, rest=False
+        mass(1.0),
+        reference={"y": wanted},
+        duration=duration,
+        state_weights={"y": weight},
+        input_weights={"force": 0.5},
+        start_end_at_rest=False,
     )
     start = np.arange(n + 1) * h
     after = start[:, None] - start[None, :-1]
@@ -137,7 +142,7 @@ def test_quaternions_turn_as_a_simulation_does():
 
 
 def test_waypoints_are_met_and_limits_kept():
-    found = across(ROTORCRAFT, state_limits={"x_dot": (-9.0, 1.3), "theta": (-0.4, 0.4)}, input_share=0.5)
+    found = across(ROTORCRAFT, state_limits={"x_dot": (-9.0, 1.3), "theta": (-0.4, 0.4)}, input_limit_fraction=0.5)
     np.testing.assert_allclose(found.columns(["x", "z"])[[0, 83, 216]], [[0, 0], [0.7, 1], [2, 1]], atol=1e-6)
     np.testing.assert_allclose(found.states[[0, -1], 2:], 0.0, atol=1e-6)
     assert found["thrust"].min() >= 1.25
@@ -145,12 +150,12 @@ def test_waypoints_are_met_and_limits_kept():
     knots = np.r_[0:83:10, 83:217:10]
     assert found["x_dot"][knots].max() <= 1.3 + 1e-2  # between knots the limit isn't asked for
     assert np.abs(found["theta"]).max() <= 0.4 + 1e-2
-    assert across(ROTORCRAFT, input_share=0.5)["x_dot"].max() > 1.4
+    assert across(ROTORCRAFT, input_limit_fraction=0.5)["x_dot"].max() > 1.4
     assert dict(found.input_limits) == LIMITS
 
 
 def test_effort_on_one_input_saves_that_input():
-    plain, saving = across(ROTORCRAFT), across(ROTORCRAFT, effort={"moment": 100.0})
+    plain, saving = across(ROTORCRAFT), across(ROTORCRAFT, input_weights={"moment": 100.0})
     assert np.square(saving["moment"]).sum() < 0.9 * np.square(plain["moment"]).sum()
 
 
@@ -188,7 +193,7 @@ def test_a_nearer_plan_costs_more_effort():
         ROTORCRAFT,
         reference={"x": np.linspace(0.0, 8.0, 3), "z": lambda t: 2.0 * np.sin(np.pi * t / 3.0)},
         duration=12.0,
-        tracking={"x": 1.0, "z": 1.0},
+        state_weights={"x": 1.0, "z": 1.0},
         input_limits=LIMITS,
     ))  # fmt: skip
     reference = 2.0 * np.sin(np.pi * near.time / 3.0)

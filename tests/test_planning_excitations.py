@@ -5,7 +5,7 @@ import pytest
 from casadi import cos
 
 import diransac as dr
-from diransac.flight.planning.flights import ROTORCRAFT_LIMITS
+from diransac.flight.planning.trajectories import ROTORCRAFT_LIMITS
 from planned import ROTORCRAFT, mass
 from rolling import BODY
 
@@ -32,7 +32,7 @@ def strayed(plant, trajectory, names):
 
 @pytest.fixture(scope="module", params=[1, 6])
 def random_flight(request):
-    return request.param, dr.places(ROTORCRAFT, seed=request.param, speed=1.8, reach=3.2)
+    return request.param, dr.random_waypoints(ROTORCRAFT, seed=request.param, speed=1.8, reach=3.2)
 
 
 def test_random_places_are_met_at_the_mean_speed_from_rest_to_rest(random_flight):
@@ -67,10 +67,10 @@ def test_feedback_keeps_a_random_flight_on_its_way_though_its_inputs_are_smoothe
 
 
 def test_random_flights_end_in_time_and_differ_by_their_seeds():
-    first, second = (dr.places(ROTORCRAFT, seed=seed, duration=6.0) for seed in (0, 1))
+    first, second = (dr.random_waypoints(ROTORCRAFT, seed=seed, duration=6.0) for seed in (0, 1))
     assert max(first.time[-1], second.time[-1]) <= 6.0
     assert np.abs(first["x"][200] - second["x"][200]) > 0.05
-    np.testing.assert_array_equal(dr.places(ROTORCRAFT, seed=0, duration=6.0).states, first.states)
+    np.testing.assert_array_equal(dr.random_waypoints(ROTORCRAFT, seed=0, duration=6.0).states, first.states)
 
 
 # ---------------------------------------------------------------------- sums of sines
@@ -79,7 +79,7 @@ def test_random_flights_end_in_time_and_differ_by_their_seeds():
 @pytest.mark.parametrize("plant", [AXIS, DOUBLE], ids=["servo-axis", "double-pendulum"])
 def test_the_equations_of_motion_hold_along_sines(plant):
     """With velocities and accelerations by differences of the positions alone."""
-    found, n = dr.sines(plant, seed=4, amplitude=0.3, frequency=0.9, duration=4.0), plant.model.n_q
+    found, n = dr.multisine(plant, seed=4, amplitude=0.3, frequency=0.9, duration=4.0), plant.model.n_q
     q, h = found.states[:, :n], found.dt
 
     def slope(y):
@@ -100,12 +100,12 @@ def test_the_equations_of_motion_hold_along_sines(plant):
 
 @pytest.mark.parametrize("plant", [AXIS, DOUBLE], ids=["servo-axis", "double-pendulum"])
 def test_feedback_keeps_a_plant_on_its_sines(plant):
-    found = dr.sines(plant, seed=4, amplitude=0.3, frequency=0.9, duration=4.0)
+    found = dr.multisine(plant, seed=4, amplitude=0.3, frequency=0.9, duration=4.0)
     assert strayed(plant, found, plant.model.coordinates) < 0.01 * 0.3
 
 
 def test_sines_are_as_large_as_they_say_and_keep_below_their_frequency():
-    found = [dr.sines(mass(), seed=seed, amplitude=0.3, frequency=2.0, duration=50.0)["y"] for seed in range(20)]
+    found = [dr.multisine(mass(), seed=seed, amplitude=0.3, frequency=2.0, duration=50.0)["y"] for seed in range(20)]
     assert np.sqrt(np.mean(np.square(found))) == pytest.approx(0.66 * 0.3, rel=0.1)
     assert np.abs(found).max() <= 5 * 0.6 * 0.3
     power = np.mean(np.abs(np.fft.rfft(found * np.hanning(len(found[0])), axis=1)) ** 2, axis=0)
@@ -115,7 +115,7 @@ def test_sines_are_as_large_as_they_say_and_keep_below_their_frequency():
 
 
 def test_sines_differ_by_their_seeds_and_last_as_long_as_they_should():
-    first, second = (dr.sines(mass(), seed=seed, duration=3.0) for seed in (0, 1))
+    first, second = (dr.multisine(mass(), seed=seed, duration=3.0) for seed in (0, 1))
     assert first.time[-1] == pytest.approx(3.0)
     assert np.abs(first.states - second.states).max() > 0.1
 
@@ -138,8 +138,8 @@ def weak(equation):
     ids=["fewer inputs", "quaternion", "square of an input", "an input of no effect"],
 )
 def test_sines_are_refused_where_inputs_cannot_push_every_coordinate(plant):
-    with pytest.raises(dr.SettingsError, match=r'model ".*" is not fully actuated: its inputs \(.*plan a flight'):
-        dr.sines(plant)
+    with pytest.raises(dr.SettingsError, match=r'model ".*" is not fully actuated: its inputs \(.*diransac\.plan'):
+        dr.multisine(plant)
 
 
 @pytest.mark.parametrize(
@@ -149,18 +149,23 @@ def test_sines_are_refused_where_inputs_cannot_push_every_coordinate(plant):
         ({"reach": -1.0}, "reach is -1.0"),
         ({"duration": np.inf}, "duration is inf; give 0.01 to 3600 s"),
         ({"seed": -1}, "seed is -1; give a whole number of at least 0"),
-        ({"duration": 1.0, "seed": 1}, "first place is 1.* s away at 1.6 m/s, and the flight lasts 1 s; give more"),
+        (
+            {"duration": 1.0, "seed": 1},
+            "first waypoint is 1.* s away at 1.6 m/s, and the trajectory lasts 1 s; give more",
+        ),
         ({"reach": 0.5}, "within a reach of 0.5 m are too near for a speed of 1.6 m/s.*give a reach of 1.6 m or more"),
     ],
 )
 def test_random_flights_that_make_no_sense_are_refused(wrong, message):
     with pytest.raises(dr.SettingsError, match=message):
-        dr.places(ROTORCRAFT, **wrong)
+        dr.random_waypoints(ROTORCRAFT, **wrong)
 
 
 def test_random_places_are_refused_where_there_is_no_plane():
-    with pytest.raises(dr.SettingsError, match=r'places are flown in x and z; model "mass" has no coordinate x'):
-        dr.places(mass())
+    with pytest.raises(
+        dr.SettingsError, match=r'random_waypoints are planned in x and z; model "mass" has no coordinate x'
+    ):
+        dr.random_waypoints(mass())
 
 
 @pytest.mark.parametrize(
@@ -176,4 +181,4 @@ def test_random_places_are_refused_where_there_is_no_plane():
 )
 def test_sines_that_make_no_sense_are_refused(wrong, message):
     with pytest.raises(dr.SettingsError, match=message):
-        dr.sines(mass(), **wrong)
+        dr.multisine(mass(), **wrong)

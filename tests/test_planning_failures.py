@@ -70,7 +70,9 @@ def test_parameters_that_are_odd_end_in_a_plan_or_a_sentence(changes):
 
 def test_no_input_holds_a_falling_body():
     falling = dr.Model("stone", {"y": "m"}, {"spin": "N"}, {"g": dr.Parameter()}, lambda q, v, a, u, p: [a.y + p.g])
-    with pytest.raises(PlanningError, match="no inputs make y_ddot zero; start elsewhere, or say with trim="):
+    with pytest.raises(
+        PlanningError, match="no inputs make y_ddot zero; start elsewhere, or give the inputs of zero cost with trim="
+    ):
         dr.plan(dr.Plant(falling, {"g": 9.81}), waypoints=[{}, {"y": 1.0}], times=[0.0, 1.0])
 
 
@@ -79,7 +81,11 @@ def test_trim_may_be_given_where_there_is_none():
                       lambda q, v, a, u, p: [a.x - u.push, a.y + p.g])  # fmt: skip
     start, end = {"x": 0.0, "x_dot": 0.0, "y": 0.0, "y_dot": 9.81}, {"x": 1.0}
     found = dr.plan(
-        dr.Plant(thrown, {"g": 9.81}), waypoints=[start, end], times=[0.0, 2.0], trim={"push": 0.0}, rest=False
+        dr.Plant(thrown, {"g": 9.81}),
+        waypoints=[start, end],
+        times=[0.0, 2.0],
+        trim={"push": 0.0},
+        start_end_at_rest=False,
     )
     assert found["y"].max() == pytest.approx(9.81 / 2, rel=1e-6)
 
@@ -117,12 +123,12 @@ SENSELESS = {
     "unknown reference": ({"reference": {"x": np.sin}, "duration": 1.0}, 'reference: there is no state "x"'),
     "NaN reference": ({"reference": {"y": lambda t: t * np.nan}, "duration": 1.0}, "NaN"),
     "one sample": ({"reference": {"y": [1.0]}, "duration": 1.0}, "at least 2 samples"),
-    "weight without reference": ({"waypoints": TWO, "times": [0, 1], "tracking": {"y": 1.0}}, "has no reference"),
-    "negative weight": ({"waypoints": TWO, "times": [0, 1], "effort": {"force": -1.0}}, "at least 0"),
+    "weight without reference": ({"waypoints": TWO, "times": [0, 1], "state_weights": {"y": 1.0}}, "has no reference"),
+    "negative weight": ({"waypoints": TWO, "times": [0, 1], "input_weights": {"force": -1.0}}, "at least 0"),
     "unknown input": ({"waypoints": TWO, "input_limits": {"push": (0, 1)}}, 'there is no input "push"'),
     "limits upside down": ({"waypoints": TWO, "input_limits": {"force": (1, 0)}}, "must be .lowest, highest."),
     "waypoint out of limits": ({"waypoints": TWO, "state_limits": {"y": (0, 0.5)}}, "move the waypoint or the limits"),
-    "no share": ({"waypoints": TWO, "input_share": 0.0}, "above 0 and at most 1"),
+    "no share": ({"waypoints": TWO, "input_limit_fraction": 0.0}, "above 0 and at most 1"),
     "unknown solver": ({"waypoints": TWO, "solver": "best"}, "choose one of ipopt, fatrop, snopt"),
     "negative time weight": ({"waypoints": TWO, "time_weight": -1.0}, "time_weight"),
     "unknown trim": ({"waypoints": TWO, "trim": {"push": 1.0}}, 'there is no input "push"'),
@@ -137,7 +143,7 @@ def test_senseless_arguments_are_refused_by_name(options, words):
 
 
 @pytest.mark.parametrize(
-    ("first", "words"), [({}, "which way the plant points"), ({**HOME, "q0": 0.5}, "its length is 0.5, not 1")]
+    ("first", "words"), [({}, "leaves the attitude open"), ({**HOME, "q0": 0.5}, "its norm is 0.5, not 1")]
 )
 def test_quaternions_must_be_said_and_be_ones(first, words):
     plant = dr.Plant(BODY, {"p0": 1.0, "p1": 1.5, "p2": 2.0})

@@ -193,15 +193,15 @@ STATE = {"states": {"s": "m"}, "rates": lambda *_: {"s": 0.0}}
         ({"forces": lambda q, v, u, p, d: {"x": d.k}}, "constants and states have no 'k'; found t"),
         ({"forces": lambda q, v, u, p, d: {"x": 1.0 if q.x > 0 else 0.0}}, "forces branch on a symbol"),
         ({"forces": lambda q, v, u, p, d: {"x": float("nan")}}, "forces 1 of 2 contains NaN"),
-        ({"states": {"s": "m"}}, "states and rates need each other"),
-        ({"rates": lambda *_: {}}, "states and rates need each other"),
+        ({"states": {"s": "m"}}, "states need rates"),
+        ({"rates": lambda *_: {}}, "states need rates"),
         ({"start": {"s": 1.0}}, 'start names "s"; states are none'),
         ({**STATE, "start": {"s": [1.0, 2.0, 3.0]}}, r"s is \(1.0, 2.0, 3.0\); give a finite number"),
         ({**STATE, "start": {"s": [2, 1]}}, r"s is \(2, 1\); give the low end of a range first"),
         ({"constants": {"t": 1.0}}, "a name is used twice"),
         ({"constants": {"k": np.inf}}, "k is inf; give a finite number"),
         ({"highest_frequency": -1.0}, "highest_frequency is -1"),
-        ({"name": "a b"}, "give letters, digits and hyphens"),
+        ({"name": "a b"}, "use letters, digits and hyphens"),
     ],
 )
 def test_a_disturbance_that_makes_no_sense_is_refused(arguments, says):
@@ -221,7 +221,7 @@ def test_disturbances_of_another_model_or_of_one_name_are_refused():
     push = dr.Disturbance(MASS, "push", forces=lambda *_: {"x": 1.0})
     with pytest.raises(ModelError, match='"push" was made for model "mass", not for "planar-rotorcraft"'):
         dr.Plant(dr.models.planar_rotorcraft(), dr.models.TABLE_I, (push,))
-    with pytest.raises(ModelError, match='two disturbances are called "push"'):
+    with pytest.raises(ModelError, match='two disturbances have the name "push"'):
         dr.Plant(MASS, {"m": 1.0}, (push, push))
 
 

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
+import diransac.plots.figure
 from diransac.data.log import Log
 from diransac.errors import LogError, SettingsError
 from diransac.flight.trajectory import Trajectory
-from diransac.plots import palette, plot_flight
-from diransac.plots.palette import COLOURS, REFERENCE
+from diransac.plots import plot_flight
+from diransac.plots.figure import COLOURS, REFERENCE
 
 N, DT = 60, 0.1
 T = np.arange(N) * DT
@@ -166,13 +167,13 @@ def test_methods_have_the_colours_of_the_reports_page():
     page = dict(re.findall(r"--(\w+): (#\w+);", css))
     assert tuple(page[f"c{i}"] for i in range(6)) == COLOURS
     for name in ("PAPER", "INK", "MUTED", "RULE", "SOFT"):
-        assert page[name.lower()] == getattr(palette, name)
+        assert page[name.lower()] == getattr(diransac.plots.figure, name)
 
 
 def test_each_flight_may_have_its_own_reference():
     references = {"a": trajectory(2.0), "b": trajectory(2.5)}
     figure = plot_flight(references, {"a": flown(), "b": flown()})
-    assert "their references" in legend(figure)
+    assert "references" in legend(figure)
     for colour, reference in zip(COLOURS[:2], references.values(), strict=True):
         planned, _ = sorted(lines(panels(figure)["z"], colour), key=lambda line: -line.get_linewidth())
         assert np.array_equal(planned.get_ydata(), reference["z"])
@@ -217,7 +218,7 @@ def test_a_method_that_diverges_does_not_spoil_the_others():
 def test_a_cross_marks_where_the_numbers_end():
     ended = {name: np.where(T < 3.0, values, np.nan) for name, values in columns().items()}
     figure = plot_flight(trajectory(), Log.from_arrays(T, ended))
-    assert "its numbers end" in legend(figure)
+    assert "last finite value" in legend(figure)
     last = np.flatnonzero(T < 3.0)[-1]
     for name in STATES:
         assert marks(panels(figure)[name], "X") == [(T[last], columns()[name][last])]
@@ -228,7 +229,7 @@ def test_a_gap_is_no_end():
     gap = np.where((T > 2.0) & (T < 3.0), np.nan, columns()["x"])
     figure = plot_flight(trajectory(), flown(x=gap))
     assert not marks(panels(figure)["x"], "X")
-    assert "its numbers end" not in legend(figure)
+    assert "last finite value" not in legend(figure)
 
 
 def test_a_flight_without_any_number_leaves_the_reference():
@@ -378,8 +379,8 @@ def test_arguments_without_meaning_are_refused(tmp_path):
     for arguments, message in (
         ((reference, log, tmp_path / "a.gif"), r"its ending is not known; use one of \.png, \.svg, \.pdf"),
         ((reference, {}), "no flight to draw"),
-        (({"a": reference}, {"b": log}), "the trajectories are called a, the logs b"),
-        (({"a": reference}, log), "the trajectories are called a, the logs flown"),
+        (({"a": reference}, {"b": log}), "the trajectories have the labels a, the logs b"),
+        (({"a": reference}, log), "the trajectories have the labels a, the logs flown"),
         ((log, reference), '"flown" is a Log and a Trajectory; give a Trajectory and a Log'),
         ((Trajectory(T, np.zeros((N, 2)), np.zeros((N, 1))), log), 'of "flown" does not name its states'),
         (({"a": reference, "b": trajectory(states=STATES[:2])}, {"a": log, "b": log}), '"b" has other states'),

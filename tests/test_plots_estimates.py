@@ -11,8 +11,8 @@ from matplotlib.colors import to_hex
 from command_line import run
 from diransac.errors import SettingsError
 from diransac.plots.estimates import plot_estimates
-from diransac.plots.palette import PAPER
-from diransac.plots.rows import Row, Scale
+from diransac.plots.figure import PAPER
+from diransac.plots.rows import LogAxis, MarkRow
 from diransac.plots.study import method_looks, plot_study
 from diransac.report.study import write_study_report
 from diransac.study import load
@@ -100,8 +100,8 @@ def test_what_is_mostly_without_an_estimate_is_hollow_and_apart_and_what_is_exac
 
 def test_where_the_best_are_not_the_plants_own_there_is_a_second_row_and_the_truth_has_a_mark(store: Path):
     figure = plot_estimates(store)
-    assert [text for text in texts(figure) if text in ("clean", "pushed", "against the plant’s own")] == [
-        "clean", "pushed", "against the plant’s own",
+    assert [text for text in texts(figure) if text in ("clean", "pushed", "relative to the true ones")] == [
+        "clean", "pushed", "relative to the true ones",
     ]  # fmt: skip
     ((at, place, _),) = marks(figure.axes[0], "true")
     assert (at, 10.0**place) == (1, pytest.approx(24.5))
@@ -166,7 +166,7 @@ def test_what_is_missing_is_said_below_the_picture(store: Path):
 
 def test_an_axis_holds_all_that_is_beyond_it_in_order():
     values = np.array([0.0, 1e-9, 0.01, 3.0, 9e3, 1e12, np.inf])
-    scale = Scale.of([Row("a", values[:-1], values[1:])], -3)
+    scale = LogAxis.of([MarkRow("a", values[:-1], values[1:])], -3)
     places = scale.place(values)
     assert places[2:5] == pytest.approx(np.log10([0.01, 3.0, 9e3]))
     assert places[0] == places[1]
@@ -179,7 +179,7 @@ def test_an_axis_holds_all_that_is_beyond_it_in_order():
 
 @pytest.mark.parametrize("width", [2.0, 9.0])
 def test_names_along_an_axis_do_not_touch(width: float):
-    scale = Scale.of([Row("a", np.array([0.002, 50.0]), np.array([np.inf, 1e9]))], -3)
+    scale = LogAxis.of([MarkRow("a", np.array([0.002, 50.0]), np.array([np.inf, 1e9]))], -3)
     at = np.sort(list(scale.names(width)))
     assert len(at) > 4
     assert np.diff(at).min() * width / (scale.ends[1] - scale.ends[0]) > 0.3
@@ -249,7 +249,7 @@ def test_the_page_has_errors_of_every_parameter_and_counts_intervals(store: Path
     assert "<td>2 [40]</td>" in text
     assert "<td>∞ [∞]</td>" in text
     assert all(f"<summary>{name}</summary>" in text for name in OWN)
-    assert "… against the plant’s own" in text
+    assert "… relative to the true ones" in text
     assert "<td>0.67 of 3</td><td>–</td>" in text, "of ols: 1 and 2 % off are within 0.01 kg of 0.249, 40 % is not"
     assert "nothing &lt;was&gt; found" in text
     assert "In short" not in text
@@ -277,7 +277,7 @@ def test_the_command_draws_what_a_study_judges(store: Path, tmp_path: Path, monk
 def test_a_study_that_judges_no_parameters_draws_none(tmp_path: Path):
     with Store(tmp_path / "n.db", load(tiny())) as kept:
         kept.add([row()])
-    with pytest.raises(SettingsError, match=r"judges no parameters; run one with evaluation\.parameters = true"):
+    with pytest.raises(SettingsError, match=r"evaluates no parameters; run one with evaluation\.parameters = true"):
         plot_estimates(tmp_path / "n.db", tmp_path / "a.png")
     assert not (tmp_path / "a.png").exists()
     assert summarise(tmp_path / "n.db").estimates is None

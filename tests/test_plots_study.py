@@ -11,7 +11,7 @@ from matplotlib.colors import to_hex
 
 from command_line import contents, run
 from diransac.errors import SettingsError, StudyError
-from diransac.plots.palette import PAPER, REFERENCE
+from diransac.plots.figure import PAPER, REFERENCE
 from diransac.plots.paths import levels_with_paths, plot_paths
 from diransac.plots.study import method_looks, plot_study
 from diransac.report.study import write_study_report

@@ -217,7 +217,7 @@ def test_a_sweep_that_overflows_says_when():
         lambda q, v, a, u, p: [p.m * a.x - u.u - q.y, a.y - 1e4 * q.y],
     )  # fmt: skip
     trajectory = Trajectory(0.01 * np.arange(900), np.zeros((900, 4)), np.zeros((900, 1)))
-    with pytest.raises(PlanningError, match=r'"pulled" did not stay finite.*lost at t = [12]\.\d+ s; give R larger'):
+    with pytest.raises(PlanningError, match=r'"pulled" did not stay finite.*back from t = [12]\.\d+ s; raise R'):
         dr.tvlqr(Plant(pulled, {"m": 1.0}), trajectory)
 
 

@@ -43,7 +43,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple, dict]:
 # Each trial its own flight ------------------------------------------------------------------------------------------
 def test_rows_are_those_of_what_users_call(whole: dict):
     plant, seed = load(DRAWN).plant.plant, derived_seed(7, "40", 1)
-    flight = dr.places(plant, duration=3.0, seed=derived_seed(seed, "data plan"))
+    flight = dr.random_waypoints(plant, duration=3.0, seed=derived_seed(seed, "data plan"))
     log = dr.fly(plant, flight, dr.tvlqr(plant, flight), substeps=3)
     noise = dr.Noise(outlier_probability=0.1, outlier_magnitude=40.0)
     spoilt = dr.corrupt(log, noise, derived_seed(seed, "noise"), signals=plant.model.signals)
@@ -62,7 +62,7 @@ def test_the_data_of_a_trial_are_to_be_had_alone(whole: dict):
     result = dr.identify(dr.models.planar_rotorcraft(), data.log, "ols", settings=load(DRAWN).methods["ols"].settings)
     assert {name: row[f"parameter_{name}"] for name in NAMES} == dict(result.parameters)
     assert {name: row[f"best_{name}"] for name in NAMES} == data.best
-    assert any(samples.any() for samples in data.log.planted.values())
+    assert any(samples.any() for samples in data.log.fault_mask.values())
     assert not (data.flight["x"] == data.log["x"]).all()
     with pytest.raises(dr.SettingsError, match='no level "some" of outlier magnitude'):
         record(DRAWN, "some")

@@ -74,7 +74,7 @@ def test_runs_of_faults_strike_about_a_fifth_of_the_gauntlets_samples(name: str)
     study = load(name)
     log = dr.fly(plant := study.plant.plant, flown := study.data.planned(plant, 5), dr.tvlqr(plant, flown))
     for level in ("bursts", "frozen", "missing"):
-        shares = [np.mean([*dr.corrupt(log, study.at(level).noise, seed).planted.values()]) for seed in range(20)]
+        shares = [np.mean([*dr.corrupt(log, study.at(level).noise, seed).fault_mask.values()]) for seed in range(20)]
         assert np.mean(shares) == pytest.approx(0.2, abs=0.02)
 
 
@@ -199,7 +199,7 @@ def test_a_drawn_flight_is_that_of_its_seed_and_any_other_that_of_its_own():
     sines = {"trajectory": "sines", "duration": 0.5}
     plant = dr.Plant(dr.models.servo_axis(), {"mass": 1.0, "viscous_friction": 1.0, "dry_friction": 1.0, "offset": 1.0})
     drawn, fixed = (Flight.from_dict({**sines, "seed": seed}) for seed in ("any", 3))
-    expected = dr.sines(plant, seed=3, duration=0.5).states
+    expected = dr.multisine(plant, seed=3, duration=0.5).states
     np.testing.assert_array_equal(drawn.planned(plant, 3, time_limit=5.0).states, expected)
     np.testing.assert_array_equal(fixed.planned(plant, 8).states, expected)
     assert not np.array_equal(drawn.planned(plant, 8).states, expected)

@@ -25,8 +25,9 @@ if TYPE_CHECKING:
     from diransac.data.preprocessing import despike, differentiate, rename, resample, scale, shift
     from diransac.data.readers import read_log
     from diransac.flight.closed_loop import fly, fly_batch, tracking_error
-    from diransac.flight.corruption import CorruptedLog, Noise, corrupt
-    from diransac.flight.planning import places, plan, sine, sines, square, star
+    from diransac.flight.corruption import CorruptedLog, corrupt
+    from diransac.flight.noise import Noise
+    from diransac.flight.planning import multisine, plan, random_waypoints, sine, square, star
     from diransac.flight.trajectory import Trajectory
     from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
     from diransac.identification.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
@@ -73,9 +74,10 @@ __all__ = [
     "fly_batch",
     "identify",
     "models",
-    "places",
+    "multisine",
     "plan",
     "plot_flight",
+    "random_waypoints",
     "read_log",
     "rename",
     "resample",
@@ -83,7 +85,6 @@ __all__ = [
     "scale",
     "shift",
     "sine",
-    "sines",
     "square",
     "star",
     "tracking_error",
@@ -103,9 +104,10 @@ _FOUND_IN = {
     "identification.methods.lo_diransac": ("LoDiransac",),
     "identification.methods.ransac": ("Diransac", "IDiransac"),
     "data.log": ("Log",),
-    "flight.corruption": ("CorruptedLog", "Noise", "corrupt"),
+    "flight.corruption": ("CorruptedLog", "corrupt"),
+    "flight.noise": ("Noise",),
     "identification.nonlinear": ("NonlinearLeastSquares",),
-    "flight.planning": ("places", "plan", "sine", "sines", "square", "star"),
+    "flight.planning": ("multisine", "plan", "random_waypoints", "sine", "square", "star"),
     "plots": ("plot_flight",),
     "data.preprocessing": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
     "data.readers": ("read_log",),

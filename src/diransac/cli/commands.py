@@ -8,15 +8,15 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import load_model, model_file
-from diransac.cli.flying import (
+from diransac.cli.flight_options import (
     FlightPicture,
     FlightSeed,
     LogOutput,
+    NoiseOptions,
     OptionalLogOutput,
-    Recorder,
+    PlantOptions,
     TrajectoryArgument,
     TrajectoryOption,
-    TruePlant,
 )
 from diransac.cli.group import Group, grouped
 from diransac.cli.options import (
@@ -175,25 +175,25 @@ def _inspect(
 @grouped
 def _simulate(
     shape: TrajectoryArgument,
-    plant: TruePlant,
-    recorder: Recorder,
+    plant: PlantOptions,
+    noise_options: NoiseOptions,
     output: LogOutput,
     model: ModelName = "planar-rotorcraft",
     plot: FlightPicture = None,
     seed: FlightSeed = 0,
     as_json: JsonFlag = False,
 ) -> None:
-    """Plan a trajectory, fly it, and write the log that a bad recorder would have kept."""
-    from diransac.cli.flights import record
+    """Plan and fly a trajectory, and write its log with noise and faults."""
+    from diransac.cli.flight_runs import simulate_flight
 
-    noise = recorder.noise()
+    noise = noise_options.noise()
     with staged([output, plot], [model_file(model)]) as (written, picture):
         known = load_model(model)
-        recording = record(shape, known, plant.of(known), noise, seed)
-        recording.log.write(written)
+        simulated = simulate_flight(shape, known, plant.of(known), noise, seed)
+        simulated.log.write(written)
         if plot:
-            recording.flight.draw(picture)
-        screen.show(recording, as_json)
+            simulated.flight.draw(picture)
+        screen.show(simulated, as_json)
 
 
 @app.command("fly")
@@ -201,23 +201,23 @@ def _simulate(
 def _fly(
     model: ResultFile,
     shape: TrajectoryOption,
-    plant: TruePlant,
+    plant: PlantOptions,
     output: OptionalLogOutput = None,
     plot: FlightPicture = None,
     seed: FlightSeed = 0,
     as_json: JsonFlag = False,
 ) -> None:
-    """Plan and steer by an identified model, fly the true machine, and say how far it strays."""
-    from diransac.cli.flights import try_out
+    """Plan and control with an identified model, fly the true plant, and show the tracking error."""
+    from diransac.cli.flight_runs import fly_identified
 
     with staged([output, plot], [model]) as (written, picture):
         result = Result.load(model)
-        trial = try_out(shape, result, plant.of(result.model), seed)
+        test = fly_identified(shape, result, plant.of(result.model), seed)
         if output:
-            trial.flight.log.write(written)
+            test.flight.log.write(written)
         if plot:
-            trial.flight.draw(picture)
-        screen.show(trial, as_json)
+            test.flight.draw(picture)
+        screen.show(test, as_json)
 
 
 @app.command("models")

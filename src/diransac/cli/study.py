@@ -154,19 +154,19 @@ def _plot(
     title: Annotated[str | None, typer.Option(metavar="TEXT", help="In place of the study's name.")] = None,
 ) -> None:
     """Draw a store: errors of the parameters if its study judges them, else of the flights, or, at one level, paths."""
-    from diransac.plots.estimates import judges_parameters, plot_estimates
+    from diransac.plots.estimates import evaluates_parameters, plot_estimates
+    from diransac.plots.figure import check_ending
     from diransac.plots.paths import levels_with_paths, plot_paths
     from diransac.plots.study import plot_study
-    from diransac.plots.writing import checked_ending
 
     if level is not None and flown is False:
         raise typer.BadParameter("--level chooses whose paths are drawn, --errors draws none; give one of them")
     if parameters and (flown is not None or level is not None):
         raise typer.BadParameter("--parameters, --errors and --paths are pictures of their own; give one of them")
-    checked_ending(output)
+    check_ending(output)
     with staged([output], [store]) as (written,):
         if flown is None and level is None and not parameters:
-            parameters = judges_parameters(store)
+            parameters = evaluates_parameters(store)
         if flown is None:
             flown = level is not None or len(levels_with_paths(store)) == 1
         if parameters:

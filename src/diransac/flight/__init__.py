@@ -1,1 +1,1 @@
-"""Flight: planned trajectories, time-varying LQR, closed loops, and logs as recorders corrupt them."""
+"""Flight: trajectory planning, time-varying LQR, closed-loop simulation, and corruption of logs."""

@@ -1,4 +1,4 @@
-"""Closed loops: a controller that knows a model steers a plant that has more to it."""
+"""Closed-loop simulation: a controller designed with a model steers a plant with disturbances."""
 
 from __future__ import annotations
 
@@ -35,25 +35,41 @@ def fly(
     substeps: int | None = None,
     seed: int = 0,
 ) -> Log:
-    """The log of a flight: ``u_k = clip(u_ref - K (x - x_ref))`` at every sample, held to the next.
-
-    The feedback sees the true state, disturbances act on the plant without the controller's knowing, and what is logged
-    is the truth: every state and acceleration of the model, and the inputs that were applied.  `corrupt` spoils it.
+    """Log of a simulated flight under ``u_k = clip(u_ref - K (x - x_ref))``, held from each sample to the next.
 
     Parameters
     ----------
-    plant : what flies, a `Plant` with its disturbances, or a `Result`
-    trajectory : what is to be flown; it says how long, and where the flight starts
-    controller : what steers
-    initial_state : state name -> value, of states that start elsewhere
-    dt : s between samples of the controller; the trajectory's by default
-    gains : of a controller on another time grid: `hold` the last, or `linear`, interpolated
-    substeps : integration steps (RK4) a sample; by default as many as the plant's disturbances need
-    seed : of disturbances that start anywhere
+    plant : Plant or Result
+        The simulated plant, with its disturbances.
+    trajectory : Trajectory
+        The reference; it gives duration and initial state.
+    controller : Controller
+        The feedback law.
+    initial_state : mapping of str to float, optional
+        States by name that differ from the start of the trajectory.
+    dt : float, optional
+        Sampling time of the controller, s; the trajectory's by default.
+    gains : {"hold", "linear"}
+        Gains of a controller on another time grid: those of the last row, or interpolated.
+    substeps : int, optional
+        Integration steps (RK4) per sample; by default as many as the plant's disturbances need.
+    seed : int
+        Of the initial states of disturbances that are drawn from a range.
 
-    From a divergence on the log has NaN, and a note says when it was.
+    Returns
+    -------
+    Log
+        Every state and acceleration of the model and the applied inputs, without noise; `corrupt` adds it. After a
+        divergence values are NaN, and a note gives its time.
 
-    Raises SettingsError: plant, trajectory and controller do not fit together, or an argument has no meaning.
+    Raises
+    ------
+    SettingsError
+        Plant, trajectory and controller do not match, or an argument has no meaning.
+
+    Notes
+    -----
+    The controller measures the true state. It does not depend on the disturbances.
     """
     plant = as_plant(plant)
     start = _start(plant, trajectory, initial_state or {})
@@ -76,23 +92,37 @@ def fly_batch(
     seeds: Sequence[int] | None = None,
     threads: int | None = None,
 ) -> list[Log]:
-    """Logs of many flights at a time, each as `fly` gives it: eight of them to a vector, vectors on several threads.
+    """Logs of many flights, each identical to that of `fly`: eight per vector, vectors on several threads.
 
     Parameters
     ----------
-    plants : one a flight, of one model and the same disturbances, whose parameters and constants may differ
-    controllers : one a flight, of equally many rows
-    initial_states : (n_flights, n_x)   by default each controller's first
-    substeps, seeds : as `fly` has them, one seed a flight
-    threads : how many vectors fly at a time; as many as there are cores by default
+    plants : sequence of Plant or Result
+        One per flight, of one model and the same disturbances; parameters and constants may differ.
+    controllers : sequence of Controller
+        One per flight, of equal length.
+    initial_states : (n_flights, n_x) array, optional
+        By default the first row of each controller.
+    substeps : int, optional
+        As in `fly`.
+    seeds : sequence of int, optional
+        One per flight, as in `fly`.
+    threads : int, optional
+        Number of vectors simulated at once; the number of cores by default. It changes no result.
 
-    Raises SettingsError: plants of different equations, controllers of different lengths or for other states.
+    Returns
+    -------
+    list of Log
+
+    Raises
+    ------
+    SettingsError
+        Plants of different equations, or controllers of different lengths or for other states.
     """
     flown = [as_plant(plant) for plant in plants]
     if not flown or len(controllers) != len(flown) or len(seeds or flown) != len(flown):
         raise SettingsError(
-            f"{len(flown)} plants, {len(controllers)} controllers and {len(seeds or flown)} seeds do not make flights; "
-            "give one of each a flight"
+            f"{len(flown)} plants, {len(controllers)} controllers and {len(seeds or flown)} seeds do not match; "
+            "give one of each per flight"
         )
     _check_names(flown, controllers)
     starts = [one.states[0] for one in controllers] if initial_states is None else np.asarray(initial_states)
@@ -103,41 +133,56 @@ def fly_batch(
     logs: dict[int, Log] = {}
     for n in np.unique(steps):
         lanes = np.flatnonzero(steps == n).tolist()
-        together = _flown_together(
+        some = _flown_with(
             [flown[k] for k in lanes], [controllers[k] for k in lanes], [states[k] for k in lanes], int(n),
             threads or default_threads(),
         )  # fmt: skip
-        logs |= zip(lanes, together, strict=True)
+        logs |= zip(lanes, some, strict=True)
     return [logs[k] for k in range(len(flown))]
 
 
-def _flown_together(
+def _flown_with(
     plants: list[Plant], controllers: list[Controller], states: list[FloatArray], substeps: int, threads: int
 ) -> list[Log]:
-    """Logs of flights with equally many integration steps a sample."""
+    """Logs of flights with the same number of integration steps per sample."""
     engine, n_x = _engine(plants, substeps), len(plants[0].model.state)
     feedback, feedback_of_lane = _feedback(controllers, len(states[0]))
     constants = np.array([plant.constants for plant in plants])
-    batch = RolloutBatch(constants, np.array(states), feedback.u_ref[0], controllers[0].dt)
-    flights = engine.fly(batch, feedback, feedback_of_lane=feedback_of_lane, threads=threads)
-    signals = np.delete(flights.signals, np.s_[n_x : len(states[0])], axis=-1)
+    lanes = RolloutBatch(constants, np.array(states), feedback.u_ref[0], controllers[0].dt)
+    batch = engine.fly(lanes, feedback, feedback_of_lane=feedback_of_lane, threads=threads)
+    signals = np.delete(batch.signals, np.s_[n_x : len(states[0])], axis=-1)
     return [
         _log(plant, controller, x, u, substeps)
-        for plant, controller, x, u in zip(plants, controllers, signals, flights.inputs, strict=True)
+        for plant, controller, x, u in zip(plants, controllers, signals, batch.inputs, strict=True)
     ]
 
 
 def tracking_error(trajectory: Trajectory, log: Log) -> dict[str, float]:
-    """RMS of ``flown - reference`` over a flight, by state, each state's unit; infinite where the flight diverged.
+    """RMS of ``flown - reference`` for each state, in its unit; infinite where the flight diverged.
 
-    Rows of the log before the trajectory's start and after its end do not count; between its rows the reference is
-    interpolated.
+    Parameters
+    ----------
+    trajectory : Trajectory
+        The reference, with names of its states.
+    log : Log
+        The flight. Rows before the start and after the end of the trajectory are ignored; between rows of the
+        trajectory the reference is interpolated.
 
-    Raises LogError: the log lacks a state.  Raises SettingsError: they have no time in common, or the trajectory's
-    columns have no names.
+    Returns
+    -------
+    dict of str to float
 
-    References: Dimmig et al. 2023, section V: "RMS error between the generated reference trajectory and the extended
-    plant's true path".
+    Raises
+    ------
+    LogError
+        The log lacks a state.
+    SettingsError
+        Log and trajectory do not overlap in time, or the trajectory has no names.
+
+    References
+    ----------
+    Dimmig et al. 2023, section V: "RMS error between the generated reference trajectory and the extended plant's true
+    path".
     """
     slack = _SAME_INSTANT * trajectory.dt
     common = (log.time >= trajectory.time[0] - slack) & (log.time <= trajectory.time[-1] + slack)
@@ -157,7 +202,7 @@ def tracking_error(trajectory: Trajectory, log: Log) -> dict[str, float]:
 
 
 def _start(plant: Plant, trajectory: Trajectory, changes: Mapping[str, float]) -> FloatArray:
-    """Initial state (n_x,): the trajectory's, but for some."""
+    """Initial state (n_x,): the trajectory's, with changes by name."""
     names = plant.model.state
     unknown = [name for name in changes if name not in names]
     if unknown:
@@ -173,28 +218,30 @@ def _start(plant: Plant, trajectory: Trajectory, changes: Mapping[str, float]) -
 
 
 def _positive(name: str, value: float) -> float:
-    """The value itself.  Raises SettingsError: it is no positive number."""
+    """The value itself.  Raises SettingsError: it is not a positive number."""
     if not (np.isfinite(value) and value > 0):
         raise SettingsError(f"{name} is {value}; give positive seconds")
     return value
 
 
 def _same_instants(a: FloatArray, b: FloatArray) -> bool:
-    """Whether two time grids are one."""
+    """True if two time grids are equal."""
     return len(a) == len(b) and bool(np.allclose(a, b, rtol=0.0, atol=_SAME_INSTANT * (b[1] - b[0])))
 
 
 def _engine(plants: Sequence[Plant], substeps: int) -> Rollouts:
-    """Rollouts of what they all are."""
+    """Rollouts of the equations that all plants share."""
     different = {id(plant): plant for plant in plants}.values()
     engines = {rollouts(plant.simulated, substeps=substeps) for plant in different}
     if len(engines) > 1:
-        raise SettingsError("the plants' equations differ; fly plants of one model and the same disturbances together")
+        raise SettingsError(
+            "the plants' equations differ; call fly_batch with plants of one model and the same disturbances"
+        )
     return engines.pop()
 
 
 def _check_names(plants: Sequence[Plant], controllers: Sequence[Controller]) -> None:
-    """Raises SettingsError: a controller is for other states or inputs than its plant's."""
+    """Raise SettingsError if a controller is for other states or inputs than its plant's."""
     for plant, controller in zip(plants, controllers, strict=True):
         has, wanted = (controller.state_names, controller.input_names), (plant.model.state, tuple(plant.model.inputs))
         if has != wanted:
@@ -205,7 +252,7 @@ def _check_names(plants: Sequence[Plant], controllers: Sequence[Controller]) -> 
 
 
 def _feedback(controllers: Sequence[Controller], n_x: int) -> tuple[LinearFeedback, npt.NDArray[np.int64]]:
-    """Feedback laws of different controllers as a table, and each lane's index; disturbances' states have no gain."""
+    """Table of the distinct feedback laws, and the law of each lane; gains on disturbances' states are zero."""
     different = list({id(controller): controller for controller in controllers}.values())
     first = different[0]
     for other in different[1:]:
@@ -213,7 +260,9 @@ def _feedback(controllers: Sequence[Controller], n_x: int) -> tuple[LinearFeedba
             len(first.time), first.u_min.tolist(), first.u_max.tolist()
         ) and np.isclose(other.dt, first.dt)  # fmt: skip
         if not same:
-            raise SettingsError("controllers of different lengths, steps or limits cannot steer flights together")
+            raise SettingsError(
+                "the controllers differ in length, time step or limits; call fly_batch for each kind, or fly for each"
+            )
     hidden = n_x - first.states.shape[1]
     u_ref, x_ref, K = (np.array([getattr(one, name) for one in different]) for name in ("inputs", "states", "gains"))
     x_ref, K = (np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, hidden)]) for array in (x_ref, K))
@@ -223,7 +272,7 @@ def _feedback(controllers: Sequence[Controller], n_x: int) -> tuple[LinearFeedba
 
 
 def _log(plant: Plant, controller: Controller, signals: FloatArray, inputs: FloatArray, substeps: int) -> Log:
-    """A flight as a log."""
+    """Log of a simulated flight."""
     model = plant.model
     columns = dict(zip((*model.signals, *model.inputs), (*signals.T, *inputs.T), strict=True))
     step = {"step": "fly", "plant": plant.simulated.name, "substeps": substeps}

@@ -1,4 +1,4 @@
-"""The Riccati sweep of time-varying LQR, compiled: linearised rows, then a recurrence that runs over them backward."""
+"""Riccati sweep of time-varying LQR, compiled: linearised rows, and a backward recurrence over them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Problem", "gains_of"]
 
 @dataclass(frozen=True)
 class Problem:
-    """What a sweep works on: parameters (n_p,), a trajectory, and the weights of `tvlqr` as matrices."""
+    """One sweep: parameters (n_p,), trajectory, and the weights of `tvlqr` as matrices."""
 
     parameters: FloatArray
     trajectory: Trajectory
@@ -31,7 +31,7 @@ class Problem:
 
 
 def gains_of(model: Model, problems: Sequence[Problem], threads: int) -> list[FloatArray]:
-    """Gains (K, n_u, n_x) of each problem, eight to a vector; what `tvlqr` defines.
+    """Gains (K, n_u, n_x) of each problem as `tvlqr` defines them, eight problems per vector.
 
     Raises PlanningError: derivatives or gains that are not finite.
     """
@@ -40,7 +40,7 @@ def gains_of(model: Model, problems: Sequence[Problem], threads: int) -> list[Fl
     rows = np.empty((len(problems), max(len(own) for own in entries), entries[0].shape[1]))
     for backward, own in zip(rows, entries, strict=True):
         backward[: len(own)] = own[::-1]
-        backward[len(own) :] = own[0]  # a shorter one goes on with its first row; what it then gives is left
+        backward[len(own) :] = own[0]  # padding of shorter ones; its outputs are not used
     weights = [one.trajectory.dt * np.concatenate([_upper(one.Q), _upper(one.R)]) for one in problems]
     ends = [_upper(one.Qf) for one in problems]
     found = compiled.recurrence(np.array(ends), rows, np.array(weights), threads=threads)
@@ -60,13 +60,13 @@ def _entries(model: Model, linearize: Map, problem: Problem, threads: int) -> Fl
         t, x, u = (array[lost[0]].tolist() for array in (trajectory.time, trajectory.states, trajectory.inputs))
         raise PlanningError(
             f'model "{model.name}" has no finite derivatives on the trajectory at t = {t:g} s: x = {x}, u = {u}, '
-            f"parameters {problem.parameters.tolist()}; check the parameters, or lead the trajectory around this state"
+            f"parameters {problem.parameters.tolist()}; check the parameters, or plan a trajectory around this state"
         )
     return entries
 
 
 def _checked(model: Model, problem: Problem, outputs: FloatArray) -> FloatArray:
-    """Gains (K, n_u, n_x) from what the recurrence gave, last row first.
+    """Gains (K, n_u, n_x) from the outputs of the recurrence, last row first.
 
     Raises PlanningError: some of them are not finite.
     """
@@ -75,20 +75,20 @@ def _checked(model: Model, problem: Problem, outputs: FloatArray) -> FloatArray:
     lost = np.flatnonzero(~np.isfinite(gains).all(axis=(1, 2)))
     if len(lost):
         raise PlanningError(
-            f'the Riccati sweep of model "{model.name}" did not stay finite and positive: back from the end it was '
-            f"lost at t = {time[lost[-1]]:g} s; give R larger or Q and Qf smaller numbers, or a shorter trajectory"
+            f'the Riccati sweep of model "{model.name}" did not stay finite and positive '
+            f"definite back from t = {time[lost[-1]]:g} s; raise R, lower Q and Qf, or shorten the trajectory"
         )
     return gains
 
 
-# What is compiled ----------------------------------------------------------------------------------------------------
+# Compilation ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class _Compiled:
-    """Rows apart from the recurrence: they are independent of each other, so that one trajectory fills vectors, too.
+    """Compiled linearisation of rows, which are independent of each other, and recurrence over them.
 
-    Attributes
+    Parameters
     ----------
-    linearize : (x, u, p, h) -> those entries of A and B that vary
+    linearize : (x, u, p, h) -> entries of A and B that vary
     recurrence : upper triangle of S, entries, upper triangles of Q dt and R dt -> S a row earlier, gains
     """
 
@@ -98,7 +98,7 @@ class _Compiled:
 
 @lru_cache(maxsize=64)
 def _compiled(model: Model) -> _Compiled:
-    """Compiled functions of a model; the same ones again for an equal model."""
+    """Compiled linearisation and recurrence of a model; the same ones again for an equal model."""
     step = linearized_step(model)
     arguments = [ca.SX.sym(name, step.sparsity_in(name)) for name in step.name_in()]
     _, A, B = step(*arguments)
@@ -108,9 +108,9 @@ def _compiled(model: Model) -> _Compiled:
 
 
 def _recurrence(A: ca.SX, B: ca.SX) -> ca.Function:
-    """S, varying entries of A and B, [Q dt; R dt] -> S a row earlier, gains column by column.
+    """Function: S, varying entries of A and B, [Q dt; R dt] -> S a row earlier, gains column by column.
 
-    A pivot of R dt + B'S B that is not positive becomes NaN: the sweep has lost its precision there.
+    A pivot of R dt + B'S B that is not positive becomes NaN: precision is lost there.
     """
     n_x, n_u = B.shape
     entries: list[ca.SX] = []
@@ -126,7 +126,7 @@ def _recurrence(A: ca.SX, B: ca.SX) -> ca.Function:
 
 
 def _with_symbols(matrix: ca.SX, entries: list[ca.SX]) -> ca.SX:
-    """The matrix with a new symbol, added to `entries`, in the place of every entry that isn't constant."""
+    """Matrix with a new symbol, also appended to `entries`, for every entry that is not constant."""
     values = ca.vertsplit(matrix.nz[:])
     for k, value in enumerate(values):
         if not value.is_constant():

@@ -1,4 +1,4 @@
-"""`Trajectory`: where a plant is to be at every moment, and the inputs that take it there."""
+"""`Trajectory`: reference states over time and the inputs that produce them."""
 
 from __future__ import annotations
 
@@ -20,17 +20,29 @@ class Trajectory:
 
     Parameters
     ----------
-    time : (K,)   seconds, evenly spaced, at least 2 rows
-    states : (K, n_x)   coordinates, then velocities, each state's unit
-    inputs : (K, n_u)   each input's unit
-    state_names, input_names : names of the columns
-    input_limits : name -> (lowest, highest) that the inputs keep to; a controller keeps to them as well
-    cost : what the planner minimised; None if it was not planned
-    solver : who planned it; None if nobody did
+    time : (K,) array
+        s, evenly spaced, at least 2 rows.
+    states : (K, n_x) array
+        Coordinates, then velocities, each in its unit.
+    inputs : (K, n_u) array
+        Each in its unit.
+    state_names, input_names : tuple of str
+        Names of the columns.
+    input_limits : mapping of str to (float, float)
+        Limits of the inputs, which a controller applies too.
+    cost : float, optional
+        Minimum found by the planner; None without a planner.
+    solver : str, optional
+        Solver of the planner; None without one.
 
+    Raises
+    ------
+    SettingsError
+        Arrays that do not fit together, a time that is not evenly spaced, or a number that is not finite.
+
+    Notes
+    -----
     The arrays are copies and read-only.
-
-    Raises SettingsError: arrays that do not fit together, a time that is not even, a number that isn't finite.
     """
 
     time: FloatArray

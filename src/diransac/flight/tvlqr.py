@@ -1,4 +1,4 @@
-"""`tvlqr`: the feedback that holds a plant to a trajectory, and `Controller`, which it gives."""
+"""Time-varying LQR: `tvlqr`, and the `Controller` that it returns."""
 
 from __future__ import annotations
 
@@ -20,39 +20,50 @@ from diransac.simulation import LinearFeedback
 __all__ = ["Controller", "tvlqr", "tvlqr_batch"]
 
 Weights: TypeAlias = "npt.ArrayLike | Mapping[str, float]"
-"""A matrix, its diagonal, one number for all of the diagonal, or the diagonal by name."""
+"""Matrix, diagonal, one number for the whole diagonal, or diagonal by name."""
 
-Limits: TypeAlias = Mapping[str, tuple[float, float]]
-"""Name of an input -> its lowest and highest value."""
+InputLimits: TypeAlias = Mapping[str, tuple[float, float]]
+"""Name of an input -> smallest and largest value."""
 
 COORDINATE_ERROR = 0.5
 VELOCITY_ERROR = 1.0
 UNLIMITED_INPUT = 1.0
 FINAL_SECONDS = 1.0
-"""The default weights, chosen once for all machines; `tvlqr` says what each means."""
+"""Default weights, explained in `tvlqr`; they are not tuned to any plant."""
 
 _GRID = 1e-6
-"""Of a row's length: by so little a time may lie before a row and still belong to it."""
+"""Tolerance, as a fraction of dt, within which a time counts as that of a row."""
 
 
 # The controller ------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Controller:
-    """``u[k] = clip(inputs[k] - gains[k] (x - states[k]), u_min, u_max)``, held from each row to the next.
+    """Feedback law ``u[k] = clip(inputs[k] - gains[k] (x - states[k]), u_min, u_max)``, held from row to row.
 
     Parameters
     ----------
-    time : (K,)   seconds, evenly spaced, at least 2 rows
-    states : (K, n_x)   state to be held: coordinates, then velocities
-    inputs : (K, n_u)   feed-forward, each input's unit
-    gains : (K, n_u, n_x)   each input's unit over each state's
-    u_min, u_max : (n_u,)   limits of the inputs, infinite where there is none
-    state_names, input_names : names of the columns
+    time : (K,) array
+        s, evenly spaced, at least 2 rows.
+    states : (K, n_x) array
+        Reference: coordinates, then velocities.
+    inputs : (K, n_u) array
+        Feed-forward, each input's unit.
+    gains : (K, n_u, n_x) array
+        Each input's unit over each state's.
+    u_min, u_max : (n_u,) array
+        Limits of the inputs, infinite where there are none.
+    state_names, input_names : tuple of str
+        Names of the columns.
 
+    Raises
+    ------
+    SettingsError
+        Arrays that do not fit together, a time that is not evenly spaced, a number that is not finite, or lower limits
+        above upper ones.
+
+    Notes
+    -----
     The arrays are copies and read-only.
-
-    Raises SettingsError: arrays that do not fit together, a time that is not even, a number that isn't finite, or
-    limits that leave no room.
     """
 
     time: FloatArray
@@ -91,21 +102,26 @@ class Controller:
         return len(self.time)
 
     def law(self) -> LinearFeedback:
-        """The controller as simulations take it, row by row."""
+        """Feedback law for simulations, row by row."""
         return LinearFeedback(self.inputs, self.states, self.gains, self.u_min, self.u_max)
 
     def at(self, time: npt.ArrayLike, how: str = "hold") -> Controller:
-        """The controller on another time grid; before its first row and after its last it stays what it is there.
+        """Controller on another time grid; constant before its first and after its last row.
 
         Parameters
         ----------
-        time : (n_rows,)   seconds, evenly spaced, at least 2 rows
-        how : ``"hold"`` holds a row to the next; ``"linear"`` interpolates states and gains. Inputs are held in both
+        time : (n_rows,) array
+            s, evenly spaced, at least 2 rows.
+        how : {"hold", "linear"}
+            ``"hold"`` takes the last row; ``"linear"`` interpolates states and gains. Inputs are held in both.
 
-        Raises SettingsError: another word, or a time that is not even.
+        Raises
+        ------
+        SettingsError
+            ``how`` is unknown, or the time is not evenly spaced.
         """
         if how not in ("hold", "linear"):
-            raise SettingsError(f'how is {how!r}; a controller can "hold" its rows, or be "linear" between them')
+            raise SettingsError(f'how is {how!r}; choose "hold" or "linear"')
         wanted = _checked_time(time)
         rows = np.maximum(np.searchsorted(self.time, wanted + _GRID * self.dt, side="right") - 1, 0)
         names = (self.state_names, self.input_names)
@@ -123,9 +139,9 @@ class Controller:
 
 
 def _checked_time(time: npt.ArrayLike) -> FloatArray:
-    """A copy of the time, read-only.
+    """Read-only copy of the time.
 
-    Raises SettingsError: it is not even.
+    Raises SettingsError: it is not evenly spaced.
     """
     array = np.array(time, np.float64)
     steps = np.diff(array) if array.ndim == 1 else np.zeros(0)
@@ -137,7 +153,7 @@ def _checked_time(time: npt.ArrayLike) -> FloatArray:
     return array
 
 
-# What users call -----------------------------------------------------------------------------------------------------
+# Design --------------------------------------------------------------------------------------------------------------
 def tvlqr(
     plant: ModelWithParameters,
     trajectory: Trajectory,
@@ -145,41 +161,61 @@ def tvlqr(
     R: Weights | None = None,
     Qf: Weights | None = None,
     *,
-    limits: Limits | None = None,
+    limits: InputLimits | None = None,
 ) -> Controller:
-    """Time-varying LQR along a trajectory: the least ``integral of e'Q e + d'R d dt + e_K'Qf e_K`` to first order.
+    """Time-varying LQR: minimum of ``integral of e'Q e + d'R d dt + e_K'Qf e_K`` to first order along a trajectory.
 
     ``e = x - x[k]`` and ``d = u - u[k]`` are errors of state and input. From ``S[K] = Qf`` back to the first row::
 
         K[k] = (R dt + B'S B)^-1 B'S A,    S[k] = Q dt + A'S (A - B K[k]),    S = S[k+1]
 
-    with ``A, B = d x[k+1] / d(x[k], u[k])`` of the step that a simulation takes from row to row: RK4, the input held,
-    quaternions scaled to length one. So the controller is optimal at its own rate, and nears the continuous one as dt
-    goes to 0. The last row counts as lasting dt, too.
+    with ``A, B = d x[k+1] / d(x[k], u[k])`` of one simulation step from row to row: RK4, the input held, quaternions
+    scaled to norm one.
 
     Parameters
     ----------
-    plant : a `Plant` or `Result`; its model and parameters count, not its disturbances
-    trajectory : what is to be held
-    Q : (n_x, n_x) or (n_x,), one number, or name -> weight (0 where not named)   positive semidefinite, 1/s over each
-        state's unit squared
-    R : the same of inputs, (n_u, n_u)   positive definite
-    Qf : the same of states at the end, not over time   positive semidefinite
-    limits : input's name -> (lowest, highest) that the law clips to; the trajectory's by default. The gains don't know
+    plant : Plant or Result
+        Model and parameters; disturbances are ignored.
+    trajectory : Trajectory
+        The reference.
+    Q : (n_x, n_x) or (n_x,) array, float, or mapping of str to float, optional
+        Positive semidefinite, 1/s over each state's unit squared; in a mapping 0 where not named.
+    R : (n_u, n_u) or (n_u,) array, float, or mapping of str to float, optional
+        Positive definite, 1/s over each input's unit squared.
+    Qf : as Q, optional
+        Weights of the final state, positive semidefinite, one over each state's unit squared.
+    limits : mapping of str to (float, float), optional
+        Smallest and largest value of each input, to which the law is clipped; the trajectory's by default. The gains do
+        not depend on them if R is given.
 
-    The default weights are Bryson's rule, untuned: an error of 0.5 in a coordinate (m, rad) or of 1 in a velocity (m/s,
-    rad/s) is worth as much as the full use of an input, which is half the range of its limits, or 1 where it has none.
-    ``Qf`` is ``Q`` times 1 s by default. The four numbers of a quaternion are coordinates like others: errors along its
-    length, which no input can change, end within a step.
+    Returns
+    -------
+    Controller
 
-    Gains know the model as it is near the trajectory. Dry friction as a steep function, ``atan(100 v)``, is viscous and
-    strong near ``v = 0``, and gains that rely on it destabilise a machine at rest: give its parameter as 0 here.
+    Raises
+    ------
+    SettingsError
+        A trajectory of another model; weights or limits of wrong shape, names or definiteness.
+    PlanningError
+        The model has no finite derivatives on the trajectory, or the recurrence does not stay finite.
 
-    Raises SettingsError: a trajectory of another model; weights or limits of other shape, names or definiteness.
-    Raises PlanningError: the model has no finite derivatives on the trajectory, or the sweep does not stay finite.
+    Notes
+    -----
+    The default weights follow Bryson's rule and are not tuned: an error of 0.5 in a coordinate (m, rad) or of 1 in a
+    velocity (m/s, rad/s) costs as much as full use of an input, which is half the range of its limits, or 1 without
+    limits. ``Qf`` is ``Q`` times 1 s by default.
 
-    References: Anderson and Moore 1990, "Optimal Control: Linear Quadratic Methods", section 2.4; Bryson and Ho 1975,
-    "Applied Optimal Control", section 5.2 (weights); Dimmig et al. 2023, section V.
+    The controller is optimal at its own rate and converges to the continuous one for dt to 0; the last row counts as
+    lasting dt. The four numbers of a quaternion are treated as coordinates: errors along its norm, which no input
+    changes, vanish within one step.
+
+    Gains rely on the linearised model. Dry friction written as a steep function, ``atan(100 v)``, is linearised as
+    strong viscous friction near ``v = 0``, and the resulting gains destabilise a plant at rest: set its parameter to 0.
+
+    References
+    ----------
+    Anderson and Moore 1990, "Optimal Control: Linear Quadratic Methods", section 2.4; Bryson and Ho 1975, "Applied
+    Optimal Control", section 5.2 (weights); Dimmig et al. 2023, section V.
     """
     return tvlqr_batch([plant], [trajectory], Q, R, Qf, limits=limits)[0]
 
@@ -191,18 +227,32 @@ def tvlqr_batch(
     R: Weights | None = None,
     Qf: Weights | None = None,
     *,
-    limits: Limits | None = None,
+    limits: InputLimits | None = None,
     threads: int = 1,
 ) -> list[Controller]:
-    """`tvlqr` of many plants that share their model, each along its own trajectory: the same controllers, sooner.
+    """Controllers of `tvlqr` for many plants of one model, each along its own trajectory, in less time.
 
     Parameters
     ----------
-    plants, trajectories : one of each a controller; the trajectories may differ in length and dt
-    Q, R, Qf, limits : as `tvlqr` has them, for all
-    threads : how many blocks of eight controllers are computed at a time; it changes no answer
+    plants : sequence of Plant or Result
+        One per controller.
+    trajectories : sequence of Trajectory
+        One per controller; lengths and dt may differ.
+    Q, R, Qf, limits
+        As in `tvlqr`, for all.
+    threads : int
+        Number of vectors of eight controllers computed at once. It changes no result.
 
-    Raises SettingsError: not as many plants as trajectories, or plants of different models; else as `tvlqr`.
+    Returns
+    -------
+    list of Controller
+
+    Raises
+    ------
+    SettingsError
+        Not as many plants as trajectories, or plants of different models; otherwise as `tvlqr`.
+    PlanningError
+        As `tvlqr`.
     """
     if len(plants) != len(trajectories):
         raise SettingsError(
@@ -216,24 +266,26 @@ def tvlqr_batch(
         raise SettingsError("the plants have different models; call tvlqr_batch for each model's own")
     for trajectory in trajectories:
         _check_columns(model, trajectory)
-    weights = _Weights(model, Q, R, Qf)
-    edges = [_edges(model, trajectory, limits) for trajectory in trajectories]
+    costs = _CostMatrices(model, Q, R, Qf)
+    limits_of_each = [_limits_of(model, trajectory, limits) for trajectory in trajectories]
     problems = [
-        Problem(np.array(list(plant.parameters.values())), trajectory, weights.Q, weights.effort(low, high), weights.Qf)
-        for plant, trajectory, (low, high) in zip(known, trajectories, edges, strict=True)
+        Problem(np.array(list(plant.parameters.values())), trajectory, costs.Q, costs.R(low, high), costs.Qf)
+        for plant, trajectory, (low, high) in zip(known, trajectories, limits_of_each, strict=True)
     ]
     names = (model.state, tuple(model.inputs))
     return [
         Controller(reference.time, reference.states, reference.inputs, K, low, high, *names)
-        for reference, K, (low, high) in zip(trajectories, gains_of(model, problems, threads), edges, strict=True)
+        for reference, K, (low, high) in zip(
+            trajectories, gains_of(model, problems, threads), limits_of_each, strict=True
+        )
     ]
 
 
-# What is asked for --------------------------------------------------------------------------------------------------
+# Arguments -----------------------------------------------------------------------------------------------------------
 def _check_columns(model: Model, trajectory: Trajectory) -> None:
-    """Raises SettingsError: the trajectory is another model's, or the model has no inputs."""
+    """Raise SettingsError if the trajectory is another model's, or the model has no inputs."""
     if not model.inputs:
-        raise SettingsError(f'model "{model.name}" has no inputs; there is nothing to steer it with')
+        raise SettingsError(f'model "{model.name}" has no inputs; a controller needs at least one')
     for kind, names, found, array in (
         ("states", model.state, trajectory.state_names, trajectory.states),
         ("inputs", tuple(model.inputs), trajectory.input_names, trajectory.inputs),
@@ -246,10 +298,10 @@ def _check_columns(model: Model, trajectory: Trajectory) -> None:
             )
 
 
-def _edges(model: Model, trajectory: Trajectory, limits: Limits | None) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest inputs (n_u,).
+def _limits_of(model: Model, trajectory: Trajectory, limits: InputLimits | None) -> tuple[FloatArray, FloatArray]:
+    """Smallest and largest inputs (n_u,).
 
-    Raises SettingsError: a name that isn't an input's, or limits that are no pair in order.
+    Raises SettingsError: an unknown name, or limits that are not a pair in increasing order.
     """
     limits = trajectory.input_limits if limits is None else limits
     unknown = [name for name in limits if name not in model.inputs]
@@ -262,8 +314,8 @@ def _edges(model: Model, trajectory: Trajectory, limits: Limits | None) -> tuple
     return low, high
 
 
-class _Weights:
-    """Matrices Q and Qf, and R where it is given."""
+class _CostMatrices:
+    """Matrices Q, Qf and R."""
 
     def __init__(self, model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None) -> None:
         errors = np.repeat([COORDINATE_ERROR, VELOCITY_ERROR], [model.n_q, model.n_v])
@@ -274,27 +326,27 @@ class _Weights:
             found = self._R.tolist()
             raise SettingsError(f"R must be positive definite: each input needs a positive weight; found {found}")
 
-    def effort(self, low: FloatArray, high: FloatArray) -> FloatArray:
-        """R; if none is given, that for which the full use of each input within these limits is worth 1."""
+    def R(self, low: FloatArray, high: FloatArray) -> FloatArray:
+        """R as given; by default full use of each input within these limits costs 1."""
         half = (high - low) / 2
         use = np.where(np.isfinite(half) & (half > 0), half, UNLIMITED_INPUT)
         return np.diag(use**-2.0) if self._R is None else self._R
 
 
 def _matrix(name: str, weights: Weights, names: Sequence[str]) -> FloatArray:
-    """Matrix of weights, from one of the forms that it may have.
+    """Weight matrix from any of its forms.
 
-    Raises SettingsError: a name that isn't known, another shape, no finite numbers, not symmetric, not semidefinite.
+    Raises SettingsError: an unknown name, another shape, not finite, not symmetric, or not positive semidefinite.
     """
     if isinstance(weights, Mapping):
         unknown = [key for key in weights if key not in names]
         if unknown:
-            raise SettingsError(f'{name} weighs "{unknown[0]}", which is none of {", ".join(names)}')
+            raise SettingsError(f'{name} weighs "{unknown[0]}"; there are {", ".join(names)}')
         weights = [weights.get(key, 0.0) for key in names]
     try:
         array, n = np.array(weights, np.float64), len(names)
     except (TypeError, ValueError) as error:
-        raise SettingsError(f"{name} is {weights!r:.80}, which is no array of numbers: {error}") from error
+        raise SettingsError(f"{name} is {weights!r:.80}, which is not an array of numbers: {error}") from error
     if array.shape not in ((), (n,), (n, n)):
         raise SettingsError(
             f"{name} must be a matrix ({n}, {n}), its diagonal ({n},), one number, or numbers by name; found shape "
@@ -306,5 +358,5 @@ def _matrix(name: str, weights: Weights, names: Sequence[str]) -> FloatArray:
         raise SettingsError(f"{name} must be finite and symmetric; found {matrix.tolist()}")
     lowest = np.linalg.eigvalsh(matrix)[0] if array.ndim == 2 else array.min(initial=0.0)
     if lowest < -1e-12 * largest:
-        raise SettingsError(f"{name} must weigh no direction negatively; its smallest eigenvalue is {lowest:g}")
+        raise SettingsError(f"{name} must be positive semidefinite; its smallest eigenvalue is {lowest:g}")
     return matrix

@@ -1,8 +1,7 @@
-"""`Plant`: a model with its parameters, and `Disturbance`: what acts on it without the model's knowing.
+"""`Plant`, a model with its parameters, and `Disturbance`, effects on a plant that its model does not contain.
 
-A disturbed plant obeys ``M a + c = f`` where its model has ``M a + c = 0``, or has ``a + e`` for the model's ``a``. The
-equations of motion stay the model's own: planning, control and identification know them alone, and only a simulation
-knows the rest.
+A disturbed plant obeys ``M a + c = f`` where its model has ``M a + c = 0``, or has ``a + e`` for the model's ``a``.
+Planning, control and identification use the model alone; only simulations include the disturbances.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ Effect = Callable[[Symbols, Symbols, Symbols, Symbols, Symbols], Mapping[str, An
 """``effect(q, v, u, p, d)`` gives expressions by name."""
 
 _STEPS_PER_PERIOD = 8
-"""Integration steps in a period of the fastest disturbance: docs/flying.md shows what more of them change."""
+"""Integration steps per period of the fastest disturbance; docs/flying.md has the convergence."""
 
 
 class ModelWithParameters(Protocol):
@@ -40,30 +39,43 @@ class ModelWithParameters(Protocol):
 
     @property
     def parameters(self) -> Mapping[str, float]:
-        """Their parameters."""
+        """Parameters by name."""
 
 
 class Disturbance:
-    """Forces on a plant, or accelerations of it, that its model doesn't know.
+    """Forces on a plant, or accelerations of it, that its model does not contain.
 
     Parameters
     ----------
-    model : whose plant is disturbed
-    name : how messages call it; what belongs to it is named after it
-    forces : ``forces(q, v, u, p, d)`` returns generalised forces by acceleration, under the name that the equations
-        use (``{"z": ..., "theta": ...}``): ``M a + c = f``, in N for m, N m for rad; what is not named is zero
-    accelerations : the same of what is added to the accelerations themselves
-    constants : name -> value, read as ``d.name``; another value needs no new compilation
-    states : name -> unit, of states of its own (the phase of a rotor), read as ``d.name``
-    rates : ``rates(q, v, u, p, d)`` returns the derivative of each state by name
-    start : name -> initial value of a state, or two, low and high, to draw it from with a flight's seed; 0 where not
-        named
-    highest_frequency : Hz, of the fastest thing in it; a flight takes at least 8 integration steps in its period
+    model : Model
+        Of the disturbed plant.
+    name : str
+        Name in messages, and prefix of the names of constants and states.
+    forces : callable, optional
+        ``forces(q, v, u, p, d)`` returns generalised forces ``f`` in ``M a + c = f`` by name of the acceleration in the
+        equations (``{"z": ..., "theta": ...}``), N for m, N m for rad; 0 where not named.
+    accelerations : callable, optional
+        The same for terms added to the accelerations.
+    constants : mapping of str to float, optional
+        Available as ``d.name``. Another value needs no new compilation.
+    states : mapping of str to str, optional
+        Units of additional states by name, such as the phase of a rotor, available as ``d.name``.
+    rates : callable, optional
+        ``rates(q, v, u, p, d)`` returns the derivative of each additional state by name.
+    start : mapping of str to float or (float, float), optional
+        Initial value of a state, or a range from which the seed of a flight draws it; 0 where not named.
+    highest_frequency : float
+        Hz, of the fastest effect. Simulations take at least 8 integration steps per period of it.
 
-    ``d.t`` is the time since the simulation's start, s. Mathematics is CasADi's.
+    Raises
+    ------
+    ModelError
+        An unknown name, a NaN constant, Python branching on a symbol, states without rates, or a force on a model whose
+        equations are not a balance of forces (``M`` not symmetric and definite).
 
-    Raises ModelError: an unknown name, a NaN constant, Python branching on a symbol, states without rates, a force
-    where the model's equations are no balance of forces (``M`` is not symmetric and definite).
+    Notes
+    -----
+    ``d.t`` is the time since the start of the simulation, s. Functions are CasADi's.
     """
 
     def __init__(
@@ -105,16 +117,17 @@ class Disturbance:
 
     @property
     def _own(self) -> tuple[str, ...]:
-        """Names of what the user's functions find in ``d``."""
+        """Names of the attributes of ``d``."""
         return (*self.constants, *self.states, "t")
 
     def _check(self, has_rates: bool) -> None:
+        """Raise ModelError for arguments that do not fit together."""
         if not self.name.replace("-", "_").isidentifier():
-            raise ModelError(f"{self._label}: the name is used in others; give letters, digits and hyphens")
+            raise ModelError(f"{self._label}: the name is part of others; use letters, digits and hyphens")
         if len(set(self._own)) < len(self._own):
-            raise ModelError(f"{self._label}: a name is used twice; found {', '.join(self._own)}, and t is the time")
+            raise ModelError(f"{self._label}: a name is used twice; found {', '.join(self._own)}; t is the time")
         if bool(self.states) != has_rates:
-            raise ModelError(f"{self._label}: states and rates need each other; give both, or neither")
+            raise ModelError(f"{self._label}: states need rates; give both or neither")
         unknown = [name for name in self.start if name not in self.states]
         if unknown:
             raise ModelError(
@@ -133,7 +146,7 @@ class Disturbance:
     def _expressions(
         self, what: str, effect: Effect | None, names: Sequence[str], arguments: Sequence[Symbols]
     ) -> ca.SX:
-        """What a function of the user returns, in order; zero where it names nothing."""
+        """Expressions that a user's function returns, in order; zero where it names none."""
         if effect is None:
             return ca.SX(len(names), 1)
 
@@ -149,7 +162,7 @@ class Disturbance:
         return column
 
     def drawn_start(self, rng: np.random.Generator) -> list[float]:
-        """Initial states, in order; those given as a range are drawn uniformly."""
+        """Initial states, in order; uniform over those given as a range."""
         return [float(rng.uniform(*value) if isinstance(value, tuple) else value) for value in self.start.values()]
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -161,27 +174,31 @@ class Disturbance:
 
 
 def _as_start(value: Any) -> Any:
-    """A number itself, a range of whatever sequence as a pair."""
+    """A number as it is, a range as a pair."""
     return tuple(value) if isinstance(value, Sequence | np.ndarray) else value
 
 
 def _restored(kept: Mapping[str, Any], effect: str) -> Disturbance:
-    """A disturbance out of its pickle."""
+    """Unpickled disturbance."""
     disturbance = Disturbance.__new__(Disturbance)
     vars(disturbance).update(kept, effect=derivation.deserialize(effect))
     return disturbance
 
 
 class DisturbedModel:
-    """A model and disturbances as one set of equations; simulated as a `Model` is, by `diransac.simulation.rollouts`.
-
-    The state is ``[q; v; own states of the disturbances; t]``, t only where it is used; the parameters are the model's,
-    then the disturbances' constants. Equal where these equations are, whatever the values of the constants.
+    """Equations of a model with disturbances, for `diransac.simulation.rollouts`.
 
     Parameters
     ----------
-    model : what is known
-    disturbances : what is not; each of them made for this model
+    model : Model
+        Without disturbances.
+    disturbances : sequence of Disturbance
+        Each made for this model.
+
+    Notes
+    -----
+    The state is ``[q; v; states of the disturbances; t]``, with t only if it is used; the parameters are the model's,
+    followed by the constants of the disturbances.  Equal where these equations are, whatever the values of the constants.
     """
 
     def __init__(self, model: Model, disturbances: Sequence[Disturbance]) -> None:
@@ -215,7 +232,7 @@ class DisturbedModel:
 
     @property
     def n_v(self) -> int:
-        """Number of states that follow the coordinates: velocities, and the disturbances' own."""
+        """Number of states that follow the coordinates: velocities, and those of the disturbances."""
         return self.model.n_v + len(self.own_states)
 
     @property
@@ -270,7 +287,7 @@ class DisturbedModel:
 
 
 def _uses_time(disturbance: Disturbance) -> bool:
-    """Whether ``d.t`` matters."""
+    """True if a disturbance depends on ``d.t``."""
     arguments = disturbance.effect.sx_in()
     results = ca.vertcat(*disturbance.effect(*arguments))
     return bool(ca.which_depends(results, arguments[-1][-1], 1, False)[0])
@@ -278,15 +295,21 @@ def _uses_time(disturbance: Disturbance) -> bool:
 
 @dataclass(frozen=True)
 class Plant:
-    """A model with its parameters: what can be simulated, planned for and flown.  A `Result` serves as one, too.
+    """Model with its parameters, for simulation, planning and control. A `Result` can take its place.
 
     Parameters
     ----------
-    model : the equations that are known
-    parameters : name -> value
-    disturbances : what acts on the plant without the model's knowing; simulations alone know it
+    model : Model
+        Equations of motion.
+    parameters : mapping of str to float
+        Value of each parameter.
+    disturbances : tuple of Disturbance
+        Effects that only simulations include.
 
-    Raises ModelError: a parameter is missing, unknown or not finite; a disturbance of another model, or two of a name.
+    Raises
+    ------
+    ModelError
+        A parameter is missing, unknown or not finite; a disturbance of another model, or two of the same name.
     """
 
     model: Model
@@ -306,25 +329,28 @@ class Plant:
                     "make it for the plant's own"
                 )
             if names.count(one.name) > 1:
-                raise ModelError(f'two disturbances are called "{one.name}"; give each a name of its own')
+                raise ModelError(f'two disturbances have the name "{one.name}"; give them different names')
 
     @cached_property
     def simulated(self) -> Model | DisturbedModel:
-        """What moves: the model, with its disturbances if there are any."""
+        """Simulated equations: the model, with its disturbances if there are any."""
         return DisturbedModel(self.model, self.disturbances) if self.disturbances else self.model
 
     @property
     def constants(self) -> FloatArray:
-        """Parameters, then the disturbances' constants: what `simulated` takes as ``p``."""
+        """Parameters and constants of the disturbances: ``p`` of `simulated`."""
         values = [*self.parameters.values(), *(x for one in self.disturbances for x in one.constants.values())]
         return np.array(values)
 
     def initial_state(self, state: npt.ArrayLike, seed: int = 0) -> FloatArray:
-        """Initial state of what is simulated, from the model's own ``(n_x,)``.
+        """Initial state of `simulated` from that of the model (n_x,).
 
         Parameters
         ----------
-        seed : of those states of disturbances that start anywhere in a range
+        state : (n_x,) array
+            Of the model.
+        seed : int
+            Of the states of disturbances that are drawn from a range.
         """
         x = np.asarray(state, np.float64)
         if isinstance(self.simulated, Model):
@@ -334,15 +360,15 @@ class Plant:
         return np.concatenate([x, own, np.zeros(int("t" in self.simulated.own_states))])
 
     def substeps(self, dt: float) -> int:
-        """Integration steps from row to row, dt seconds apart, that resolve every disturbance."""
+        """Integration steps per sample of dt (s) that resolve every disturbance."""
         fastest = max((one.highest_frequency for one in self.disturbances), default=0.0)
         return max(1, int(np.ceil(_STEPS_PER_PERIOD * fastest * dt)))
 
 
 def as_plant(plant: ModelWithParameters) -> Plant:
-    """The plant itself, or a result as a plant.
+    """A plant as it is, or a result as a plant.
 
-    Raises SettingsError: it is something else.
+    Raises SettingsError: it is neither.
     """
     if isinstance(plant, Plant):
         return plant

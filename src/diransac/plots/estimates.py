@@ -1,4 +1,4 @@
-"""The picture of a study that judges parameters: how far off the worst of them is, a row a level, a mark a method."""
+"""Figure of parameter errors of a study: the largest per method, a row per level."""
 
 from __future__ import annotations
 
@@ -10,12 +10,9 @@ import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
-from diransac.plots.heading import draw_heading, header_height
-from diransac.plots.layout import WIDTH
-from diransac.plots.palette import INK, MUTED, PAPER
-from diransac.plots.rows import Row, Scale, as_marks, draw_rows, name_rows, names_width, row_height
+from diransac.plots.figure import INK, MUTED, PAPER, WIDTH, check_ending, draw_heading, header_height, write
+from diransac.plots.rows import LogAxis, MarkRow, as_marks, draw_rows, name_rows, names_width, row_height
 from diransac.plots.study import axis_label, level_labels, method_looks, n_trials, title_of
-from diransac.plots.writing import checked_ending, write
 from diransac.study.specification import TRUE
 from diransac.study.store import Store
 from diransac.study.summary import Estimates, Summary, summarise
@@ -23,44 +20,57 @@ from diransac.study.summary import Estimates, Summary, summarise
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["LEAST", "judges_parameters", "methods_and_errors", "plot_estimates"]
+__all__ = ["LEAST", "evaluates_parameters", "methods_and_errors", "plot_estimates"]
 
 
 LEAST = -3
-"""Power of ten, %: what is less is shown as nothing."""
+"""Power of ten, %, below which errors are not resolved."""
 
-OF_OWN = "against the plant’s own"
+_TO_TRUE = "relative to the true ones"
 
-# Inches: what names the picture with the values above the rows, values below, a line of the caption.
+# Inches: name of the panel with the values above its rows, values below, a line of the caption.
 _ABOVE, _BELOW, _LINE = 0.42, 0.3, 0.155
 _CAPTION = (
-    "Marks are medians over {trials} of a level, lines end at the worst. Errors are relative to the best "
-    "parameters that the model can reach in the",
-    "very flight; where those differ from the plant’s own, a second row has the errors against the latter.",
+    "Marks are medians over {trials} of a level, lines end at the largest. Errors are relative to the pseudo-true "
+    "parameters, the best of the",
+    "model in that flight; where those differ from the true ones, a second row has the errors relative to the latter.",
 )
-_NONE = " none: no estimate, which is worse than any."
+_NONE = " none: no estimate, counted as an infinite error."
 
 
 def plot_estimates(store: str | Path, path: str | Path | None = None, *, title: str | None = None) -> Figure:
-    """Error of the worst parameter: a row a level, a mark a method, on a logarithmic axis in %.
+    """Figure of the error of the worst parameter: a row per level, a mark per method, on a logarithmic axis in %.
 
     Parameters
     ----------
-    store : of a study that judges parameters
-    path : ``.png``, ``.svg`` or ``.pdf`` to be written, whole or not at all; None writes nothing
-    title : None: the study's name and description
+    store : str or Path
+        Of a study that evaluates parameters.
+    path : str or Path, optional
+        ``.png``, ``.svg`` or ``.pdf`` file, written completely or not at all; None writes none.
+    title : str, optional
+        By default the study's name and description.
 
-    Marks are medians over the trials of a level, from which a line runs to the worst of them.  Errors are relative to
-    the best parameters that the model can reach in the very flight.  Where these differ from the plant's own by more
-    than 0.2 %, a second row has the errors against the plant's own.  A trial without an estimate counts as worse than
-    any.  The method ``true`` has a mark where its parameters are not the best ones.
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The same store gives the same file.
 
-    Returns a Matplotlib figure. The same rows give the same file.
-    Raises StudyError: there is no such store, or it has no rows; SettingsError: its study judges no parameters, or the
-    file cannot be written.
+    Raises
+    ------
+    StudyError
+        There is no such store, or it has no rows.
+    SettingsError
+        The study evaluates no parameters, or the file cannot be written.
+
+    Notes
+    -----
+    Marks are medians over the trials of a level; a line runs from each to the largest value. Errors are relative to the
+    pseudo-true parameters, the best of the model in that flight. Where these differ from the true ones by more than
+    0.2 %, a second row has the errors relative to the latter. A trial without an estimate has an infinite error. The
+    method ``true`` has a mark where its parameters are not the pseudo-true ones.
     """
     if path is not None:
-        checked_ending(Path(path))
+        check_ending(Path(path))
     summary = summarise(store)
     figure = _drawn(summary, title_of(summary) if title is None else title)
     if path is not None:
@@ -68,43 +78,43 @@ def plot_estimates(store: str | Path, path: str | Path | None = None, *, title: 
     return figure
 
 
-def judges_parameters(store: str | Path) -> bool:
-    """Whether a store's study judges parameters.  Raises StudyError: there is no such store."""
+def evaluates_parameters(store: str | Path) -> bool:
+    """True if a store's study evaluates parameters.  Raises StudyError: there is no such store."""
     with Store.existing(store) as kept:
         return bool(kept.configuration["study"].get("evaluation.parameters"))
 
 
-def methods_and_errors(summary: Summary, parameter: str | None = None) -> tuple[list[str], list[Row]]:
-    """The methods that have errors worth showing, and their errors at each level, in %.
+def methods_and_errors(summary: Summary, parameter: str | None = None) -> tuple[list[str], list[MarkRow]]:
+    """Methods and rows of their errors at each level, %.
 
-    What ``true`` has found is no news but where the best parameters are others; where it is alone, nothing is shown.
+    The method ``true`` is left out where its parameters are the pseudo-true ones, unless it is the only one.
 
     Parameters
     ----------
-    parameter : whose errors; None: of the worst
+    parameter : its errors; None: the largest over all parameters
 
-    Raises SettingsError: the study judges no parameters.
+    Raises SettingsError: the study evaluates no parameters.
     """
     estimates = summary.estimates
     if estimates is None:
-        raise SettingsError("the study judges no parameters; run one with evaluation.parameters = true")
+        raise SettingsError("the study evaluates no parameters; run one with evaluation.parameters = true")
     best = estimates.worst if parameter is None else estimates.errors[parameter]
     own = estimates.worst_of_own if parameter is None else estimates.errors_of_own[parameter]
-    is_news = estimates.differs.any() or summary.methods == (TRUE,)
-    kept = [k for k, label in enumerate(summary.methods) if label != TRUE or is_news]
+    shows_true = estimates.differs.any() or summary.methods == (TRUE,)
+    kept = [k for k, label in enumerate(summary.methods) if label != TRUE or shows_true]
     is_true = np.array([summary.methods[k] == TRUE for k in kept])
     rows = []
     for i, name in enumerate(level_labels(summary)):
         rows.append(_row(name, best[i, kept], is_true & ~estimates.differs[i]))
         if estimates.differs[i]:
-            rows.append(_row(OF_OWN, own[i, kept], is_true, quiet=True))
+            rows.append(_row(_TO_TRUE, own[i, kept], is_true, quiet=True))
     return [summary.methods[k] for k in kept], rows
 
 
-def _row(name: str, errors: FloatArray, hidden: npt.NDArray[np.bool_], *, quiet: bool = False) -> Row:
-    """A row of the errors (n_methods, n_trials) that are not hidden."""
+def _row(name: str, errors: FloatArray, hidden: npt.NDArray[np.bool_], *, quiet: bool = False) -> MarkRow:
+    """Row of the errors (n_methods, n_trials) that are not hidden."""
     shown = 100.0 * np.where(hidden[:, None], np.nan, errors)[None]
-    return Row(name, Estimates.median(shown)[0], Estimates.largest(shown)[0], quiet)
+    return MarkRow(name, Estimates.median(shown)[0], Estimates.largest(shown)[0], quiet)
 
 
 def _drawn(summary: Summary, title: str) -> Figure:
@@ -114,7 +124,7 @@ def _drawn(summary: Summary, title: str) -> Figure:
     every = as_marks(method_looks(summary.methods))
     looks = {label: every[label] for label in methods}
     entries = list(looks.items())
-    scale = Scale.of(rows, LEAST)
+    scale = LogAxis.of(rows, LEAST)
     caption = _caption(summary, scale)
     header, height = header_height(entries, title), row_height(len(methods)) * len(rows)
     full = header + _ABOVE + height + _BELOW + _LINE * len(caption) + 0.08
@@ -132,8 +142,8 @@ def _drawn(summary: Summary, title: str) -> Figure:
     return figure
 
 
-def _caption(summary: Summary, scale: Scale) -> list[str]:
-    """Lines that say what is drawn, and what is missing."""
+def _caption(summary: Summary, scale: LogAxis) -> list[str]:
+    """Lines of the caption."""
     first, second = _CAPTION
     lines = [first.format(trials=n_trials(summary)), second + _NONE * scale.endless]
     return [*lines, summary.remark] if summary.remark else lines

@@ -1,4 +1,4 @@
-"""The paths that a study has flown, all trials over one another: Fig. 5 of the paper."""
+"""Figure of the paths flown in a study, all trials superimposed: Fig. 5 of the paper."""
 
 from __future__ import annotations
 
@@ -10,12 +10,22 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.errors import SettingsError
-from diransac.plots.flights import Range, extent
-from diransac.plots.heading import draw_heading, header_height
-from diransac.plots.layout import WIDTH
-from diransac.plots.palette import INK, MUTED, PAPER, REFERENCE, RULE, SOFT
+from diransac.plots.figure import (
+    INK,
+    MUTED,
+    PAPER,
+    REFERENCE,
+    RULE,
+    SOFT,
+    WIDTH,
+    Range,
+    check_ending,
+    draw_heading,
+    extent,
+    header_height,
+    write,
+)
 from diransac.plots.study import method_looks, title_of
-from diransac.plots.writing import checked_ending, write
 from diransac.study.reading import paths
 from diransac.study.specification import TRUE
 from diransac.study.store import Store
@@ -29,37 +39,50 @@ __all__ = ["levels_with_paths", "plot_paths"]
 
 Path2 = npt.NDArray[np.float32]
 
-# Inches: left of the panels, between them, above a row of them (its trajectory), below (what is not seen), the caption.
+# Inches: left of the panels, between them, above a row (trajectory's name), below it (counts), the caption.
 _LEFT, _GAP, _NAME, _BELOW, _CAPTION = 0.42, 0.12, 0.24, 0.42, 0.3
-# Of what a panel shows: room on each side of the reference, as a share of its larger side; of paths, every n-th row.
+# Margin around the reference as a fraction of its larger side; every n-th row of paths is drawn.
 _MARGIN, _EVERY = 0.3, 3
 _PALE = 0.35
-# Lines of the grid across a panel, at most.
+# Largest number of grid lines across a panel.
 _LINES = 5.0
 
 
 def plot_paths(
     store: str | Path, path: str | Path | None = None, *, level: str | None = None, title: str | None = None
 ) -> Figure:
-    """The flown paths of every trial at one level: a row of panels a trajectory, a panel a method.
+    """Figure of the paths of all trials at one level: a row of panels per trajectory, a panel per method.
 
     Parameters
     ----------
-    store : of a study that keeps paths
-    path : ``.png``, ``.svg`` or ``.pdf`` to be written, whole or not at all; None writes nothing
-    level : None: the only one that has paths
-    title : None: the study's name and description
+    store : str or Path
+        Of a study that keeps paths.
+    path : str or Path, optional
+        ``.png``, ``.svg`` or ``.pdf`` file, written completely or not at all; None writes none.
+    level : str, optional
+        Default: the only level with paths.
+    title : str, optional
+        By default the study's name and description.
 
-    Below the flights lies, broad and grey, what was flown with the true parameters, if the study has the method
-    ``true``.  Panels show as much of the plane as that takes and some more; how many flights leave it, and how many
-    trials have none, stands below each.
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The same store gives the same file.
 
-    Returns a Matplotlib figure. The same rows give the same file.
-    Raises StudyError: there is no such store, or it has no rows; SettingsError: it has no paths at that level, or the
-    file cannot be written.
+    Raises
+    ------
+    StudyError
+        There is no such store, or it has no rows.
+    SettingsError
+        It has no paths at that level, or the file cannot be written.
+
+    Notes
+    -----
+    The path flown with the true parameters is broad and grey, if the study has the method ``true``. The panels cover
+    that path and a margin; below each are the numbers of flights that leave it and of failed trials.
     """
     if path is not None:
-        checked_ending(Path(path))
+        check_ending(Path(path))
     summary = summarise(store)
     chosen = _chosen(levels_with_paths(store), level)
     flown = {shape: _at(paths(store, shape), chosen, summary.methods) for shape in summary.flights}
@@ -70,7 +93,7 @@ def plot_paths(
 
 
 def levels_with_paths(store: str | Path) -> list[str]:
-    """The levels at which a store keeps paths, in the order in which they were kept.  Raises StudyError: as above."""
+    """Levels with paths in a store.  Raises StudyError: there is no such store."""
     with Store.existing(store) as kept:
         return [level for (level,) in kept.select("SELECT DISTINCT level FROM trials WHERE paths NOT NULL")]
 
@@ -87,7 +110,7 @@ def _chosen(levels: Sequence[str], level: str | None) -> str:
 
 
 def _at(found: Mapping[tuple[str, int, str], Path2], level: str, methods: Sequence[str]) -> dict[str, list[Path2]]:
-    """The paths of each method at one level."""
+    """Paths of each method at one level."""
     return {m: [path for (at, _, method), path in found.items() if (at, method) == (level, m)] for m in methods}
 
 
@@ -125,7 +148,7 @@ def _drawn(summary: Summary, level: str, flown: Mapping[str, Mapping[str, list[P
 
 
 def _box(by_method: Mapping[str, list[Path2]]) -> tuple[Range, Range]:
-    """What a panel shows in x and z: the flights with the true parameters, or the median extent, and some more."""
+    """Ranges of a panel in x and z: median extent of the flights with the true parameters, or of all, with a margin."""
     every = by_method.get(TRUE) or [path for some in by_method.values() for path in some]
     low = np.median([path[:, :2].min(axis=0) for path in every], axis=0)
     high = np.median([path[:, :2].max(axis=0) for path in every], axis=0)
@@ -160,7 +183,7 @@ def _dress(axes: Axes, box: tuple[Range, Range], first: bool) -> None:
         axis.set_major_locator(MultipleLocator(next(n * decade for n in (1.0, 2.0, 5.0, 10.0) if n * decade >= least)))
 
 
-# Words ---------------------------------------------------------------------------------------------------------------
+# Text ----------------------------------------------------------------------------------------------------------------
 def _counts(summary: Summary, shape: str, level: str) -> dict[str, tuple[int, int]]:
     """Trials of each method at the level, and how many failed."""
     flights, row = summary.flights[shape], summary.levels.index(level)
@@ -169,7 +192,7 @@ def _counts(summary: Summary, shape: str, level: str) -> dict[str, tuple[int, in
 
 
 def _unseen(flown: Sequence[Path2], box: tuple[Range, Range], ran: int, failed: int) -> str:
-    """How many flights leave the panel, and how many trials have none."""
+    """Number of flights that leave the panel, and of failed trials."""
     low, high = np.transpose(box)
     leaving = sum(bool(((path[:, :2] < low) | (path[:, :2] > high)).any()) for path in flown)
     lines = [f"{leaving} of {ran} leave the panel"] * (leaving > 0) + [f"{failed} of {ran} failed"] * (failed > 0)

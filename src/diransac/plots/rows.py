@@ -1,8 +1,8 @@
-"""Rows of marks: what each method reached at each level, median and worst, on a logarithmic axis; for long names."""
+"""Rows of marks: median and largest error of each method at each level, on a logarithmic axis."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
@@ -10,40 +10,49 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.plots.layout import WIDTH
-from diransac.plots.palette import INK, MUTED, PAPER, RULE, SOFT
+from diransac.plots.figure import INK, MUTED, PAPER, RULE, SOFT, WIDTH
+from diransac.study.summary import Flights
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["Row", "Scale", "as_marks", "draw_rows", "name_rows", "names_width", "row_height"]
+__all__ = [
+    "LogAxis",
+    "MarkRow",
+    "as_marks",
+    "draw_flight_rows",
+    "draw_rows",
+    "flight_rows_height",
+    "name_rows",
+    "names_width",
+    "row_height",
+]
 
 Looks = Mapping[str, Mapping[str, Any]]
 
-# Inches: of a row, what each method takes, what is free, and the least in all; decades that have a name each are so far
-# apart, and names no nearer.
+# Inches: height of a row per method, its margin, its least height; least distances of labelled decades and of labels.
 _METHOD, _FREE, _LEAST = 0.044, 0.075, 0.24
 _APART, _NEAR = 0.5, 0.32
-# Inches: a letter of a row's name; letters of a line of it.
+# Width of a letter of a row's name, inches; letters per line.
 _LETTER, _LETTERS = 0.059, 40
-# Inches: how far the heading of the rows' names is above these, beside the values.
+# Inches: distance of the heading above the rows' names.
 _HEADING = 0.05
-# Decades that an axis has at most, and the room beyond its ends, in decades: for too little, too much, none at all.
+# Largest number of decades of an axis, and the distance of the places beyond its ends, in decades.
 _DECADES, _ROOM = 6, 0.6
 _WORST: dict[str, Any] = {"linewidth": 1.0, "alpha": 0.45, "solid_capstyle": "butt"}
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
-class Row:
-    """One row.
+class MarkRow:
+    """Marks of one level.
 
     Parameters
     ----------
-    name : how it is called
-    median, worst : (n_methods,) what is drawn; infinite where a method has nothing, NaN where it was not asked
-    quiet : whether it belongs to the row above it
+    name : of the level
+    median, worst : (n_methods,)   infinite where a method has no result, NaN where it was not run
+    quiet : whether it is a second row of the level above
     """
 
     name: str
@@ -53,15 +62,15 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Scale:
-    """A logarithmic axis, beyond whose ends stands what is too small or too large for it, or no number at all.
+class LogAxis:
+    """Logarithmic axis with places beyond its ends for values that are too small, too large or infinite.
 
     Parameters
     ----------
-    least : the power of ten below which everything is too small
-    low, high : powers of ten where the axis begins and ends
-    exceeded : whether something is larger
-    endless : whether something is infinite
+    least : power of ten below which values are too small
+    low, high : powers of ten at the ends of the axis
+    exceeded : whether a value is larger
+    endless : whether a value is infinite
     """
 
     least: int
@@ -71,8 +80,8 @@ class Scale:
     endless: bool
 
     @classmethod
-    def of(cls, rows: Sequence[Row], least: int) -> Scale:
-        """The axis for these rows."""
+    def of(cls, rows: Sequence[MarkRow], least: int) -> LogAxis:
+        """Axis for these rows."""
         values = np.array([[row.median, row.worst] for row in rows])
         seen = values[np.isfinite(values) & (values >= 10.0**least)]
         smallest, largest = (float(seen.min()), float(seen.max())) if len(seen) else (10.0**least, 10.0**least)
@@ -82,34 +91,34 @@ class Scale:
 
     @property
     def nothing(self) -> float:
-        """Where what is too small stands, in decades."""
+        """Place of values that are too small, in decades."""
         return self.low - _ROOM
 
     @property
     def most(self) -> float:
-        """Where what is too large stands."""
+        """Place of values that are too large."""
         return self.high + _ROOM
 
     @property
     def none(self) -> float:
-        """Where what is infinite stands."""
+        """Place of infinite values."""
         return self.high + (3.6 if self.exceeded else 1.2) * _ROOM
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Of the panel."""
+        """Ends of the panel."""
         last = self.none if self.endless else self.most if self.exceeded else self.high
         return self.nothing - 0.6 * _ROOM, last + 0.6 * _ROOM
 
     def place(self, values: FloatArray) -> FloatArray:
-        """Where values stand, in decades; NaN of NaN."""
+        """Places of values, in decades; NaN for NaN."""
         with np.errstate(divide="ignore"):
             decades = np.log10(values)
         inside = np.where(decades < self.low, self.nothing, np.where(decades > self.high, self.most, decades))
         return np.where(np.isinf(values), self.none, inside)
 
     def names(self, width: float) -> dict[float, str]:
-        """What stands where along a panel of so many inches; no name is near another."""
+        """Labels by place along a panel of this width, inches; labels do not overlap."""
         decade = width / (self.ends[1] - self.ends[0])
         name, step = (_decade, 1) if decade > _APART else (_power, 2)
         beyond = {self.nothing: f"<{name(self.least)}"}
@@ -120,7 +129,7 @@ class Scale:
 
 
 def as_marks(looks: Looks) -> dict[str, dict[str, Any]]:
-    """The looks of methods as marks without lines; what has no mark gets a square."""
+    """Styles of methods as marks without lines; the default mark is a square."""
     plain = {"marker": "s", "markersize": 4.0}
     return {label: {**plain, **look, "linestyle": "none"} for label, look in looks.items()}
 
@@ -131,14 +140,14 @@ def row_height(n_methods: int) -> float:
 
 
 def draw_rows(
-    figure: Figure, place: tuple[float, float, float], rows: Sequence[Row], looks: Looks, scale: Scale
+    figure: Figure, place: tuple[float, float, float], rows: Sequence[MarkRow], looks: Looks, scale: LogAxis
 ) -> None:
-    """Draw rows of marks: at the median, from where a line runs to the worst.
+    """Draw rows of marks at the medians, with lines to the largest values.
 
     Parameters
     ----------
     place : left, top and width, inches from the figure's top left
-    looks : of each method's mark, as `as_marks` has them; within a row the first is uppermost
+    looks : style of each method's mark, from `as_marks`; the first is at the top of a row
     """
     left, top, width = place
     full, n_methods = figure.get_figheight(), len(looks)
@@ -159,15 +168,15 @@ def draw_rows(
 
 
 def _mark(axes: Axes, x: float, end: float, y: float, look: Mapping[str, Any], *, hollow: bool) -> None:
-    """A method's mark, and the line to its worst."""
+    """Draw a method's mark, and the line to its largest value."""
     colour = look["color"]
     axes.plot([x, end], [y, y], color=colour, **_WORST, zorder=2.2)
     face = PAPER if hollow else colour
     axes.plot([x], [y], **{**look, "markerfacecolor": face, "markeredgewidth": 0.8 if hollow else 0.3}, zorder=2.5)
 
 
-def _shade(axes: Axes, rows: Sequence[Row], scale: Scale) -> None:
-    """Bands behind every other level, lines at the decades, dotted ones that set apart what has no place among them."""
+def _shade(axes: Axes, rows: Sequence[MarkRow], scale: LogAxis) -> None:
+    """Draw bands behind every other level, lines at the decades, and dotted lines before the places beyond the ends."""
     band = 0
     for i, row in enumerate(rows):
         band += not row.quiet
@@ -180,16 +189,18 @@ def _shade(axes: Axes, rows: Sequence[Row], scale: Scale) -> None:
 
 
 def names_width(names: Sequence[str], heading: str) -> float:
-    """What names of rows and their heading take at the left, with what is free beside them, inches."""
+    """Width of the names of rows and their heading with margins, inches."""
     return 0.25 + _LETTER * max(len(line) for name in (*names, heading) for line in _lines(name))
 
 
-def name_rows(figure: Figure, place: tuple[float, float], rows: Sequence[Row], n_methods: int, heading: str) -> None:
-    """Names of the rows below what they are names of.
+def name_rows(
+    figure: Figure, place: tuple[float, float], rows: Sequence[MarkRow], n_methods: int, heading: str
+) -> None:
+    """Write the names of the rows below their heading.
 
     Parameters
     ----------
-    place : where their panel begins: left and top, inches from the figure's top left
+    place : left and top of their panel, inches from the figure's top left
     heading : such as ``outlier magnitude, m/s²``
     """
     left, top = place
@@ -203,7 +214,7 @@ def name_rows(figure: Figure, place: tuple[float, float], rows: Sequence[Row], n
 
 
 def _lines(name: str) -> list[str]:
-    """A name in lines that are not too long."""
+    """Name wrapped into lines."""
     return wrap(name, _LETTERS) or [name]
 
 
@@ -215,3 +226,55 @@ def _decade(power: int) -> str:
 def _power(power: int) -> str:
     """``0.1``, ``1``, ``10``, and ``10⁻³`` or ``10³`` further out."""
     return _decade(power) if abs(power) < 2 else f"10{str(power).translate(_SUPERSCRIPTS)}"
+
+
+# Tracking errors -----------------------------------------------------------------------------------------------------
+_COLUMNS = 3
+# Inches: between panels, name of a panel with the values above its rows, values below them.
+_GAP, _ABOVE, _BELOW = 0.26, 0.42, 0.3
+_LEAST_ERROR = -3
+"""Power of ten, m or rad, below which errors are not resolved."""
+
+
+def flight_rows_height(flights: Flights, n_levels: int, n_methods: int) -> float:
+    """Height of the panels, inches."""
+    return -(-len(_coordinates(flights.errors)) // _COLUMNS) * (_ABOVE + n_levels * row_height(n_methods) + _BELOW)
+
+
+def draw_flight_rows(
+    figure: Figure,
+    top: float,
+    flights: Flights,
+    units: Mapping[str, str],
+    levels: Sequence[str],
+    axis: str,
+    looks: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Draw median and largest RMS tracking error over all trials; that of a failed trial is infinite.
+
+    Parameters
+    ----------
+    top : inches from the figure's top
+    units : of the states
+    levels, axis : names of the levels, and of the quantity that varies
+    looks : style of each method
+    """
+    full, height, beside = figure.get_figheight(), len(levels) * row_height(len(looks)), names_width(levels, axis)
+    width = (WIDTH - beside - 0.1) / _COLUMNS
+    for i, state in enumerate(_coordinates(flights.errors)):
+        row, column = divmod(i, _COLUMNS)
+        left, above = beside + column * width, top + row * (_ABOVE + height + _BELOW)
+        medians, worst = flights.median(state), flights.largest(state)
+        rows = [MarkRow(name, *pair) for name, *pair in zip(levels, medians, worst, strict=True)]
+        y = 1.0 - (above + 0.02) / full
+        figure.text(left / WIDTH, y, state, fontsize=8.5, color=INK, va="top")
+        figure.text((left + width - _GAP) / WIDTH, y, units[state], fontsize=7.5, color=MUTED, va="top", ha="right")
+        if column == 0:
+            name_rows(figure, (left, above + _ABOVE), rows, len(looks), axis)
+        draw_rows(figure, (left, above + _ABOVE, width - _GAP), rows, looks, LogAxis.of(rows, _LEAST_ERROR))
+
+
+def _coordinates(states: Iterable[str]) -> list[str]:
+    """Coordinates; velocities repeat them and are in tables."""
+    names = list(states)
+    return [name for name in names if not name.endswith("_dot")] or names

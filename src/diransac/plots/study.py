@@ -1,4 +1,4 @@
-"""Pictures of studies: tracking errors over the axis, and the paths that were flown."""
+"""Figures of studies: tracking errors and failures over the axis."""
 
 from __future__ import annotations
 
@@ -12,13 +12,22 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
-from diransac.plots.failures import draw_failures, failures_height
-from diransac.plots.flight_rows import draw_flight_rows, flight_rows_height
-from diransac.plots.heading import draw_heading, header_height
-from diransac.plots.layout import WIDTH, name_panel, panel
-from diransac.plots.palette import COLOURS, INK, MUTED, PAPER, REFERENCE
-from diransac.plots.rows import as_marks
-from diransac.plots.writing import checked_ending, write
+from diransac.plots.figure import (
+    COLOURS,
+    INK,
+    MUTED,
+    PAPER,
+    REFERENCE,
+    SOFT,
+    WIDTH,
+    check_ending,
+    draw_heading,
+    header_height,
+    name_panel,
+    panel,
+    write,
+)
+from diransac.plots.rows import as_marks, draw_flight_rows, flight_rows_height
 from diransac.study.specification import TRUE
 from diransac.study.summary import Flights, Summary, summarise
 
@@ -29,56 +38,68 @@ if TYPE_CHECKING:
 __all__ = ["axis_label", "level_labels", "method_looks", "n_trials", "plot_study", "title_of"]
 
 
-# Inches: a row of panels, what names a trajectory, the axis below the panels, a line of the caption.
+# Inches: height of a row of panels, of a trajectory's name, of the axis below the panels, of a line of the caption.
 _ROW, _NAME, _AXIS, _LINE = 1.5, 0.24, 0.36, 0.155
 _COLUMNS = 3
-# Methods stand side by side within this share of the least distance between levels.
+# Methods are side by side within this fraction of the least distance between levels.
 _SPREAD = 0.5
-# Means this many times the median mean call for a logarithmic scale, of so many decades above a linear beginning.
+# Ratio of the largest to the median mean above which the scale is logarithmic; its decades above a linear part.
 _MANY, _DECADES = 20.0, 3
-# Letters of a title's line; lines of one title differ by so many at most.
+# Letters per line of a title, and largest difference between its lines.
 _LETTERS, _RAGGED = 92, 12
 
-# The palette's fifth colour is too near the first where lines cross.
+# The fifth colour is too close to the first where lines cross.
 _COLOURS = (*COLOURS[:4], INK, COLOURS[5], "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _CAPTION = (
     "Mean of the RMS tracking error and one standard deviation, over {trials}; a dash is the median, for which "
     "a failed trial",
-    "has an infinite error. Without a flight (no plan, or one that diverged) a trial has failed: means leave it out, "
-    "and are then hollow.",
+    "has an infinite error. A trial without a flight (no plan, or one that diverged) has failed: means exclude it, and "
+    "are then hollow.",
 )
-_CAPTION_OF_ROWS = ("Marks are medians of the RMS tracking error over {trials} of a level, lines end at the worst.",)
-_NONE = "none: no flight (no plan, or one that diverged), which is worse than any."
+_CAPTION_OF_ROWS = ("Marks are medians of the RMS tracking error over {trials} of a level, lines end at the largest.",)
+_NONE = "none: no flight (no plan, or one that diverged), counted as an infinite error."
 
 
 def plot_study(store: str | Path, path: str | Path | None = None, *, title: str | None = None) -> Figure:
-    """Tracking errors over a study's axis, as in Figs. 2 to 4 of the paper: a panel a state, a line a method.
+    """Figure of tracking errors over a study's axis: a panel per state, a line per method; Figs. 2 to 4 of the paper.
 
     Parameters
     ----------
-    store : of a study
-    path : ``.png``, ``.svg`` or ``.pdf`` to be written, whole or not at all; None writes nothing
-    title : None: the study's name and description
+    store : str or Path
+        Of a study.
+    path : str or Path, optional
+        ``.png``, ``.svg`` or ``.pdf`` file, written completely or not at all; None writes none.
+    title : str, optional
+        By default the study's name and description.
 
-    Points are means over the flights there are, bars one standard deviation to either side (errors are not negative:
-    they end at 0), dashes medians over all trials.  A trial that has no flight fails and has no error: below the panels
-    stands which share of the trials that is, and a mean that leaves some out is hollow, for these are the worst.
-    Where means differ by orders of magnitude the scale is linear up to a first decade, and logarithmic from there.
-    Levels that are words are rows, with a panel a coordinate on a logarithmic axis: marks are medians over all trials,
-    lines end at the worst.
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The same store gives the same file.
 
-    Returns a Matplotlib figure. The same rows give the same file.
-    Raises StudyError: there is no such store, or it has no rows; SettingsError: its study flies nothing with what was
-    identified, or the file cannot be written.
+    Raises
+    ------
+    StudyError
+        There is no such store, or it has no rows.
+    SettingsError
+        The study has no trajectories to evaluate, or the file cannot be written.
+
+    Notes
+    -----
+    Points are means over the flights, bars one standard deviation to either side (clipped at 0), dashes medians over
+    all trials. A trial without a flight has failed: the fraction of such trials is shown below the panels, and a mean
+    that excludes some is hollow. Where means differ by orders of magnitude the scale is linear up to a first decade and
+    logarithmic above. Levels that are words are rows, with a panel per coordinate on a logarithmic axis: marks are
+    medians over all trials, lines end at the largest value.
     """
     if path is not None:
-        checked_ending(Path(path))
+        check_ending(Path(path))
     summary = summarise(store)
     if not summary.flights:
         raise SettingsError(
-            "the study has no trajectories to evaluate; draw its parameters, as study plot --parameters does"
+            "the study has no trajectories to evaluate; draw its parameter errors with study plot --parameters"
         )
     figure = _drawn(summary, title_of(summary) if title is None else title)
     if path is not None:
@@ -108,25 +129,26 @@ def _drawn(summary: Summary, title: str) -> Figure:
 
 
 def _caption(summary: Summary) -> list[str]:
-    """Lines that say what is drawn, and what is missing."""
+    """Lines of the caption."""
     some_failed = any(flights.failed.any() for flights in summary.flights.values())
     of_rows = [*_CAPTION_OF_ROWS, _NONE if some_failed else ""]
     lines = [*(_CAPTION if summary.is_numeric else of_rows), summary.remark]
     return [line.format(trials=n_trials(summary)) for line in lines if line]
 
 
-# A trajectory: panels, and what failed ------------------------------------------------------------------------------
+# Panels of one trajectory ------------------------------------------------------------------------------------------
 def _looks(summary: Summary) -> dict[str, dict[str, Any]]:
-    """Lines, or marks where levels are words, which no line joins: they are rows."""
+    """Styles of lines, or of marks if levels are words."""
     looks = method_looks(summary.methods)
     return looks if summary.is_numeric else as_marks(looks)
 
 
 def _block_height(summary: Summary, flights: Flights) -> float:
+    """Height of a trajectory's panels, inches."""
     if not summary.is_numeric:
         return _NAME + flight_rows_height(flights, len(summary.levels), len(summary.methods))
     n_rows = -(-len(summary.units) // _COLUMNS)
-    return _NAME + n_rows * _ROW + _AXIS + failures_height(flights.failure_share)
+    return _NAME + n_rows * _ROW + _AXIS + _failures_height(flights.failure_share)
 
 
 def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, top: float) -> None:
@@ -146,7 +168,7 @@ def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, 
     below = top + _NAME + -(-len(states) // _COLUMNS) * _ROW
     figure.text(0.5, 1.0 - (below + 0.2) / full, axis_label(summary), fontsize=8.5, color=INK, va="top", ha="center")
     rows = [(label, look["color"]) for label, look in method_looks(summary.methods).items()]
-    draw_failures(figure, below + _AXIS, rows, level_labels(summary), flights.failure_share)
+    _draw_failures(figure, below + _AXIS, rows, level_labels(summary), flights.failure_share)
 
 
 def _draw_state(axes: Axes, summary: Summary, flights: Flights, state: str, logarithmic: bool) -> None:
@@ -182,14 +204,14 @@ def _draw_state(axes: Axes, summary: Summary, flights: Flights, state: str, loga
 
 
 def _spans_decades(flights: Flights) -> bool:
-    """Whether the means of some state differ so much that a linear scale shows the largest alone."""
+    """True if the means of a state differ so much that a linear scale shows the largest alone."""
     seen = [mean[np.isfinite(mean)] for mean in map(flights.mean, flights.errors)]
     return any(len(x) and float(x.max()) > _MANY * float(np.median(x)) for x in seen)
 
 
 # Axes ----------------------------------------------------------------------------------------------------------------
 def _placed(summary: Summary) -> FloatArray:
-    """Where each point stands, (n_levels, n_methods): methods side by side, so that their bars can be told apart."""
+    """Abscissa of each point (n_levels, n_methods), methods side by side."""
     positions, _ = _positions(summary)
     least = float(np.diff(positions).min()) if len(positions) > 1 else 1.0
     others = [label for label in summary.methods if label != TRUE]
@@ -218,7 +240,7 @@ def _name_levels(axes: Axes, summary: Summary) -> None:
 
 
 def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool) -> None:
-    """Linear from 0, or only up to a first decade and logarithmic from there."""
+    """Set a linear scale from 0, or one that is linear up to a first decade and logarithmic above."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
     largest = float(mean[np.isfinite(mean)].max(initial=0.0))
@@ -245,16 +267,16 @@ def _tick(y: float) -> str:
     return mantissa.replace("-", "−") if not power else power if mantissa == "1" else f"{mantissa}×{power}"
 
 
-# Words and looks -----------------------------------------------------------------------------------------------------
+# Labels and styles ---------------------------------------------------------------------------------------------------
 def title_of(summary: Summary) -> str:
-    """The study's name and what it is about, in as many lines as it needs."""
+    """Name and description of the study, wrapped."""
     text = f"{summary.name}: {summary.description}".removesuffix(": ")
     n_lines = -(-len(text) // _LETTERS)
     return "\n".join(wrap(text, min(_LETTERS, len(text) // n_lines + _RAGGED)))
 
 
 def method_looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """How each method's line looks: its own colour and mark; broad and grey of the true parameters."""
+    """Style of each method's line: its own colour and mark; broad and grey for the true parameters."""
     others = [label for label in methods if label != TRUE]
     looks: dict[str, dict[str, Any]] = {TRUE: {"color": REFERENCE, "linewidth": 2.8, "solid_capstyle": "round"}}
     for i, label in enumerate(others):
@@ -264,7 +286,7 @@ def method_looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def axis_label(summary: Summary) -> str:
-    """The axis with its unit, ``mass imbalance, 10⁻⁵ kg``."""
+    """Name of the axis with its unit, ``mass imbalance, 10⁻⁵ kg``."""
     _, exponent = _positions(summary)
     power = f"10{str(exponent).translate(_SUPERSCRIPTS)}" if exponent else ""
     unit = re.sub(r"\^(-?\d+)", lambda found: found[1].translate(_SUPERSCRIPTS), summary.unit)
@@ -272,13 +294,82 @@ def axis_label(summary: Summary) -> str:
 
 
 def level_labels(summary: Summary) -> list[str]:
-    """What the levels are called beside that label."""
+    """Labels of the levels for that axis."""
     positions, _ = _positions(summary)
     return [f"{x:.6g}".replace("-", "−") for x in positions] if summary.is_numeric else list(summary.levels)
 
 
 def n_trials(summary: Summary) -> str:
-    """How many trials a point has: ``50 trials``, ``2 to 50 trials`` where some are yet to run."""
+    """Number of trials per point: ``50 trials``, or ``2 to 50 trials`` for an unfinished study."""
     counts = summary.ran.sum(axis=2)
     least, most = int(counts.min()), int(counts.max())
     return f"{least} to {most} trials" if least < most else f"{most} trial{'s' * (most != 1)}"
+
+
+# Failed trials -------------------------------------------------------------------------------------------------------
+_FAILED = "#b42318"
+"""Colour of failures, as in the report."""
+
+# Inches: height of a row of cells, of the heading, of the margin below; left and right ends of the cells.
+_CELL, _HEADING, _FREE, _LEFT, _RIGHT = 0.19, 0.21, 0.1, 1.75, 8.83
+
+
+def _failures_height(share: FloatArray) -> float:
+    """Height of the table of failures, inches: a row per method with failures, one line without any."""
+    return _HEADING + _FREE + _CELL * len(_failing(share))
+
+
+def _draw_failures(
+    figure: Figure, top: float, methods: Sequence[tuple[str, str]], levels: Sequence[str], share: FloatArray
+) -> None:
+    """Draw the table of failures: fraction of the trials without a flight, by method and level.
+
+    Parameters
+    ----------
+    top : inches from the figure's top
+    methods : label and colour of each
+    levels : their labels
+    share : (n_levels, n_methods)   fraction of the trials; NaN without trials
+    """
+    rows = _failing(share)
+    text = "Trials that failed, %" if rows else "No trial failed."
+    _write(figure, 0.1, top + 0.05, text, color=INK, ha="left")
+    width = (_RIGHT - _LEFT) / len(levels)
+    if rows:
+        for i, level in enumerate(levels):
+            _write(figure, _LEFT + (i + 0.5) * width, top + 0.05, level, color=MUTED, ha="center")
+    for line, k in enumerate(rows):
+        y = top + _HEADING + line * _CELL
+        _write(figure, 0.1, y + 0.03, methods[k][0], color=methods[k][1], ha="left")
+        for i, fraction in enumerate(share[:, k]):
+            _draw_cell(figure, _LEFT + i * width, y, width, fraction)
+
+
+def _failing(share: FloatArray) -> list[int]:
+    """Indices of the methods with failures."""
+    return [int(k) for k in np.flatnonzero((np.nan_to_num(share) > 0.0).any(axis=0))]
+
+
+def _draw_cell(figure: Figure, left: float, top: float, width: float, fraction: float) -> None:
+    """Draw a cell with the percentage of failures, the darker the more there are."""
+    from matplotlib.patches import Rectangle
+
+    full = figure.get_figheight()
+    place = ((left + 0.015) / WIDTH, 1.0 - (top + _CELL - 0.02) / full)
+    size = ((width - 0.03) / WIDTH, (_CELL - 0.02) / full)
+    look: dict[str, Any] = {"transform": figure.transFigure, "linewidth": 0.0}
+    figure.add_artist(Rectangle(place, *size, facecolor=SOFT, **look))
+    if not fraction > 0.0:
+        return
+    figure.add_artist(Rectangle(place, *size, facecolor=_FAILED, alpha=0.12 + 0.6 * fraction, **look))
+    dark = fraction > 0.5
+    _write(figure, left + width / 2.0, top + 0.025, _percent(fraction), color="#ffffff" if dark else INK, ha="center")
+
+
+def _percent(fraction: float) -> str:
+    """Whole percent; 0 and 100 only if exact."""
+    return str(100 if fraction == 1.0 else min(99, max(1, round(100.0 * fraction))))
+
+
+def _write(figure: Figure, x: float, top: float, text: str, **look: Any) -> None:
+    figure.text(x / WIDTH, 1.0 - top / figure.get_figheight(), text, fontsize=7.5, va="top", **look)

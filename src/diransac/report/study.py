@@ -12,9 +12,9 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.plots.estimates import LEAST, methods_and_errors, plot_estimates
+from diransac.plots.figure import svg
 from diransac.plots.paths import levels_with_paths, plot_paths
 from diransac.plots.study import axis_label, level_labels, plot_study, title_of
-from diransac.plots.writing import svg
 from diransac.report.rendering import Table, number, percent, plural, write_page
 from diransac.study.summary import Estimates, Flights, Summary, summarise
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from diransac.errors import SettingsError
-from diransac.flight.planning import places, sine, sines, square, star
-from diransac.flight.planning.excitations import LONGEST, check_fully_actuated
-from diransac.flight.planning.flights import check_plane
+from diransac.flight.planning import multisine, random_waypoints, sine, square, star
+from diransac.flight.planning.trajectories import MAX_DURATION, check_fully_actuated, check_plane
 from diransac.flight.trajectory import Trajectory
 from diransac.model import Model
 from diransac.model.plant import ModelWithParameters
@@ -21,7 +20,7 @@ __all__ = ["MISSIONS", "TRAJECTORIES", "Flight", "check_flown"]
 MISSIONS: dict[str, Callable[..., Trajectory]] = {"square": square, "star": star, "sine": sine}
 """What identified models are judged by."""
 
-TRAJECTORIES: dict[str, Callable[..., Trajectory]] = {**MISSIONS, "places": places, "sines": sines}
+TRAJECTORIES: dict[str, Callable[..., Trajectory]] = {**MISSIONS, "places": random_waypoints, "sines": multisine}
 """What may be flown for data."""
 
 
@@ -51,8 +50,8 @@ class Flight:
         for name, value in self.arguments.items():
             if name != "seed" and is_number(value) and value <= 0:
                 raise SettingsError(f"data.{name} is {value:g}; give a number above 0")
-            if name == "duration" and value > LONGEST:
-                raise SettingsError(f"data.duration is {value:g}; give {LONGEST:g} s or less")
+            if name == "duration" and value > MAX_DURATION:
+                raise SettingsError(f"data.duration is {value:g}; give {MAX_DURATION:g} s or less")
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Flight:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from diransac.errors import DiransacError, SettingsError
-from diransac.flight.corruption import Noise
+from diransac.flight.noise import Noise
 from diransac.identification.identify import METHODS
 from diransac.identification.settings import Settings
 from diransac.study.axis import Axis

@@ -1,20 +1,17 @@
-"""Trajectories for any model: through waypoints at given or free times, or along a reference.
+"""Trajectory planning: direct transcription for any model, and named trajectories.
 
-| file | what it holds |
+| file | content |
 |---|---|
-| `planner.py` | `plan`, the one entry |
-| `flights.py` | the paper's square, star and sine |
-| `excitations.py` | flights for data, another with every seed: through random places, sums of sines |
-| `request.py`, `trim.py` | what is asked for, checked; the inputs that hold a plant at rest |
-| `problem.py` | from a task to a nonlinear program, and from its solution to a trajectory |
-| `transcription.py` | the program: where each unknown stands, values and exact derivatives |
+| `planner.py` | `plan`: the search for a solution, and the explanation where there is none |
+| `trajectories.py` | square, star, sine, random waypoints, multisine |
+| `request.py` | the arguments of a plan, checked; the trim at its start |
+| `problem.py` | the nonlinear program of a task, a first guess, the trajectory of a solution |
+| `transcription.py` | the program: index of each unknown, values and exact derivatives |
 | `stage.py` | one stage of it, compiled |
-| `solvers.py`, `snopt.py` | who solves it |
-| `diagnosis.py` | why there is no plan |
+| `solvers.py`, `snopt.py` | interior-point solvers, SNOPT |
 """
 
-from diransac.flight.planning.excitations import places, sines
-from diransac.flight.planning.flights import sine, square, star
 from diransac.flight.planning.planner import plan
+from diransac.flight.planning.trajectories import multisine, random_waypoints, sine, square, star
 
-__all__ = ["places", "plan", "sine", "sines", "square", "star"]
+__all__ = ["multisine", "plan", "random_waypoints", "sine", "square", "star"]

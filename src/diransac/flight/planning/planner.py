@@ -1,4 +1,4 @@
-"""`plan`: from waypoints or a reference to a trajectory."""
+"""Trajectory optimisation: `plan`, the search for a solution, and the explanation where there is none."""
 
 from __future__ import annotations
 
@@ -10,52 +10,49 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import PlanningError, SettingsError
-from diransac.flight.planning.diagnosis import why_not
 from diransac.flight.planning.problem import (
-    Path,
+    InitialGuess,
     Task,
-    first_path,
     fixed_program,
     free_program,
-    path_of,
+    guess_along,
+    straight_guess,
+    stretched_guess,
     trajectory_of,
     unknowns_of,
 )
 from diransac.flight.planning.request import (
+    TIME_STEP,
     Limits,
-    Reference,
     Signal,
     Waypoint,
+    check_search,
+    check_weights,
+    check_within,
     limits_of,
-    named_values,
-    rows_of,
-    waypoints_of,
+    reference_weights,
+    route_of,
+    trim_at,
     weights_of,
 )
-from diransac.flight.planning.solvers import TIME_LIMIT, Manner, Outcome, SearchLimits, interior_point
-from diransac.flight.planning.trim import trim_of
+from diransac.flight.planning.solvers import TIME_LIMIT, SearchLimits, Solution, Strategy, interior_point
+from diransac.flight.planning.transcription import Program
 from diransac.flight.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from diransac.flight.planning.transcription import Program
-    from diransac.model import Model
     from diransac.model.plant import ModelWithParameters
 
-
-__all__ = ["SOLVERS", "TIME_STEP", "plan"]
-
-TIME_STEP = 0.01
-"""s, from row to row of a plan: flights are simulated and controlled at 100 Hz."""
+__all__ = ["SOLVERS", "plan"]
 
 SOLVERS = ("ipopt", "fatrop", "snopt")
 
 _FIRST_ATTEMPTS = 0.4
-"""Share of the iterations that an attempt gets which is not the last: most plans take a tenth of them."""
+"""Fraction of the iterations for every attempt but the last: most plans take a tenth of them."""
 
 _MORE_ROWS = (0, 1, 2, 4, 8)
-"""Rows that a free duration is lengthened by, one after the other, until the rounded plan can be flown on the grid."""
+"""Rows added to optimal durations in turn until there is a plan on the grid of the inputs."""
 
 
 def plan(
@@ -66,186 +63,115 @@ def plan(
     reference: Mapping[str, Signal | ArrayLike] | None = None,
     duration: float | None = None,
     input_limits: Mapping[str, tuple[float, float]] | None = None,
-    input_share: float = 1.0,
+    input_limit_fraction: float = 1.0,
     state_limits: Mapping[str, tuple[float, float]] | None = None,
-    effort: Mapping[str, float] | None = None,
-    tracking: Mapping[str, float] | None = None,
+    input_weights: Mapping[str, float] | None = None,
+    state_weights: Mapping[str, float] | None = None,
     time_weight: float = 1.0,
     trim: Mapping[str, float] | None = None,
-    rest: bool = True,
+    start_end_at_rest: bool = True,
     guess: Trajectory | None = None,
     solver: str = "ipopt",
     max_iterations: int = 200,
     time_limit: float = 30.0,
 ) -> Trajectory:
-    """The cheapest trajectory through waypoints or along a reference, by direct transcription.
+    """Trajectory of least cost through waypoints or along a reference, by direct transcription.
 
-    What it costs: the integral of ``sum_i effort_i ((u_i - trim_i) / half_range_i)^2``, half the range of the input's
-    limits (1 where it has none), plus ``sum_j tracking_j (x_j - reference_j)^2``; where time is free,
-    plus `time_weight` for every second: by default a second costs what an input does that is fully used for a second.
-
-    Inputs are held over intervals of 0.1 s or a little less, each a whole number of rows. From row to row goes one
-    Runge-Kutta step, as in a simulation: the rows of a plan are what a simulation gives. Waypoints and state limits
-    hold at the ends of intervals.
+    The cost is the integral of ``sum_i r_i ((u_i - trim_i) / h_i)^2 + sum_j w_j (x_j - reference_j)^2``, with input
+    weights r, state weights w and h half the range of an input's limits (1 without limits); where time is free, plus
+    ``time_weight`` times the duration.
 
     Parameters
     ----------
-    plant : `Plant`, `Result` or anything else with a model and parameters
-    waypoints : states by name, the first the start and the last the end; what they don't name is free between them
-    times : s, of each waypoint, rounded to rows; None where the durations of the segments are to be found
-    reference : state -> function of time (s from the start, an array), or samples evenly spread over the duration
-    duration : s, of a plan along a reference without waypoints: it starts and ends on the reference
-    input_limits, state_limits : name -> (lowest, highest), each input's or state's unit
-    input_share : share of the way from trim to each of an input's limits that the plan uses; feedback keeps the rest
-    effort : input -> weight, per s; 1 by default
-    tracking : state -> weight of its squared distance from the reference, one over its unit squared and s; 1 by default
-    time_weight : per s, where time is free
-    trim : input -> value that costs nothing, 0 where not named; by default what holds the plant at rest at the start
-    rest : what the first and the last waypoint don't name is zero there; otherwise free
-    guess : a trajectory of the same model to start the search from
-    solver : ``ipopt``; ``fatrop``, which takes two thirds of the time, but now and then searches for ever, beyond the
-        reach of time_limit and Ctrl-C, where parameters are far off; or ``snopt``, with ``pip install diransac[snopt]``
-    max_iterations : of the last attempt; those before it, from the guess, or more carefully, get two fifths of them;
-        five of SNOPT's count as one
-    time_limit : s; to find out why there is no plan may take as long again
+    plant : Plant or Result
+        Model and parameters.
+    waypoints : sequence of mappings of str to float, optional
+        States by name, from the start to the end; states that are not named are free between both.
+    times : sequence of float, optional
+        Time of each waypoint, s, rounded to rows. None: the durations of the segments are optimised.
+    reference : mapping of str to callable or (n,) array, optional
+        Function of time (array, s from the start) for each state, or samples evenly spaced over the duration.
+    duration : float, optional
+        s, of a plan along a reference without waypoints, whose first and last values it starts and ends with.
+    input_limits, state_limits : mapping of str to (float, float), optional
+        Smallest and largest value, in the unit of the input or state.
+    input_limit_fraction : float
+        Fraction of the range from trim to each input limit that the plan uses; the rest remains for feedback.
+    input_weights : mapping of str to float, optional
+        r, 1/s; 1 by default.
+    state_weights : mapping of str to float, optional
+        w, one over the state's unit squared and s; 1 by default for each state with a reference.
+    time_weight : float
+        1/s, where time is free. With 1, a second costs as much as full use of an input for a second.
+    trim : mapping of str to float, optional
+        Inputs of zero cost, 0 where not named. By default those that hold the plant at rest at the start.
+    start_end_at_rest : bool
+        Whether states that the first and last waypoint do not name are zero there. False: they are free.
+    guess : Trajectory, optional
+        Starting point of the search, of the same model.
+    solver : {"ipopt", "fatrop", "snopt"}
+        ``fatrop`` takes two thirds of the time of ``ipopt``, but with parameters far from plausible ones it may not
+        return, and then neither ``time_limit`` nor Ctrl-C ends it. ``snopt`` needs ``pip install diransac[snopt]``.
+    max_iterations : int
+        Of the last attempt; earlier ones get two fifths of it. Five iterations of SNOPT count as one.
+    time_limit : float
+        s. Explaining why there is no plan may take the same time again.
 
     Returns
     -------
-    Trajectory at 100 Hz; its `input_limits` are the whole ones
+    Trajectory
+        At 100 Hz; its ``input_limits`` are the full ones.
 
-    Raises SettingsError: arguments that make no sense, by name.
-    Raises PlanningError: the plant cannot rest at the start; or there is no such trajectory, and it says why.
+    Raises
+    ------
+    SettingsError
+        An argument has no meaning; the message names it.
+    PlanningError
+        The plant cannot rest at the start, or there is no such trajectory; the message gives the reason.
 
-    References: Betts 2010, "Practical Methods for Optimal Control and Estimation", chapter 4; Dimmig et al. 2023, V-A.
+    Notes
+    -----
+    Inputs are held over intervals of 0.1 s or slightly less, each a whole number of rows. One Runge-Kutta step leads
+    from row to row, so that a simulation reproduces the rows of a plan. Waypoints and state limits hold at the ends of
+    intervals.
+
+    References
+    ----------
+    Betts 2010, "Practical Methods for Optimal Control and Estimation", chapter 4; Dimmig et al. 2023, section V-A.
     """
     if solver not in SOLVERS:
         raise SettingsError(f'solver "{solver}" is unknown; choose one of {", ".join(SOLVERS)}')
     model, limits = plant.model, limits_of("input", input_limits, tuple(plant.model.inputs))
-    way = _way(model, waypoints, times, reference, duration, rest)
-    _check_weights(tracking, way, input_share)
-    _check_search(time_weight, max_iterations, time_limit)
+    route = route_of(model, waypoints, times, reference, duration, start_end_at_rest)
+    check_weights(state_weights, route, input_limit_fraction)
+    check_search(time_weight, max_iterations, time_limit)
     parameters = model.parameter_vector(plant.parameters)
-    at_rest = _trim(model, parameters, way.waypoints[0], limits, trim)
+    trim_inputs = trim_at(model, parameters, route.waypoints[0], limits, trim)
     states = limits_of("state", state_limits, model.state)
-    _check_within(model, way.waypoints, states)
+    check_within(model, route.waypoints, states)
     task = Task(
         model=model,
         parameters=parameters,
-        waypoints=way.waypoints,
-        reference=way.reference,
-        tracking=_tracking(model, way.reference, tracking),
-        effort=weights_of("effort", "input", effort, tuple(model.inputs), np.ones(model.n_u)) / limits.half_ranges**2,
-        trim=at_rest,
-        time_weight=float(time_weight) if way.rows is None else 0.0,
-        inputs=limits.around(at_rest, input_share),
+        waypoints=route.waypoints,
+        reference=route.reference,
+        state_weights=reference_weights(model, route.reference, state_weights),
+        input_weights=weights_of("input_weights", "input", input_weights, tuple(model.inputs), np.ones(model.n_u))
+        / limits.half_ranges**2,
+        trim=trim_inputs,
+        time_weight=float(time_weight) if route.rows is None else 0.0,
+        inputs=limits.around(trim_inputs, input_limit_fraction),
         states=states,
         dt=TIME_STEP,
     )
-    search = _Search(task, solver, SearchLimits(int(max_iterations), float(time_limit)), way.start, limits)
-    path = None if guess is None else _path(model, guess)
-    return search.free(path) if way.rows is None else search.fixed(way.rows, path)
-
-
-# Arguments -----------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class _Way:
-    """Where to be when: waypoints, the rows between them (None: free), the time of the first, and what is followed."""
-
-    waypoints: tuple[Waypoint, ...]
-    rows: tuple[int, ...] | None
-    start: float
-    reference: Reference
-
-
-def _way(
-    model: Model,
-    waypoints: Sequence[Mapping[str, float]] | None,
-    times: Sequence[float] | None,
-    reference: Mapping[str, Signal | ArrayLike] | None,
-    duration: float | None,
-    rest: bool,
-) -> _Way:
-    followed = Reference(dict(reference or {}))
-    unknown = [name for name in followed.signals if name not in model.state]
-    if unknown:
-        raise SettingsError(f'reference: there is no state "{unknown[0]}"; there are {", ".join(model.state)}')
-    if waypoints is None:
-        if reference is None:
-            raise SettingsError("a plan needs waypoints=, or reference= with duration=")
-        if duration is None or times is not None or not np.isfinite(duration):
-            raise SettingsError("a reference without waypoints needs duration=, in s, and no times=")
-        rows = rows_of((0.0, duration), 2, TIME_STEP)
-        ends = followed.at(np.array([0.0, rows[0] * TIME_STEP]))
-        places = [{name: float(values[k]) for name, values in ends.items()} for k in (0, 1)]
-        return _Way(waypoints_of(model, places, rest), rows, 0.0, followed)
-    if duration is not None:
-        raise SettingsError("waypoints have times=; duration= belongs to a reference without waypoints")
-    if times is None and reference is not None:
-        raise SettingsError("a reference is a function of time: waypoints that are to lie on it need times=")
-    places_ = waypoints_of(model, waypoints, rest)
-    if times is None:
-        return _Way(places_, None, 0.0, followed)
-    return _Way(places_, rows_of(times, len(places_), TIME_STEP), float(times[0]), followed)
-
-
-def _check_weights(tracking: Mapping[str, float] | None, way: _Way, input_share: float) -> None:
-    stray = [name for name in tracking or {} if name not in way.reference.signals]
-    if stray:
-        raise SettingsError(f'tracking: "{stray[0]}" has no reference; give one, or leave its weight out')
-    if not 0.0 < input_share <= 1.0:
-        raise SettingsError(f"input_share is {input_share}; it must be above 0 and at most 1")
-
-
-def _check_search(time_weight: float, max_iterations: int, time_limit: float) -> None:
-    if not (np.isfinite(time_weight) and time_weight >= 0.0):
-        raise SettingsError(f"time_weight is {time_weight}; it must be a finite number of at least 0")
-    if not max_iterations >= 1 or not time_limit >= 0.0:
-        raise SettingsError(
-            f"max_iterations is {max_iterations} and time_limit {time_limit} s; give at least 1 iteration and 0 s"
-        )
-
-
-def _check_within(model: Model, waypoints: Sequence[Waypoint], limits: Limits) -> None:
-    for k, waypoint in enumerate(waypoints):
-        for j, value in zip(waypoint.states, waypoint.values, strict=True):
-            if not limits.lower[j] <= value <= limits.upper[j]:
-                raise SettingsError(
-                    f"waypoint {k} wants {model.state[j]} = {value:g}, but its limits are {limits.lower[j]:g} to "
-                    f"{limits.upper[j]:g}; move the waypoint or the limits"
-                )
-
-
-def _tracking(model: Model, reference: Reference, weights: Mapping[str, float] | None) -> FloatArray:
-    default = np.array([1.0 if name in reference.signals else 0.0 for name in model.state])
-    return weights_of("tracking", "state", weights, model.state, default)
-
-
-def _trim(
-    model: Model, parameters: FloatArray, start: Waypoint, limits: Limits, given: Mapping[str, float] | None
-) -> FloatArray:
-    if given is not None:
-        values = named_values("trim", "input", given, tuple(model.inputs))
-        return np.array([values.get(name, 0.0) for name in model.inputs])
-    coordinates = np.zeros(model.n_q)
-    for j, value in zip(start.states, start.values, strict=True):
-        if j < model.n_q:
-            coordinates[j] = value
-    return trim_of(model, parameters, coordinates, limits.lower, limits.upper)
-
-
-def _path(model: Model, guess: Trajectory) -> Path:
-    if guess.state_names != model.state or guess.input_names != tuple(model.inputs):
-        raise SettingsError(
-            f"guess= is a trajectory of {', '.join((*guess.state_names, *guess.input_names))}, but model "
-            f'"{model.name}" has {", ".join((*model.state, *model.inputs))}'
-        )
-    return Path(guess.time - guess.time[0], guess.states, guess.inputs)
+    search = _Search(task, solver, SearchLimits(int(max_iterations), float(time_limit)), route.start, limits)
+    initial = None if guess is None else guess_along(model, guess)
+    return search.free(initial) if route.rows is None else search.fixed(route.rows, initial)
 
 
 # Search --------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class _Search:
-    """One task, and who is to solve it for how long."""
+    """Search for the solution of one task by one solver."""
 
     task: Task
     solver: str
@@ -253,68 +179,159 @@ class _Search:
     start: float
     limits: Limits
 
-    def fixed(self, rows: tuple[int, ...], path: Path | None) -> Trajectory:
-        """A plan whose segments last so many rows."""
+    def fixed(self, rows: tuple[int, ...], guess: InitialGuess | None) -> Trajectory:
+        """Plan whose segments have these numbers of rows."""
         program = fixed_program(self.task, rows)
-        outcome = self._solved(program, rows, path)
-        if not outcome.success:
-            raise PlanningError(why_not(self.task, rows, outcome, self.search_limits))
-        return self._trajectory(program, outcome)
+        solution = self._solved(program, rows, guess)
+        if not solution.success:
+            raise PlanningError(_explanation(self.task, rows, solution, self.search_limits))
+        return self._trajectory(program, solution)
 
-    def free(self, path: Path | None) -> Trajectory:
-        """A plan whose segments last as long as is best: first any durations, then the next ones of whole rows."""
+    def free(self, guess: InitialGuess | None) -> Trajectory:
+        """Plan of optimal durations, rounded up to whole rows for which there is a plan, too."""
         task, program = self.task, free_program(self.task)
         n = len(program.layout.intervals)
-        durations = None if path is None else np.full(n, path.time[-1] / n)
-        straight = first_path(task, np.ones(n) if durations is None else durations)
-        manner: Manner = "careful" if path is None else "near"
-        outcome = self._search(program, unknowns_of(program, path or straight, durations), manner)
-        if not outcome.success:
+        durations = None if guess is None else np.full(n, guess.time[-1] / n)
+        straight = straight_guess(task, np.ones(n) if durations is None else durations)
+        strategy: Strategy = "line search" if guess is None else "warm start"
+        solution = self._search(program, unknowns_of(program, guess or straight, durations), strategy)
+        if not solution.success:
             raise PlanningError(
-                f"no durations were found for which the plan works: {outcome.words}; "
-                "give times=, which lets the error say what stands in the way"
+                f"no durations were found for which the plan works: {solution.summary}; "
+                "give times=, for which the message names the binding limits"
             )
-        found = program.split(outcome.unknowns)[0][program.layout.waypoint_knots[:-1], -1]
+        found = program.split(solution.unknowns)[0][program.layout.waypoint_knots[:-1], -1]
         shortest = np.maximum(np.ceil(found / task.dt - 1e-6), 1).astype(int)
         for more in _MORE_ROWS:
             rows = tuple(int(k) + more for k in shortest)
             whole = fixed_program(task, rows)
-            along = path_of(program, outcome.unknowns, task.dt * np.array(rows))
-            rounded = self._search(whole, unknowns_of(whole, along), "near")
+            along = stretched_guess(program, solution.unknowns, task.dt * np.array(rows))
+            rounded = self._search(whole, unknowns_of(whole, along), "warm start")
             if rounded.success:
                 return self._trajectory(whole, rounded)
-        raise PlanningError(why_not(task, rows, rounded, self.search_limits))
+        raise PlanningError(_explanation(task, rows, rounded, self.search_limits))
 
-    def _solved(self, program: Program, rows: tuple[int, ...], path: Path | None) -> Outcome:
-        """From the guess, if there is one, then from the straight way, at last with bolder steps.
+    def _solved(self, program: Program, rows: tuple[int, ...], guess: InitialGuess | None) -> Solution:
+        """Solution from the guess, if there is one, else from straight lines, else by full Newton steps.
 
-        Parameters that are far off, such as an inertia a fiftieth of the true one, make the constraints so curved that
-        a search along each step creeps; whole steps get there.
+        Parameters far from plausible ones, such as an inertia of a fiftieth of the true one, make the constraints so
+        curved that line searches stall; full steps converge.
         """
-        straight = unknowns_of(program, first_path(self.task, self.task.dt * np.array(rows)))
-        attempts: list[tuple[FloatArray, Manner]] = [] if path is None else [(unknowns_of(program, path), "near")]
-        attempts.append((straight, "careful"))
+        straight = unknowns_of(program, straight_guess(self.task, self.task.dt * np.array(rows)))
+        attempts: list[tuple[FloatArray, Strategy]] = [(straight, "line search")]
+        if guess is not None:
+            attempts.insert(0, (unknowns_of(program, guess), "warm start"))
         if self.solver == "ipopt":
-            attempts.append((straight, "bold"))
+            attempts.append((straight, "full steps"))
         whole = self.search_limits
         short = replace(whole, iterations=max(1, round(_FIRST_ATTEMPTS * whole.iterations)))
-        for k, (unknowns, manner) in enumerate(attempts, start=1):
-            outcome = self._search(program, unknowns, manner, whole if k == len(attempts) else short)
-            if outcome.success or outcome.status == TIME_LIMIT:
+        for k, (unknowns, strategy) in enumerate(attempts, start=1):
+            solution = self._search(program, unknowns, strategy, whole if k == len(attempts) else short)
+            if solution.success or solution.status == TIME_LIMIT:
                 break
-        return outcome
+        return solution
 
     def _search(
-        self, program: Program, unknowns: FloatArray, manner: Manner, limits: SearchLimits | None = None
-    ) -> Outcome:
-        """Solve by the solver that was chosen."""
+        self, program: Program, unknowns: FloatArray, strategy: Strategy, limits: SearchLimits | None = None
+    ) -> Solution:
+        """Solution by the chosen solver."""
         limits = limits or self.search_limits
         if self.solver == "snopt":
             from diransac.flight.planning.snopt import active_set
 
             return active_set(program, unknowns, limits)
-        return interior_point(self.solver, program, unknowns, limits, manner)
+        return interior_point(self.solver, program, unknowns, limits, strategy)
 
-    def _trajectory(self, program: Program, outcome: Outcome) -> Trajectory:
-        kept = np.clip(outcome.unknowns, program.numbers.lower, program.numbers.upper)
-        return trajectory_of(self.task, program, kept, self.start, self.limits, outcome.solver)
+    def _trajectory(self, program: Program, solution: Solution) -> Trajectory:
+        kept = np.clip(solution.unknowns, program.numbers.lower, program.numbers.upper)
+        return trajectory_of(self.task, program, kept, self.start, self.limits, solution.solver)
+
+
+# Infeasible plans ----------------------------------------------------------------------------------------------------
+
+_EXPLANATION_ITERATIONS = 500
+
+_MISS_WEIGHT = 1e4
+"""Penalty on the distance from a waypoint, one over the state's unit squared."""
+
+_MET = 1e-2
+"""Distance within which a waypoint counts as reached, state's unit: the penalty is finite."""
+
+_AT_LIMIT = 1e-3
+"""Fraction of a range, or of a unit, within which a value is at its limit."""
+
+
+def _explanation(task: Task, rows: tuple[int, ...], solution: Solution, limits: SearchLimits) -> str:
+    """Sentence on the waypoint that is missed by most, the limits that bind, and what to relax.
+
+    It describes the plan nearest to a feasible one: the start and all limits hold, and the squared distances from the
+    later waypoints are least. IPOPT finds it.
+    """
+    if solution.status == TIME_LIMIT:
+        return f"no plan was found within {limits.seconds:g} s; raise time_limit=, or give a guess="
+    program = _relaxed(task, rows)
+    guess = unknowns_of(program, straight_guess(task, task.dt * np.array(rows)))
+    nearest = interior_point("ipopt", program, guess, SearchLimits(_EXPLANATION_ITERATIONS, limits.seconds))
+    if not nearest.success:
+        return (
+            f"there is no plan: {solution.summary}, and none was found that may miss its waypoints; "
+            "check the parameters, or give more time"
+        )
+    missed = _largest_miss(task, program, nearest.unknowns)
+    binding = _binding(task, program, nearest.unknowns)
+    if missed is None:
+        remedy = f"relax {binding}" if binding else "give guess= or more max_iterations="
+        return (
+            f"no plan was found, though one comes near every waypoint: {solution.summary}; "
+            f"give slightly more time, or {remedy}"
+        )
+    remedy = f"raise the limits of {binding}" if binding else "ask for something that the inputs can reach"
+    return f"the plan cannot be flown: {missed}; give it more time, or {remedy}"
+
+
+def _relaxed(task: Task, rows: tuple[int, ...]) -> Program:
+    """Program with a penalty on the distance from every waypoint but the first in place of a constraint."""
+    free = Waypoint((), np.zeros(0))
+    relaxed = replace(
+        task,
+        waypoints=(task.waypoints[0], *(free for _ in task.waypoints[1:])),
+        state_weights=np.zeros_like(task.state_weights),
+    )
+    program = fixed_program(relaxed, rows)
+    costs = program.numbers.costs
+    reference, weights = costs.reference.copy(), costs.weights.copy()
+    for knot, waypoint in zip(program.layout.waypoint_knots[1:], task.waypoints[1:], strict=True):
+        states = list(waypoint.states)
+        reference[knot, states], weights[knot, states] = waypoint.values, _MISS_WEIGHT
+    numbers = replace(program.numbers, costs=replace(costs, reference=reference, weights=weights))
+    return Program(program.stage, program.layout, numbers)
+
+
+def _largest_miss(task: Task, program: Program, unknowns: FloatArray) -> str | None:
+    """Waypoint state that is missed by most; None where every waypoint is reached."""
+    states, names = program.split(unknowns)[0], task.model.state
+    ends = np.concatenate([[0.0], np.cumsum(program.numbers.steps.sum(axis=1))])
+    worst, text = _MET, None
+    for k, (knot, waypoint) in enumerate(zip(program.layout.waypoint_knots, task.waypoints, strict=True)):
+        misses = np.abs(states[knot, list(waypoint.states)] - waypoint.values)
+        if len(misses) and misses.max() > worst:
+            worst, name = misses.max(), names[waypoint.states[int(misses.argmax())]]
+            text = (
+                f"waypoint {k} ({waypoint.text(names)}) at t = {ends[knot]:.2f} s is missed by {worst:.2g} "
+                f"{task.model.units[name]} in {name}"
+            )
+    return text
+
+
+def _binding(task: Task, program: Program, unknowns: FloatArray) -> str:
+    """Names of the inputs and states that reach a limit."""
+    states, inputs = program.split(unknowns)
+    names = []
+    for values, limits, known in (
+        (inputs, task.inputs, tuple(task.model.inputs)),
+        (states[1:, : len(task.model.state)], task.states, task.model.state),
+    ):
+        slack = _AT_LIMIT * limits.half_ranges
+        at_limit = np.any((values <= limits.lower + slack) | (values >= limits.upper - slack), axis=0)
+        names += [known[j] for j in np.flatnonzero(at_limit)]
+    return " and ".join(names)

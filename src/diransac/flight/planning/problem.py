@@ -1,4 +1,4 @@
-"""From a task to a nonlinear program, to a first guess of its solution, and from the solution to a trajectory."""
+"""Nonlinear program of a planning task, a first guess of its solution, and the trajectory of a solution."""
 
 from __future__ import annotations
 
@@ -7,45 +7,54 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, IntArray
+from diransac.errors import SettingsError
 from diransac.flight.planning.request import Limits, Reference, Waypoint
 from diransac.flight.planning.stage import Costs, stage_of
 from diransac.flight.planning.transcription import Layout, Numbers, Program
 from diransac.flight.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from diransac.model import Model
 
 
-__all__ = ["Path", "Task", "first_path", "fixed_program", "free_program", "path_of", "trajectory_of", "unknowns_of"]
+__all__ = [
+    "InitialGuess",
+    "Task",
+    "fixed_program",
+    "free_program",
+    "guess_along",
+    "straight_guess",
+    "stretched_guess",
+    "trajectory_of",
+    "unknowns_of",
+]
 
 INTERVAL_STEPS = 10
-"""Integration steps of a full interval, over which the input is held."""
+"""Integration steps of a full interval, over which inputs are held."""
 
 FREE_INTERVALS = 20
-"""Intervals of a segment whose duration is unknown; even, so that an input may switch half way."""
+"""Intervals of a segment of free duration; even, so that an input may switch in the middle."""
 
 _DIGITS = 9
-"""Of a time in s: the same moment, computed in two ways, is one."""
+"""Decimals of a time in s, within which equal moments computed in different ways agree."""
 
 _FIRST_DURATION = 1.0
-"""s; where the search for a segment's duration starts."""
+"""First guess of a segment's duration, s."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be planned, checked: names are gone, arrays are in the model's order.
+    """Planning task with checked values, in the model's order.
 
     Parameters
     ----------
     model, parameters : the plant; parameters (n_p,)
     waypoints : at least a start and an end
-    reference, tracking : what is followed, and the weight (n_x,) of each state's squared error, per s
-    effort : (n_u,)   cost of an input's squared distance from trim, per s
-    trim : (n_u,)   inputs that cost nothing
-    time_weight : cost of a second; 0 where time is given
+    reference, state_weights : reference signals, and the weight (n_x,) of each state's squared error, per s
+    input_weights : (n_u,)   cost of an input's squared distance from trim, per s
+    trim : (n_u,)   inputs of zero cost
+    time_weight : cost of a second; 0 where times are given
     inputs, states : their limits
     dt : s   from row to row
     """
@@ -54,8 +63,8 @@ class Task:
     parameters: FloatArray
     waypoints: tuple[Waypoint, ...]
     reference: Reference
-    tracking: FloatArray
-    effort: FloatArray
+    state_weights: FloatArray
+    input_weights: FloatArray
     trim: FloatArray
     time_weight: float
     inputs: Limits
@@ -64,8 +73,8 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Path:
-    """A rough trajectory to start a search from.
+class InitialGuess:
+    """Approximate trajectory from which a search starts.
 
     Parameters
     ----------
@@ -87,18 +96,18 @@ class Path:
 
 # Programs ------------------------------------------------------------------------------------------------------------
 def fixed_program(task: Task, rows: tuple[int, ...]) -> Program:
-    """The program whose segments last so many rows; every integration step is one from row to row."""
+    """Program of segments with these numbers of rows; each integration step leads from row to row."""
     intervals = tuple(-(-n // INTERVAL_STEPS) for n in rows)
     counts = np.concatenate([_spread(n, k) for n, k in zip(rows, intervals, strict=True)])
     steps = np.where(np.arange(INTERVAL_STEPS) < counts[:, None], task.dt, 0.0)
     lengths = task.dt * counts
     time = np.concatenate([[0.0], np.cumsum(lengths)])
-    weights = np.outer(np.append(lengths, 0.0) + np.append(0.0, lengths), 0.5 * task.tracking)
+    weights = np.outer(np.append(lengths, 0.0) + np.append(0.0, lengths), 0.5 * task.state_weights)
     return _program(task, intervals, steps, _reference(task, time), weights, free_time=False)
 
 
 def free_program(task: Task) -> Program:
-    """The program whose segments last as long as is best."""
+    """Program of segments of free duration."""
     intervals = (FREE_INTERVALS,) * (len(task.waypoints) - 1)
     shares = np.full((sum(intervals), INTERVAL_STEPS), 1.0 / (FREE_INTERVALS * INTERVAL_STEPS))
     nothing = np.zeros((len(shares) + 1, len(task.model.state)))
@@ -117,7 +126,7 @@ def _program(
     model = task.model
     pinned = tuple(waypoint.states for waypoint in task.waypoints)
     layout = Layout(len(model.state), model.n_u, intervals, pinned, free_time)
-    costs = Costs(reference, weights, task.effort, task.trim, task.time_weight)
+    costs = Costs(reference, weights, task.input_weights, task.trim, task.time_weight)
     lower, upper = (np.full(layout.n_unknowns, end) for end in (-np.inf, np.inf))
     lower[layout.inputs], upper[layout.inputs] = task.inputs.lower, task.inputs.upper
     knots = layout.states[:, : layout.n_x]
@@ -128,13 +137,13 @@ def _program(
     return Program(stage_of(model, free_time), layout, Numbers(task.parameters, steps, values, costs, lower, upper))
 
 
-def _spread(total: int, parts: int) -> NDArray[np.int64]:
-    """Whole numbers, as equal as can be, with this sum."""
+def _spread(total: int, parts: int) -> IntArray:
+    """Whole numbers with this sum that differ by 1 at most."""
     return np.diff(np.arange(parts + 1) * total // parts)
 
 
 def _reference(task: Task, time: FloatArray) -> FloatArray:
-    """Reference (n_knots, n_x), zero where there is none."""
+    """Reference (n_knots, n_x); zero for states without one."""
     reference = np.zeros((len(time), len(task.model.state)))
     for name, values in task.reference.at(time).items():
         reference[:, task.model.state.index(name)] = values
@@ -142,10 +151,10 @@ def _reference(task: Task, time: FloatArray) -> FloatArray:
 
 
 # Guesses -------------------------------------------------------------------------------------------------------------
-def first_path(task: Task, durations: FloatArray) -> Path:
-    """Straight from each waypoint to the next, along the reference where there is one, with the inputs of rest.
+def straight_guess(task: Task, durations: FloatArray) -> InitialGuess:
+    """Guess of straight lines between waypoints, or along the reference, with trim inputs.
 
-    A velocity is its coordinate's slope; where a waypoint or the reference says otherwise, that counts.
+    Velocities are slopes of the coordinates where neither a waypoint nor the reference gives them.
     """
     at_waypoints = np.round(np.concatenate([[0.0], np.cumsum(durations)]), _DIGITS)
     rows = np.linspace(0.0, at_waypoints[-1], 1 + int(np.rint(at_waypoints[-1] / task.dt)))
@@ -163,18 +172,31 @@ def first_path(task: Task, durations: FloatArray) -> Path:
     for four in task.model.quaternions:
         lengths = np.linalg.norm(states[:, list(four)], axis=1, keepdims=True)
         states[:, list(four)] /= np.where(lengths > 0.0, lengths, 1.0)
-    return Path(time, states, np.broadcast_to(task.trim, (len(time), len(task.trim))))
+    return InitialGuess(time, states, np.broadcast_to(task.trim, (len(time), len(task.trim))))
+
+
+def guess_along(model: Model, guess: Trajectory) -> InitialGuess:
+    """Guess along a trajectory of the same model.
+
+    Raises SettingsError: the trajectory has other states or inputs.
+    """
+    if guess.state_names != model.state or guess.input_names != tuple(model.inputs):
+        raise SettingsError(
+            f"guess= is a trajectory of {', '.join((*guess.state_names, *guess.input_names))}, but model "
+            f'"{model.name}" has {", ".join((*model.state, *model.inputs))}'
+        )
+    return InitialGuess(guess.time - guess.time[0], guess.states, guess.inputs)
 
 
 def _fixed(task: Task, at_waypoints: FloatArray, j: int) -> tuple[FloatArray, FloatArray]:
-    """Times and values of a state that waypoints fix."""
+    """Times and values at which waypoints fix a state."""
     there = [k for k, waypoint in enumerate(task.waypoints) if j in waypoint.states]
     values = [task.waypoints[k].values[task.waypoints[k].states.index(j)] for k in there]
     return at_waypoints[there], np.array(values)
 
 
-def unknowns_of(program: Program, path: Path, durations: FloatArray | None = None) -> FloatArray:
-    """Unknowns that follow a path, within the limits; with free time the durations of the segments are guessed too."""
+def unknowns_of(program: Program, guess: InitialGuess, durations: FloatArray | None = None) -> FloatArray:
+    """Unknowns along a guess, clipped to the limits; with free time also the durations of the segments."""
     layout, numbers = program.layout, program.numbers
     lengths = numbers.steps.sum(axis=1)
     unknowns = np.zeros(layout.n_unknowns)
@@ -183,26 +205,26 @@ def unknowns_of(program: Program, path: Path, durations: FloatArray | None = Non
         lengths = lengths * guessed[layout.segment_of]
         unknowns[layout.states[:, -1]] = np.append(guessed[layout.segment_of], guessed[-1])
         unknowns[layout.next_durations] = guessed[1:]
-    states, inputs = path.at(np.concatenate([[0.0], np.cumsum(lengths)]))
+    states, inputs = guess.at(np.concatenate([[0.0], np.cumsum(lengths)]))
     unknowns[layout.states[:, : layout.n_x]] = states
     unknowns[layout.inputs] = inputs[:-1]
     return np.clip(unknowns, numbers.lower, numbers.upper)
 
 
-def path_of(program: Program, unknowns: FloatArray, durations: FloatArray) -> Path:
-    """The path that a solution takes, stretched to other durations of its segments."""
+def stretched_guess(program: Program, unknowns: FloatArray, durations: FloatArray) -> InitialGuess:
+    """Guess from a solution, with its segments stretched to other durations."""
     layout = program.layout
     lengths = (durations / np.array(layout.intervals))[layout.segment_of]
     states, inputs = program.split(unknowns)
     time = np.concatenate([[0.0], np.cumsum(lengths)])
-    return Path(time, states[:, : layout.n_x], np.concatenate([inputs, inputs[-1:]]))
+    return InitialGuess(time, states[:, : layout.n_x], np.concatenate([inputs, inputs[-1:]]))
 
 
 # Solutions -----------------------------------------------------------------------------------------------------------
 def trajectory_of(
     task: Task, program: Program, unknowns: FloatArray, start: float, limits: Limits, solver: str
 ) -> Trajectory:
-    """Rows of a solution at fixed times, each interval integrated from its own knot; the last input is held on."""
+    """Trajectory of a solution at fixed times, each interval integrated from its knot; the last input is repeated."""
     steps, layout = program.numbers.steps, program.layout
     moments = program.advance(unknowns)[:-1].transpose(1, 0, 2)
     states, inputs = program.split(unknowns)

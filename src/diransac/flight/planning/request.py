@@ -1,4 +1,4 @@
-"""What a plan is asked to do: a user's arguments, checked and turned into arrays."""
+"""The arguments of a plan, checked and turned into arrays, and the trim at its start."""
 
 from __future__ import annotations
 
@@ -6,28 +6,46 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.errors import SettingsError
+from diransac.errors import PlanningError, SettingsError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from diransac.model import Model
 
+__all__ = [
+    "TIME_STEP",
+    "Limits",
+    "Reference",
+    "Route",
+    "Signal",
+    "Waypoint",
+    "check_search",
+    "check_weights",
+    "check_within",
+    "limits_of",
+    "reference_weights",
+    "route_of",
+    "trim_at",
+    "weights_of",
+]
 
-__all__ = ["Limits", "Reference", "Waypoint", "limits_of", "named_values", "rows_of", "waypoints_of", "weights_of"]
+TIME_STEP = 0.01
+"""Time from row to row of a plan, s: flights are simulated and controlled at 100 Hz."""
 
 _UNIT_LENGTH = 1e-3
-"""How far a quaternion's length may be from one where a user writes it."""
+"""Largest deviation of a given quaternion's norm from one."""
 
 Signal = Callable[["FloatArray"], "ArrayLike"]
 
 
 @dataclass(frozen=True)
 class Waypoint:
-    """States that are fixed at one moment.
+    """States fixed at one moment.
 
     Parameters
     ----------
@@ -39,26 +57,26 @@ class Waypoint:
     values: FloatArray
 
     def text(self, names: Sequence[str]) -> str:
-        """What it fixes away from zero, or all of it."""
+        """Values that are not zero, in words."""
         shown = [(names[j], v) for j, v in zip(self.states, self.values, strict=True) if v != 0.0]
         return ", ".join(f"{n} = {v:g}" for n, v in shown) or "all zero"
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Smallest and largest values (n,) of the inputs or the states; infinite where there are none."""
+    """Smallest and largest values (n,) of the inputs or the states; infinite without limits."""
 
     lower: FloatArray
     upper: FloatArray
 
-    def around(self, trim: FloatArray, share: float) -> Limits:
-        """Limits that leave this share of the way from trim (n,) to each limit; a trim beyond a limit is left alone."""
-        lower, upper = (trim + share * (limit - trim) for limit in (self.lower, self.upper))
+    def around(self, trim: FloatArray, fraction: float) -> Limits:
+        """Limits at this fraction of the range from trim (n,) to each limit; unchanged for a trim beyond it."""
+        lower, upper = (trim + fraction * (limit - trim) for limit in (self.lower, self.upper))
         return Limits(np.maximum(self.lower, lower), np.minimum(self.upper, upper))
 
     @property
     def half_ranges(self) -> FloatArray:
-        """(n,)   1 where there is no range, or none that has two ends."""
+        """Half the range between the limits (n,); 1 where it is zero or infinite."""
         half = 0.5 * (self.upper - self.lower)
         return np.where(np.isfinite(half) & (half > 0.0), half, 1.0)
 
@@ -69,11 +87,11 @@ class Limits:
 
 @dataclass(frozen=True)
 class Reference:
-    """What is to be followed.
+    """Reference signals of a plan.
 
     Parameters
     ----------
-    signals : state -> function of time in s, or samples evenly spread from the start to the end
+    signals : state -> function of time in s, or samples evenly spaced from start to end
     """
 
     signals: Mapping[str, Signal | ArrayLike]
@@ -81,7 +99,7 @@ class Reference:
     def at(self, time: FloatArray) -> dict[str, FloatArray]:
         """Values (n_times,) by state; time starts at 0 and ends with the plan.
 
-        Raises SettingsError: a function gives something else than a number for each time.
+        Raises SettingsError: a function does not give a finite number for each time.
         """
         return {name: _sampled(name, signal, time) for name, signal in self.signals.items()}
 
@@ -105,19 +123,21 @@ def _sampled(name: str, signal: Signal | ArrayLike, time: FloatArray) -> FloatAr
     return np.broadcast_to(values, time.shape).astype(np.float64)
 
 
-def waypoints_of(model: Model, waypoints: Sequence[Mapping[str, float]], rest: bool) -> tuple[Waypoint, ...]:
-    """Checked waypoints; with `rest`, what the first and the last don't name is zero.
+def _waypoints_of(
+    model: Model, waypoints: Sequence[Mapping[str, float]], start_end_at_rest: bool
+) -> tuple[Waypoint, ...]:
+    """Checked waypoints; with `start_end_at_rest`, states that the first and last do not name are zero.
 
-    Raises SettingsError: fewer than two, an unknown state, a value that isn't finite, a quaternion that isn't one.
+    Raises SettingsError: fewer than two, an unknown state, a value that is not finite, a quaternion without unit norm.
     """
     if len(waypoints) < 2:
         raise SettingsError(f"a plan needs at least 2 waypoints, a start and an end; found {len(waypoints)}")
     found = []
     for k, waypoint in enumerate(waypoints):
         at_end = k in (0, len(waypoints) - 1)
-        values = named_values(f"waypoint {k}", "state", waypoint, model.state)
-        _check_quaternions(model, k, values, rest and at_end)
-        if rest and at_end:
+        values = _named_values(f"waypoint {k}", "state", waypoint, model.state)
+        _check_quaternions(model, k, values, start_end_at_rest and at_end)
+        if start_end_at_rest and at_end:
             values = dict.fromkeys(model.state, 0.0) | values
         states = tuple(j for j, name in enumerate(model.state) if name in values)
         found.append(Waypoint(states, _normalised(model, states, values)))
@@ -130,16 +150,16 @@ def _check_quaternions(model: Model, k: int, values: Mapping[str, float], all_fi
         given = [values[n] for n in names if n in values]
         if all_fixed and len(given) < 4:
             raise SettingsError(
-                f"waypoint {k} must say which way the plant points: name {', '.join(names)}, or pass rest=False"
+                f"waypoint {k} leaves the attitude open: name {', '.join(names)}, or pass start_end_at_rest=False"
             )
         if len(given) == 4 and abs(np.linalg.norm(given) - 1.0) > _UNIT_LENGTH:
             raise SettingsError(
-                f"waypoint {k}: {', '.join(names)} are a quaternion; its length is {np.linalg.norm(given):.4g}, not 1"
+                f"waypoint {k}: {', '.join(names)} are a quaternion; its norm is {np.linalg.norm(given):.4g}, not 1"
             )
 
 
 def _normalised(model: Model, states: tuple[int, ...], values: Mapping[str, float]) -> FloatArray:
-    """Values in the model's order, whole quaternions with length one: nothing else can be reached."""
+    """Values in the model's order, complete quaternions scaled to norm one."""
     array = np.array([values[model.state[j]] for j in states])
     for four in model.quaternions:
         if set(four) <= set(states):
@@ -149,9 +169,9 @@ def _normalised(model: Model, states: tuple[int, ...], values: Mapping[str, floa
 
 
 def limits_of(what: str, limits: Mapping[str, tuple[float, float]] | None, names: Sequence[str]) -> Limits:
-    """Limits (n,) by name; none where none is given.
+    """Limits (n,) from limits by name.
 
-    Raises SettingsError: an unknown name, no pair of numbers, no room between them.
+    Raises SettingsError: an unknown name, or no pair in increasing order.
     """
     lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     for name, pair in (limits or {}).items():
@@ -165,22 +185,22 @@ def limits_of(what: str, limits: Mapping[str, tuple[float, float]] | None, names
 def weights_of(
     what: str, kind: str, weights: Mapping[str, float] | None, names: Sequence[str], default: FloatArray
 ) -> FloatArray:
-    """Weights (n,) by name.
+    """Weights (n,) from weights by name.
 
     Raises SettingsError: an unknown name, or a weight that is negative or not finite.
     """
     values = default.copy()
-    for name, weight in named_values(what, kind, weights or {}, names).items():
+    for name, weight in _named_values(what, kind, weights or {}, names).items():
         if weight < 0.0:
             raise SettingsError(f'{what} of "{name}" is {weight:g}; a weight is at least 0')
         values[names.index(name)] = weight
     return values
 
 
-def rows_of(times: Sequence[float], n_waypoints: int, dt: float) -> tuple[int, ...]:
-    """Rows of each segment's duration: the times rounded to the time step.
+def _rows_of(times: Sequence[float], n_waypoints: int, dt: float) -> tuple[int, ...]:
+    """Number of rows of each segment, of times rounded to the time step.
 
-    Raises SettingsError: not a time for each waypoint, times that don't increase, or by less than a time step.
+    Raises SettingsError: not one time per waypoint, or times that increase by less than a time step.
     """
     array = np.asarray(times, np.float64)
     if array.shape != (n_waypoints,) or not np.isfinite(array).all():
@@ -197,10 +217,10 @@ def rows_of(times: Sequence[float], n_waypoints: int, dt: float) -> tuple[int, .
     return tuple(int(n) for n in steps)
 
 
-def named_values(what: str, kind: str, values: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
-    """The same as finite floats.
+def _named_values(what: str, kind: str, values: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
+    """Values by name as finite floats.
 
-    Raises SettingsError: an unknown name, or a value that is no finite number.
+    Raises SettingsError: an unknown name, or a value that is not a finite number.
     """
     found = {}
     for name, value in values.items():
@@ -215,3 +235,173 @@ def named_values(what: str, kind: str, values: Mapping[str, float], names: Seque
 def _check_known(what: str, kind: str, name: str, names: Sequence[str]) -> None:
     if name not in names:
         raise SettingsError(f'{what}: there is no {kind} "{name}"; there are {", ".join(names)}')
+
+
+# Route and checks ----------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Route:
+    """Waypoints, rows of each segment (None: free), time of the first waypoint (s), and reference."""
+
+    waypoints: tuple[Waypoint, ...]
+    rows: tuple[int, ...] | None
+    start: float
+    reference: Reference
+
+
+def route_of(
+    model: Model,
+    waypoints: Sequence[Mapping[str, float]] | None,
+    times: Sequence[float] | None,
+    reference: Mapping[str, Signal | ArrayLike] | None,
+    duration: float | None,
+    start_end_at_rest: bool,
+) -> Route:
+    """Route from the arguments of a plan.
+
+    Raises SettingsError: arguments that are missing or exclude each other, or values without meaning.
+    """
+    followed = Reference(dict(reference or {}))
+    unknown = [name for name in followed.signals if name not in model.state]
+    if unknown:
+        raise SettingsError(f'reference: there is no state "{unknown[0]}"; there are {", ".join(model.state)}')
+    if waypoints is None:
+        if reference is None:
+            raise SettingsError("a plan needs waypoints=, or reference= with duration=")
+        if duration is None or times is not None or not np.isfinite(duration):
+            raise SettingsError("a reference without waypoints needs duration=, in s, and no times=")
+        rows = _rows_of((0.0, duration), 2, TIME_STEP)
+        ends = followed.at(np.array([0.0, rows[0] * TIME_STEP]))
+        end_points = [{name: float(values[k]) for name, values in ends.items()} for k in (0, 1)]
+        return Route(_waypoints_of(model, end_points, start_end_at_rest), rows, 0.0, followed)
+    if duration is not None:
+        raise SettingsError("waypoints have times=; duration= belongs to a reference without waypoints")
+    if times is None and reference is not None:
+        raise SettingsError("a reference is a function of time: waypoints along a reference need times=")
+    checked = _waypoints_of(model, waypoints, start_end_at_rest)
+    if times is None:
+        return Route(checked, None, 0.0, followed)
+    return Route(checked, _rows_of(times, len(checked), TIME_STEP), float(times[0]), followed)
+
+
+def check_weights(state_weights: Mapping[str, float] | None, route: Route, input_limit_fraction: float) -> None:
+    """Raise SettingsError for a weight without reference, or an input_limit_fraction that is not in (0, 1]."""
+    unknown = [name for name in state_weights or {} if name not in route.reference.signals]
+    if unknown:
+        raise SettingsError(f'state_weights: "{unknown[0]}" has no reference; give one, or leave its weight out')
+    if not 0.0 < input_limit_fraction <= 1.0:
+        raise SettingsError(f"input_limit_fraction is {input_limit_fraction}; it must be above 0 and at most 1")
+
+
+def check_search(time_weight: float, max_iterations: int, time_limit: float) -> None:
+    """Raise SettingsError for a value that is out of range."""
+    if not (np.isfinite(time_weight) and time_weight >= 0.0):
+        raise SettingsError(f"time_weight is {time_weight}; it must be a finite number of at least 0")
+    if not max_iterations >= 1 or not time_limit >= 0.0:
+        raise SettingsError(
+            f"max_iterations is {max_iterations} and time_limit {time_limit} s; give at least 1 iteration and 0 s"
+        )
+
+
+def check_within(model: Model, waypoints: Sequence[Waypoint], limits: Limits) -> None:
+    """Raise SettingsError for a waypoint beyond the state limits."""
+    for k, waypoint in enumerate(waypoints):
+        for j, value in zip(waypoint.states, waypoint.values, strict=True):
+            if not limits.lower[j] <= value <= limits.upper[j]:
+                raise SettingsError(
+                    f"waypoint {k} has {model.state[j]} = {value:g}, but its limits are {limits.lower[j]:g} to "
+                    f"{limits.upper[j]:g}; move the waypoint or the limits"
+                )
+
+
+def reference_weights(model: Model, reference: Reference, weights: Mapping[str, float] | None) -> FloatArray:
+    """Weight (n_x,) of each state's squared error; 1 by default for states with a reference, else 0."""
+    default = np.array([1.0 if name in reference.signals else 0.0 for name in model.state])
+    return weights_of("state_weights", "state", weights, model.state, default)
+
+
+def trim_at(
+    model: Model, parameters: FloatArray, start: Waypoint, limits: Limits, given: Mapping[str, float] | None
+) -> FloatArray:
+    """Inputs (n_u,) of zero cost: the given ones, else those that hold the plant at rest at the first waypoint.
+
+    Raises PlanningError: as `_rest_inputs`.
+    """
+    if given is not None:
+        values = _named_values("trim", "input", given, tuple(model.inputs))
+        return np.array([values.get(name, 0.0) for name in model.inputs])
+    coordinates = np.zeros(model.n_q)
+    for j, value in zip(start.states, start.values, strict=True):
+        if j < model.n_q:
+            coordinates[j] = value
+    return _rest_inputs(model, parameters, coordinates, limits.lower, limits.upper)
+
+
+# Trim ----------------------------------------------------------------------------------------------------------------
+
+_TRIM_ITERATIONS = 30
+_TRIM_TOLERANCE = 1e-6
+
+
+def _rest_inputs(
+    model: Model, parameters: FloatArray, coordinates: FloatArray, lower: FloatArray, upper: FloatArray
+) -> FloatArray:
+    """Inputs (n_u,) within their limits of zero acceleration at rest at these coordinates (n_q,).
+
+    Gauss-Newton on the accelerations, each step a bounded linear least-squares problem; exact for a model that is
+    affine in its inputs.
+
+    Raises PlanningError: there are none within the limits, or none at all.
+    """
+    x = np.concatenate([coordinates, np.zeros(model.n_v)])
+    unlimited = np.full(model.n_u, np.inf)
+    trim, residual = _least_acceleration(model, parameters, x, lower, upper)
+    scale = 1.0 + np.abs(_accelerations(model, parameters, x, np.zeros(model.n_u))).max()
+    if np.abs(residual).max() <= _TRIM_TOLERANCE * scale:
+        return trim
+    coordinates_text = ", ".join(f"{n} = {v:g}" for n, v in zip(model.coordinates, coordinates, strict=True))
+    unlimited_trim, left = _least_acceleration(model, parameters, x, -unlimited, unlimited)
+    if np.isfinite(left).all() and np.abs(left).max() <= _TRIM_TOLERANCE * scale:
+        needs = ", ".join(
+            f"{n} would have to be {v:.4g}, but may be {low:.4g} to {high:.4g}"
+            for n, v, low, high in zip(model.inputs, unlimited_trim, lower, upper, strict=True)
+            if not low <= v <= high
+        )
+        raise PlanningError(
+            f'model "{model.name}" cannot rest at {coordinates_text} with these parameters: {needs}; '
+            "raise the input limits, or check the parameters"
+        )
+    worst = int(np.argmax(np.abs(np.nan_to_num(left, nan=np.inf))))
+    name = list(model.accelerations)[worst]
+    raise PlanningError(
+        f'model "{model.name}" cannot rest at {coordinates_text}: no inputs make {name} zero; '
+        "start elsewhere, or give the inputs of zero cost with trim="
+    )
+
+
+def _least_acceleration(
+    model: Model, parameters: FloatArray, x: FloatArray, lower: FloatArray, upper: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Inputs of least squared acceleration, and this acceleration (n_v,)."""
+    from scipy.optimize import lsq_linear  # slow to import
+
+    u = np.clip(np.zeros(model.n_u), lower, upper)
+    free = upper > lower
+    for _ in range(_TRIM_ITERATIONS):
+        B = np.array(model.linearization(x, u, parameters)[1])[model.n_q :]
+        a = _accelerations(model, parameters, x, u)
+        if not (np.isfinite(B).all() and np.isfinite(a).all()):
+            return u, np.full(model.n_v, np.nan)
+        target = B[:, free] @ u[free] - a
+        new = u.copy()
+        if free.any():
+            new[free] = lsq_linear(B[:, free], target, (lower[free], upper[free]), method="bvls").x
+        converged = np.allclose(new, u, rtol=1e-13, atol=1e-13)
+        u = new
+        if converged:
+            break
+    return u, _accelerations(model, parameters, x, u)
+
+
+def _accelerations(model: Model, parameters: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
+    """Accelerations (n_v,) in a state x under inputs u."""
+    return np.array(model.dynamics(ca.DM(x), ca.DM(u), ca.DM(parameters))[1]).ravel()

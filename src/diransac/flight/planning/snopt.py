@@ -1,7 +1,7 @@
-"""SNOPT, the solver of the paper, through the ``drake`` wheel that carries it: ``pip install diransac[snopt]``.
+"""Solution of a `Program` by SNOPT, the solver of the paper, through Drake: ``pip install diransac[snopt]``.
 
-Drake takes constraints one binding at a time, each with all derivatives of all its values: a segment of the plan is a
-binding, itself a small program of the same stage.
+Drake evaluates constraints in bindings, each with dense derivatives. Each segment of a plan is one binding, a small
+program of the same stage.
 
 References: Gill, Murray, Saunders 2005, "SNOPT: An SQP algorithm for large-scale constrained optimization".
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
 from diransac.errors import PlanningError
-from diransac.flight.planning.solvers import Outcome, SearchLimits
+from diransac.flight.planning.solvers import SearchLimits, Solution
 from diransac.flight.planning.transcription import Layout, Program
 
 if TYPE_CHECKING:
@@ -28,19 +28,19 @@ __all__ = ["active_set"]
 _TOLERANCE = 1e-8
 
 _MAJOR = 5
-"""Major iterations of SNOPT for one that is asked for: an active set changes more often than a barrier."""
+"""Major iterations of SNOPT per requested iteration: active-set methods need more of them than barrier methods."""
 
 
-def active_set(program: Program, guess: FloatArray, limits: SearchLimits) -> Outcome:
-    """Solve by SNOPT.
+def active_set(program: Program, guess: FloatArray, limits: SearchLimits) -> Solution:
+    """Solution by SNOPT.
 
-    Raises PlanningError: Drake, which carries SNOPT, isn't installed.
+    Raises PlanningError: Drake is not installed.
     """
     try:
         from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
     except ImportError as error:
         raise PlanningError(
-            "SNOPT comes with the drake package, which isn't installed here; pip install 'diransac[snopt]', or choose "
+            "SNOPT comes with the package drake, which is not installed; pip install 'diransac[snopt]', or choose "
             'solver="ipopt"'
         ) from error
     stopped: list[BaseException] = []
@@ -50,15 +50,15 @@ def active_set(program: Program, guess: FloatArray, limits: SearchLimits) -> Out
         options.SetOption(SnoptSolver.id(), name, value)
     try:
         found = SnoptSolver().Solve(drake, guess, options)
-    except RuntimeError as error:  # what Drake makes of anything that is raised in a binding, interrupts too
+    except RuntimeError as error:  # Drake wraps whatever a binding raises, interrupts included
         raise (stopped or [error])[0] from None
     solution = np.array(found.GetSolution(unknowns), np.float64)
     success = found.is_success() and bool(np.isfinite(solution).all())
-    return Outcome(solution, success, f"exit {found.get_solver_details().info}", None, "snopt")
+    return Solution(solution, success, f"exit {found.get_solver_details().info}", None, "snopt")
 
 
 def _options(program: Program, limits: SearchLimits) -> dict[str, float | int]:
-    """SNOPT's own names; minor iterations are many where it starts far from the active set."""
+    """Options by SNOPT's names; far from the active set it takes many minor iterations."""
     return {
         "Major optimality tolerance": _TOLERANCE,
         "Major feasibility tolerance": _TOLERANCE,
@@ -69,7 +69,7 @@ def _options(program: Program, limits: SearchLimits) -> dict[str, float | int]:
 
 
 def _bind(drake: Any, program: Program, stopped: list[BaseException]) -> Any:
-    """The program's unknowns as variables of Drake's, its segments and limits as bindings."""
+    """Unknowns as Drake variables; segments and limits are bound to them."""
     unknowns = drake.NewContinuousVariables(program.layout.n_unknowns)
     drake.AddBoundingBoxConstraint(*_limits(program), unknowns)
     for part, chosen in _segments(program):
@@ -85,7 +85,7 @@ def _bind(drake: Any, program: Program, stopped: list[BaseException]) -> Any:
 
 
 def _limits(program: Program) -> tuple[FloatArray, FloatArray]:
-    """Limits of the unknowns, those that a waypoint fixes with no room between."""
+    """Limits of the unknowns, equal where a waypoint fixes a value."""
     lower, upper = program.numbers.lower.copy(), program.numbers.upper.copy()
     fixed = program.layout.pinned_unknowns
     lower[fixed] = upper[fixed] = program.numbers.pin_values
@@ -93,7 +93,7 @@ def _limits(program: Program) -> tuple[FloatArray, FloatArray]:
 
 
 def _segments(program: Program) -> list[tuple[Program, IntArray]]:
-    """Each segment as a program without waypoints, and the unknowns that are its own."""
+    """Each segment as a program without waypoints, and the indices of its unknowns."""
     layout, numbers = program.layout, program.numbers
     parts = []
     for first, after in zip(layout.waypoint_knots[:-1], layout.waypoint_knots[1:], strict=True):
@@ -110,14 +110,14 @@ def _segments(program: Program) -> list[tuple[Program, IntArray]]:
 
 
 def _join_durations(drake: Any, unknowns: Any, layout: Layout) -> None:
-    """Let the input that chooses the next segment's duration be that duration."""
+    """Constrain the input that sets the next segment's duration to that duration."""
     following = layout.states[1:][layout.ends_segment, -1]
     for chooser, duration in zip(layout.next_durations, following, strict=True):
         drake.AddLinearEqualityConstraint(unknowns[chooser] == unknowns[duration])
 
 
 def _dense(part: Program, unknowns: FloatArray) -> FloatArray:
-    """Jacobian (n_constraints, n_unknowns) with its zeros."""
+    """Dense Jacobian (n_constraints, n_unknowns)."""
     whole = np.zeros((part.layout.n_constraints, part.layout.n_unknowns))
     whole[part.jacobian_entries] = part.jacobian(unknowns)
     return whole
@@ -129,7 +129,7 @@ def _value(
     derivative: Callable[[FloatArray], FloatArray],
     unknowns: Any,
 ) -> Any:
-    """A value for Drake, with its derivatives where it asks for them; what is raised is kept in `stopped`."""
+    """Value for Drake, with derivatives for unknowns of type AutoDiffXd; an exception is also kept in `stopped`."""
     from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 
     try:

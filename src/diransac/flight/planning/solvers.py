@@ -1,7 +1,7 @@
-"""The interior-point solvers that come with CasADi, given a `Program`'s own derivatives.
+"""Interior-point solution of a `Program` by IPOPT or FATROP through CasADi, with the program's own derivatives.
 
-An `nlpsol` object is built once for a layout and solved for many numbers: its functions are looked up in the program
-that is being solved. CasADi's function cache hands them over, so that nothing is differentiated a second time.
+An `nlpsol` object is built once per layout and serves every program of it: its functions read the program that is being
+solved. They are passed through CasADi's function cache, so that nothing is differentiated a second time.
 
 References: Waechter and Biegler 2006 (IPOPT); Vanroye et al. 2023, "FATROP" (structure-exploiting interior point).
 """
@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -24,33 +24,30 @@ import numpy as np
 from diransac.arrays import FloatArray, IntArray
 from diransac.flight.planning.transcription import Layout, Numbers, Program
 
-if TYPE_CHECKING:
-    pass
+__all__ = ["TIME_LIMIT", "SearchLimits", "Solution", "Strategy", "interior_point"]
 
-
-__all__ = ["TIME_LIMIT", "Manner", "Outcome", "SearchLimits", "interior_point"]
-
-Manner: TypeAlias = Literal["careful", "near", "bold"]
+Strategy: TypeAlias = Literal["line search", "warm start", "full steps"]
+"""``warm start``: the guess is close to the solution, the barrier starts small; ``full steps``: without line search."""
 
 _QUIET: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
 _TOLERANCE = 1e-9
 _FATROP_RELAXES = 1e-8
-"""Times a limit, or one: how much wider fatrop takes every limit, which cannot be switched off."""
+"""Relative widening of every limit by fatrop, which no option disables."""
 _FATROP_LARGEST = 1e10
-"""Values beyond which fatrop may search for a regularisation for ever, without asking for another value."""
+"""Magnitude beyond which fatrop may look for a regularisation without end and without evaluating a function."""
 
 TIME_LIMIT = "time limit reached"
 
 
 @dataclass(frozen=True)
 class SearchLimits:
-    """How long solvers may try, one after the other.
+    """Limits of a search by one solver after the other.
 
     Parameters
     ----------
-    iterations : of one solver, at most
-    seconds : of all of them, at most
-    deadline : when these are over, by the monotonic clock; that many seconds from now by default
+    iterations : of one solver
+    seconds : of all of them together
+    deadline : their end by the monotonic clock, s; by default that many seconds from now
     """
 
     iterations: int
@@ -62,20 +59,20 @@ class SearchLimits:
 
     @property
     def left(self) -> float:
-        """Seconds that are left."""
+        """Time to the deadline, s."""
         return max(0.0, self.deadline - time.monotonic())
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a solver found.
+class Solution:
+    """Result of a solver.
 
     Parameters
     ----------
-    unknowns : (n_unknowns,)   the solution, or where the solver gave up
-    success : whether it is a solution
-    status : the solver's own words
-    iterations : that it took; None where it doesn't tell
+    unknowns : (n_unknowns,)   the last iterate
+    success : whether that is a solution
+    status : the solver's return status
+    iterations : None where the solver does not report them
     solver : its name
     """
 
@@ -86,36 +83,35 @@ class Outcome:
     solver: str
 
     @property
-    def words(self) -> str:
-        """How it ended."""
+    def summary(self) -> str:
+        """Solver, status and iterations."""
         count = "" if self.iterations is None else f" after {self.iterations} iterations"
         return f"{self.solver} says {self.status}{count}"
 
 
 def interior_point(
-    name: str, program: Program, guess: FloatArray, limits: SearchLimits, manner: Manner = "careful"
-) -> Outcome:
-    """Solve by ``ipopt`` or ``fatrop``.
+    name: str, program: Program, guess: FloatArray, limits: SearchLimits, strategy: Strategy = "line search"
+) -> Solution:
+    """Solution by ``ipopt`` or ``fatrop``.
 
     Parameters
     ----------
-    guess : (n_unknowns,)   where to start
-    manner : ``careful``; ``near``, from a guess that is close to the solution: the barrier starts small; ``bold``:
-        every Newton step is taken whole, for problems on which the search along each step creeps (IPOPT alone)
+    guess : (n_unknowns,)   first iterate
+    strategy : ``full steps`` is for IPOPT alone
 
     Raises KeyboardInterrupt: the user stopped it.
     """
-    return _solver(name, program.layout, limits.iterations, manner).solve(program, guess, limits.deadline)
+    return _solver(name, program.layout, limits.iterations, strategy).solve(program, guess, limits.deadline)
 
 
 @lru_cache(maxsize=64)
-def _solver(name: str, layout: Layout, iterations: int, manner: Manner) -> _Solver:
-    return _Solver(name, layout, iterations, manner)
+def _solver(name: str, layout: Layout, iterations: int, strategy: Strategy) -> _Solver:
+    return _Solver(name, layout, iterations, strategy)
 
 
 @contextmanager
 def _interrupts_noted() -> Iterator[list[int]]:
-    """Note Ctrl-C instead of raising it: CasADi keeps to itself what is raised between two evaluations."""
+    """Interrupts (Ctrl-C) during the block, recorded in place of an exception, which CasADi may swallow."""
     noted: list[int] = []
     if threading.current_thread() is not threading.main_thread():  # interrupts come to the main thread alone
         yield noted
@@ -132,15 +128,15 @@ def _interrupts_noted() -> Iterator[list[int]]:
 
 
 class _Stopped(Exception):
-    """The solver is to give up; it says why."""
+    """The search is stopped, for the reason given."""
 
 
 class _Solver:
-    """An `nlpsol` object of one layout; one solve at a time."""
+    """`nlpsol` object of one layout, for one solve at a time."""
 
-    def __init__(self, name: str, layout: Layout, iterations: int, manner: Manner) -> None:
+    def __init__(self, name: str, layout: Layout, iterations: int, strategy: Strategy) -> None:
         self._name, self._layout = name, layout
-        self._options = {"ipopt": _ipopt_options, "fatrop": _fatrop_options}[name](layout, iterations, manner)
+        self._options = {"ipopt": _ipopt_options, "fatrop": _fatrop_options}[name](layout, iterations, strategy)
         self._lock = Lock()
         self._program: Program | None = None
         self._nlpsol: ca.Function | None = None
@@ -149,8 +145,8 @@ class _Solver:
         self._stopped: BaseException | None = None
         self._interrupts: list[int] = []
 
-    def solve(self, program: Program, guess: FloatArray, deadline: float) -> Outcome:
-        """Solve one program of this layout."""
+    def solve(self, program: Program, guess: FloatArray, deadline: float) -> Solution:
+        """Solution of one program of this layout."""
         with self._lock:
             self._program, self._stopped, self._deadline = program, None, deadline
             try:
@@ -158,7 +154,7 @@ class _Solver:
             finally:
                 self._program = self._stopped = None
 
-    def _run(self, program: Program, guess: FloatArray) -> Outcome:
+    def _run(self, program: Program, guess: FloatArray) -> Solution:
         if self._nlpsol is None:
             self._build(program)
         assert self._nlpsol is not None
@@ -173,15 +169,15 @@ class _Solver:
         if self._interrupts:
             raise KeyboardInterrupt
         if isinstance(self._stopped, _Stopped):
-            return Outcome(guess, False, str(self._stopped), None, self._name)
+            return Solution(guess, False, str(self._stopped), None, self._name)
         if self._stopped is not None:
             raise self._stopped
         stats, unknowns = self._nlpsol.stats(), np.array(found["x"]).ravel()
         success = bool(stats["success"]) and bool(np.isfinite(unknowns).all())
-        return Outcome(unknowns, success, str(stats["return_status"]), int(stats["iter_count"]), self._name)
+        return Solution(unknowns, success, str(stats["return_status"]), int(stats["iter_count"]), self._name)
 
     def _limits(self, numbers: Numbers) -> tuple[FloatArray, FloatArray]:
-        """Limits of the unknowns, so that those that the solver really keeps to are the ones that were asked for."""
+        """Limits of the unknowns, narrowed by as much as the solver widens them."""
         lower, upper = numbers.lower, numbers.upper
         if self._name != "fatrop":
             return lower, upper
@@ -204,7 +200,7 @@ class _Solver:
     def _values(self, name: str, x: FloatArray, objective_factor: float, multipliers: FloatArray) -> FloatArray:
         """One of `_COMPUTE` at a point.
 
-        Raises whatever stopped the solver: from then on no function has a value, which ends the solver's search.
+        Raises whatever stopped the search: from then on no function has a value, which ends it.
         """
         if self._stopped is None and self._interrupts:
             self._stopped = KeyboardInterrupt()
@@ -224,7 +220,7 @@ class _Solver:
 
 
 class _Structure:
-    """Sparsity of everything that a solver asks for, and how its entries are ordered."""
+    """Sparsity of each function of a program, and the order of its entries."""
 
     def __init__(self, program: Program) -> None:
         n, m = program.layout.n_unknowns, program.layout.n_constraints
@@ -265,7 +261,7 @@ _COMPUTE: Mapping[str, Callable[[Program, FloatArray, float, FloatArray], Any]] 
     "hess_gamma_x_x": Program.hessian,
     "triu_hess_gamma_x_x": Program.hessian,
 }
-"""What a solver may ask for, by CasADi's names: (program, unknowns, objective's factor, multipliers) -> its entries."""
+"""Functions by CasADi's names: (program, unknowns, objective's factor, multipliers) -> entries."""
 
 _SIGNATURES: dict[str, dict[str, tuple[str, ...]]] = {
     "ipopt": {
@@ -285,11 +281,11 @@ _SIGNATURES: dict[str, dict[str, tuple[str, ...]]] = {
         "nlp_grad": ("f", "g", "grad_gamma_x", "grad_gamma_p"),
     },
 }
-"""What each solver asks for under which name; multipliers go in where their name says that they matter."""
+"""Functions that each solver calls, and the results of each; CasADi's names decide which take multipliers."""
 
 
 class _Evaluation(ca.Callback):
-    """One function of the nonlinear program for CasADi: (x, p, lam_f, lam_g) or (x, p) -> some of `_COMPUTE`."""
+    """CasADi callback of a program: (x, p, lam_f, lam_g) or (x, p) -> some of `_COMPUTE`."""
 
     def __init__(
         self, name: str, results: tuple[str, ...], structure: _Structure, values: Callable[..., FloatArray]
@@ -301,7 +297,7 @@ class _Evaluation(ca.Callback):
         if weighted:
             sizes |= {"lam_f": 1, "lam_g": structure.n_constraints}
         self._sizes = sizes
-        # CasADi adds multipliers to every solution, even to one that was stopped, and warns if it can't.
+        # CasADi computes multipliers even of a stopped search, and warns where it cannot; they are not used.
         self._unread = name == "nlp_grad"
         self.construct(name, {})
 
@@ -327,7 +323,7 @@ class _Evaluation(ca.Callback):
         return True
 
     def eval_buffer(self, arguments: Any, results: Any) -> int:
-        """Fill the buffers; 1 where there is no value, which CasADi tells the solver."""
+        """Fill the buffers; return 1 if there is no value."""
         wanted = [(name, np.frombuffer(b)) for name, b in zip(self._results, results, strict=True) if b is not None]
         if self._unread:
             for _, buffer in wanted:
@@ -337,10 +333,10 @@ class _Evaluation(ca.Callback):
         given = [np.zeros(n) if a is None else np.frombuffer(a) for a, n in zip(arguments, sizes, strict=True)]
         factor, multipliers = (float(given[2][0]), given[3]) if len(given) > 2 else (0.0, np.zeros(0))
         try:
-            # Derivatives stand last and are computed first: values are known then.
+            # Derivatives stand last and are computed first; values are by-products of them.
             for name, buffer in reversed(wanted):
                 buffer[:] = self._values(name, given[0], factor, multipliers)[self._structure.parts[name][1]]
-        except BaseException:  # noqa: BLE001 - CasADi would print it; it is raised where the solver was called
+        except BaseException:  # noqa: BLE001 - CasADi would print it; `_run` raises it
             return 1
         return 0
 
@@ -353,21 +349,21 @@ def _sorted(entries: tuple[IntArray, IntArray], shape: tuple[int, int]) -> tuple
     return ca.Sparsity(*shape, starts.tolist(), rows[order].tolist()), order
 
 
-def _ipopt_options(_layout: Layout, iterations: int, manner: Manner) -> dict[str, Any]:
-    options = {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, **_interior(iterations, manner)}
-    if manner == "bold":
+def _ipopt_options(_layout: Layout, iterations: int, strategy: Strategy) -> dict[str, Any]:
+    options = {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, **_interior(iterations, strategy)}
+    if strategy == "full steps":
         options |= {"accept_every_trial_step": "yes", "mu_init": 1e-3}
     return {"ipopt": options}
 
 
-def _fatrop_options(layout: Layout, iterations: int, manner: Manner) -> dict[str, Any]:
-    options = {"print_level": 0, **_interior(iterations, manner)}
+def _fatrop_options(layout: Layout, iterations: int, strategy: Strategy) -> dict[str, Any]:
+    options = {"print_level": 0, **_interior(iterations, strategy)}
     return {"structure_detection": "auto", "equality": [True] * layout.n_constraints, "fatrop": options}
 
 
-def _interior(iterations: int, manner: Manner) -> dict[str, Any]:
-    """What both solvers call by the same name."""
+def _interior(iterations: int, strategy: Strategy) -> dict[str, Any]:
+    """Options that both solvers share."""
     options = {"max_iter": iterations, "tol": _TOLERANCE}
-    if manner == "near":
+    if strategy == "warm start":
         options |= {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
     return options

@@ -1,10 +1,10 @@
-"""One stage of a plan: the state an interval later, what the interval costs, and the derivatives of both, compiled.
+"""Stage of a plan: state after an interval, cost of the interval, and first and second derivatives of both, compiled.
 
-An interval is a few Runge-Kutta steps with the input held, the very steps of a simulation. One step and its derivatives
-are expressions; the kernel makes machine code of them that takes every stage of a plan at once, step after step. So an
-exact second derivative through ten steps takes a model no longer to compile than one step's.
+An interval is a few Runge-Kutta steps with the input held, the same as in a simulation. One step and its derivatives
+are compiled, and evaluated for all stages of a plan at once, step after step: second derivatives through ten steps
+take no longer to compile than those of one step.
 
-Names, of a stage: ``s`` its state, ``u`` its input, ``z = [s; u]``; ``Z = ds/dz`` from the start of the interval on.
+Symbols of a stage: ``s`` its state, ``u`` its input, ``z = [s; u]``; ``Z = ds/dz`` from the start of the interval on.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ __all__ = ["Costs", "Interval", "Stage", "stage_of"]
 
 @dataclass(frozen=True)
 class Costs:
-    """What every knot and interval costs: ``tau (w_t + sum_i e_i (u_i - trim_i)^2) + sum_j w_j (x_j - ref_j)^2``.
+    """Cost of knots and intervals: ``tau (w_t + sum_i e_i (u_i - trim_i)^2) + sum_j w_j (x_j - ref_j)^2``.
 
     Parameters
     ----------
-    reference, weights : (n_knots, n_x)   ref, and w with the length of time that a knot stands for
-    effort : (n_u,)   e, one over each input's unit squared
-    trim : (n_u,)   inputs that cost nothing
+    reference, weights : (n_knots, n_x)   ref, and w times the duration that a knot represents
+    input_weights : (n_u,)   e, one over each input's unit squared
+    trim : (n_u,)   inputs of zero cost
     time : w_t, one over seconds
     """
 
     reference: FloatArray
     weights: FloatArray
-    effort: FloatArray
+    input_weights: FloatArray
     trim: FloatArray
     time: float
 
 
 @dataclass(frozen=True)
 class Interval:
-    """All intervals of a plan after integration, with derivatives.
+    """Integrated intervals of a plan, with derivatives.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Interval:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """Compiled steps, costs and derivatives of one model; made by `stage_of`.
+    """Compiled steps, costs and derivatives of one model, from `stage_of`.
 
     Shapes: N stages, n_s states (with free time the duration of the segment is the last), n_z = n_s + n_u, M steps.
     """
@@ -88,7 +88,7 @@ class Stage:
         return np.concatenate([states[None], after.swapaxes(0, 1)])
 
     def linearize(self, states: FloatArray, inputs: FloatArray, parameters: FloatArray, steps: FloatArray) -> Interval:
-        """The same with derivatives."""
+        """Intervals: the states of `advance` with their derivatives."""
         identity = np.broadcast_to(np.eye(self.n_z, self.n_s).ravel(), (len(states), self.n_z * self.n_s))
         start = np.hstack([states, identity])
         after = self._sensitivities(start, steps[:, :, None], _constants(inputs, parameters))
@@ -129,7 +129,7 @@ class Stage:
         lengths : (n_knots,)   of each knot's interval: s, or a share of the duration where time is free
         """
         values, gradients, curvatures = self._cost(
-            states, inputs, _column(lengths), costs.reference, costs.weights, costs.effort, costs.trim,
+            states, inputs, _column(lengths), costs.reference, costs.weights, costs.input_weights, costs.trim,
             np.array([costs.time]),
         )  # fmt: skip
         return values[:, 0], gradients, curvatures.reshape(-1, self.n_z, self.n_z)
@@ -168,7 +168,7 @@ def stage_of(model: Model, free_time: bool) -> Stage:
 
 
 def _stepped(model: Model, s: ca.SX, u: ca.SX, p: ca.SX, c: ca.SX, free_time: bool) -> ca.SX:
-    """State one Runge-Kutta step later; the duration, where it is a state, stays."""
+    """State one Runge-Kutta step later; the duration, where it is a state, is constant."""
     n_x = len(model.state)
     x, h = s[:n_x], c * s[n_x] if free_time else c
 
@@ -186,12 +186,12 @@ def _cost_of(n_x: int, s: ca.SX, u: ca.SX, free_time: bool) -> tuple[list[ca.SX]
     """Arguments and results of the cost of a knot and its interval."""
     length, time = ca.SX.sym("tau"), ca.SX.sym("w_t")
     reference, weights = ca.SX.sym("ref", n_x), ca.SX.sym("w", n_x)
-    effort, trim = ca.SX.sym("e", u.numel()), ca.SX.sym("trim", u.numel())
+    input_weights, trim = ca.SX.sym("e", u.numel()), ca.SX.sym("trim", u.numel())
     tau = length * s[n_x] if free_time else length
     x = s[:n_x]
-    cost = tau * (time + ca.dot(effort, (u - trim) ** 2)) + ca.dot(weights, (x - reference) ** 2)
+    cost = tau * (time + ca.dot(input_weights, (u - trim) ** 2)) + ca.dot(weights, (x - reference) ** 2)
     curved, gradient = ca.hessian(cost, ca.vertcat(s, u))
-    return [s, u, length, reference, weights, effort, trim, time], [cost, gradient, curved]
+    return [s, u, length, reference, weights, input_weights, trim, time], [cost, gradient, curved]
 
 
 def _function(name: str, arguments: Sequence[ca.SX], results: Sequence[ca.SX]) -> ca.Function:
@@ -199,7 +199,7 @@ def _function(name: str, arguments: Sequence[ca.SX], results: Sequence[ca.SX]) -
 
 
 def _constants(inputs: FloatArray, parameters: FloatArray) -> FloatArray:
-    """What a stage keeps for all its steps: its input, and the parameters (N, n_u + n_p)."""
+    """Constants of a stage over its steps: input and parameters (N, n_u + n_p)."""
     return np.hstack([inputs, np.broadcast_to(parameters, (len(inputs), len(parameters)))])
 
 

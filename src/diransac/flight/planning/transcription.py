@@ -1,13 +1,13 @@
-"""Direct transcription: a plan as a sparse nonlinear program, stage after stage.
+"""Sparse nonlinear program of a plan, by direct transcription.
 
     minimise  sum_k cost(s_k, u_k)   over  s_0, u_0, s_1, u_1, ..., s_N
     such that  s_(k+1) = integral of the dynamics over interval k from s_k with u_k held,
                the states that a waypoint names have its values at its knot,
                inputs and states keep to their limits.
 
-With free time the duration of a segment is a state of every stage: constant within the segment, and chosen anew by an
-input of its own at the segment's last stage. Unknowns and constraints are ordered stage by stage, defects first, then
-waypoints: the order that solvers for optimal control detect.
+With free time the duration of a segment is a state of every stage: constant within the segment, and set for the next
+one by an input of the segment's last stage. Unknowns and constraints are ordered stage by stage, defects before
+waypoints: the structure that solvers for optimal control detect.
 
 References: Betts 2010, "Practical Methods for Optimal Control", chapter 4 (direct transcription).
 """
@@ -16,23 +16,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.flight.planning.stage import Costs, Interval, Stage
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 
 __all__ = ["Layout", "Numbers", "Program"]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each unknown and each constraint of a plan stands; what shapes the problem, as a value.
+    """Index of each unknown and each constraint of a plan.
 
     Parameters
     ----------
@@ -50,12 +45,12 @@ class Layout:
 
     @property
     def n_s(self) -> int:
-        """States of a stage."""
+        """Number of states of a stage."""
         return self.n_x + self.free_time
 
     @property
     def n_stages(self) -> int:
-        """Intervals of all segments; there is one knot more."""
+        """Number of intervals of all segments; there is one knot more."""
         return sum(self.intervals)
 
     @cached_property
@@ -69,8 +64,8 @@ class Layout:
         return np.repeat(np.arange(len(self.intervals)), self.intervals)
 
     @cached_property
-    def ends_segment(self) -> NDArray[np.bool_]:
-        """Stages (N,) after which another segment begins with a duration of its own."""
+    def ends_segment(self) -> BoolArray:
+        """Mask (N,) of the stages after which a segment with another duration begins."""
         ends = np.zeros(self.n_stages, bool)
         ends[self.waypoint_knots[1:-1] - 1] = self.free_time
         return ends
@@ -82,17 +77,17 @@ class Layout:
 
     @cached_property
     def states(self) -> IntArray:
-        """Unknowns (N + 1, n_s) that are the states of each knot."""
+        """Indices (N + 1, n_s) of the states of each knot among the unknowns."""
         return self._stage_starts[:, None] + np.arange(self.n_s)
 
     @cached_property
     def inputs(self) -> IntArray:
-        """Unknowns (N, n_u) that are the inputs of each stage."""
+        """Indices (N, n_u) of the inputs of each stage among the unknowns."""
         return self._stage_starts[:-1, None] + self.n_s + np.arange(self.n_u)
 
     @cached_property
     def next_durations(self) -> IntArray:
-        """Unknowns that are the duration of the next segment, of the stages that end one."""
+        """Indices of the inputs that set the duration of the next segment among the unknowns."""
         return self._stage_starts[:-1][self.ends_segment] + self.n_s + self.n_u
 
     @property
@@ -109,20 +104,20 @@ class Layout:
 
     @cached_property
     def pinned_unknowns(self) -> IntArray:
-        """Unknown of each pin."""
+        """Index of each pin among the unknowns."""
         knots, states = self.pins.T
         unknowns: IntArray = self.states[knots, states]
         return unknowns
 
     @cached_property
     def pin_rows(self) -> IntArray:
-        """Constraint of each pin: after the defects of its stage."""
+        """Index of each pin among the constraints: after the defects of its stage."""
         before = np.minimum(self.pins[:, 0] + 1, self.n_stages)
         return self.n_s * before + np.arange(len(self.pins))
 
     @cached_property
     def defects(self) -> IntArray:
-        """Constraints (N, n_s) that are the defects of each stage."""
+        """Indices (N, n_s) of the defects of each stage among the constraints."""
         pins_before = np.searchsorted(self.pins[:, 0], np.arange(self.n_stages))
         starts = self.n_s * np.arange(self.n_stages) + pins_before
         return starts[:, None] + np.arange(self.n_s)
@@ -135,14 +130,14 @@ class Layout:
 
 @dataclass(frozen=True)
 class Numbers:
-    """What may differ between problems of one layout.
+    """Values of one problem among those of a layout.
 
     Parameters
     ----------
     parameters : (n_p,)   each parameter's unit
     steps : (N, M)   integration steps of each interval: s, or shares of its segment's duration where time is free
-    pin_values : (n_pins,)   what the waypoints fix, in the order of `Layout.pins`
-    costs : what is minimised
+    pin_values : (n_pins,)   values that waypoints fix, in the order of `Layout.pins`
+    costs : the objective
     lower, upper : (n_unknowns,)   limits of the unknowns
     """
 
@@ -174,7 +169,7 @@ class Program:
         return self.stage.advance(states[:-1], inputs, self.numbers.parameters, self.numbers.steps)
 
     def objective(self, unknowns: FloatArray) -> float:
-        """What is minimised."""
+        """Cost of all knots and intervals."""
         return float(self._cost(unknowns)[0].sum())
 
     def gradient(self, unknowns: FloatArray) -> FloatArray:
@@ -229,7 +224,7 @@ class Program:
         """Hessian of ``objective_factor * objective + multipliers . constraints``."""
         layout, numbers = self.layout, self.numbers
         costs = objective_factor * self._cost(unknowns)[2]
-        # The duration that follows a segment's end isn't this segment's: no curvature comes from it.
+        # The duration after a segment's end belongs to the next segment: it has no curvature here.
         weights = -multipliers[layout.defects]
         weights[layout.ends_segment, layout.n_x :] = 0.0
         _, inputs = self.split(unknowns)
@@ -252,7 +247,7 @@ class Program:
         return self.stage.cost(states, np.concatenate([inputs, last]), lengths, self.numbers.costs)
 
     def _linearized(self, unknowns: FloatArray) -> Interval:
-        """Intervals with derivatives, kept for the Hessian that is asked for where the Jacobian was."""
+        """Intervals with derivatives, cached: solvers evaluate Jacobian and Hessian at the same point."""
         interval = self._known(unknowns)
         if interval is None:
             (states, inputs), numbers = self.split(unknowns), self.numbers
@@ -261,5 +256,5 @@ class Program:
         return interval
 
     def _known(self, unknowns: FloatArray) -> Interval | None:
-        """Intervals that have been linearized at these very unknowns."""
+        """Cached intervals of these unknowns; None for others."""
         return self._interval if np.array_equal(self._at, unknowns) else None

@@ -1,4 +1,4 @@
-"""The built-in models; ``builtin(name)`` finds one by the name that users type."""
+"""Built-in models, and `builtin`, which returns one by name."""
 
 from collections.abc import Callable
 
@@ -31,9 +31,12 @@ BUILTIN: dict[str, Callable[[], Model]] = {
 
 
 def builtin(name: str) -> Model:
-    """The built-in model of that name, ``planar-rotorcraft`` or ``planar_rotorcraft``.
+    """Built-in model by name, such as ``planar-rotorcraft`` or ``planar_rotorcraft``.
 
-    Raises ModelError: there is none; it lists those there are.
+    Raises
+    ------
+    ModelError
+        There is no such model.
     """
     key = name.replace("_", "-")
     if key not in BUILTIN:

@@ -1,4 +1,4 @@
-"""A double pendulum with a motor at each joint."""
+"""Double pendulum with a motor at each joint."""
 
 from casadi import atan, cos, sin
 
@@ -12,21 +12,31 @@ __all__ = ["double_pendulum"]
 def double_pendulum(
     upper_length: float = 0.3, gravity: float = 9.81, gear_ratio: float = 6.0, friction_steepness: float = 100.0
 ) -> Model:
-    """``M(q) q'' + c(q, q') + g(q) + f(q') = tau`` in the nine parameters that motion shows.
+    """Model ``M(q) q'' + c(q, q') + g(q) + f(q') = tau`` in nine base parameters.
 
     Parameters
     ----------
-    upper_length : l1, length of the upper link, m
-    gravity : g, m/s^2
-    gear_ratio : n; the rotors' inertia Ir acts n^2-fold at its own joint and, through the belt, across both
-    friction_steepness : k, s/rad: dry friction is ``cf atan(k q')``
+    upper_length : float
+        l1, length of the upper link, m.
+    gravity : float
+        g, m/s^2.
+    gear_ratio : float
+        n; the rotor inertia Ir acts n^2-fold at its own joint and, through the belt, across both.
+    friction_steepness : float
+        k, s/rad, of the dry friction ``cf atan(k q')``.
 
-    Coordinates q1 (0 hanging) and q2 (relative to the upper link), rad; inputs torque1, torque2 at the joints, N m.
-    Parameters: inertia1 = I1 + m2 l1^2, moment1 = m1 r1 + m2 l1, inertia2 = I2, moment2 = m2 r2, rotor_inertia = Ir,
-    viscous friction b1, b2 (N m s/rad) and dry friction cf1, cf2 (N m).  Masses and I1 alone never show in the motion.
+    Returns
+    -------
+    Model
+        Coordinates q1 (0 hanging) and q2 (relative to the upper link), rad. Inputs torque1, torque2 at the joints, N m.
+        Parameters inertia1 = I1 + m2 l1^2, moment1 = m1 r1 + m2 l1, inertia2 = I2, moment2 = m2 r2, rotor_inertia = Ir,
+        viscous friction b1, b2 (N m s/rad) and dry friction cf1, cf2 (N m). Masses and I1 are not identifiable
+        separately.
 
-    References: Wiebe et al. 2022, "Torque-limited simple/double pendulum: an open source reference platform" (DFKI),
-    equations of motion; Gautier and Khalil 1990 for base parameters.
+    References
+    ----------
+    Wiebe et al. 2022, "Torque-limited simple/double pendulum: an open source reference platform" (DFKI), equations of
+    motion; Gautier and Khalil 1990 for base parameters.
     """
 
     def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:

@@ -1,4 +1,4 @@
-"""Planar rotorcraft with what its model leaves out: the extended plant, Dimmig et al. 2023, section IV."""
+"""Planar rotorcraft with unmodelled effects of its rotors: the extended plant, Dimmig et al. 2023, section IV."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ TABLE_I: Mapping[str, float] = MappingProxyType({"mass": 0.249, "inertia": 0.004
 """Mass (kg), inertia (kg m^2) and induced drag (s/m) of the paper's rotorcraft, Table I."""
 
 BLADE_FLAPPING = 0.3
-"""Typical flapping of such rotors, rad a unit of advance ratio: ``4 theta_t - 2 lambda`` by blade elements.
+"""Typical flapping of such rotors, rad per unit of advance ratio: ``4 theta_t - 2 lambda`` by blade elements.
 
 With ideal twist and C_T of Table I: inflow ``lambda = sqrt(2 C_T / pi) / pi = 0.062``; tip pitch
 ``theta_t = lambda + 16 C_T / (pi^3 sigma a) = 0.107`` with solidity sigma = 0.12 and lift slope a = 5.7.
 """
 
 _LARGEST_MU = 0.5
-"""Advance ratio up to which flapping follows its formula; beyond it, where a rotor hardly turns, it stays as it is."""
+"""Advance ratio above which flapping is constant: the rotor almost stands still."""
 
 _EFFECTS = ("rotational", "gravitational")
 PerRotor = float | tuple[float, float]
@@ -53,41 +53,61 @@ def extended_rotorcraft(
     air_density: float = 1.225,
     gravity: float = 9.81,
 ) -> Plant:
-    """The planar rotorcraft, disturbed by imbalance of its rotors, eqs. (6) to (20), and by flapping of their blades.
+    """Planar rotorcraft with rotor imbalance, eqs. (6) to (20), and blade flapping.
 
     Rotor i turns with ``n_i = sqrt(max(T_i, 0) / (C_T rho D^4))`` (eq. (11)) and has the phase ``phi_i``; its projected
-    radius is ``r_i = D/2 cos(phi_i)`` (eq. (14)).  What it adds, summed over both rotors, is
+    radius is ``r_i = D/2 cos(phi_i)`` (eq. (14)). The disturbances, summed over both rotors, are
 
     ``f_z     = gamma_i rho n_i^2 + dm_i g``                                      (eqs. (13) and (18), upwards)
     ``f_theta = 4 pi C_P/C_T gamma_i rho n_i^2 r_i + dm_i (2 pi n_i)^2 r_i L_z + dm_i g r_i``  (eqs. (16), (17), (19))
 
     Parameters
     ----------
-    aerodynamic_imbalance : gamma, m^4: of both rotors, or (of the first, of the second); Table II has 1.0e-6 to 1.8e-6
-    mass_imbalance : dm, kg, likewise; Table II has 6e-5 to 1.4e-4
-    convention : `physical`: forces and torques, divided by mass and inertia, and ``T_i = (u_1 -+ u_2) / 2``, with which
-        eq. (4) has the torque ``L u_2``; `printed`: added to the accelerations, and ``T_i = (u_1 -+ u_2 / L) / 2``, as
-        eqs. (9), (10) and (20) are printed
-    phase : `integrated`: ``phi_i' = 2 pi n_i``; `instantaneous`: ``phi_i = 2 pi n_i t``, as eq. (14) is printed
-    parameters : of the model, by name
-    mass_effects : which of dm's are on: `rotational` (eq. (17)), `gravitational` (eqs. (18) and (19))
-    blade_flapping : K, rad: a rotor that advances with ``mu = v_x / (pi n_i D)`` along the body's x axis tilts back by
-        ``a_i = K mu / (1 - mu^2 / 2)``, and so does its thrust, L_z above the centre of gravity; always forces and
-        torques, whatever the convention.  0: off, as in the paper; `BLADE_FLAPPING` is typical
-    rotor_phase : phi_i at the start, rad, of `integrated` phases; None: anywhere, drawn with a flight's seed
-    thrust_coefficient, power_coefficient : C_T, C_P, Table I
-    diameter, arm_length, rotor_height : D, L and L_z, m, Table I
-    air_density : rho, kg/m^3
-    gravity : g, m/s^2
+    aerodynamic_imbalance : float or (float, float)
+        gamma of both rotors or of each, m^4; 1.0e-6 to 1.8e-6 in Table II.
+    mass_imbalance : float or (float, float)
+        dm of both rotors or of each, kg; 6e-5 to 1.4e-4 in Table II.
+    convention : {"physical", "printed"}
+        ``"physical"``: forces and torques, divided by mass and inertia, and ``T_i = (u_1 -+ u_2) / 2``, which is
+        consistent with the torque ``L u_2`` of eq. (4). ``"printed"``: added to the accelerations, and
+        ``T_i = (u_1 -+ u_2 / L) / 2``, as eqs. (9), (10) and (20) are printed.
+    phase : {"integrated", "instantaneous"}
+        ``phi_i' = 2 pi n_i``, or ``phi_i = 2 pi n_i t`` as eq. (14) is printed.
+    parameters : mapping of str to float
+        Of the model.
+    mass_effects : collection of str
+        Enabled effects of dm: ``"rotational"`` (eq. (17)), ``"gravitational"`` (eqs. (18) and (19)).
+    blade_flapping : float or (float, float)
+        K, rad: a rotor that advances with ``mu = v_x / (pi n_i D)`` along the body's x axis tilts its thrust, which
+        acts L_z above the centre of gravity, back by ``a_i = K mu / (1 - mu^2 / 2)``; always as forces and torques. 0:
+        none, as in the paper. `BLADE_FLAPPING` is a typical value.
+    rotor_phase : float or (float, float), optional
+        phi_i at the start, rad, of integrated phases; None: drawn with the seed of a flight.
+    thrust_coefficient, power_coefficient : float
+        C_T, C_P, Table I.
+    diameter, arm_length, rotor_height : float
+        D, L and L_z, m, Table I.
+    air_density : float
+        rho, kg/m^3.
+    gravity : float
+        g, m/s^2.
 
-    A flight resolves a turn of the rotors at twice the thrust of hovering with 8 steps.
+    Returns
+    -------
+    Plant
+        Simulations take 8 integration steps per turn of the rotors at twice the thrust of hover.
 
-    Raises ModelError: an unknown convention, phase, effect or parameter, a number that isn't finite.
+    Raises
+    ------
+    ModelError
+        An unknown convention, phase, effect or parameter, or a number that is not finite.
 
-    References: Dimmig et al. 2023, eqs. (6) to (20), Tables I and II. Blade flapping: Hoffmann, Huang, Waslander,
-    Tomlin, "Quadrotor helicopter flight dynamics and control: theory and experiment", AIAA GNC 2007 (tilt of the thrust
-    and its moment); Pounds, Mahony, Corke, "Modelling and control of a large quadrotor robot", Control Engineering
-    Practice 18(7), 2010 (the angle, ``mu (4 theta_t - 2 lambda) / (1 - mu^2 / 2)`` for ideal twist).
+    References
+    ----------
+    Dimmig et al. 2023, eqs. (6) to (20), Tables I and II. Blade flapping: Hoffmann, Huang, Waslander, Tomlin,
+    "Quadrotor helicopter flight dynamics and control: theory and experiment", AIAA GNC 2007 (tilt of the thrust and its
+    moment); Pounds, Mahony, Corke, "Modelling and control of a large quadrotor robot", Control Engineering Practice
+    18(7), 2010 (the angle, ``mu (4 theta_t - 2 lambda) / (1 - mu^2 / 2)`` for ideal twist).
     """
     _check_choice("convention", convention, ("physical", "printed"))
     _check_choice("phase", phase, ("integrated", "instantaneous"))
@@ -116,7 +136,7 @@ def extended_rotorcraft(
 
 @dataclass(frozen=True)
 class _Rotors:
-    """Both rotors; the names are those of `extended_rotorcraft`."""
+    """Both rotors, with the arguments of `extended_rotorcraft`."""
 
     convention: str
     phase: str
@@ -139,13 +159,13 @@ class _Rotors:
         return (u.thrust - couple) / 2, (u.thrust + couple) / 2
 
     def speeds(self, u: Symbols) -> list[ca.SX]:
-        """n_1 and n_2, turns a second: eq. (11)."""
+        """n_1 and n_2, turns per second: eq. (11)."""
         return [ca.sqrt(ca.fmax(thrust, 0) / self.thrust_factor) for thrust in self.thrusts(u)]
 
     def imbalance(
         self, model: Model, constants: Mapping[str, float], start: PerRotor | None, mass: float
     ) -> Disturbance:
-        """Aerodynamic and mass imbalance, eqs. (12) to (19); a turn at twice the thrust of hovering is resolved."""
+        """Aerodynamic and mass imbalance, eqs. (12) to (19); resolved up to twice the thrust of hover."""
 
         def effect(_q: Symbols, _v: Symbols, u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:
             both = [self._one_rotor(i, n, d) for i, n in enumerate(self.speeds(u), start=1)]
@@ -169,7 +189,7 @@ class _Rotors:
         )
 
     def _one_rotor(self, i: int, n: ca.SX, d: Symbols) -> tuple[ca.SX, ca.SX]:
-        """Force upwards and torque of rotor i, which makes n turns a second."""
+        """Upward force and torque of rotor i at n turns per second."""
         angle = d[f"phase_{i}"] if self.phase == "integrated" else 2 * pi * n * d.t
         radius = self.diameter / 2 * ca.cos(angle)
         excess = d[f"aerodynamic_{i}"] * self.air_density * n**2
@@ -179,7 +199,7 @@ class _Rotors:
         return excess + weight, excess * torque_of_thrust + (whirling + weight) * radius
 
     def flapping(self, model: Model, constants: Mapping[str, float]) -> Disturbance:
-        """Thrust that tilts back with the tips of its blades."""
+        """Tilt of the thrust by blade flapping."""
 
         def forces(q: Symbols, v: Symbols, u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:
             along = v.x * ca.cos(q.theta) + v.z * ca.sin(q.theta)
@@ -202,11 +222,12 @@ class _Rotors:
 
 
 def _per_rotor(**values: PerRotor) -> dict[str, float]:
-    """``name_1`` and ``name_2`` of each."""
+    """Values by ``name_1`` and ``name_2``."""
     pairs = {name: value if isinstance(value, tuple) else (value, value) for name, value in values.items()}
     return {f"{name}_{i}": float(value) for name, pair in pairs.items() for i, value in enumerate(pair, start=1)}
 
 
 def _check_choice(name: str, value: str, known: Collection[str]) -> None:
+    """Raise ModelError for an unknown word."""
     if value not in known:
         raise ModelError(f"extended rotorcraft: {name} is {value!r}; choose {' or '.join(known)}")

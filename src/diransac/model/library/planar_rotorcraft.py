@@ -10,7 +10,7 @@ __all__ = ["planar_rotorcraft"]
 
 
 def planar_rotorcraft(arm_length: float = 0.177, gravity: float = 9.81) -> Model:
-    """Two rotors in the vertical plane, with induced drag.
+    """Model of two rotors in the vertical plane, with induced drag.
 
     ``m x'' = -T sin(theta) - C |T| x' cos(theta)``
     ``m (z'' + g) = T cos(theta) - C |T| z' sin(theta)``
@@ -18,13 +18,20 @@ def planar_rotorcraft(arm_length: float = 0.177, gravity: float = 9.81) -> Model
 
     Parameters
     ----------
-    arm_length : L, distance of each rotor from the centre of gravity, m (Table I)
-    gravity : g, m/s^2
+    arm_length : float
+        L, distance of each rotor from the centre of gravity, m (Table I).
+    gravity : float
+        g, m/s^2.
 
-    Coordinates x, z (world frame, m) and theta (rad); inputs thrust T (N, along the body's z axis) and moment M (the
-    paper's u_2, which eq. (4) multiplies by L: N); parameters mass m, inertia I, drag C (induced drag, s/m).
+    Returns
+    -------
+    Model
+        Coordinates x, z (world frame, m) and theta (rad). Inputs thrust T (N, along the body's z axis) and moment M
+        (the paper's u_2, multiplied by L in eq. (4): N). Parameters mass m, inertia I, drag C (induced drag, s/m).
 
-    References: Dimmig et al. 2023, eqs. (4) and (5), Table I.
+    References
+    ----------
+    Dimmig et al. 2023, eqs. (4) and (5), Table I.
     """
 
     def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:

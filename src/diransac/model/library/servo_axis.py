@@ -1,4 +1,4 @@
-"""A linear servo axis with viscous and dry friction."""
+"""Linear servo axis with viscous and dry friction."""
 
 from casadi import sign
 
@@ -10,12 +10,17 @@ __all__ = ["servo_axis"]
 
 
 def servo_axis() -> Model:
-    """``M q'' + Fv q' + Fc sign(q') + F0 = F``.
+    """Model ``M q'' + Fv q' + Fc sign(q') + F0 = F`` of a linear axis with viscous and dry friction.
 
-    Coordinate position q (m), input force F (N); parameters mass M (kg), viscous friction Fv (N s/m), dry (Coulomb)
-    friction Fc (N) and offset F0 (N: gravity, cable pull, amplifier offset).
+    Returns
+    -------
+    Model
+        Coordinate position q (m), input force F (N). Parameters mass M (kg), viscous friction Fv (N s/m), dry (Coulomb)
+        friction Fc (N) and offset F0 (N: gravity, cable pull, amplifier offset).
 
-    References: Janot, Gautier, Brunot 2019, "Data set and reference models of EMPS", eq. (1).
+    References
+    ----------
+    Janot, Gautier, Brunot 2019, "Data set and reference models of EMPS", eq. (1).
     """
 
     def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:

@@ -1,4 +1,4 @@
-"""An underwater vehicle in one degree of freedom, the kind of plant DIRANSAC began with."""
+"""Underwater vehicle in one degree of freedom, the first application of DIRANSAC."""
 
 from casadi import fabs
 
@@ -10,12 +10,17 @@ __all__ = ["underwater_vehicle"]
 
 
 def underwater_vehicle() -> Model:
-    """``m x'' + d1 x' + d2 |x'| x' + b = T``, decoupled motion along one axis.
+    """Model ``m x'' + d1 x' + d2 |x'| x' + b = T`` of an underwater vehicle in decoupled motion along one axis.
 
-    Coordinate x (m), input thrust T (N); parameters effective mass m (rigid body and added mass, kg), linear drag d1
-    (N s/m), quadratic drag d2 (N s^2/m^2) and bias b (N: net buoyancy, tether, thruster offset).
+    Returns
+    -------
+    Model
+        Coordinate x (m), input thrust T (N). Parameters effective mass m (rigid body and added mass, kg), linear drag
+        d1 (N s/m), quadratic drag d2 (N s^2/m^2) and bias b (N: net buoyancy, tether, thruster offset).
 
-    References: Fossen 2011, "Handbook of Marine Craft Hydrodynamics and Motion Control", section 7.5.
+    References
+    ----------
+    Fossen 2011, "Handbook of Marine Craft Hydrodynamics and Motion Control", section 7.5.
     """
 
     def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:

@@ -1,4 +1,4 @@
-"""What commands that fly do and show: a flight that fills a log, and one that judges an identified model."""
+"""Flights of the commands ``simulate``, which writes a noisy log, and ``fly``, which tests an identified model."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from diransac.cli.flying import SHAPES, same_equations
+from diransac.cli.flight_options import SHAPES, same_equations
 from diransac.data.log import Log
 from diransac.errors import DiransacError, PlanningError, SettingsError
 from diransac.flight.closed_loop import fly, tracking_error
-from diransac.flight.corruption import CorruptedLog, Noise, corrupt
+from diransac.flight.corruption import CorruptedLog, corrupt
+from diransac.flight.noise import Noise
 from diransac.flight.planning import sine, square, star
 from diransac.flight.trajectory import Trajectory
 from diransac.flight.tvlqr import Controller, tvlqr
@@ -22,14 +23,14 @@ from diransac.model import Model
 from diransac.model.plant import ModelWithParameters, Plant
 from diransac.text_table import aligned
 
-__all__ = ["Flight", "Recording", "Trial", "record", "try_out"]
+__all__ = ["FlightTest", "SimulatedFlight", "TrackedFlight", "fly_identified", "simulate_flight"]
 
 _PLANNERS = dict(zip(SHAPES, (star, square, sine), strict=True))
 
 
 @dataclass(frozen=True)
-class Flight:
-    """One closed loop: what was to be flown, what steered, what was flown, RMS errors by state."""
+class TrackedFlight:
+    """Closed-loop flight: reference, controller, log without noise, RMS errors by state."""
 
     trajectory: Trajectory
     controller: Controller
@@ -38,52 +39,54 @@ class Flight:
 
     @property
     def at_limit(self) -> dict[str, float]:
-        """Share of the samples in which an input was at one of its limits, by input."""
+        """Fraction of the samples at a limit, by input."""
         controller = self.controller
         edges = zip(controller.input_names, controller.u_min, controller.u_max, strict=True)
         return {name: float(np.mean((self.log[name] <= low) | (self.log[name] >= high))) for name, low, high in edges}
 
     def draw(self, path: Path) -> None:
-        """Write a picture of it."""
+        """Write a figure of the flight."""
         from diransac.plots import plot_flight
 
         plot_flight(self.trajectory, self.log, path)
 
     def to_dict(self) -> dict[str, Any]:
-        """How well it went."""
+        """Tracking errors and fractions at limits."""
         return {"tracking_error": self.errors, "at_limit": self.at_limit}
 
 
-def flown(shape: str, known: ModelWithParameters, plant: Plant, seed: int) -> Flight:
-    """Plan with what is known, steer by it, fly what there is.
+def _flown(shape: str, known: ModelWithParameters, plant: Plant, seed: int) -> TrackedFlight:
+    """Flight of a plant along a plan and under a controller of the known model.
 
-    Raises PlanningError: there is no such plan or no controller, or the flight diverges.
-    Raises SettingsError: the plant has other states or inputs than what is known.
+    Raises PlanningError: there is no plan or no controller, or the flight diverges.
+    Raises SettingsError: the plant has other states or inputs than the known model.
     """
     trajectory = _PLANNERS[shape](known)
     controller = tvlqr(known, trajectory)
     log = fly(plant, trajectory, controller, seed=seed)
     errors = tracking_error(trajectory, log)
     if not np.isfinite(list(errors.values())).all():
-        raise PlanningError(f"{shape}: {'; '.join(log.notes)}; these parameters don't fly this plant")
-    return Flight(trajectory, controller, log, errors)
+        raise PlanningError(
+            f"{shape}: {'; '.join(log.notes)}; planning and control with these parameters fail on this plant"
+        )
+    return TrackedFlight(trajectory, controller, log, errors)
 
 
-# ---------------------------------------------------------------------- a flight that fills a log
+# simulate -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Recording:
-    """A flight and the log that is left of it."""
+class SimulatedFlight:
+    """Flight and its noisy log."""
 
     shape: str
     plant: Plant
-    flight: Flight
+    flight: TrackedFlight
     log: CorruptedLog
     seed: int
 
     def to_dict(self) -> dict[str, Any]:
-        """What was flown, how well, and what is wrong with the log."""
+        """Flight, tracking errors, noise and faults."""
         return {
             "trajectory": self.shape,
             "plant": self.plant.simulated.name,
@@ -93,52 +96,52 @@ class Recording:
             "rate": 1.0 / self.log.dt,
             "units": self.log.units,
             **self.flight.to_dict(),
-            "spoilt": {name: int(mask.sum()) for name, mask in self.log.planted.items()},
+            "faults": {name: int(mask.sum()) for name, mask in self.log.fault_mask.items()},
             "noise": self.log.history[-1]["noise"],
         }
 
     def __str__(self) -> str:
         errors, limits = self.flight.errors, self.flight.at_limit
-        rows = [["signal", "unit", "tracking error", "spoilt values", "at a limit"]]
+        rows = [["signal", "unit", "tracking error", "faults", "at a limit"]]
         for name in self.log.names:
             error = f"{errors[name]:.4g}" if name in errors else ""
-            spoilt = str(self.log.planted[name].sum()) if name in self.log.planted else ""
-            rows.append([name, self.log.units[name], error, spoilt, _percent(limits[name]) if name in limits else ""])
+            faults = str(self.log.fault_mask[name].sum()) if name in self.log.fault_mask else ""
+            rows.append([name, self.log.units[name], error, faults, _percent(limits[name]) if name in limits else ""])
         return "\n".join([f"{self.shape} of {_size(self.plant, self.log)}, seed {self.seed}", *aligned(rows)])
 
 
-def record(shape: str, model: Model, plant: Plant, noise: Noise, seed: int) -> Recording:
-    """Fly by what is true, and spoil the log.
+def simulate_flight(shape: str, model: Model, plant: Plant, noise: Noise, seed: int) -> SimulatedFlight:
+    """Flight with the true model, and its noisy log.
 
-    Raises as `flown` does; SettingsError: the plant is not of that model; LogError: the noise doesn't fit the log.
+    Raises as `_flown`; SettingsError: the plant is not of that model; LogError: the noise does not fit the log.
     """
     if not same_equations(model, plant.model):
         raise SettingsError(
             f'the plant "{plant.simulated.name}" has the equations of {plant.model.name}, not those of the model '
             f'"{model.name}"; leave the model or the plant out'
         )
-    flight = flown(shape, plant, plant, seed)
+    flight = _flown(shape, plant, plant, seed)
     log = corrupt(flight.log, noise, seed, signals=model.signals)
-    return Recording(shape, plant, flight, log, seed)
+    return SimulatedFlight(shape, plant, flight, log, seed)
 
 
-# ---------------------------------------------------------------------- a flight that judges a model
+# fly ----------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Trial:
-    """An identified model, flown on the true plant, beside what the true parameters do there, or why they can't."""
+class FlightTest:
+    """Flights of the true plant with the identified model and with the true parameters, or the latter's error."""
 
     shape: str
     result: Result
     plant: Plant
-    flight: Flight
-    ideal: Flight | DiransacError
+    flight: TrackedFlight
+    ideal: TrackedFlight | DiransacError
     seed: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Both flights, and what each knew."""
-        ideal = self.ideal.to_dict() if isinstance(self.ideal, Flight) else {"refused": str(self.ideal)}
+        """Both flights and their parameters."""
+        ideal = self.ideal.to_dict() if isinstance(self.ideal, TrackedFlight) else {"refused": str(self.ideal)}
         return {
             "trajectory": self.shape,
             "model": self.result.model.name,
@@ -155,7 +158,7 @@ class Trial:
 
     def __str__(self) -> str:
         lines = [
-            f"{self.shape} planned and steered by {self.result.model.name} ({self.result.method}); "
+            f"{self.shape} planned and controlled with {self.result.model.name} ({self.result.method}); "
             f"flight of {_size(self.plant, self.flight.log)}, seed {self.seed}",
             *aligned(self._parameters()),
             "",
@@ -166,7 +169,7 @@ class Trial:
         if not same_equations(self.result.model, self.plant.model):
             lines.append(f"! the model has other equations than the plant's {self.plant.model.name}")
         if isinstance(self.ideal, DiransacError):
-            lines.append(f"! the true parameters don't fly: {self.ideal}")
+            lines.append(f"! the flight with the true parameters failed: {self.ideal}")
         return "\n".join(lines)
 
     def _parameters(self) -> list[list[str]]:
@@ -178,7 +181,7 @@ class Trial:
         ]
 
     def _errors(self) -> list[list[str]]:
-        ideal = self.ideal.errors if isinstance(self.ideal, Flight) else {}
+        ideal = self.ideal.errors if isinstance(self.ideal, TrackedFlight) else {}
         rows = [["state", "unit", "tracking error", "with the true parameters"]]
         for name, error in self.flight.errors.items():
             other = f"{ideal[name]:.4g}" if name in ideal else "-"
@@ -187,7 +190,7 @@ class Trial:
 
     def _limits(self) -> list[list[str]]:
         controller = self.flight.controller
-        ideal = self.ideal.at_limit if isinstance(self.ideal, Flight) else {}
+        ideal = self.ideal.at_limit if isinstance(self.ideal, TrackedFlight) else {}
         rows = [["input", "unit", "limits", "at a limit", "with the true parameters"]]
         edges = zip(controller.u_min, controller.u_max, strict=True)
         for (name, share), (low, high) in zip(self.flight.at_limit.items(), edges, strict=True):
@@ -197,21 +200,22 @@ class Trial:
         return rows
 
 
-def try_out(shape: str, result: Result, plant: Plant, seed: int) -> Trial:
-    """Fly the plant by what an identification found, and by what is true.
+def fly_identified(shape: str, result: Result, plant: Plant, seed: int) -> FlightTest:
+    """Flights of the plant with the identified model and with the true parameters.
 
-    Raises as `flown` does, of the identified model alone.
+    Raises as `_flown`, for the identified model alone.
     """
-    flight = flown(shape, result, plant, seed)
-    ideal: Flight | DiransacError
+    flight = _flown(shape, result, plant, seed)
+    ideal: TrackedFlight | DiransacError
     try:
-        ideal = flown(shape, plant, plant, seed)
+        ideal = _flown(shape, plant, plant, seed)
     except DiransacError as error:
         ideal = error
-    return Trial(shape, result, plant, flight, ideal, seed)
+    return FlightTest(shape, result, plant, flight, ideal, seed)
 
 
 def _size(plant: Plant, log: Log) -> str:
+    """Plant, number of rows and rate."""
     return f"{plant.simulated.name}: {len(log)} rows at {1.0 / log.dt:.4g} Hz"
 
 

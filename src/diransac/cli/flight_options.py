@@ -1,4 +1,4 @@
-"""The options of commands that fly: what is flown, what machine flies, what spoils its log."""
+"""Options of the flying commands: trajectory, plant, and noise of the log."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from diransac.cli.arguments import numbers
 from diransac.cli.options import output_file
 from diransac.data.files import ENDINGS
 from diransac.errors import ModelError
-from diransac.flight.corruption import Noise
+from diransac.flight.noise import Noise
 from diransac.model import Model
 from diransac.model.library import TABLE_I, extended_rotorcraft, planar_rotorcraft
 from diransac.model.plant import Plant
@@ -24,11 +24,11 @@ __all__ = [
     "FlightPicture",
     "FlightSeed",
     "LogOutput",
+    "NoiseOptions",
     "OptionalLogOutput",
-    "Recorder",
+    "PlantOptions",
     "TrajectoryArgument",
     "TrajectoryOption",
-    "TruePlant",
 ]
 
 SHAPES = ("star", "square", "sine")
@@ -36,7 +36,7 @@ EXTENDED = "extended-rotorcraft"
 
 
 def _one_of(*choices: str) -> Callable[[str | None], str | None]:
-    """What lets a word pass if it is one of these; None stays None."""
+    """Callback that accepts None and these words."""
 
     def check(word: str | None) -> str | None:
         if word is not None and word not in choices:
@@ -47,13 +47,14 @@ def _one_of(*choices: str) -> Callable[[str | None], str | None]:
 
 
 def _finite(number: float | None) -> float | None:
+    """Callback that accepts None and finite numbers."""
     if number is not None and not isfinite(number):
         raise typer.BadParameter(f"{number} is not finite; give a number")
     return number
 
 
 def _angle(text: str) -> float | str:
-    """Radians, or the word ``any``."""
+    """Angle in rad, or the word ``any``."""
     try:
         return text if text == "any" else float(text)
     except ValueError as error:
@@ -61,7 +62,7 @@ def _angle(text: str) -> float | str:
 
 
 def _steps(text: str) -> float | dict[str, float]:
-    """One number, or numbers by name."""
+    """One step, or steps by name."""
     try:
         return float(text)
     except ValueError:
@@ -69,6 +70,7 @@ def _steps(text: str) -> float | dict[str, float]:
 
 
 def _log_file(text: str) -> Path:
+    """Path of a log."""
     path = output_file(text)
     if not path.name.lower().endswith(ENDINGS):
         raise typer.BadParameter(f"{text!r} has an ending that is not known; use one of {', '.join(ENDINGS)}")
@@ -76,6 +78,7 @@ def _log_file(text: str) -> Path:
 
 
 def _picture_file(text: str) -> Path:
+    """Path of a figure."""
     path = output_file(text)
     if path.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise typer.BadParameter(f"{text!r} has an ending that is not known; use one of .png, .svg, .pdf")
@@ -86,38 +89,39 @@ _SHAPE = "|".join(SHAPES)
 _LOG_NAMES: dict[str, Any] = {"parser": _log_file, "metavar": "FILE.csv"}
 
 TrajectoryArgument = Annotated[
-    str, typer.Argument(metavar=_SHAPE, callback=_one_of(*SHAPES), help="What is flown: section V of the paper.")
+    str, typer.Argument(metavar=_SHAPE, callback=_one_of(*SHAPES), help="Trajectory, section V of the paper.")
 ]
 TrajectoryOption = Annotated[
-    str, typer.Option("--trajectory", metavar=_SHAPE, callback=_one_of(*SHAPES), help="What is flown.")
+    str, typer.Option("--trajectory", metavar=_SHAPE, callback=_one_of(*SHAPES), help="Trajectory.")
 ]
-LogOutput = Annotated[
-    Path, typer.Option("--output", "-o", help=f"Where to write the log: {', '.join(ENDINGS)}.", **_LOG_NAMES)
-]
+LogOutput = Annotated[Path, typer.Option("--output", "-o", help=f"Log to write: {', '.join(ENDINGS)}.", **_LOG_NAMES)]
 OptionalLogOutput = Annotated[
-    Path | None, typer.Option("--output", "-o", help="Where to write the log of the flight.", **_LOG_NAMES)
+    Path | None, typer.Option("--output", "-o", help="Log of the flight to write.", **_LOG_NAMES)
 ]
 FlightPicture = Annotated[
     Path | None,
-    typer.Option("--plot", parser=_picture_file, metavar="FILE.png", help="Where to draw the flight, as it was."),
+    typer.Option(
+        "--plot", parser=_picture_file, metavar="FILE.png", help="Figure of the flight, without noise, to write."
+    ),
 ]
-FlightSeed = Annotated[int, typer.Option("--seed", min=0, help="The same seed gives the same flight and log.")]
+FlightSeed = Annotated[int, typer.Option("--seed", min=0, help="Seed of flight and noise.")]
 
 
 def _plant_option(*names: str, **about: Any) -> Any:
-    return typer.Option(*names, rich_help_panel="The machine that flies", **about)
+    """Option in the panel of the plant."""
+    return typer.Option(*names, rich_help_panel="Plant", **about)
 
 
 @dataclass(frozen=True)
-class TruePlant:
-    """The machine that flies: the model's own equations, or those and more."""
+class PlantOptions:
+    """Plant: the model's equations, or these with disturbances."""
 
     plant: Annotated[
         str | None,
         _plant_option(
             metavar=EXTENDED,
             callback=_one_of(EXTENDED),
-            help="A disturbed machine; without it, the model itself flies.",
+            help="Plant with disturbances; the model itself by default.",
         ),
     ] = None
     assignments: Annotated[
@@ -125,14 +129,18 @@ class TruePlant:
         _plant_option(
             "--parameter",
             metavar="NAME=VALUE",
-            help="A true parameter, repeatable. The planar rotorcraft has those of Table I already.",
+            help="True parameter, repeatable; by default Table I for the planar rotorcraft.",
         ),
     ] = None
     aerodynamic_imbalance: Annotated[
-        float | None, _plant_option(metavar="M4", callback=_finite, help="Of each rotor; Table II: 1.0e-6 to 1.8e-6.")
+        float | None,
+        _plant_option(
+            metavar="M4", callback=_finite, help="Aerodynamic imbalance of each rotor; Table II: 1.0e-6 to 1.8e-6."
+        ),
     ] = None
     mass_imbalance: Annotated[
-        float | None, _plant_option(metavar="KG", callback=_finite, help="Of each rotor; Table II: 6e-5 to 1.4e-4.")
+        float | None,
+        _plant_option(metavar="KG", callback=_finite, help="Mass imbalance of each rotor; Table II: 6e-5 to 1.4e-4."),
     ] = None
     convention: Annotated[
         str | None,
@@ -140,7 +148,7 @@ class TruePlant:
             metavar="physical|printed",
             callback=_one_of("physical", "printed"),
             show_default="physical",
-            help="Imbalance is forces, or added to accelerations as eq. (20) is printed.",
+            help="Imbalance as forces and torques, or added to accelerations as in eq. (20).",
         ),
     ] = None
     phase: Annotated[
@@ -149,21 +157,22 @@ class TruePlant:
             metavar="integrated|instantaneous",
             callback=_one_of("integrated", "instantaneous"),
             show_default="integrated",
-            help="Of the rotors; instantaneous as eq. (14) is printed.",
+            help="Rotor phase: integrated speed, or as in eq. (14).",
         ),
     ] = None
     blade_flapping: Annotated[
-        float | None, _plant_option(metavar="RAD", callback=_finite, help="Tilt for each unit of advance ratio.")
+        float | None,
+        _plant_option(metavar="RAD", callback=_finite, help="Tilt of the rotor disc per unit of advance ratio."),
     ] = None
     rotor_phase: Annotated[
         Any,
         _plant_option(
-            parser=_angle, metavar="RAD|any", show_default="0", help="At the start; any: drawn with the seed."
+            parser=_angle, metavar="RAD|any", show_default="0", help="Initial rotor phase; any: drawn with the seed."
         ),
     ] = None
 
     def of(self, model: Model) -> Plant:
-        """The machine: a disturbed one if it is asked for, else the model with its true parameters.
+        """Plant with disturbances, if requested, else the model with its true parameters.
 
         Raises ModelError: a parameter is unknown, outside its bounds, or missing where Table I has none.
         Raises typer.BadParameter: disturbances without a plant that has them.
@@ -172,7 +181,7 @@ class TruePlant:
         disturbances = self._disturbances()
         if self.plant is None and disturbances:
             option = next(iter(disturbances)).replace("_", "-")
-            raise typer.BadParameter(f"--{option} is that of --plant {EXTENDED}, which is not given; give both")
+            raise typer.BadParameter(f"--{option} needs --plant {EXTENDED}; give both")
         if self.plant is None:
             return Plant(model, _true_parameters(model, given))
         parameters = _true_parameters(planar_rotorcraft(), given)
@@ -181,19 +190,19 @@ class TruePlant:
         return extended_rotorcraft(parameters=parameters, **disturbances)
 
     def _disturbances(self) -> dict[str, Any]:
-        """What is given of the arguments that `extended_rotorcraft` takes."""
+        """Given arguments of `extended_rotorcraft`, by name."""
         own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("plant", "assignments")}
         return {name: value for name, value in own.items() if value is not None}
 
 
 def same_equations(a: Model, b: Model) -> bool:
-    """Whether two models have the same signals, inputs, parameters and equations, whatever they are called."""
+    """True if two models have the same signals, inputs, parameters and equations; their names may differ."""
     one, other = a.to_dict(), b.to_dict()
     return all(one[key] == other[key] for key in one if key not in ("name", "description", "checksum"))
 
 
 def _true_parameters(model: Model, given: Mapping[str, float]) -> dict[str, float]:
-    """The values that are given, over those of Table I where the model is the paper's.
+    """Given parameters, with those of Table I as defaults for the paper's model.
 
     Raises ModelError: a name is unknown, a value is missing or outside its bounds.
     """
@@ -213,26 +222,29 @@ def _true_parameters(model: Model, given: Mapping[str, float]) -> dict[str, floa
 
 
 def _noise_option(*names: str, **about: Any) -> Any:
-    return typer.Option(*names, rich_help_panel="What spoils the log", **about)
+    """Option in the panel of noise and faults."""
+    return typer.Option(*names, rich_help_panel="Noise and faults of the log", **about)
 
 
-def _share(*names: str, **about: Any) -> Any:
+def _probability(*names: str, **about: Any) -> Any:
+    """Option with a value from 0 to 1."""
     return _noise_option(*names, min=0.0, max=1.0, metavar="P", **about)
 
 
 def _length(*names: str, **about: Any) -> Any:
+    """Option with a mean length in rows."""
     return _noise_option(*names, min=1.0, metavar="ROWS", **about)
 
 
 @dataclass(frozen=True)
-class Recorder:
-    """What spoils the log: the fields of `Noise`, under the names that users type."""
+class NoiseOptions:
+    """Noise and faults of the log: the fields of `Noise` as options."""
 
     outlier_probability: Annotated[
-        float | None, _share("--outliers", help="Probability that a value is an outlier; with --magnitude.")
+        float | None, _probability("--outliers", help="Probability of an outlier per sample; with --magnitude.")
     ] = None
     outlier_magnitude: Annotated[
-        float | None, _noise_option("--magnitude", min=0.0, metavar="A", help="An outlier adds uniform(-A, A).")
+        float | None, _noise_option("--magnitude", min=0.0, metavar="A", help="Outliers add uniform(-A, A).")
     ] = None
     acceleration_std: Annotated[
         float | None, _noise_option("--acceleration-noise", min=0.0, metavar="M/S2", help="Standard deviation.")
@@ -257,87 +269,105 @@ class Recorder:
             metavar="white|random-walk",
             callback=_one_of("white", "random-walk"),
             show_default="white",
-            help="What the noise of velocities and positions is.",
+            help="Noise of velocities and positions.",
         ),
     ] = None
     first_row: Annotated[
         str | None,
         _noise_option(
-            metavar="clean|hit",
-            callback=_one_of("clean", "hit"),
+            metavar="clean|corrupted",
+            callback=_one_of("clean", "corrupted"),
             show_default="clean",
-            help="Spare the first row, or none.",
+            help="First row: without noise and faults, or like the others.",
         ),
     ] = None
     burst_probability: Annotated[
-        float | None, _share("--bursts", help="That a run of outliers starts; with --magnitude.")
+        float | None,
+        _probability("--bursts", help="Probability per sample that a burst of outliers starts; with --magnitude."),
     ] = None
-    burst_length: Annotated[float | None, _length("--burst-length", show_default="10", help="Mean.")] = None
-    freeze_probability: Annotated[float | None, _share("--freezes", help="That a value freezes.")] = None
-    freeze_length: Annotated[float | None, _length("--freeze-length", show_default="10", help="Mean.")] = None
-    dropout_probability: Annotated[float | None, _share("--dropouts", help="That values go missing.")] = None
-    dropout_length: Annotated[float | None, _length("--dropout-length", show_default="10", help="Mean.")] = None
-    runs: Annotated[
-        str | None,
+    burst_length: Annotated[
+        float | None, _length("--burst-length", show_default="10", help="Mean length of bursts.")
+    ] = None
+    stuck_probability: Annotated[
+        float | None, _probability("--stuck", help="Probability per sample that a run of repeated values starts.")
+    ] = None
+    stuck_length: Annotated[
+        float | None, _length("--stuck-length", show_default="10", help="Mean length of these runs.")
+    ] = None
+    dropout_probability: Annotated[
+        float | None, _probability("--dropouts", help="Probability per sample that a run of missing values starts.")
+    ] = None
+    dropout_length: Annotated[
+        float | None, _length("--dropout-length", show_default="10", help="Mean length of these runs.")
+    ] = None
+    correlated: Annotated[
+        bool | None,
         _noise_option(
-            metavar="independent|together",
-            callback=_one_of("independent", "together"),
-            show_default="independent",
-            help="Bursts, freezes and dropouts strike each signal alone, or all at once.",
+            "--correlated",
+            help="Bursts, stuck values and dropouts occur in the same rows of all signals.",
+            show_default=False,
         ),
     ] = None
     leverage_probability: Annotated[
-        float | None, _share("--leverage", help="Of one-sided offsets where --leverage-signal is largest.")
+        float | None,
+        _probability(
+            "--leverage", help="Probability of a one-sided offset per sample where --leverage-signal is large."
+        ),
     ] = None
     leverage_offset: Annotated[
-        float | None, _noise_option(metavar="A", callback=_finite, help="Such an offset is uniform(0, A).")
+        float | None, _noise_option(metavar="A", callback=_finite, help="One-sided offsets are uniform(0, A).")
     ] = None
-    leverage_signal: Annotated[str | None, _noise_option(metavar="NAME", help="Such as thrust.")] = None
+    leverage_signal: Annotated[
+        str | None,
+        _noise_option(metavar="NAME", help="Signal that selects the rows of one-sided offsets, such as thrust."),
+    ] = None
     leverage_quantile: Annotated[
-        float | None, _share("--leverage-quantile", show_default="0.7", help="Above which it counts as large.")
+        float | None, _probability("--leverage-quantile", show_default="0.7", help="Quantile above which it is large.")
     ] = None
     delay: Annotated[
-        float | None, _noise_option(min=0.0, metavar="S", help="Signals lag behind inputs by so much.")
+        float | None, _noise_option(min=0.0, metavar="S", help="Delay of the signals after the inputs.")
     ] = None
     quantisation: Annotated[
         Any,
         _noise_option(
-            parser=_steps, metavar="STEP|NAME=STEP,...", help="Rounding: a share of the range, or steps by signal."
+            parser=_steps,
+            metavar="STEP|NAME=STEP,...",
+            help="Quantisation step: fraction of the range, or steps by signal.",
         ),
     ] = None
 
     def noise(self) -> Noise:
-        """The noise that is asked for.
+        """Noise of these options.
 
         Raises SettingsError: a value has no meaning.
-        Raises typer.BadParameter: an option is given without one that it needs.
+        Raises typer.BadParameter: an option lacks another one that it needs.
         """
         given = {f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None}
-        for name, others in _COMPANY.items():
+        for name, others in _NEEDED.items():
             if name in given and not any(other in given for other in others):
                 wanted = " or ".join(map(_option_of, others))
-                raise typer.BadParameter(f"{_option_of(name)} means nothing without {wanted}; give both")
+                raise typer.BadParameter(f"{_option_of(name)} needs {wanted}; give both")
         return Noise(**given)
 
 
-_COMPANY = {
+_NEEDED = {
     "outlier_probability": ("outlier_magnitude",),
     "outlier_magnitude": ("outlier_probability", "burst_probability"),
     "burst_probability": ("outlier_magnitude",),
     "burst_length": ("burst_probability",),
-    "freeze_length": ("freeze_probability",),
+    "stuck_length": ("stuck_probability",),
     "dropout_length": ("dropout_probability",),
-    "runs": ("burst_probability", "freeze_probability", "dropout_probability"),
+    "correlated": ("burst_probability", "stuck_probability", "dropout_probability"),
     "leverage_probability": ("leverage_offset",),
     "leverage_offset": ("leverage_signal",),
     "leverage_signal": ("leverage_probability",),
     "leverage_quantile": ("leverage_probability",),
     "integrated": ("acceleration_std", "rate_std"),
 }
-"""What needs one of others to mean anything."""
+"""Field -> fields of which it needs one."""
 
 
 def _option_of(name: str) -> str:
-    """What users type for a field of `Recorder`."""
-    about = get_type_hints(Recorder, include_extras=True)[name].__metadata__[0]
+    """Name of the option of a field of `NoiseOptions`."""
+    about = get_type_hints(NoiseOptions, include_extras=True)[name].__metadata__[0]
     return about.default if isinstance(about.default, str) else f"--{name.replace('_', '-')}"

@@ -1,0 +1,242 @@
+"""Figures: colours, panels in inches, heading with legend, and files that are reproducible byte for byte."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from diransac.atomic import write_with
+from diransac.errors import SettingsError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "COLOURS",
+    "DASHES",
+    "INK",
+    "MUTED",
+    "PAPER",
+    "REFERENCE",
+    "RULE",
+    "SOFT",
+    "WIDTH",
+    "LegendEntry",
+    "Range",
+    "check_ending",
+    "draw_heading",
+    "extent",
+    "flight_panels",
+    "header_height",
+    "inches",
+    "name_panel",
+    "panel",
+    "svg",
+    "write",
+]
+
+Range = tuple[float, float]
+"""Smallest and largest value that an axis shows."""
+
+# Colours and dashes are those of the report: a method looks the same there.
+PAPER, INK, MUTED, RULE, SOFT = "#ffffff", "#1c2126", "#5a646e", "#d8dde2", "#f4f6f8"
+REFERENCE = "#a3adb6"
+COLOURS = ("#0072b2", "#00875f", "#a63a79", "#946a00", "#2e9bd6", "#4b4bb5")
+# On and off, in line widths.
+DASHES = ((), (5.3, 1.8), (1.8, 1.8), (5.3, 1.8, 1.2, 1.8), (8.2, 2.4), (3.5, 0.9))
+
+
+def extent(visible: Range) -> float:
+    """Length of the range of an axis."""
+    return visible[1] - visible[0]
+
+
+# Panels --------------------------------------------------------------------------------------------------------------
+
+WIDTH = 9.0
+"""Width of every figure, inches."""
+
+# Inches: height of a row; margins of a panel for values on the left, its name above, and times below the last one.
+_ROW, _VALUES, _NAME, _TIMES, _GAP, _EDGE = 1.12, 0.46, 0.25, 0.24, 0.06, 0.17
+# Largest width and rows of a path beside the states; aspect ratio above which, and height with which, it is above them.
+_PATH_WIDTH, _PATH_ROWS, _WIDE, _PATH_HEIGHT = 3.75, 3, 2.2, 2.3
+_STEPS = (1, 2, 5, 10)
+
+
+def flight_panels(
+    states: Sequence[str], inputs: Sequence[str], box: tuple[Range, Range] | None, header: float
+) -> tuple[Figure, dict[str, Axes], Axes | None]:
+    """Empty figure, a panel per signal, and a panel for the path: beside the states, or above them if it is wide.
+
+    Parameters
+    ----------
+    box : ranges of the path in x and z; None for no path
+    header : free height at the top, inches
+    """
+    from matplotlib.figure import Figure
+
+    columns = _halves(states)
+    n_rows, n_input_rows = max(map(len, columns)), -(-len(inputs) // 2)
+    wide = box is not None and extent(box[0]) > _WIDE * extent(box[1])
+    top = header + (_PATH_HEIGHT + _TIMES if wide else 0.0)
+    below = top + n_rows * _ROW + _TIMES
+    figure = Figure(figsize=(WIDTH, below + n_input_rows * _ROW + _TIMES + _GAP), facecolor=PAPER)
+
+    path = None
+    if box is not None:
+        rows = min(n_rows, _PATH_ROWS)
+        path = panel(figure, 0.0, header, *((WIDTH, _PATH_HEIGHT) if wide else (_PATH_WIDTH, rows * _ROW)))
+    left = _PATH_WIDTH if box is not None and not wide else 0.0
+    width = (WIDTH - left) / 2.0
+    panels = {}
+    for column, names in enumerate(columns):
+        for row, name in enumerate(names):
+            place = (left + column * width, top + row * _ROW, width, _ROW)
+            panels[name] = panel(figure, *place, last=row == len(names) - 1)
+    for i, name in enumerate(inputs):
+        alone = i == len(inputs) - 1 and i % 2 == 0
+        place = (i % 2 * WIDTH / 2.0, below + i // 2 * _ROW, WIDTH if alone else WIDTH / 2.0, _ROW)
+        panels[name] = panel(figure, *place, last=i >= len(inputs) - 2)
+    return figure, panels, path
+
+
+def _halves(states: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
+    """Coordinates and velocities by name; the first and second half if names do not distinguish them."""
+    velocities = [name for name in states if name.endswith("_dot")]
+    if not velocities or len(velocities) == len(states):
+        half = -(-len(states) // 2)
+        return states[:half], states[half:]
+    return [name for name in states if name not in velocities], velocities
+
+
+def panel(figure: Figure, left: float, top: float, width: float, height: float, *, last: bool = True) -> Axes:
+    """Panel in a rectangle, inches from the figure's top left; only the last of a column has time labels."""
+    from matplotlib.ticker import MaxNLocator
+
+    full = figure.get_figheight()
+    inner_width, inner_height = width - _VALUES - _EDGE, height - _NAME - _GAP
+    bottom = full - top - _NAME - inner_height
+    place = ((left + _VALUES) / WIDTH, bottom / full, inner_width / WIDTH, inner_height / full)
+    axes = figure.add_axes(place, facecolor=SOFT)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    axes.tick_params(length=0, labelsize=7.5, labelcolor=MUTED, labelbottom=last, pad=3)
+    axes.grid(color=RULE, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.yaxis.set_major_locator(MaxNLocator(max(4, round(1.7 * inner_height)), steps=_STEPS))
+    axes.xaxis.set_major_locator(MaxNLocator(max(4, round(2.2 * inner_width)), steps=_STEPS))
+    return axes
+
+
+def name_panel(axes: Axes, name: str, detail: str) -> None:
+    """Write a panel's name, and in a muted colour its unit."""
+    axes.set_title(name, loc="left", fontsize=8.5, color=INK, pad=4)
+    axes.set_title(detail, loc="right", fontsize=7.5, color=MUTED, pad=4)
+
+
+def inches(axes: Axes) -> tuple[float, float]:
+    """Width and height of a panel, inches."""
+    return axes.bbox.width / axes.figure.dpi, axes.bbox.height / axes.figure.dpi
+
+
+# Heading -------------------------------------------------------------------------------------------------------------
+
+# Inches: height of the title and of a line of the legend, margin around them.
+_TITLE, _LEGEND_LINE, _MARGIN = 0.27, 0.19, 0.16
+# Inches: width of a letter in the legend, and of a sample line with its margins.
+_LETTER, _SAMPLE = 0.075, 0.65
+
+LegendEntry = tuple[str, dict[str, Any]]
+"""Label, and style of its line."""
+
+
+def _columns(entries: Sequence[LegendEntry]) -> int:
+    """Number of entries per line of the legend."""
+    widths = [_SAMPLE + _LETTER * len(label) for label, _ in entries]
+    return len(entries) if sum(widths) < WIDTH - 0.2 else max(1, int((WIDTH - 0.2) / max(widths)))
+
+
+def header_height(entries: Sequence[LegendEntry], title: str | None) -> float:
+    """Height of title and legend, inches."""
+    lines = -(-len(entries) // _columns(entries))
+    return _MARGIN + _LEGEND_LINE * lines + _title_height(title)
+
+
+def _title_height(title: str | None) -> float:
+    """Height of the title, inches."""
+    return _TITLE * len(title.splitlines()) if title else 0.0
+
+
+def draw_heading(figure: Figure, entries: Sequence[LegendEntry], title: str | None) -> None:
+    """Draw title and legend at the top of a figure, in a height of `header_height`."""
+    from matplotlib.lines import Line2D
+
+    inch = 1.0 / figure.get_figheight()
+    top = 1.0 - _MARGIN / 2.0 * inch
+    if title:
+        figure.text(0.08 / WIDTH, top, title, fontsize=11.5, fontweight="bold", color=INK, va="top")
+        top -= _title_height(title) * inch
+    n_columns = _columns(entries)
+    in_lines = [entry for column in range(n_columns) for entry in entries[column::n_columns]]
+    figure.legend(
+        handles=[Line2D([], [], label=label, **style) for label, style in in_lines],
+        loc="upper left",
+        bbox_to_anchor=(0.06 / WIDTH, top),
+        ncols=n_columns,
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
+        borderaxespad=0.0,
+        borderpad=0.2,
+        handlelength=2.6,
+        columnspacing=1.8,
+    )
+
+
+# Files ---------------------------------------------------------------------------------------------------------------
+
+_DOTS_PER_INCH = 200
+_METADATA = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+# The ids of an SVG are hashes with a random salt; a fixed one gives the same file each time.
+_SALT = {"svg.hashsalt": "diransac"}
+
+
+def check_ending(path: Path) -> str:
+    """Lower-case ending of a figure's file.  Raises SettingsError: it is unknown."""
+    ending = path.suffix.lower()
+    if ending not in _METADATA:
+        raise SettingsError(f'cannot write "{path}": its ending is not known; use one of {", ".join(_METADATA)}')
+    return ending
+
+
+def write(figure: Figure, path: Path) -> None:
+    """Write the figure in the format of the file's ending, completely or not at all.
+
+    Raises SettingsError: the ending is unknown, or the file cannot be written.
+    """
+    from matplotlib import rc_context
+
+    ending = check_ending(path)
+
+    def save(temporary: Path) -> None:
+        with rc_context(_SALT):
+            figure.savefig(temporary, format=ending[1:], dpi=_DOTS_PER_INCH, metadata=_METADATA[ending])
+
+    try:
+        write_with(path, save)
+    except OSError as error:
+        raise SettingsError(f'cannot write "{path}": {error.strerror or error}') from error
+
+
+def svg(figure: Figure) -> str:
+    """Figure as an ``<svg>`` element with selectable text, for embedding in a page."""
+    from matplotlib import rc_context
+
+    memory = io.StringIO()
+    with rc_context({**_SALT, "svg.fonttype": "none"}):
+        figure.savefig(memory, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = memory.getvalue()
+    return text[text.index("<svg") :]

@@ -1,0 +1,406 @@
+"""Figures of flights: the path over its reference, states and inputs over time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.data.log import Log
+from diransac.errors import SettingsError
+from diransac.flight.trajectory import Trajectory
+from diransac.plots.figure import (
+    COLOURS,
+    DASHES,
+    INK,
+    MUTED,
+    PAPER,
+    REFERENCE,
+    LegendEntry,
+    Range,
+    check_ending,
+    draw_heading,
+    extent,
+    flight_panels,
+    header_height,
+    inches,
+    name_panel,
+    write,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_flight"]
+
+
+def plot_flight(
+    trajectory: Trajectory | Mapping[str, Trajectory],
+    log: Log | Mapping[str, Log],
+    path: str | Path | None = None,
+    *,
+    title: str | None = None,
+) -> Figure:
+    """Figure of one or more flights over their references: the path, states and inputs over time.
+
+    Parameters
+    ----------
+    trajectory : Trajectory or mapping of str to Trajectory
+        Reference of all flights, or of each by label, with names of states and inputs.
+    log : Log or mapping of str to Log
+        Flights, by label if there are several; with those states and inputs.
+    path : str or Path, optional
+        ``.png``, ``.svg`` or ``.pdf`` file, written completely or not at all; None writes none.
+    title : str, optional
+        Title of the figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The path in the XZ plane, if there are states x and z, with the attitude of a single flight with a theta; a
+        panel per state; a panel per input, held from row to row, with its limits. References are broad and grey, or
+        pale in the flight's colour where each flight has its own.
+
+    Raises
+    ------
+    SettingsError
+        Labels that do not match, a trajectory without names, or a file that cannot be written.
+    LogError
+        A log lacks a state or input of the trajectory.
+
+    Notes
+    -----
+    The axes cover the references and as much of the flights as lies about as near as the references are large, so that
+    a diverging flight leaves the others readable: a triangle marks where it leaves a panel, a cross its last finite
+    value. The same flights give the same file, byte for byte. pyplot and its settings are not touched.
+    """
+    if path is not None:
+        check_ending(Path(path))
+    flights = _flights(trajectory, log)
+    states, inputs = flights[0].reference.state_names, flights[0].reference.input_names
+    entries, box = _legend_entries(flights), _path_box(flights)
+    figure, panels, path_panel = flight_panels(states, inputs, box, header_height(entries, title))
+    for name in states:
+        _draw_state(panels[name], name, flights)
+    for name in inputs:
+        _draw_input(panels[name], name, flights)
+    if path_panel is not None and box is not None:
+        _draw_path(path_panel, flights, box)
+    draw_heading(figure, entries, title)
+    if path is not None:
+        write(figure, Path(path))
+    return figure
+
+
+# Heading -------------------------------------------------------------------------------------------------------------
+def _legend_entries(flights: Sequence[FlightCurve]) -> list[LegendEntry]:
+    """Label and style of each entry of the legend."""
+    shared = "color" in _reference_style(flights)
+    name = "reference" if shared else "references"
+    entries = [(name, {"color": MUTED} | _reference_style(flights)), *((f.label, _style(f)) for f in flights)]
+    states, inputs = flights[0].reference.state_names, flights[0].reference.input_names
+    seen = {name: _visible(name, flights) for name in (*states, *inputs)}
+    limits = flights[0].reference.input_limits
+    if any(seen[name][0] <= limit <= seen[name][1] for name in inputs for limit in limits.get(name, ())):
+        entries.append(("limits", _LIMIT_STYLE))
+    marks: dict[str, Any] = {"color": MUTED, "linestyle": "none", "markersize": 6}
+    if any(_first_outside(f.log[name], seen[name]) is not None for f in flights for name in seen):
+        entries.append(("leaves the panel", {"marker": "^", **marks}))
+    if any(_last_finite(f.log[name]) is not None for f in flights for name in seen):
+        entries.append(("last finite value", {"marker": "X", **marks}))
+    return entries
+
+
+# Of the range of an axis: margin, and distance up to which a line is drawn; least aspect ratio of a path.
+_MARGIN, _FARTHEST, _LEAST_BREADTH = 0.06, 20.0, 0.15
+# Quantile and factor of a flight's usual distance from its reference, its largest widening of an axis, and the ratio
+# below which the extent of the reference is negligible; see `_reach`.
+_USUAL_SHARE, _USUAL_FACTOR, _WIDENING, _NEGLIGIBLE = 0.2, 5.0, 5.0, 1e-4
+
+
+@dataclass(frozen=True)
+class FlightCurve:
+    """One flight, its reference, colour and dashes."""
+
+    label: str
+    reference: Trajectory
+    log: Log
+    colour: str
+    dashes: tuple[float, ...]
+
+
+def _flights(trajectory: Trajectory | Mapping[str, Trajectory], log: Log | Mapping[str, Log]) -> list[FlightCurve]:
+    """Flights by label.
+
+    Raises SettingsError: no flight, labels that do not match, a trajectory without names or with others than the first.
+    Raises LogError: a log lacks a state or input.
+    """
+    logs = dict(log) if isinstance(log, Mapping) else {"flown": log}
+    if not logs:
+        raise SettingsError("there is no flight to draw; give a log, or a mapping from label to log")
+    references = dict(trajectory) if isinstance(trajectory, Mapping) else dict.fromkeys(logs, trajectory)
+    if set(references) != set(logs):
+        raise SettingsError(
+            f"the trajectories have the labels {', '.join(map(str, references))}, "
+            f"the logs {', '.join(map(str, logs))}; "
+            "give both the same labels, or one trajectory for all"
+        )
+    for label, flown in logs.items():
+        _check(label, references[label], flown)
+    first = references[next(iter(logs))]
+    for label, other in references.items():
+        if (other.state_names, other.input_names) != (first.state_names, first.input_names):
+            raise SettingsError(f'the trajectory of "{label}" has other states or inputs; draw it in another figure')
+    looks = [(COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)]) for i in range(len(logs))]
+    return [
+        FlightCurve(str(label), references[label], flown, *look)
+        for (label, flown), look in zip(logs.items(), looks, strict=True)
+    ]
+
+
+def _check(label: str, reference: object, log: object) -> None:
+    """Raise an error if a flight cannot be drawn."""
+    if not isinstance(reference, Trajectory) or not isinstance(log, Log):
+        raise SettingsError(
+            f'"{label}" is a {type(reference).__name__} and a {type(log).__name__}; give a Trajectory and a Log'
+        )
+    if not reference.state_names or not reference.input_names:
+        raise SettingsError(
+            f'the trajectory of "{label}" does not name its states and inputs; give state_names and input_names'
+        )
+    for name in (*reference.state_names, *reference.input_names):
+        log[name]
+
+
+# Ranges of axes -----------------------------------------------------------------------------------------------------
+def _visible(name: str, flights: Sequence[FlightCurve]) -> Range:
+    """Range of the references and of the flights within reach of them, with a margin."""
+    planned = np.concatenate([flight.reference[name] for flight in flights])
+    flown = [values for flight in flights if len(values := _finite(flight.log[name]))]
+    low, high = float(planned.min()), float(planned.max())
+    reach = _reach(planned, flown)
+    visible = np.clip(np.concatenate([planned, *flown]), low - reach, high + reach)
+    low, high = float(visible.min()), float(visible.max())
+    width = high - low
+    if not width > 1e-9 * max(abs(low), abs(high)):
+        width = max(abs(low), abs(high), 1.0)
+    return low - _MARGIN * width, high + _MARGIN * width
+
+
+def _reach(planned: FloatArray, flown: Sequence[FloatArray]) -> float:
+    """Distance beyond the references that a panel shows of the flights: the extent of the references.
+
+    Where these are almost constant, it is the usual distance of the nearest flight, limited to a few times their extent
+    unless they are constant but for rounding.
+    """
+    size = float(np.ptp(planned))
+    off = [float(np.quantile(np.abs(values - np.median(planned)), _USUAL_SHARE)) for values in flown]
+    usual = _USUAL_FACTOR * min(off, default=0.0)
+    return usual if size < _NEGLIGIBLE * usual else max(size, min(usual, _WIDENING * size))
+
+
+def _path_box(flights: Sequence[FlightCurve]) -> tuple[Range, Range] | None:
+    """Least ranges of a path in x and z; None without states x and z."""
+    if not {"x", "z"} <= set(flights[0].reference.state_names):
+        return None
+    x, z = _visible("x", flights), _visible("z", flights)
+    least = _LEAST_BREADTH * max(extent(x), extent(z))
+    return _around(x, max(extent(x), least)), _around(z, max(extent(z), least))
+
+
+def _near(values: FloatArray, visible: Range) -> FloatArray:
+    """Values clipped far outside of the range, which a canvas cannot draw."""
+    reach = _FARTHEST * extent(visible)
+    return np.asarray(np.clip(values, visible[0] - reach, visible[1] + reach))
+
+
+def _around(visible: Range, width: float) -> Range:
+    """Range of this length around the same middle."""
+    middle = (visible[0] + visible[1]) / 2.0
+    return middle - width / 2.0, middle + width / 2.0
+
+
+def _finite(values: Iterable[float]) -> FloatArray:
+    """Finite values."""
+    array = np.asarray(values)
+    return np.asarray(array[np.isfinite(array)])
+
+
+# Ends of curves ----------------------------------------------------------------------------------------------------
+def _first_outside(values: FloatArray, visible: Range) -> int | None:
+    """First row outside of the range, or None."""
+    outside = np.flatnonzero((values < visible[0]) | (values > visible[1]))
+    return int(outside[0]) if len(outside) else None
+
+
+def _last_finite(values: FloatArray) -> int | None:
+    """Last finite row, if rows follow; otherwise None."""
+    finite = np.flatnonzero(np.isfinite(values))
+    return int(finite[-1]) if len(finite) and finite[-1] < len(values) - 1 else None
+
+
+# Panels --------------------------------------------------------------------------------------------------------------
+
+_LIMIT_STYLE: dict[str, Any] = {"color": MUTED, "linewidth": 0.9, "linestyle": (0.0, (1.0, 2.0))}
+# Number of attitudes; inches: length of each arm of a bar, least distance between grid lines of the path.
+_ATTITUDES, _ARM, _GRID = 20, 0.085, 0.6
+
+
+def _style(flight: FlightCurve) -> dict[str, Any]:
+    """Style of a flight's line."""
+    style: Any = (0.0, flight.dashes) if flight.dashes else "-"
+    return {"color": flight.colour, "linewidth": 1.25, "linestyle": style}
+
+
+def _reference_style(flights: Sequence[FlightCurve]) -> dict[str, Any]:
+    """Style of references: broad and grey if shared, else pale in the flight's colour."""
+    if _is_shared(flights):
+        return {"color": REFERENCE, "linewidth": 2.8, "solid_capstyle": "round"}
+    return {"linewidth": 2.6, "alpha": 0.3, "solid_capstyle": "round"}
+
+
+def _is_shared(flights: Sequence[FlightCurve]) -> bool:
+    """True if all flights have the same reference."""
+    return all(flight.reference is flights[0].reference for flight in flights)
+
+
+def _draw_references(axes: Axes, x: str, y: str, flights: Sequence[FlightCurve], **more: Any) -> None:
+    """Draw the references."""
+    for flight in flights[:1] if _is_shared(flights) else flights:
+        horizontal = flight.reference.time if x == "t" else flight.reference[x]
+        style = {"color": flight.colour} | _reference_style(flights) | more
+        axes.plot(horizontal, flight.reference[y], **style, zorder=1.8)
+
+
+# Over time -----------------------------------------------------------------------------------------------------------
+def _draw_state(axes: Axes, name: str, flights: Sequence[FlightCurve]) -> None:
+    """Draw a state over time, each flight over its reference."""
+    visible = _visible(name, flights)
+    _draw_references(axes, "t", name, flights)
+    for flight in flights:
+        axes.plot(flight.log.time, _near(flight.log[name], visible), **_style(flight), zorder=2.5)
+        _mark_end(axes, flight, flight.log[name], visible)
+    _frame(axes, name, _unit(name, flights), visible, flights)
+
+
+def _draw_input(axes: Axes, name: str, flights: Sequence[FlightCurve]) -> None:
+    """Draw an input over time, held from row to row, and its limits where they are in the range."""
+    visible = _visible(name, flights)
+    _draw_references(axes, "t", name, flights, drawstyle="steps-post")
+    for flight in flights:
+        values = _near(flight.log[name], visible)
+        axes.plot(flight.log.time, values, drawstyle="steps-post", **_style(flight), zorder=2.5)
+        _mark_end(axes, flight, flight.log[name], visible)
+    detail = _unit(name, flights)
+    limits = flights[0].reference.input_limits.get(name)
+    if limits is not None:
+        for limit in limits:
+            if visible[0] <= limit <= visible[1]:
+                axes.axhline(limit, **_LIMIT_STYLE, zorder=2.2)
+        detail = f"{detail}, limits {_number(limits[0])} to {_number(limits[1])}".removeprefix(", ")
+    _frame(axes, name, detail, visible, flights)
+
+
+def _frame(axes: Axes, name: str, detail: str, visible: Range, flights: Sequence[FlightCurve]) -> None:
+    times = [time for flight in flights for time in (flight.reference.time, flight.log.time)]
+    axes.set(xlim=(min(float(t[0]) for t in times), max(float(t[-1]) for t in times)), ylim=visible)
+    axes.xaxis.set_major_formatter("{x:g} s")
+    name_panel(axes, name, detail)
+
+
+def _mark_end(axes: Axes, flight: FlightCurve, values: FloatArray, visible: Range) -> None:
+    """Draw a triangle where a flight first leaves the panel, else a cross at its last finite value."""
+    time = flight.log.time
+    if (row := _first_outside(values, visible)) is not None:
+        above = values[row] > visible[1]
+        _mark(axes, time[row], visible[1] if above else visible[0], "^" if above else "v", flight)
+    elif (row := _last_finite(values)) is not None:
+        _mark(axes, time[row], values[row], "X", flight)
+
+
+def _mark(axes: Axes, x: float, y: float, marker: str, flight: FlightCurve) -> None:
+    edge: dict[str, Any] = {"markeredgecolor": PAPER, "markeredgewidth": 0.6}
+    axes.plot([x], [y], marker, color=flight.colour, markersize=6.5, **edge, clip_on=False, zorder=4)
+
+
+def _unit(name: str, flights: Sequence[FlightCurve]) -> str:
+    return next((flight.log.units[name] for flight in flights if name in flight.log.units), "")
+
+
+def _number(x: float) -> str:
+    return f"{x:.4g}".replace("-", "−")
+
+
+# The path ------------------------------------------------------------------------------------------------------------
+def _draw_path(axes: Axes, flights: Sequence[FlightCurve], needed: tuple[Range, Range]) -> None:
+    """Draw the paths in the XZ plane at equal scale, and the attitude of a single flight with a theta."""
+    from matplotlib.ticker import MultipleLocator
+
+    width, height = inches(axes)
+    scale = max(extent(needed[0]) / width, extent(needed[1]) / height)
+    box = _around(needed[0], scale * width), _around(needed[1], scale * height)
+    _draw_references(axes, "x", "z", flights)
+    for flight in flights:
+        x, z = (_near(flight.log[name], visible) for name, visible in zip(("x", "z"), box, strict=True))
+        axes.plot(x, z, **_style(flight), zorder=2.5)
+        _mark_path_end(axes, flight, box)
+    if len(flights) == 1 and "theta" in flights[0].reference.state_names:
+        _draw_attitudes(axes, flights[0], box, reach=_ARM * scale)
+    _mark_start(axes, flights[0].reference, box)
+    axes.set(xlim=box[0], ylim=box[1], aspect="equal")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MultipleLocator(_round_step(_GRID * scale)))
+    unit = _unit("x", flights)
+    axes.xaxis.set_major_formatter(f"{{x:g}} {unit}" if unit else "{x:g}")
+    name_panel(axes, "path", f"z over x, {unit}" if unit else "z over x")
+
+
+def _round_step(least: float) -> float:
+    """Smallest of 1, 2 and 5 times a power of ten that is at least this."""
+    decade = 10.0 ** np.floor(np.log10(least))
+    return float(min(step for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= least) * decade)
+
+
+def _mark_start(axes: Axes, reference: Trajectory, box: tuple[Range, Range]) -> None:
+    (x0, x1), (z0, z1) = reference["x"][[0, -1]], reference["z"][[0, -1]]
+    closed = np.hypot(x1 - x0, z1 - z0) < 0.04 * max(map(extent, box))
+    ends = [(x0, z0, "o", "start, end" if closed else "start"), (x1, z1, "s", "" if closed else "end")]
+    for x, z, marker, text in ends:
+        axes.plot([x], [z], marker, markersize=5, markerfacecolor=PAPER, markeredgecolor=INK, zorder=5)
+        side = -1 if x > box[0][1] - 0.03 * extent(box[0]) else 1
+        place: dict[str, Any] = {"xytext": (7 * side, -5), "textcoords": "offset points", "va": "top"}
+        place["ha"] = "left" if side > 0 else "right"
+        axes.annotate(text, (x, z), **place, fontsize=8, color=INK, zorder=5)
+
+
+def _mark_path_end(axes: Axes, flight: FlightCurve, box: tuple[Range, Range]) -> None:
+    """Draw the mark of `_mark_end` on the path; the triangle points over the edge that is exceeded most."""
+    x, z = flight.log["x"], flight.log["z"]
+    beyond = np.array([x - box[0][1], box[0][0] - x, z - box[1][1], box[1][0] - z])
+    rows = np.flatnonzero((beyond > 0.0).any(axis=0))
+    if len(rows):
+        row = int(rows[0])
+        marker = "><^v"[int(np.argmax(beyond[:, row]))]
+        _mark(axes, float(np.clip(x[row], *box[0])), float(np.clip(z[row], *box[1])), marker, flight)
+    elif (last := _last_finite(x + z)) is not None:
+        _mark(axes, x[last], z[last], "X", flight)
+
+
+def _draw_attitudes(axes: Axes, flight: FlightCurve, box: tuple[Range, Range], reach: float) -> None:
+    """Draw the body's x axis as a bar and its z axis as a tick at evenly spaced times."""
+    from matplotlib.collections import LineCollection
+
+    rows = np.linspace(0, len(flight.log) - 1, _ATTITUDES).astype(int)
+    x, z, theta = (flight.log[name][rows] for name in ("x", "z", "theta"))
+    seen = (x > box[0][0]) & (x < box[0][1]) & (z > box[1][0]) & (z < box[1][1]) & np.isfinite(theta)
+    centre = np.column_stack([x, z])[seen]
+    along = np.column_stack([np.cos(theta), np.sin(theta)])[seen] * reach
+    up = 0.7 * np.column_stack([-along[:, 1], along[:, 0]])
+    bars, ticks = np.stack([centre - along, centre + along], axis=1), np.stack([centre, centre + up], axis=1)
+    for lines, width in ((bars, 1.4), (ticks, 0.9)):
+        axes.add_collection(LineCollection(list(lines), colors=INK, linewidths=width, zorder=3), autolim=False)
