@@ -126,7 +126,7 @@ def test_mass_matrix_of_uneven_units_is_not_taken_for_singular():
         ({"inputs": {"x": "N"}}, "'x' is used twice"),
         ({"inputs": {"x_ddot": "N"}}, "'x_ddot' is used twice"),
         ({"parameters": {"f": Parameter()}}, "'f' is used twice"),
-        ({"coordinates": {"t": "s"}}, '"t" is kept for time'),
+        ({"coordinates": {"t": "s"}}, '"t" is reserved for time'),
         ({"coordinates": {"my x": "m"}}, "'my x' cannot name"),
         ({"coordinates": {"class": "m"}}, "'class' cannot name"),
         ({"coordinates": {"__x": "m"}}, "cannot name"),

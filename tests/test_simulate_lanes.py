@@ -1,4 +1,4 @@
-"""The promise that a lane depends on nothing but its own data, and what is refused."""
+"""Independence of lanes, and arguments that are refused."""
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor

@@ -85,7 +85,7 @@ def call_user(label: str, what: str, function: Callable[..., Any], *arguments: S
 
 
 def check_groups(label: str, units: Mapping[str, object], parameters: object) -> None:
-    """Raises ModelError: a group of signals is not a mapping from names to units, or one of parameters is not."""
+    """Raises ModelError: signals are not mappings from names to units, or parameters from names to `Parameter`."""
     for kind, group in units.items():
         if not isinstance(group, Mapping):
             raise ModelError(f'{label}: {kind} = {group!r}; give a mapping from name to unit, such as {{"x": "m"}}')

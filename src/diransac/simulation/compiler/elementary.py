@@ -111,11 +111,11 @@ def _sin_cos(v: Vectors, x: Value) -> tuple[Value, Value]:
 
     def emit() -> tuple[Value, Value]:
         sine, cosine, suspect = _fast_sin_cos(v, x)
-        cells = {"sin": v.cell(sine), "cos": v.cell(cosine)}
+        variables = {"sin": v.variable(sine), "cos": v.variable(cosine)}
         with v.builder.if_then(v.any_lane(suspect), likely=False):
-            for name, cell in cells.items():
-                v.set(cell, v.call_aside(f"{name}_of_huge", _replaced_where_huge(name), x, v.get(cell)))
-        return v.get(cells["sin"]), v.get(cells["cos"])
+            for name, variable in variables.items():
+                v.set(variable, v.call_aside(f"{name}_of_huge", _replaced_where_huge(name), x, v.get(variable)))
+        return v.get(variables["sin"]), v.get(variables["cos"])
 
     pair: tuple[Value, Value] = v.once("sin_cos", x, emit)
     return pair
@@ -151,10 +151,10 @@ def _replaced_where_huge(name: str) -> Callable[[Vectors, Value, Value], Value]:
     def emit(v: Vectors, x: Value, fast: Value) -> Value:
         size = v.absolute(x)
         huge = v.both(v.compare(">", size, v.number(MOST_QUARTERS)), v.compare("<", size, v.number(math.inf)))
-        cell = v.cell(fast)
+        variable = v.variable(fast)
         with v.builder.if_then(v.any_lane(huge)):
-            v.set(cell, v.select(huge, v.libm(name, x), fast))
-        return v.get(cell)
+            v.set(variable, v.select(huge, v.libm(name, x), fast))
+        return v.get(variable)
 
     return emit
 

@@ -114,9 +114,9 @@ def evaluate(
     ----------
     v : emits at the end of the current block
     graph : what to evaluate
-    wanted : instructions whose results are wanted; what they need is emitted too
-    load : gives an element of an input, by argument and element
-    known : results that are there already
+    wanted : instructions whose results are wanted; their operands are emitted, too
+    load : returns an element of an input, by argument and element
+    known : results that are known already
 
     Returns
     -------
@@ -173,7 +173,7 @@ def emit_map_loop(graph: Graph, widths_in: Sequence[int]) -> Value:
 
     Parameters
     ----------
-    graph : of the function; its invariant inputs are those that all rows share
+    graph : of the function, with the inputs that all rows share as invariants
     widths_in : elements of each input, whose array is (n_rows, width) or, shared, (width,)
 
     The outputs' arrays are (n_rows, width).

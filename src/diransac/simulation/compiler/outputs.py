@@ -62,13 +62,13 @@ class ScoreOutput(_Output):
 
     def __init__(self, loop: TimeLoop) -> None:
         super().__init__(loop)
-        self.sums = [self.v.cell(self.v.number(0.0)) for _ in self.specification.scored]
-        self.inliers = self.v.cell(self.v.integer(0))
+        self.sums = [self.v.variable(self.v.number(0.0)) for _ in self.specification.scored]
+        self.inliers = self.v.variable(self.v.integer(0))
 
     def start(self, block: Block) -> None:
         """Set the sums and the count to zero."""
-        for cell in self.sums:
-            self.v.set(cell, self.v.number(0.0))
+        for variable in self.sums:
+            self.v.set(variable, self.v.number(0.0))
         self.v.set(self.inliers, self.v.integer(0))
         builder = self.loop.builder
         self.first_bits = builder.mul(builder.udiv(block.first, integer(LANES)), self.arguments["n_rows"])
@@ -155,7 +155,7 @@ class GaussNewtonOutput(_Output):
         v = self.v
         n_states = self.specification.n_states
         totals = [v.load(*self._place("sums", block, self.n_sums, k), NUMBERS) for k in range(self.n_sums)]
-        states = [v.get(cell) for cell in self.loop.state]
+        states = [v.get(variable) for variable in self.loop.state]
         guard = v.get(self.loop.guard)
         for value in (*totals, *states):
             guard = v.fma(value, v.number(0.0), guard)

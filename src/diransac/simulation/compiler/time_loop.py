@@ -1,6 +1,6 @@
 """The time loop of a simulation, as machine code: eight rollouts to a vector.
 
-A lane is one rollout: its parameters, its initial state, its window of rows. What a lane computes is the same in every
+A lane is one rollout: its parameters, its initial state, its rows of the log. Its arithmetic is the same in every
 variant of the loop; variants differ in their output (`outputs.py`) and in the source of the inputs.
 """
 
@@ -20,9 +20,9 @@ from diransac.simulation.compiler.vectors import (
     INTEGERS,
     NUMBERS,
     POINTER,
-    Cell,
     Loop,
     Value,
+    Variable,
     Vectors,
     integer,
 )
@@ -57,10 +57,10 @@ ARGUMENTS = {
     "valid": "pointer",  # (n_log,) bytes, 0 or 1
     "weights": "pointer",  # (n_log, n_s) float64
     "squared_thresholds": "pointer",  # (n_s,) float64
-    "start_rows": "pointer",  # (n_padded,) int64, read where lanes have windows of their own
+    "start_rows": "pointer",  # (n_padded,) int64, read where lanes start at different rows
     "sums": "pointer",  # float64, written by the output; so are the next four
     "counts": "pointer",  # (2, n_padded) int64
-    "inlier_bits": "pointer",  # (n_blocks, n_rows) bytes, a bit a lane
+    "inlier_bits": "pointer",  # (n_blocks, n_rows) bytes, one bit per lane
     "series": "pointer",  # (n_lanes, n_rows, width) float64
     "final": "pointer",  # (n_blocks, n_states, 8) float64
     "step": "number",  # seconds, of one sub-step
@@ -84,12 +84,12 @@ class LoopSpecification:
     ----------
     step : graph of (x, u, p, h) -> (x after one sub-step, signals before it, Jacobian (n_s, n_z) of the scored ones)
     further_step : graph of (x, u, p, h) -> (x after one sub-step,), for the sub-steps after the first
-    substeps : sub-steps a row
-    n_states, n_inputs, n_signals, n_unknowns : sizes of x, u, all signals, and what the Jacobian is with respect to;
-        x holds the model's state, and after it those sensitivities of it that are not constant
-    scored : positions among all signals of those that are compared with measurements
-    quaternions : positions among the scored ones; four that have an arbitrary common sign
-    state_quaternions : positions in x of all such fours
+    substeps : sub-steps per row
+    n_states, n_inputs, n_signals, n_unknowns : sizes of x, u, all signals, and the unknowns of the Jacobian; x is the
+        model's state, followed by its varying sensitivities
+    scored : positions of the scored signals among all signals
+    quaternions : positions of whole quaternions among the scored signals; their sign is arbitrary
+    state_quaternions : positions of all quaternions in x
     """
 
     step: Graph
@@ -128,7 +128,7 @@ class LoopRow:
     Attributes
     ----------
     index : row of the rollout
-    inputs : those that act from this row to the next
+    inputs : inputs from this row to the next
     signals : states and accelerations at this row
     slopes : Jacobian of the scored signals, by signal and unknown; None where always zero
     alive : lanes in which every signal has been finite in all rows so far
@@ -195,8 +195,8 @@ class TimeLoop:
         self.arguments = {argument.name: argument for argument in function.args}
         self.v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
         self.builder = self.v.builder
-        self.state: list[Cell] = [self.v.cell(self.v.number(0.0)) for _ in range(specification.n_states)]
-        self.guard = self.v.cell(self.v.number(0.0))
+        self.state: list[Variable] = [self.v.variable(self.v.number(0.0)) for _ in range(specification.n_states)]
+        self.guard = self.v.variable(self.v.number(0.0))
         """Zero as long as every signal has been finite."""
 
     def emit(self, variant: type[Output], inputs: InputSource) -> None:
@@ -215,8 +215,8 @@ class TimeLoop:
         """Load the initial values of a block of lanes, and compute the invariants of its rows."""
         v, specification = self.v, self.specification
         first = self.builder.mul(index, integer(LANES))
-        for k, cell in enumerate(self.state):
-            v.set(cell, self._lane_vector("initial_states", k, first))
+        for k, variable in enumerate(self.state):
+            v.set(variable, self._lane_vector("initial_states", k, first))
         v.set(self.guard, v.number(0.0))
 
         def load(argument: int, element: int) -> Value:
@@ -266,14 +266,14 @@ class TimeLoop:
 
     def _set_state(self, after: list[Value]) -> None:
         """Set the state."""
-        for cell, value in zip(self.state, after, strict=True):
-            self.v.set(cell, value)
+        for variable, value in zip(self.state, after, strict=True):
+            self.v.set(variable, value)
 
     def _evaluate(
         self, graph: Graph, wanted: Iterable[int], u: list[Value], known: dict[int, Value]
     ) -> dict[int, Value]:
         """Evaluate a graph at the current state."""
-        x = [self.v.get(cell) for cell in self.state]
+        x = [self.v.get(variable) for variable in self.state]
         return evaluate(self.v, graph, list(wanted), lambda argument, k: (x if argument == STATE else u)[k], known)
 
     def _still_finite(self, signals: list[Value]) -> Value:
@@ -326,7 +326,7 @@ def _feedback_inputs(loop: TimeLoop, law: list[Value]) -> list[Value]:
     """clip(u_ref - K (x - x_ref)); the state's quaternions first take the sign nearer to the reference's."""
     v, n_u, n_x = loop.v, loop.specification.n_inputs, loop.specification.n_states
     u_ref, x_ref, gains = law[:n_u], law[n_u : n_u + n_x], law[n_u + n_x :]
-    x = [v.get(cell) for cell in loop.state]
+    x = [v.get(variable) for variable in loop.state]
     for four in loop.specification.state_quaternions:
         x, _ = v.turned_towards(x, x_ref, four)
     errors = [v.sub(a, b) for a, b in zip(x, x_ref, strict=True)]

@@ -17,7 +17,7 @@ from diransac.simulation.compiler.machine_code import LANES
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-__all__ = ["Cell", "Loop", "Value", "Vectors", "integer"]
+__all__ = ["Loop", "Value", "Variable", "Vectors", "integer"]
 
 Value: TypeAlias = Any
 """An LLVM value: a vector of numbers, of 64-bit integers or of conditions, or a scalar (llvmlite has no types)."""
@@ -34,7 +34,7 @@ CONDITIONS = ir.VectorType(BIT, LANES)
 
 
 @dataclass(frozen=True)
-class Cell:
+class Variable:
     """A mutable variable of the emitted code; LLVM keeps it in a register."""
 
     address: Value
@@ -282,20 +282,20 @@ class Vectors:
         self.builder.store(self.builder.bitcast(condition, BITS), self.builder.gep(base, [index], source_etype=BITS))
 
     # Control -------------------------------------------------------------------------------------------------------
-    def cell(self, value: Value) -> Cell:
+    def variable(self, value: Value) -> Variable:
         """Return a new variable that holds the value."""
         with self.builder.goto_entry_block():
             address = self.builder.alloca(value.type)
         self.builder.store(value, address)
-        return Cell(address, value.type)
+        return Variable(address, value.type)
 
-    def get(self, cell: Cell) -> Value:
+    def get(self, variable: Variable) -> Value:
         """Return the value of a variable."""
-        return self.builder.load(cell.address, typ=cell.type)
+        return self.builder.load(variable.address, typ=variable.type)
 
-    def set(self, cell: Cell, value: Value) -> None:
+    def set(self, variable: Variable, value: Value) -> None:
         """Set a variable."""
-        self.builder.store(value, cell.address)
+        self.builder.store(value, variable.address)
 
     def call_aside(self, name: str, emit: Callable[..., Value], *operands: Value) -> Value:
         """Return `emit(vectors, *operands)`, as a separate function, once per module: for rare cases.
@@ -318,7 +318,7 @@ class Vectors:
     def repeat(self, first: Value, end: Value) -> Iterator[Loop]:
         """Emit a loop over every index from `first` to before `end`; the context is its body."""
         builder = self.builder
-        index = self.cell(first)
+        index = self.variable(first)
         test, body, leave = (builder.append_basic_block(name) for name in ("test", "body", "leave"))
         builder.branch(test)
         builder.position_at_end(test)
