@@ -198,7 +198,7 @@ class DisturbedModel:
     Notes
     -----
     The state is ``[q; v; states of the disturbances; t]``, with t only if it is used; the parameters are the model's,
-    followed by the constants of the disturbances.  Equal where these equations are, whatever the values of the constants.
+    followed by the constants of the disturbances.  Two are equal if these equations are, for any values of constants.
     """
 
     def __init__(self, model: Model, disturbances: Sequence[Disturbance]) -> None:
