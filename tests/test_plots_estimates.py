@@ -33,7 +33,7 @@ JUDGED = tiny(
 
 def judged(level: str, trial: int, method: str, error: float | None, best_mass: float = 0.249) -> dict:
     """A row in which the mass is off by that share of the best; None: nothing was found."""
-    best = {f"best_{name}": x for name, x in {**OWN, "mass": best_mass}.items()}
+    best = {f"pseudo_true_{name}": x for name, x in {**OWN, "mass": best_mass}.items()}
     if error is None:
         return row(level, trial, method, status="failed", error="nothing <was> found", **best)
     mass = best_mass * (1 + error)

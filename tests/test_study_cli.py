@@ -14,7 +14,7 @@ from rich.console import Console
 from command_line import contents, run
 from diransac.cli.study import _bar
 from diransac.study import builtin_names, load, template
-from diransac.study.workers import Given
+from diransac.study.run import Given
 from studies import TINY_TOML, rows
 
 QUICK = ["--store", "a.db", "--jobs", 1, "--trials", 1]

@@ -80,7 +80,7 @@ def _run(
     if cluster is not None and jobs is not None:
         raise typer.BadParameter("--jobs counts processes of this machine, --cluster runs on others; give one of them")
     wanted = load(source, _changes(assignments or ()))
-    wanted = wanted.narrowed(trials, _listed("--levels", levels), _listed("--methods", methods))
+    wanted = wanted.subset(trials, _listed("--levels", levels), _listed("--methods", methods))
     with _kept(store) as note, _bar(wanted.name) as show:
 
         def progress(done: int, asked: int) -> None:
@@ -209,7 +209,7 @@ class _Studies:
             one = load(name)
             levels = [level.text for level in one.axis.levels]
             span = levels[0] if len(levels) == 1 else f"{levels[0]} .. {levels[-1]} ({len(levels)})"
-            judges = [*(["parameters"] if one.judges_parameters else []), *one.evaluation]
+            judges = [*(["parameters"] if one.evaluate_parameters else []), *one.evaluation.trajectories]
             rows.append([name, one.axis.name, span, ", ".join(judges), str(one.trials), one.description])
         return "\n".join([*aligned(rows), "", *self._methods()])
 

@@ -18,7 +18,7 @@ from diransac.plots.study import axis_label, level_labels, method_looks, n_trial
 from diransac.plots.writing import checked_ending, write
 from diransac.study.specification import TRUE
 from diransac.study.store import Store
-from diransac.study.summary import Estimates, Summary, summarise
+from diransac.study.summary import ParameterErrors, Summary, summarise
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,7 +89,7 @@ def methods_and_errors(summary: Summary, parameter: str | None = None) -> tuple[
     if estimates is None:
         raise SettingsError("the study judges no parameters; run one with evaluation.parameters = true")
     best = estimates.worst if parameter is None else estimates.errors[parameter]
-    own = estimates.worst_of_own if parameter is None else estimates.errors_of_own[parameter]
+    own = estimates.worst_to_true if parameter is None else estimates.errors_to_true[parameter]
     is_news = estimates.differs.any() or summary.methods == (TRUE,)
     kept = [k for k, label in enumerate(summary.methods) if label != TRUE or is_news]
     is_true = np.array([summary.methods[k] == TRUE for k in kept])
@@ -104,7 +104,7 @@ def methods_and_errors(summary: Summary, parameter: str | None = None) -> tuple[
 def _row(name: str, errors: FloatArray, hidden: npt.NDArray[np.bool_], *, quiet: bool = False) -> Row:
     """A row of the errors (n_methods, n_trials) that are not hidden."""
     shown = 100.0 * np.where(hidden[:, None], np.nan, errors)[None]
-    return Row(name, Estimates.median(shown)[0], Estimates.largest(shown)[0], quiet)
+    return Row(name, ParameterErrors.median(shown)[0], ParameterErrors.largest(shown)[0], quiet)
 
 
 def _drawn(summary: Summary, title: str) -> Figure:

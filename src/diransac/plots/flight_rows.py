@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from diransac.plots.layout import WIDTH
 from diransac.plots.palette import INK, MUTED
 from diransac.plots.rows import Row, Scale, draw_rows, name_rows, names_width, row_height
-from diransac.study.summary import Flights
+from diransac.study.summary import TrackingErrors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,7 +22,7 @@ _LEAST = -3
 """Power of ten, m or rad: what is less is shown as nothing."""
 
 
-def flight_rows_height(flights: Flights, n_levels: int, n_methods: int) -> float:
+def flight_rows_height(flights: TrackingErrors, n_levels: int, n_methods: int) -> float:
     """Height of the panels, inches."""
     return -(-len(_shown(flights.errors)) // _COLUMNS) * (_ABOVE + n_levels * row_height(n_methods) + _BELOW)
 
@@ -30,7 +30,7 @@ def flight_rows_height(flights: Flights, n_levels: int, n_methods: int) -> float
 def draw_flight_rows(
     figure: Figure,
     top: float,
-    flights: Flights,
+    flights: TrackingErrors,
     units: Mapping[str, str],
     levels: Sequence[str],
     axis: str,

@@ -20,7 +20,7 @@ from diransac.plots.palette import COLOURS, INK, MUTED, PAPER, REFERENCE
 from diransac.plots.rows import as_marks
 from diransac.plots.writing import checked_ending, write
 from diransac.study.specification import TRUE
-from diransac.study.summary import Flights, Summary, summarise
+from diransac.study.summary import Summary, TrackingErrors, summarise
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -122,14 +122,14 @@ def _looks(summary: Summary) -> dict[str, dict[str, Any]]:
     return looks if summary.is_numeric else as_marks(looks)
 
 
-def _block_height(summary: Summary, flights: Flights) -> float:
+def _block_height(summary: Summary, flights: TrackingErrors) -> float:
     if not summary.is_numeric:
         return _NAME + flight_rows_height(flights, len(summary.levels), len(summary.methods))
     n_rows = -(-len(summary.units) // _COLUMNS)
     return _NAME + n_rows * _ROW + _AXIS + failures_height(flights.failure_share)
 
 
-def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, top: float) -> None:
+def _draw_block(figure: Figure, summary: Summary, shape: str, flights: TrackingErrors, top: float) -> None:
     full = figure.get_figheight()
     figure.text(0.1 / WIDTH, 1.0 - (top + 0.05) / full, f"Flown: {shape}", fontsize=9.5, color=INK, va="top")
     if not summary.is_numeric:
@@ -149,7 +149,7 @@ def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, 
     draw_failures(figure, below + _AXIS, rows, level_labels(summary), flights.failure_share)
 
 
-def _draw_state(axes: Axes, summary: Summary, flights: Flights, state: str, logarithmic: bool) -> None:
+def _draw_state(axes: Axes, summary: Summary, flights: TrackingErrors, state: str, logarithmic: bool) -> None:
     mean, deviation, median = flights.mean(state), flights.deviation(state), flights.median(state)
     spread, hollow = np.nan_to_num(deviation), flights.failure_share > 0.0
     at = _placed(summary)
@@ -181,7 +181,7 @@ def _draw_state(axes: Axes, summary: Summary, flights: Flights, state: str, loga
     _name_levels(axes, summary)
 
 
-def _spans_decades(flights: Flights) -> bool:
+def _spans_decades(flights: TrackingErrors) -> bool:
     """Whether the means of some state differ so much that a linear scale shows the largest alone."""
     seen = [mean[np.isfinite(mean)] for mean in map(flights.mean, flights.errors)]
     return any(len(x) and float(x.max()) > _MANY * float(np.median(x)) for x in seen)

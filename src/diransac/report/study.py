@@ -18,7 +18,7 @@ from diransac.plots.paths import levels_with_paths, plot_paths
 from diransac.plots.study import axis_label, level_labels, plot_study, title_of
 from diransac.plots.writing import svg
 from diransac.report.markup import Html, join, number, percent, plural, table, tag
-from diransac.study.summary import Estimates, Flights, Summary, summarise
+from diransac.study.summary import ParameterErrors, Summary, TrackingErrors, summarise
 
 __all__ = ["write_study_report"]
 
@@ -119,7 +119,7 @@ def _percent(x: float) -> str:
     return "0" if x < 10.0**LEAST else f"{x:.0f}" if whole else number(x, 2)
 
 
-def _intervals(methods: Sequence[str], estimates: Estimates) -> Html:
+def _intervals(methods: Sequence[str], estimates: ParameterErrors) -> Html:
     """Of each method's intervals, which share holds the best parameter."""
     pairs = zip(methods, estimates.coverage(disturbed=False), estimates.coverage(disturbed=True), strict=True)
     rows = [[label, *(_share(*one) for one in both)] for label, *both in pairs if any(n for _, n in both)]
@@ -144,7 +144,7 @@ def _flights(summary: Summary) -> Iterator[Html]:
         yield from _levels(summary, shape, flights)
 
 
-def _short(summary: Summary, shape: str, flights: Flights) -> Iterator[Html]:
+def _short(summary: Summary, shape: str, flights: TrackingErrors) -> Iterator[Html]:
     """The least and the largest mean, and median, of each method over all levels."""
     header = ["method", "failed", *(f"{state}, {unit}" for state, unit in summary.units.items())]
     for about, of in (
@@ -159,7 +159,7 @@ def _short(summary: Summary, shape: str, flights: Flights) -> Iterator[Html]:
         yield table(header, rows, f"{shape}: {about}, least … largest of all levels")
 
 
-def _levels(summary: Summary, shape: str, flights: Flights) -> Iterator[Html]:
+def _levels(summary: Summary, shape: str, flights: TrackingErrors) -> Iterator[Html]:
     """A table a state, to be opened: mean ± standard deviation, and the median."""
     yield tag("h3", shape)
     for state, unit in summary.units.items():
@@ -199,7 +199,7 @@ def _seconds(summary: Summary) -> Html:
     return table(["method", *compress(summary.stages, there), "all"], rows, caption)
 
 
-def _failures(flights: Flights, k: int) -> str:
+def _failures(flights: TrackingErrors, k: int) -> str:
     ran, failed = int(flights.ran[:, k].sum()), int(flights.failed[:, k].sum())
     return f"{failed} of {ran} ({percent(failed / ran)})" if failed else "none"
 
