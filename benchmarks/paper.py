@@ -29,7 +29,7 @@ def variants(source: str, settings: dict[str, dict[str, object]], levels: list[f
     table["methods"] = {
         label: {"method": "i-diransac", "preset": "table-iv", "settings": more} for label, more in settings.items()
     }
-    return load(table).narrowed(levels=levels)
+    return load(table).subset(levels=levels)
 
 
 WEIGHTS = {

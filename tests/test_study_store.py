@@ -187,7 +187,7 @@ def test_a_store_of_format_1_is_read_and_resumed_under_the_new_names(first_use, 
     assert read(path)["pseudo_true_mass"].to_list() == [0.3]
     with Store(path, study) as kept:
         assert kept.finished("calm", [0]) == {("calm", 0, "ols")}
-    with pytest.raises(dr.StudyError, match="noise.stuck_probability is 0.02 in the store, 0.5 was asked for"):
+    with pytest.raises(dr.StudyError, match=r"noise\.stuck_probability is 0\.02 in the store, 0.5 was asked for"):
         Store(path, load(study, {"noise.stuck_probability": 0.5}))
 
 

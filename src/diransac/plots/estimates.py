@@ -23,7 +23,7 @@ from diransac.study.summary import ParameterErrors, Summary, summarise
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["LEAST", "judges_parameters", "methods_and_errors", "plot_estimates"]
+__all__ = ["LEAST", "evaluates_parameters", "methods_and_errors", "plot_estimates"]
 
 
 LEAST = -3
@@ -68,7 +68,7 @@ def plot_estimates(store: str | Path, path: str | Path | None = None, *, title: 
     return figure
 
 
-def judges_parameters(store: str | Path) -> bool:
+def evaluates_parameters(store: str | Path) -> bool:
     """Whether a store's study judges parameters.  Raises StudyError: there is no such store."""
     with Store.existing(store) as kept:
         return bool(kept.configuration["study"].get("evaluation.parameters"))

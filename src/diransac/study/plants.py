@@ -193,8 +193,11 @@ class PlantChoice(FunctionTable):
     @field_validator("file_digest")
     @classmethod
     def _of_the_file(cls, digest: str, info: ValidationInfo) -> str:
-        kind = info.data.get("kind", "")
-        return digest if digest or kind in _KINDS or not kind else _digest(kind)
+        kind = info.data.get("kind")
+        if kind is None or kind in _KINDS:
+            return digest
+        found = _digest(kind)  # also where one is given: the file must be there
+        return digest or found
 
     @field_validator("arguments")
     @classmethod

@@ -27,6 +27,7 @@ from pydantic import (
     TypeAdapter,
     ValidationError,
     ValidationInfo,
+    conlist,
     model_serializer,
     model_validator,
 )
@@ -243,7 +244,8 @@ def _arguments(function: Callable[..., Any], random: str, pairs: bool) -> dict[s
             continue
         default = _as_written(parameter.default)
         kind, wanted = _kind(default, pairs, parameter.annotation in _WHOLE)
-        found[name] = default, TypeAdapter[Any](kind | Literal["random"] if name == random else kind), wanted
+        drawn: Any = Literal["random"]
+        found[name] = default, TypeAdapter[Any](kind | drawn if name == random else kind), wanted
     return found
 
 
@@ -254,7 +256,7 @@ def _kind(default: Any, pairs: bool, whole: bool) -> tuple[Any, str]:
     if isinstance(default, list):
         if not _are_numbers(default):
             return list[StrictStr], "a list of words"
-        return list[_number(default[0])], "a list of numbers"  # type: ignore[misc]
+        return conlist(_number(default[0])), "a list of numbers"
     if isinstance(default, bool):
         return StrictBool, "true or false"
     if isinstance(default, str):
@@ -262,7 +264,7 @@ def _kind(default: Any, pairs: bool, whole: bool) -> tuple[Any, str]:
     if whole:
         return Whole, "a whole number from 0"
     number = _number(default)
-    return number | Annotated[list[number], Field(min_length=2, max_length=2)] if pairs else number, "a number"
+    return number | conlist(number, min_length=2, max_length=2) if pairs else number, "a number"
 
 
 def _number(default: float) -> Any:
