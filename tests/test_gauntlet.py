@@ -35,16 +35,16 @@ def clean_log(vehicle):
 def test_the_best_parameters_are_the_plants_own_where_nothing_is_unknown_or_has_a_mean(vehicle, scenario):
     plant, data = recorded(vehicle, scenario)
     assert max(judging.relative(data.pseudo_true, plant.parameters).values()) < 1e-9
-    assert len(data.flight) > 1900
+    assert len(data.clean_log) > 1900
 
 
 @pytest.mark.parametrize(("vehicle", "scenario"), WORST.items())
 def test_what_other_vehicles_do_not_know_shows_in_their_accelerations(vehicle, scenario):
     plant, data = recorded(vehicle, scenario)
-    columns = [np.array([data.flight[name] for name in names]) for names in (plant.model.state, plant.model.inputs)]
-    p = np.tile(np.array(list(plant.parameters.values()))[:, None], len(data.flight))
+    columns = [np.array([data.clean_log[name] for name in names]) for names in (plant.model.state, plant.model.inputs)]
+    p = np.tile(np.array(list(plant.parameters.values()))[:, None], len(data.clean_log))
     known = np.array(plant.model.dynamics(*columns, p)[1])
-    assert np.std(known - [data.flight[name] for name in plant.model.accelerations]) > 0.01
+    assert np.std(known - [data.clean_log[name] for name in plant.model.accelerations]) > 0.01
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
