@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,10 @@ from gauntlet_studies import study_of
 
 import diransac as dr
 from diransac.simulation import Measurements, RolloutBatch, rollouts
-from diransac.study import Study, record
-from diransac.study.flights import MISSIONS
-from diransac.study.judging import differ, hold, is_disturbed, relative_errors
-from diransac.study.recording import PATIENCE, record_all, trial_seed
-from diransac.study.seeds import derived_seed
+from diransac.study import Study, trial_data
+from diransac.study.assessment import covers, differ, is_disturbed, relative_errors
+from diransac.study.data import PLANNING_TIME_LIMIT, derived_seed, trial_data_batch, trial_seed
+from diransac.study.specification import MISSIONS
 
 Array = np.ndarray[Any, Any]
 ErrorsByName = Mapping[str, float]
@@ -78,9 +77,9 @@ def run(trial: Trial, methods: Sequence[str], *, fly: bool = True) -> list[Recor
     """Let every method at the log that the study's trial of that number has."""
     study = study_of(trial.vehicle, trial.flight)
     at = study.at(trial.scenario)
-    plant, data = at.plant.plant, record(study, trial.scenario, trial.seed)
+    plant, data = at.plant.plant, trial_data(study, trial.scenario, trial.seed)
     bound = cramer_rao(*_as_the_model_says(study, trial), at.noise) if _is_gaussian(at.noise) else {}
-    differs = any(differ(x, plant.parameters[name]) for name, x in data.best.items())
+    differs = any(differ(x, plant.parameters[name]) for name, x in data.pseudo_true.items())
     of_truth = _flown(at, trial, plant.parameters) if fly else np.nan
     records = []
     for method in methods:
@@ -89,8 +88,8 @@ def run(trial: Trial, methods: Sequence[str], *, fly: bool = True) -> list[Recor
         flown = (_flown(at, trial, found) if fly else np.nan), of_truth
         records.append(
             Record(
-                trial, method, relative(found, data.best), relative(found, plant.parameters),
-                _covered(estimate, data.best), differs, *flown, is_disturbed(plant), bound, seconds, refusal,
+                trial, method, relative(found, data.pseudo_true), relative(found, plant.parameters),
+                _covered(estimate, data.pseudo_true), differs, *flown, is_disturbed(plant), bound, seconds, refusal,
             )
         )  # fmt: skip
     return records
@@ -117,7 +116,7 @@ def relative(found: ErrorsByName, reference: ErrorsByName) -> dict[str, float]:
 def _covered(estimate: Estimate | None, best: ErrorsByName) -> dict[str, bool]:
     """Whether each finite interval holds the best parameter."""
     intervals = (estimate.intervals or {}) if estimate else {}
-    holds = {name: float(hold(low, high, best[name])) for name, (low, high) in intervals.items()}
+    holds = {name: float(covers(low, high, best[name])) for name, (low, high) in intervals.items()}
     return {name: bool(one) for name, one in holds.items() if not np.isnan(one)}
 
 
@@ -127,7 +126,7 @@ def tracking(mission: str, plant: dr.Plant, parameters: ErrorsByName, seed: int)
         return np.inf
     try:
         known = dr.Plant(plant.model, parameters)
-        trajectory = MISSIONS[mission](known, time_limit=PATIENCE)
+        trajectory = MISSIONS[mission](known, time_limit=PLANNING_TIME_LIMIT)
         log = dr.fly(plant, trajectory, dr.tvlqr(known, trajectory), seed=seed)
     except dr.DiransacError:
         return np.inf
@@ -137,9 +136,9 @@ def tracking(mission: str, plant: dr.Plant, parameters: ErrorsByName, seed: int)
 
 def _flown(at: Study, trial: Trial, parameters: ErrorsByName) -> float:
     """`tracking` of the mission as the study flies it in this trial; NaN where it flies none."""
-    if not at.evaluation:
+    if not at.evaluation.trajectories:
         return np.nan
-    mission, seed = at.evaluation[0], trial_seed(at, trial.scenario, trial.seed)
+    mission, seed = at.evaluation.trajectories[0], trial_seed(at, trial.scenario, trial.seed)
     return tracking(mission, at.plant.plant, parameters, derived_seed(seed, mission))
 
 
@@ -150,11 +149,11 @@ def _is_gaussian(noise: dr.Noise) -> bool:
 
 def _as_the_model_says(study: Study, trial: Trial) -> tuple[dr.Plant, dr.Log]:
     """The plant without what the model does not know, and its log of the same flight."""
-    calm = replace(study.at(trial.scenario), plant=study.plant)
-    (found,) = record_all(calm, trial.scenario, [trial.seed])
+    calm = study.at(trial.scenario).model_copy(update={"plant": study.plant})
+    (found,) = trial_data_batch(calm, trial.scenario, [trial.seed])
     if isinstance(found, dr.DiransacError):
         raise found
-    return calm.plant.plant, found.flight
+    return calm.plant.plant, found.clean_log
 
 
 def cramer_rao(plant: dr.Plant, clean: dr.Log, noise: dr.Noise) -> dict[str, float]:

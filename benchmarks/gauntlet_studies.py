@@ -4,11 +4,9 @@ A new vehicle is one more study in `VEHICLES`; its scenarios are the study's lev
 run.
 """
 
-from dataclasses import replace
 from functools import cache
 
-from diransac.study import Study, load
-from diransac.study.flights import Flight
+from diransac.study import FlightChoice, Study, load
 
 VEHICLES = {
     "rotorcraft": "gauntlet",
@@ -21,7 +19,7 @@ VEHICLES = {
 DRAWN = "drawn"
 """The study's own flights: another one in every scenario and seed."""
 
-SHOWN_APART = {"rotorcraft": {"star": Flight("star", substeps=20)}}
+SHOWN_APART = {"rotorcraft": {"star": FlightChoice(trajectory="star", substeps=20)}}
 """Flights that methods have been developed on, which only run when they are asked for."""
 
 
@@ -39,4 +37,4 @@ def scenarios_of(vehicle: str) -> list[str]:
 def study_of(vehicle: str, flight: str = DRAWN) -> Study:
     """The study of a vehicle, recorded on one of its flights."""
     study = load(VEHICLES[vehicle])
-    return study if flight == DRAWN else replace(study, data=SHOWN_APART[vehicle][flight])
+    return study if flight == DRAWN else study.model_copy(update={"data": SHOWN_APART[vehicle][flight]})

@@ -16,7 +16,7 @@ import numpy as np
 import diransac as dr
 from diransac.model.library import TABLE_I
 from diransac.study import Study, load
-from diransac.study.summary import Flights, Summary, summarise
+from diransac.study.summary import Summary, TrackingErrors, summarise
 
 NEAR = 0.1
 """m"""
@@ -29,7 +29,7 @@ def variants(source: str, settings: dict[str, dict[str, object]], levels: list[f
     table["methods"] = {
         label: {"method": "i-diransac", "preset": "table-iv", "settings": more} for label, more in settings.items()
     }
-    return load(table).narrowed(levels=levels)
+    return load(table).subset(levels=levels)
 
 
 WEIGHTS = {
@@ -77,7 +77,7 @@ def text(x: float) -> str:
     return "-" if np.isnan(x) else "fails" if np.isinf(x) else f"{x:.3g}" if abs(x) >= 1e-5 or not x else "< 1e-5"
 
 
-def near(flights: Flights, i: int, k: int) -> str:
+def near(flights: TrackingErrors, i: int, k: int) -> str:
     """Share of the trials that stay near the reference."""
     ran = flights.ran[i, k]
     close = (flights.errors["x"][i, k] < NEAR) & (flights.errors["z"][i, k] < NEAR)

@@ -60,7 +60,7 @@ OWN = {
     "name": "own",
     "trials": 2,
     "plant": {"kind": "own.py"},
-    "data": {"trajectory": "sines", "duration": 2.0},
+    "data": {"trajectory": "multisine", "duration": 2.0},
     "methods": {"ols": {}},
     "evaluation": {"trajectories": [], "parameters": True},
     "axis": {"levels": {"calm": {}, "pulled": {"plant.pull": 2.0, "plant.M": 1.5}}},

@@ -23,7 +23,7 @@ WORST = {"servo-axis": "cogging", "double-pendulum": "ripple", "pendulum": "ripp
 def recorded(vehicle, scenario="clean"):
     """A plant, and the data of its first trial."""
     study = studies.study_of(vehicle)
-    return study.at(scenario).plant.plant, dr.study.record(study, scenario)
+    return study.at(scenario).plant.plant, dr.study.trial_data(study, scenario)
 
 
 def clean_log(vehicle):
@@ -34,17 +34,17 @@ def clean_log(vehicle):
 @pytest.mark.parametrize(("vehicle", "scenario"), [*((name, "clean") for name in studies.VEHICLES), *WORST.items()])
 def test_the_best_parameters_are_the_plants_own_where_nothing_is_unknown_or_has_a_mean(vehicle, scenario):
     plant, data = recorded(vehicle, scenario)
-    assert max(judging.relative(data.best, plant.parameters).values()) < 1e-9
-    assert len(data.flight) > 1900
+    assert max(judging.relative(data.pseudo_true, plant.parameters).values()) < 1e-9
+    assert len(data.clean_log) > 1900
 
 
 @pytest.mark.parametrize(("vehicle", "scenario"), WORST.items())
 def test_what_other_vehicles_do_not_know_shows_in_their_accelerations(vehicle, scenario):
     plant, data = recorded(vehicle, scenario)
-    columns = [np.array([data.flight[name] for name in names]) for names in (plant.model.state, plant.model.inputs)]
-    p = np.tile(np.array(list(plant.parameters.values()))[:, None], len(data.flight))
+    columns = [np.array([data.clean_log[name] for name in names]) for names in (plant.model.state, plant.model.inputs)]
+    p = np.tile(np.array(list(plant.parameters.values()))[:, None], len(data.clean_log))
     known = np.array(plant.model.dynamics(*columns, p)[1])
-    assert np.std(known - [data.flight[name] for name in plant.model.accelerations]) > 0.01
+    assert np.std(known - [data.clean_log[name] for name in plant.model.accelerations]) > 0.01
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
@@ -112,16 +112,18 @@ def test_a_method_that_breaks_says_where(monkeypatch):
 
 def test_a_truer_model_flies_nearer_to_the_mission():
     plant, data = recorded("rotorcraft", "aerodynamic (physical)")
-    assert judging.tracking("square", plant, data.best, 0) < judging.tracking("square", plant, plant.parameters, 0)
-    assert judging.tracking("square", plant, {**data.best, "mass": -1.0}, 0) == np.inf
+    assert judging.tracking("square", plant, data.pseudo_true, 0) < judging.tracking(
+        "square", plant, plant.parameters, 0
+    )
+    assert judging.tracking("square", plant, {**data.pseudo_true, "mass": -1.0}, 0) == np.inf
 
 
 def test_a_log_is_that_of_the_study():
     study = studies.study_of("servo-axis")
     (found,) = judging.run(judging.Trial("servo-axis", "drawn", "bursts", 2), ["ols"])
-    data = dr.study.record(study, "bursts", 2)
+    data = dr.study.trial_data(study, "bursts", 2)
     result = dr.identify(dr.models.servo_axis(), data.log, "ols")
-    assert found.errors == judging.relative(result.parameters, data.best)
+    assert found.errors == judging.relative(result.parameters, data.pseudo_true)
     assert not found.mismatch
 
 
@@ -129,7 +131,7 @@ def test_a_log_is_that_of_the_study():
     ("vehicle", "level", "flown"), [("rotorcraft", "aerodynamic (physical)", ["square"]), ("servo-axis", "cogging", [])]
 )
 def test_the_benchmark_judges_and_flies_what_the_study_does(vehicle, level, flown, tmp_path):
-    study = studies.study_of(vehicle).narrowed(trials=1, levels=[level], methods=["ols", "tls"])
+    study = studies.study_of(vehicle).subset(trials=1, levels=[level], methods=["ols", "tls"])
     with Store(tmp_path / "a.db", study) as kept:
         rows = run_trials(json.dumps(study.to_dict()), level, [0], list(study.methods))
         kept.add(rows)
@@ -137,7 +139,7 @@ def test_the_benchmark_judges_and_flies_what_the_study_does(vehicle, level, flow
     records = judging.run(judging.Trial(vehicle, "drawn", level, 0), study.methods)
     for k, (one, row) in enumerate(zip(records, rows, strict=True)):
         for name, error in one.errors.items():
-            of_study = (found.errors[name], found.errors_of_own[name], found.covered[name])
+            of_study = (found.errors[name], found.errors_to_true[name], found.covered[name])
             assert (error, one.errors_of_truth[name], one.covered[name]) == tuple(x[0, k, 0] for x in of_study)
         assert [one.differs, one.mismatch] == [found.differs[0], found.disturbed[0]]
         assert [one.tracking] * len(flown) == [np.hypot(row[f"{shape}_x"], row[f"{shape}_z"]) for shape in flown]

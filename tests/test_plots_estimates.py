@@ -33,7 +33,7 @@ JUDGED = tiny(
 
 def judged(level: str, trial: int, method: str, error: float | None, best_mass: float = 0.249) -> dict:
     """A row in which the mass is off by that share of the best; None: nothing was found."""
-    best = {f"best_{name}": x for name, x in {**OWN, "mass": best_mass}.items()}
+    best = {f"pseudo_true_{name}": x for name, x in {**OWN, "mass": best_mass}.items()}
     if error is None:
         return row(level, trial, method, status="failed", error="nothing <was> found", **best)
     mass = best_mass * (1 + error)
@@ -117,7 +117,7 @@ def test_the_truth_is_left_out_where_it_is_the_best_everywhere(tmp_path: Path):
 
 @pytest.mark.parametrize("rows", [[judged("clean", 0, "true", 0.0)], [row("clean", 0, "true", status="failed")]])
 def test_a_study_that_has_nothing_to_show_yet_has_a_picture_and_a_page(rows: list, tmp_path: Path):
-    with Store(tmp_path / "b.db", load(JUDGED).narrowed(methods=["true"])) as kept:
+    with Store(tmp_path / "b.db", load(JUDGED).subset(methods=["true"])) as kept:
         kept.add(rows)
     assert not marks(plot_estimates(tmp_path / "b.db").axes[0], "true")
     write_study_report(tmp_path / "b.db", tmp_path / "page.html")

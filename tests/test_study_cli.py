@@ -14,7 +14,7 @@ from rich.console import Console
 from command_line import contents, run
 from diransac.cli.study import _bar
 from diransac.study import builtin_names, load, template
-from diransac.study.workers import Given
+from diransac.study.run import Given
 from studies import TINY_TOML, rows
 
 QUICK = ["--store", "a.db", "--jobs", 1, "--trials", 1]
@@ -111,7 +111,7 @@ def test_export_writes_rows(folder: Path):
         (["run", "tiny.toml", *QUICK, "--methods", ","], 2, "--methods: nothing is named"),
         (["run", "tiny.toml", *QUICK, "--set", "seed"], 2, "'seed' is not key=value"),
         (["run", "tiny.toml", *QUICK, "--set", "a..b=3"], 2, "'a..b=3' is not key=value"),
-        (["run", "tiny.toml", *QUICK, "--cluster", "tcp://a:1"], 2, "--jobs counts processes of this machine"),
+        (["run", "tiny.toml", *QUICK, "--cluster", "tcp://a:1"], 2, "--jobs sets the processes of this machine"),
         (["run", "tiny.toml", "--store", "a.db", "--trials", 0], 2, "--trials"),
         (["run", "tiny.toml"], 2, "--store"),
         (["plot", "a.db", "-o", "a.jpg"], 1, 'cannot write "a.jpg": its ending is not known; use one of .png'),

@@ -11,16 +11,16 @@ import polars as pl
 import pytest
 
 import diransac as dr
-from diransac.study import export, load, read, record, recording, status, trials
-from diransac.study.flights import Flight
-from diransac.study.seeds import derived_seed
+from diransac.study import FlightChoice, export, load, read, status, trial_data, trials
+from diransac.study import data as data_module
+from diransac.study.data import derived_seed
 from diransac.study.store import Store
 from diransac.study.summary import summarise
 from studies import OWN, OWN_PLANT, row, rows, tiny
 
 NAMES = ("mass", "inertia", "drag")
 DRAWN = tiny(
-    data={"trajectory": "places", "duration": 3.0, "seed": "any", "substeps": 3},
+    data={"trajectory": "random-waypoints", "duration": 3.0, "seed": "random", "substeps": 3},
     methods={"true": {}, "ols": {}},
     evaluation={"trajectories": [], "parameters": True},
 )
@@ -28,7 +28,7 @@ DRAWN = tiny(
 
 def run(tmp_path: Path, spec: dict = DRAWN, **options: object) -> dict[tuple, dict]:
     """Rows of a run in this process, which plans anew what an earlier run has planned."""
-    recording._steering.cache_clear()
+    data_module._steering.cache_clear()
     with ThreadPoolExecutor(1) as here:
         dr.run_study(spec, store=tmp_path / "a.db", executor=here, **options)
     return rows(tmp_path / "a.db")
@@ -54,21 +54,21 @@ def test_rows_are_those_of_what_users_call(whole: dict):
             low,
             high,
         )
-        assert row[f"best_{name}"] == pytest.approx(plant.parameters[name], rel=1e-9)
+        assert row[f"pseudo_true_{name}"] == pytest.approx(plant.parameters[name], rel=1e-9)
 
 
 def test_the_data_of_a_trial_are_to_be_had_alone(whole: dict):
-    data, row = record(DRAWN, 40, trial=1), whole["40", 1, "ols"]
+    data, row = trial_data(DRAWN, 40, trial=1), whole["40", 1, "ols"]
     result = dr.identify(dr.models.planar_rotorcraft(), data.log, "ols", settings=load(DRAWN).methods["ols"].settings)
     assert {name: row[f"parameter_{name}"] for name in NAMES} == dict(result.parameters)
-    assert {name: row[f"best_{name}"] for name in NAMES} == data.best
+    assert {name: row[f"pseudo_true_{name}"] for name in NAMES} == data.pseudo_true
     assert any(samples.any() for samples in data.log.fault_mask.values())
-    assert not (data.flight["x"] == data.log["x"]).all()
+    assert not (data.clean_log["x"] == data.log["x"]).all()
     with pytest.raises(dr.SettingsError, match='no level "some" of outlier magnitude'):
-        record(DRAWN, "some")
+        trial_data(DRAWN, "some")
     for trial in (-1, 1.5, True):
         with pytest.raises(dr.SettingsError, match=f"trial is {trial}; give a whole number of at least 0"):
-            record(DRAWN, 40, trial=trial)
+            trial_data(DRAWN, 40, trial=trial)
 
 
 def test_trials_fly_different_flights_and_methods_of_a_trial_the_same(whole: dict):
@@ -76,7 +76,7 @@ def test_trials_fly_different_flights_and_methods_of_a_trial_the_same(whole: dic
     assert len(set(scores.values())) == 4
     for level, trial in {key[:2] for key in whole}:
         true, ols = (whole[level, trial, method] for method in ("true", "ols"))
-        assert all(true[f"best_{name}"] == ols[f"best_{name}"] for name in NAMES)
+        assert all(true[f"pseudo_true_{name}"] == ols[f"pseudo_true_{name}"] for name in NAMES)
         assert all(true[f"low_{name}"] is None for name in NAMES), "who knows the truth has no intervals"
 
 
@@ -89,14 +89,14 @@ def test_drawn_flights_are_the_same_in_whatever_company_and_order_and_after_an_e
 def test_a_flight_that_cannot_be_planned_fails_its_own_trial_alone(
     whole: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    unlucky, planned = derived_seed(derived_seed(7, "0", 1), "data plan"), Flight.planned
+    unlucky, planned = derived_seed(derived_seed(7, "0", 1), "data plan"), FlightChoice.planned
 
-    def sometimes(self: Flight, plant: dr.Plant, seed: int, **options: object) -> dr.Trajectory:
+    def sometimes(self: FlightChoice, plant: dr.Plant, seed: int, **options: object) -> dr.Trajectory:
         if seed == unlucky:
             raise dr.PlanningError("there is no way")
         return planned(self, plant, seed, **options)
 
-    monkeypatch.setattr(Flight, "planned", sometimes)
+    monkeypatch.setattr(FlightChoice, "planned", sometimes)
     found = run(tmp_path)
     lost = {key for key, row in found.items() if row["error"] == "there is no way"}
     assert lost == {("0", 1, "true"), ("0", 1, "ols")}
@@ -109,7 +109,7 @@ def test_a_method_that_finds_nothing_is_still_judged(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(trials, "identify", nothing)
     row = run(tmp_path, trials=1, levels=[0])["0", 0, "ols"]
-    assert row["best_mass"] == pytest.approx(0.249, rel=1e-9)
+    assert row["pseudo_true_mass"] == pytest.approx(0.249, rel=1e-9)
     estimates = summarise(tmp_path / "a.db").estimates
     assert estimates.worst.tolist() == [[[pytest.approx(0.0, abs=1e-9)], [np.inf]]]
 
@@ -118,7 +118,7 @@ def test_a_study_that_flies_nothing_has_a_status_and_is_exported(whole: dict, tm
     run(tmp_path, trials=1, levels=[0])
     assert (status(tmp_path / "a.db").done, summarise(tmp_path / "a.db").flights) == (2, {})
     export(tmp_path / "a.db", tmp_path / "a.csv", "csv")
-    assert {f"{kind}_{name}" for kind in ("best", "low", "high") for name in NAMES} <= set(
+    assert {f"{kind}_{name}" for kind in ("pseudo_true", "low", "high") for name in NAMES} <= set(
         pl.read_csv(tmp_path / "a.csv").columns
     )
 
@@ -126,7 +126,7 @@ def test_a_study_that_flies_nothing_has_a_status_and_is_exported(whole: dict, tm
 def test_a_study_that_judges_no_parameters_has_no_such_columns(tmp_path: Path):
     with Store(tmp_path / "a.db", load(tiny())) as kept:
         kept.add([row()])
-    assert not [name for name in read(tmp_path / "a.db").columns if name.startswith(("best", "low", "high"))]
+    assert not [name for name in read(tmp_path / "a.db").columns if name.startswith(("pseudo_true", "low", "high"))]
     assert summarise(tmp_path / "a.db").estimates is None
 
 
@@ -142,14 +142,14 @@ BEST = {"none": {"mass": 0.25, "inertia": 0.004, "drag": 0.025}, "some": {"mass"
 
 
 def judged(level: str, trial: int, factors: dict[str, float], spread: float | None = None, method: str = "ols") -> dict:
-    """A row whose parameters are the best ones times factors, with intervals of that relative half-width."""
+    """A row whose parameters are the pseudo-true ones times factors, with intervals of that relative half-width."""
     best = BEST[level]
     found = {f"parameter_{name}": best[name] * factor for name, factor in factors.items()}
     ends = {} if spread is None else {
         f"{end}_{name}": found[f"parameter_{name}"] + sign * spread * best[name]
         for name in factors for end, sign in (("low", -1), ("high", 1))
     }  # fmt: skip
-    return row(level, trial, method, **{f"best_{name}": x for name, x in best.items()}, **found, **ends)
+    return row(level, trial, method, **{f"pseudo_true_{name}": x for name, x in best.items()}, **found, **ends)
 
 
 @pytest.fixture
@@ -179,7 +179,7 @@ def test_of_an_even_number_the_median_is_between_the_middle_two_or_infinite_if_o
 
 def test_a_trial_without_data_has_no_estimate_and_one_that_was_not_run_counts_neither_way(estimates):
     assert estimates.worst[1, 1, 1] == np.inf
-    assert estimates.worst_of_own[1, 1, 1] == np.inf
+    assert estimates.worst_to_true[1, 1, 1] == np.inf
     assert np.isnan(estimates.worst[1, 1, 2])
     assert np.isnan(estimates.worst[0, 0]).all(), "that of a method that was not run"
     assert np.isnan(estimates.median(estimates.worst)[0, 0])
@@ -187,8 +187,8 @@ def test_a_trial_without_data_has_no_estimate_and_one_that_was_not_run_counts_ne
 
 def test_against_the_plants_own_it_is_another_error_where_the_best_ones_differ(estimates):
     assert estimates.differs.tolist() == [False, True]
-    assert estimates.worst_of_own[1, 1, 0] == pytest.approx(0.2, rel=1e-5)
-    assert estimates.worst_of_own[1, 0, 0] == pytest.approx(0.0)
+    assert estimates.worst_to_true[1, 1, 0] == pytest.approx(0.2, rel=1e-5)
+    assert estimates.worst_to_true[1, 0, 0] == pytest.approx(0.0)
     assert estimates.worst[1, 0, 0] == pytest.approx(0.25)
 
 
@@ -213,9 +213,9 @@ def of_a_users_plant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A store of two levels of a user's plant, asked for one after the other."""
     monkeypatch.chdir(tmp_path)
     Path("own.py").write_text(OWN_PLANT)
-    values = {f"{kind}_{name}": 1.0 for kind in ("parameter", "best") for name in "Mm"}
+    values = {f"{kind}_{name}": 1.0 for kind in ("parameter", "pseudo_true") for name in "Mm"}
     for level in ("calm", "pulled"):
-        with Store("a.db", load(OWN).narrowed(levels=[level])) as kept:
+        with Store("a.db", load(OWN).subset(levels=[level])) as kept:
             kept.add([row(level, **values)])
     return tmp_path / "a.db"
 
@@ -232,7 +232,7 @@ def test_a_store_is_reported_without_the_file_of_its_plant(of_a_users_plant: Pat
 def test_facts_of_a_store_are_those_of_the_plant_that_one_of_before_makes_anew(of_a_users_plant: Path):
     noted = summarise(of_a_users_plant)
     assert noted.estimates.disturbed.tolist() == [False, True]
-    assert noted.estimates.errors_of_own["M"][:, 0, 0] == pytest.approx([0.0, 0.5 / 1.5])
+    assert noted.estimates.errors_to_true["M"][:, 0, 0] == pytest.approx([0.0, 0.5 / 1.5])
     assert noted.units == {"s": "m", "s_dot": "m/s"}
     connection = sqlite3.connect(of_a_users_plant)
     with connection:
@@ -241,5 +241,5 @@ def test_facts_of_a_store_are_those_of_the_plant_that_one_of_before_makes_anew(o
     anew = summarise(of_a_users_plant)
     assert (anew.units, anew.estimates.disturbed.tolist()) == (noted.units, [False, True])
     assert all(
-        np.array_equal(x, noted.estimates.errors_of_own[name]) for name, x in anew.estimates.errors_of_own.items()
+        np.array_equal(x, noted.estimates.errors_to_true[name]) for name, x in anew.estimates.errors_to_true.items()
     )

@@ -52,7 +52,7 @@ model = dr.Model("sledge", {"s": "m"}, {"force": "N"}, {"mass": dr.Parameter("kg
                  lambda q, v, a, u, p: [p.mass * a.s - u.force])
 """
 
-SINES = {"trajectory": "sines", "duration": 5.0}
+SINES = {"trajectory": "multisine", "duration": 5.0}
 JUDGED = {"evaluation": {"trajectories": [], "parameters": True}}
 
 
@@ -206,7 +206,7 @@ def test_a_users_file_that_has_changed_is_another_study(own):
         ({"kind": "sledges.py"}, 'has no function "plant" that returns a diransac.Plant; functions found: sledge, dem'),
         ({"kind": "sledges.py:model"}, 'has no function "model"'),
         ({"kind": "sledges.py:demanding"}, '"demanding" needs pull; give every argument a default'),
-        ({"kind": "sledges.py:table"}, 'sledges.py": "table" does not tell which arguments it takes; wrap it in'),
+        ({"kind": "sledges.py:table"}, 'sledges.py": "table" has no signature that can be read; wrap it in'),
         ({"kind": "sledges.py:of_an_array"}, r'"of_an_array" has pull = array.* \(ndarray\); give a default that TOML'),
         ({"kind": "sledges.py:of_a_numpy_number"}, r'"of_a_numpy_number" has teeth = .*3.* \(int64\); give a default'),
         ({"kind": "sledges.py:of_a_path"}, r'"of_a_path" has route = .*Path\(.*; give a default that TOML'),

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.study import connected, load, paths, recording, status, trials
-from diransac.study.seeds import derived_seed
+from diransac.study import connected, load, paths, status, trials
+from diransac.study import data as data_module
+from diransac.study.data import derived_seed
 from studies import TINY, TINY_TOML, command, rows, tiny
 
 PLANT = load(TINY).plant.plant
@@ -126,7 +127,7 @@ def test_rows_do_not_depend_on_what_a_study_is_called_or_which_other_methods_it_
 
 
 def test_trials_draw_their_own_rotor_phases_whatever_the_batch(tmp_path: Path):
-    plant = {"kind": "extended-rotorcraft", "mass_imbalance": 1e-4, "rotor_phase": "any"}
+    plant = {"kind": "extended-rotorcraft", "mass_imbalance": 1e-4, "rotor_phase": "random"}
     shaken = tiny(plant=plant, axis={"path": "noise.outlier_magnitude", "levels": [0]})
     together = run(tmp_path, shaken, trials=3, methods=["true"])
     (tmp_path / "alone").mkdir()
@@ -202,15 +203,15 @@ def test_an_error_that_nobody_foresaw_ends_one_trial_and_says_what_it_was(
 def test_a_flight_that_ends_in_an_error_that_nobody_foresaw_takes_no_other_with_it(
     purpose: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    spec = tiny(plant={"kind": "extended-rotorcraft", "rotor_phase": "any"})
-    fly_batch, struck = dr.fly_batch, derived_seed(recording.trial_seed(load(spec), "40", 1), purpose)
+    spec = tiny(plant={"kind": "extended-rotorcraft", "rotor_phase": "random"})
+    fly_batch, struck = dr.fly_batch, derived_seed(data_module.trial_seed(load(spec), "40", 1), purpose)
 
     def breaks(plants: list, controllers: list, **more: object) -> list:
         if struck in more["seeds"]:
             raise ZeroDivisionError("by accident")
         return fly_batch(plants, controllers, **more)
 
-    monkeypatch.setattr(recording, "fly_batch", breaks)
+    monkeypatch.setattr(data_module, "fly_batch", breaks)
     found = run(tmp_path, spec, levels=[40], methods=["ols"], batch_size=2)
     assert found["40", 0, "ols"]["status"] == "done"
     assert found["40", 1, "ols"]["error"] == "internal error: ZeroDivisionError: by accident"
@@ -243,7 +244,7 @@ def test_a_flight_that_diverges_is_a_row_that_says_so(tmp_path: Path, monkeypatc
             dr.Log(log.time, {n: log[n] for n in log.names}, notes=("the flight diverged at t = 1 s",)) for log in logs
         ]
 
-    monkeypatch.setattr(recording, "fly_batch", runaway)
+    monkeypatch.setattr(data_module, "fly_batch", runaway)
     found = run(tmp_path, trials=1, levels=[40])
     assert {row["error"] for row in found.values()} == {"the flight diverged at t = 1 s"}
 
@@ -266,8 +267,8 @@ def test_a_data_flight_that_diverges_fails_its_own_trial_alone(tmp_path: Path, m
             logs[1] = dr.Log(lost.time, {n: lost[n] for n in lost.names}, notes=("the flight diverged at t = 1 s",))
         return logs
 
-    monkeypatch.setattr(recording, "fly_batch", one_runs_away)
-    plant = {"kind": "extended-rotorcraft", "rotor_phase": "any"}
+    monkeypatch.setattr(data_module, "fly_batch", one_runs_away)
+    plant = {"kind": "extended-rotorcraft", "rotor_phase": "random"}
     found = run(tmp_path, tiny(plant=plant), levels=[40], methods=["ols"], batch_size=2)
     assert flown == [2, 1]
     assert found["40", 0, "ols"]["status"] == "done"
@@ -370,7 +371,7 @@ def test_a_worker_without_the_users_file_ends_the_run_at_once_and_is_named(
             return super().submit(function, *arguments)
 
     here = re.escape(platform.node())
-    message = rf'a worker on {here} cannot run .* "own.py" cannot be read: .*; all that is done is kept$'
+    message = rf'a worker on {here} cannot run .* "own.py" cannot be read: .*; finished rows are kept$'
     with Elsewhere(1) as pool, pytest.raises(dr.StudyError, match=message):
         run(tmp_path, tiny(plant={"kind": "own.py"}), executor=pool, tasks=1)
     assert len(handed_out) == 1
@@ -440,7 +441,7 @@ def test_a_cluster_whose_worker_is_killed_gives_the_same_rows(whole: dict, tmp_p
 
 def test_a_scheduler_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("diransac.study.cluster._PATIENCE", "0.2s")
+    monkeypatch.setattr("diransac.study.run._CONNECTION_TIMEOUT", "0.2s")
     with (
         pytest.raises(dr.StudyError, match=r"no scheduler at tcp://127.0.0.1:9: .*dask scheduler"),
         connected("tcp://127.0.0.1:9"),

@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -9,10 +11,9 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.study import builtin_names, load, template
-from diransac.study.flights import Flight
+from diransac.study import FlightChoice, builtin_names, load, template
+from diransac.study.data import derived_seed
 from diransac.study.plants import PlantChoice
-from diransac.study.seeds import derived_seed
 from studies import TINY, tiny
 
 STUDY = load(TINY)
@@ -34,12 +35,18 @@ def test_the_figures_of_the_paper_vary_what_they_say():
         "fig4": pytest.approx([6e-5, 8e-5, 1e-4, 1.2e-4, 1.4e-4], rel=1e-12),
         "fig5": [80],
     }
-    assert [load(f"fig{k}").evaluation for k in (2, 3, 4, 5)] == [("square",), ("sine",), ("sine",), ("square", "sine")]
+    flown = [load(f"fig{k}").evaluation.trajectories for k in (2, 3, 4, 5)]
+    assert flown == [
+        ("square",),
+        ("sine",),
+        ("sine",),
+        ("square", "sine"),
+    ]
     assert load("fig2").noise.outlier_probability == 0.1
     assert load("fig3").at("1.8e-06").plant.arguments["aerodynamic_imbalance"] == 1.8e-6
     assert load("fig4").at("0.00014").plant.arguments["mass_imbalance"] == 1.4e-4
-    assert all(load(name).data == Flight("star") and load(name).trials == 50 for name in levels)
-    assert load("fig5").keep_paths
+    assert all(load(name).data == FlightChoice(trajectory="star") and load(name).trials == 50 for name in levels)
+    assert load("fig5").evaluation.keep_paths
 
 
 @pytest.mark.parametrize("name", ["fig2", "fig3", "fig4", "fig5", "gaussian"])
@@ -64,8 +71,8 @@ def test_every_trial_of_the_gauntlet_flies_another_flight_and_is_judged_by_its_p
     assert study.data.is_drawn
     assert study.data.substeps == 20
     assert study.plant.is_drawn
-    assert study.judges_parameters
-    assert study.evaluation == (("square",) if name == "gauntlet" else ())
+    assert study.evaluate_parameters
+    assert study.evaluation.trajectories == (("square",) if name == "gauntlet" else ())
     assert {"diransac", "lo-diransac"} <= {method.method for method in study.methods.values()}
 
 
@@ -96,13 +103,13 @@ def test_the_template_is_a_study_and_comments_every_table():
 def test_levels_are_the_same_however_they_are_written():
     study = load(tiny(axis__levels=[0, 0.0000010, 80.0, -0.0000010 + 0.0000010 + 3]))
     assert [level.text for level in study.axis.levels] == ["0", "1e-06", "80", "3"]
-    assert study.narrowed(levels=["80.00", 3]).axis.levels == study.narrowed(levels=[80, "3"]).axis.levels
+    assert study.subset(levels=["80.00", 3]).axis.levels == study.subset(levels=[80, "3"]).axis.levels
 
 
 def test_a_level_that_has_a_path_may_be_new_and_a_combination_may_not():
-    assert STUDY.narrowed(levels=[55]).at("55").noise.outlier_magnitude == 55.0
+    assert STUDY.subset(levels=[55]).at("55").noise.outlier_magnitude == 55.0
     with pytest.raises(dr.SettingsError, match=r'no level "0.3".*there are 0, 0.25, 0.5, 0.75, 1'):
-        load("gaussian").narrowed(levels=["0.3"])
+        load("gaussian").subset(levels=["0.3"])
 
 
 WORDS = {
@@ -117,31 +124,33 @@ def test_levels_that_are_words_may_each_change_something_else():
     assert [level.text for level in study.axis.levels] == ["calm", "some", "much"]
     assert [study.at(level).noise.outlier_probability for level in WORDS] == [0.1, 0.2, 0.5]
     assert [study.at(level).noise.delay for level in WORDS] == [0.0, 0.02, 0.0]
-    for some in (study, study.narrowed(levels=["calm"])):
+    for some in (study, study.subset(levels=["calm"])):
         assert load(json.loads(json.dumps(some.to_dict()))) == some
 
 
 def test_levels_that_are_words_may_look_like_numbers():
     study = load(tiny(axis={"levels": {"1e3": {"noise.delay": 0.01}, "1000": {"noise.delay": 0.02}, "007": {}}}))
     assert [study.at(text).noise.delay for text in ("1e3", "1000", "007")] == [0.01, 0.02, 0.0]
-    assert [level.text for level in study.narrowed(levels=["007", "1e3"]).axis.levels] == ["007", "1e3"]
+    assert [level.text for level in study.subset(levels=["007", "1e3"]).axis.levels] == ["007", "1e3"]
 
 
 def test_a_level_may_fly_another_trajectory_which_takes_over_what_was_given_but_no_defaults():
     study = load(
-        tiny(data={"trajectory": "places", "substeps": 7}, axis={"path": "data.trajectory", "levels": ["star"]})
+        tiny(
+            data={"trajectory": "random-waypoints", "substeps": 7}, axis={"path": "data.trajectory", "levels": ["star"]}
+        )
     )
-    assert study.at("star").data == Flight("star", substeps=7)
-    given = {"trajectory": "places", "duration": 25.0, "seed": "any"}
-    study = load(tiny(data=given, axis={"path": "data.trajectory", "levels": ["places"]}))
-    assert study.at("places").data == study.data
+    assert study.at("star").data == FlightChoice(trajectory="star", substeps=7)
+    given = {"trajectory": "random-waypoints", "duration": 25.0, "seed": "random"}
+    study = load(tiny(data=given, axis={"path": "data.trajectory", "levels": ["random-waypoints"]}))
+    assert study.at("random-waypoints").data == study.data
     with pytest.raises(dr.SettingsError, match=r'at level star, there is no key "data.seed"; in data there are'):
         load(tiny(data=given, axis={"path": "data.trajectory", "levels": ["star"]}))
 
 
 def test_a_level_may_fly_another_plant_which_takes_over_what_was_given_but_no_defaults():
     axis = {"path": "plant.kind", "levels": ["servo-axis", "pendulum"]}
-    data = {"trajectory": "sines", "seed": "any", "duration": 5.0}
+    data = {"trajectory": "multisine", "seed": "random", "duration": 5.0}
     judged = {"trajectories": [], "parameters": True}
     study = load(tiny(plant={"kind": "servo-axis"}, data=data, evaluation=judged, axis=axis))
     assert study.at("pendulum").plant == PlantChoice.from_dict({"kind": "pendulum"})
@@ -166,7 +175,7 @@ def test_a_level_that_changes_nothing_is_noted_as_such():
 def test_an_axis_may_lead_into_a_method():
     study = load(tiny(axis={"path": "methods.quick.settings.max_iterations", "levels": [5, 50]}))
     assert [study.at(level).methods["quick"].settings.max_iterations for level in ("5", "50")] == [5, 50]
-    assert study.narrowed(methods=["ols"]).at("5").methods.keys() == {"ols"}
+    assert study.subset(methods=["ols"]).at("5").methods.keys() == {"ols"}
 
 
 def test_settings_are_laid_over_their_preset():
@@ -180,25 +189,25 @@ def test_parameters_that_are_not_named_are_those_of_table_i():
 
 
 def test_a_rotor_phase_may_be_drawn():
-    drawn = load(tiny(plant={"kind": "extended-rotorcraft", "rotor_phase": "any"})).plant
+    drawn = load(tiny(plant={"kind": "extended-rotorcraft", "rotor_phase": "random"})).plant
     assert drawn.is_drawn
     assert not load("fig4").plant.is_drawn
     assert drawn.plant.disturbances[0].start["phase_1"] == pytest.approx((0.0, 2 * 3.141592653589793))
 
 
 def test_a_data_flight_has_all_of_its_arguments_and_its_seed_may_be_drawn():
-    study = load(tiny(data={"trajectory": "places", "seed": "any", "speed": 2, "substeps": 20}))
+    study = load(tiny(data={"trajectory": "random-waypoints", "seed": "random", "speed": 2, "substeps": 20}))
     assert study.data.is_drawn
     assert study.data.substeps == 20
-    assert study.data.arguments == {"seed": "any", "speed": 2.0, "reach": 2.0, "duration": 25.0}
+    assert study.data.arguments == {"seed": "random", "speed": 2.0, "reach": 2.0, "duration": 25.0}
     assert load(json.loads(json.dumps(study.to_dict()))) == study
-    assert not load(tiny(data={"trajectory": "places", "seed": 3})).data.is_drawn
+    assert not load(tiny(data={"trajectory": "random-waypoints", "seed": 3})).data.is_drawn
 
 
 def test_a_drawn_flight_is_that_of_its_seed_and_any_other_that_of_its_own():
-    sines = {"trajectory": "sines", "duration": 0.5}
+    sines = {"trajectory": "multisine", "duration": 0.5}
     plant = dr.Plant(dr.models.servo_axis(), {"mass": 1.0, "viscous_friction": 1.0, "dry_friction": 1.0, "offset": 1.0})
-    drawn, fixed = (Flight.from_dict({**sines, "seed": seed}) for seed in ("any", 3))
+    drawn, fixed = (FlightChoice.from_dict({**sines, "seed": seed}) for seed in ("random", 3))
     expected = dr.multisine(plant, seed=3, duration=0.5).states
     np.testing.assert_array_equal(drawn.planned(plant, 3, time_limit=5.0).states, expected)
     np.testing.assert_array_equal(fixed.planned(plant, 8).states, expected)
@@ -215,9 +224,9 @@ def test_a_store_of_before_there_were_drawn_flights_and_judged_parameters_is_sti
 
 def test_where_parameters_are_judged_no_flight_need_be():
     study = load(tiny(evaluation={"trajectories": [], "parameters": True}))
-    assert study.judges_parameters
-    assert study.evaluation == ()
-    assert not STUDY.judges_parameters
+    assert study.evaluate_parameters
+    assert study.evaluation.trajectories == ()
+    assert not STUDY.evaluate_parameters
     assert study.configuration != load(tiny(evaluation={"trajectories": ["square"], "parameters": True})).configuration
 
 
@@ -241,19 +250,22 @@ def test_what_people_call_things_and_how_many_there_are_decide_nothing():
         ({"plant.parameters.mass": "heavy"}, "plant.parameters is .*heavy.*; give a table of numbers"),
         ({"data.trajectory": "loop"}, "data.trajectory is 'loop'; there are square, star, sine"),
         ({"data.speed": 2}, 'no key "data.speed"; in data there are trajectory, substeps'),
-        ({"data": {"trajectory": "places", "speed": "fast"}}, "data.speed is 'fast'; give a number"),
-        ({"data": {"trajectory": "places", "speed": [1, 2]}}, r"data.speed is \[1, 2\]; give a number"),
-        ({"data": {"trajectory": "places", "speed": -2}}, "data.speed is -2; give a number above 0"),
-        ({"data": {"trajectory": "places", "duration": 1e12}}, r"data.duration is 1e\+12; give 3600 s or less"),
-        ({"data": {"trajectory": "places", "seed": 1.5}}, "data.seed is 1.5; give a whole number from 0"),
-        ({"data": {"trajectory": "places", "reach": "any"}}, "data.reach is 'any'; give a number"),
+        ({"data": {"trajectory": "random-waypoints", "speed": "fast"}}, "data.speed is 'fast'; give a number"),
+        ({"data": {"trajectory": "random-waypoints", "speed": [1, 2]}}, r"data.speed is \[1, 2\]; give a number"),
+        ({"data": {"trajectory": "random-waypoints", "speed": -2}}, "data.speed is -2; give a number above 0"),
+        (
+            {"data": {"trajectory": "random-waypoints", "duration": 1e12}},
+            r"data.duration is 1e\+12; give 3600 s or less",
+        ),
+        ({"data": {"trajectory": "random-waypoints", "seed": 1.5}}, "data.seed is 1.5; give a whole number from 0"),
+        ({"data": {"trajectory": "random-waypoints", "reach": "random"}}, "data.reach is 'random'; give a number"),
         ({"data.substeps": 0}, "data.substeps is 0; give a whole number of at least 1"),
         (
-            {"data.trajectory": "sines"},
-            "data.trajectory has 'sines': model \"planar-rotorcraft\" is not fully actuated",
+            {"data.trajectory": "multisine"},
+            "data.trajectory has 'multisine': model \"planar-rotorcraft\" is not fully actuated",
         ),
         (
-            {"plant.kind": "servo-axis", "data.trajectory": "sines"},
+            {"plant.kind": "servo-axis", "data.trajectory": "multisine"},
             "evaluation.trajectories has 'square': .* model \"servo-axis\" has no coordinate x",
         ),
         ({"evaluation.parameters": 1}, "evaluation.parameters is 1; give true or false"),
@@ -340,7 +352,12 @@ def test_a_file_that_is_no_toml_is_refused(tmp_path):
 )
 def test_what_a_study_does_not_have_cannot_be_chosen(narrower: dict, message: str):
     with pytest.raises(dr.SettingsError, match=message):
-        STUDY.narrowed(**narrower)
+        STUDY.subset(**narrower)
+
+
+def test_pydantic_is_loaded_with_studies_only():
+    code = "import sys, diransac, diransac.cli.commands; print('pydantic' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
 
 
 # Seeds ----------------------------------------------------------------------------------------------------------------

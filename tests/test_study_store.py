@@ -81,7 +81,7 @@ def test_processes_that_write_at_once_lose_nothing_and_repeat_nothing(tmp_path: 
 def test_parameters_that_differ_in_case_alone_are_kept_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     Path("own.py").write_text(OWN_PLANT)
-    values = {"parameter_M": 1.0, "parameter_m": 2.0, "best_M": 3.0, "best_m": 4.0}
+    values = {"parameter_M": 1.0, "parameter_m": 2.0, "pseudo_true_M": 3.0, "pseudo_true_m": 4.0}
     with Store("a.db", load(OWN)) as kept:
         kept.add([row("calm", **values)])
     with Store("a.db", load(OWN)) as kept:
@@ -113,7 +113,7 @@ def test_another_configuration_is_refused_key_by_key(store: Path, changes: dict,
 
 
 def test_many_differences_are_counted_rather_than_listed(store: Path):
-    with pytest.raises(dr.StudyError, match=r"; and \d+ more\. Take another store") as caught:
+    with pytest.raises(dr.StudyError, match=r"; and \d+ more\. Use another store") as caught:
         Store(store, load(TINY, {"plant.kind": "extended-rotorcraft"}))
     assert str(caught.value).count(" in the store, ") == 6
 
@@ -135,9 +135,60 @@ def test_more_trials_levels_and_methods_extend_a_store(store: Path):
 
 
 def test_fewer_trials_take_nothing_away(store: Path):
-    with Store(store, STUDY.narrowed(trials=1, levels=[0])):
+    with Store(store, STUDY.subset(trials=1, levels=[0])):
         pass
     assert (status(store).asked, len(rows(store))) == (12, 3)
+
+
+# Format 1 -------------------------------------------------------------------------------------------------------------
+FAULTY = {
+    "noise": {"outlier_probability": 0.1, "stuck_probability": 0.02, "correlated": True, "first_row": "corrupted"},
+    "plant": {"kind": "extended-rotorcraft", "rotor_phase": "random"},
+    "data": {"trajectory": "random-waypoints", "seed": "random"},
+    "evaluation": {"trajectories": [], "parameters": True},
+    "axis": {"name": "fault", "levels": {"calm": {}, "stuck": {"noise.stuck_length": 5.0, "noise.correlated": False}}},
+}
+OLD_NAMES = {
+    "noise.stuck_probability": ("noise.freeze_probability", {}),
+    "noise.stuck_length": ("noise.freeze_length", {}),
+    "noise.correlated": ("noise.runs", {"true": "together", "false": "independent"}),
+    "noise.first_row": ("noise.first_row", {'"corrupted"': "hit"}),
+    "plant.rotor_phase": ("plant.rotor_phase", {'"random"': "any"}),
+    "data.trajectory": ("data.trajectory", {'"random-waypoints"': "places"}),
+    "data.seed": ("data.seed", {'"random"': "any"}),
+}
+
+
+def write_as_format_1(path: Path) -> None:
+    """Give a store the names that its format had first."""
+    connection = sqlite3.connect(path)
+    for name in ("mass", "inertia", "drag"):
+        connection.execute(f"ALTER TABLE trials RENAME COLUMN pseudo_true_{name} TO best_{name}")
+    for key, (old, values) in OLD_NAMES.items():
+        connection.execute("UPDATE configuration SET key = ? WHERE key = ?", (old, key))
+        for value, before in values.items():
+            change = "UPDATE configuration SET value = ? WHERE key = ? AND value = ?"
+            connection.execute(change, (json.dumps(before), old, value))
+    connection.execute("PRAGMA user_version = 1")
+    connection.commit()
+    connection.close()
+
+
+@pytest.mark.parametrize("first_use", [read, lambda path: Store(path, load(tiny(**FAULTY)))])
+def test_a_store_of_format_1_is_read_and_resumed_under_the_new_names(first_use, tmp_path: Path):
+    path, study = tmp_path / "a.db", load(tiny(**FAULTY))
+    with Store(path, study) as kept:
+        kept.add([row("calm", pseudo_true_mass=0.3)])
+    before = rows(path)
+    write_as_format_1(path)
+    assert rows(path)["calm", 0, "ols"]["best_mass"] == 0.3
+    first_use(path)
+    assert rows(path) == before
+    assert read(path)["pseudo_true_mass"].to_list() == [0.3]
+    with Store(path, study) as kept:
+        assert kept.finished("calm", [0]) == {("calm", 0, "ols")}
+    with pytest.raises(dr.StudyError, match=r"noise\.stuck_probability is 0\.02 in the store, 0.5 was asked for"):
+        Store(path, load(study, {"noise.stuck_probability": 0.5}))
 
 
 # What is no store -----------------------------------------------------------------------------------------------------
@@ -164,7 +215,7 @@ def test_a_store_of_another_format_is_refused(store: Path):
     connection = sqlite3.connect(store)
     connection.execute("PRAGMA user_version = 9")
     connection.close()
-    with pytest.raises(dr.StudyError, match="has format 9, this version reads 1"):
+    with pytest.raises(dr.StudyError, match="has format 9, this version reads 1 to 2"):
         read(store)
 
 

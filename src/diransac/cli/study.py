@@ -29,21 +29,21 @@ __all__ = ["study"]
 
 study = typer.Typer(name="study", help="Run grids of Monte-Carlo trials, such as the paper's figures.")
 
-StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="What study run made.")]
+StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="Store of study run.")]
 
 
 def _listed(option: str, text: str | None) -> list[str] | None:
-    """``a,b`` as a list; None stays None.  Raises typer.BadParameter: nothing is named."""
+    """The names of ``a,b``; None for None.  Raises typer.BadParameter: there are none."""
     if text is None:
         return None
     found = names(text)
     if not found:
-        raise typer.BadParameter(f"{option}: nothing is named; give names, separated by commas")
+        raise typer.BadParameter(f"{option}: nothing is named; give names separated by commas")
     return found
 
 
 def _changes(assignments: Sequence[str]) -> dict[str, Any]:
-    """``path.to.key=value`` pairs by path.  Raises typer.BadParameter: one is none."""
+    """Values of ``path.to.key=value`` by path.  Raises typer.BadParameter: another form."""
     found = {}
     for text in assignments:
         path, equals, value = (part.strip() for part in text.partition("="))
@@ -55,32 +55,33 @@ def _changes(assignments: Sequence[str]) -> dict[str, Any]:
 
 @study.command("run")
 def _run(
-    source: Annotated[
-        str, typer.Argument(metavar="NAME|FILE.toml", help=f"{', '.join(builtin_names())}, or one of yours.")
-    ],
+    source: Annotated[str, typer.Argument(metavar="NAME|FILE.toml", help=f"{', '.join(builtin_names())}, or a file.")],
     store: Annotated[
-        Path, typer.Option(metavar="FILE.db", help="Where rows are kept; what is there is not run again.")
+        Path, typer.Option(metavar="FILE.db", help="File for the rows; those that it has are not run again.")
     ],
-    trials: Annotated[int | None, typer.Option(min=1, metavar="N", help="So many at each level.")] = None,
-    levels: Annotated[str | None, typer.Option(metavar="A,B,...", help="At these levels alone: 0,80.")] = None,
-    methods: Annotated[str | None, typer.Option(metavar="A,B,...", help="Of these methods alone, by label.")] = None,
+    trials: Annotated[int | None, typer.Option(min=1, metavar="N", help="Trials at each level.")] = None,
+    levels: Annotated[str | None, typer.Option(metavar="A,B,...", help="Only these levels: 0,80.")] = None,
+    methods: Annotated[str | None, typer.Option(metavar="A,B,...", help="Only these methods, by label.")] = None,
     assignments: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Another value: plant.convention=printed; repeatable."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a value: plant.convention=printed; repeatable."),
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Processes; as many as cores if not given.")
+        int | None, typer.Option(min=1, metavar="N", help="Number of processes; one per core by default.")
     ] = None,
     cluster: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run it: tcp://host:8786.")
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run the trials: tcp://host:8786."),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Run what a store lacks of a study: the same command again runs the rest."""
+    """Run the trials that a store lacks; after an interruption, the same command runs the rest."""
     if cluster is not None and jobs is not None:
-        raise typer.BadParameter("--jobs counts processes of this machine, --cluster runs on others; give one of them")
+        raise typer.BadParameter(
+            "--jobs sets the processes of this machine, --cluster runs on others; give one of them"
+        )
     wanted = load(source, _changes(assignments or ()))
-    wanted = wanted.narrowed(trials, _listed("--levels", levels), _listed("--methods", methods))
+    wanted = wanted.subset(trials, _listed("--levels", levels), _listed("--methods", methods))
     with _kept(store) as note, _bar(wanted.name) as show:
 
         def progress(done: int, asked: int) -> None:
@@ -96,16 +97,16 @@ def _everywhere(wanted: Study, store: Path, jobs: int | None, cluster: str | Non
     if cluster is None:
         return run_study(wanted, store=store, jobs=jobs, progress=progress)
     with connected(cluster) as (executor, tasks):
-        for talker in ("distributed", "concurrent.futures"):  # an error says in a line what they say in many
+        for talker in ("distributed", "concurrent.futures"):  # the error itself is one line
             logging.getLogger(talker).setLevel(logging.CRITICAL)
         return run_study(wanted, store=store, executor=executor, tasks=tasks, progress=progress)
 
 
 @study.command("new")
 def _new(
-    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="Where to write it; there must be none yet.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="File to write; it must not exist.")],
 ) -> None:
-    """Write a study with a comment at every key, to start one's own from."""
+    """Write a study file with a comment at every key."""
     if file.suffix != ".toml":
         raise typer.BadParameter(f'"{file}" does not end in .toml; give the name of a TOML file')
     try:
@@ -113,22 +114,22 @@ def _new(
             new.write(template())
     except FileExistsError as error:
         raise SettingsError(f'"{file}" is there already; give another name') from error
-    typer.echo(f"{file}: change it, then run it with diransac study run {file} --store {file.with_suffix('.db')}")
+    typer.echo(f"{file}: edit it, then run diransac study run {file} --store {file.with_suffix('.db')}")
 
 
 @study.command("status")
 def _status(store: StoreArgument, as_json: JsonFlag = False) -> None:
-    """Show how many trials of each level and method are done, failed or missing."""
+    """Show the numbers of trials done, failed and missing, by level and method."""
     screen.show(status(store), as_json)
 
 
 @study.command("export")
 def _export(
     store: StoreArgument,
-    kind: Annotated[str, typer.Option("--to", metavar="parquet|csv", help="What kind of file.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="Where to write it.")],
+    kind: Annotated[str, typer.Option("--to", metavar="parquet|csv", help="Format of the file.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")],
 ) -> None:
-    """Write a store's rows as a table, one a level, trial and method."""
+    """Write the rows of a store as a table, one per level, trial and method."""
     if kind not in ("parquet", "csv"):
         raise typer.BadParameter(f"--to: {kind!r} is not one of parquet, csv")
     with staged([output], [store]) as (written,):
@@ -139,21 +140,19 @@ def _export(
 def _plot(
     store: StoreArgument,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="Where to draw it: .png, .svg or .pdf.")
+        Path, typer.Option("--output", "-o", metavar="FILE", help="Figure to write: .png, .svg or .pdf.")
     ],
     flown: Annotated[
         bool | None,
-        typer.Option(
-            "--paths/--errors", help="Flown paths at one level, or how flights were tracked.", show_default=False
-        ),
+        typer.Option("--paths/--errors", help="Flown paths at one level, or tracking errors.", show_default=False),
     ] = None,
     parameters: Annotated[
-        bool, typer.Option("--parameters", help="Errors of the parameters, if the study judges these.")
+        bool, typer.Option("--parameters", help="Parameter errors, if the study evaluates parameters.")
     ] = False,
-    level: Annotated[str | None, typer.Option(metavar="A", help="Whose paths are drawn.")] = None,
-    title: Annotated[str | None, typer.Option(metavar="TEXT", help="In place of the study's name.")] = None,
+    level: Annotated[str | None, typer.Option(metavar="A", help="Level whose paths are drawn.")] = None,
+    title: Annotated[str | None, typer.Option(metavar="TEXT", help="Title in place of the study's name.")] = None,
 ) -> None:
-    """Draw a store: errors of the parameters if its study judges them, else of the flights, or, at one level, paths."""
+    """Plot a store: parameter errors if the study evaluates parameters, else tracking errors, or paths of one level."""
     from diransac.plots.estimates import evaluates_parameters, plot_estimates
     from diransac.plots.figure import check_ending
     from diransac.plots.paths import levels_with_paths, plot_paths
@@ -162,7 +161,7 @@ def _plot(
     if level is not None and flown is False:
         raise typer.BadParameter("--level chooses whose paths are drawn, --errors draws none; give one of them")
     if parameters and (flown is not None or level is not None):
-        raise typer.BadParameter("--parameters, --errors and --paths are pictures of their own; give one of them")
+        raise typer.BadParameter("--parameters, --errors and --paths choose different figures; give one of them")
     check_ending(output)
     with staged([output], [store]) as (written,):
         if flown is None and level is None and not parameters:
@@ -180,9 +179,9 @@ def _plot(
 @study.command("report")
 def _report(
     store: StoreArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.html", help="Where to write it.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.html", help="File to write.")],
 ) -> None:
-    """Write a store as one HTML page: figures, the numbers behind them, what failed and what took its time."""
+    """Write a store as one HTML page: figures, tables, failures and run times."""
     from diransac.report.study import write_study_report
 
     with staged([output], [store]) as (written,):
@@ -191,30 +190,30 @@ def _report(
 
 @study.command("list")
 def _list(as_json: JsonFlag = False) -> None:
-    """List the studies that are built in, and the methods there are."""
+    """List the built-in studies and the methods."""
     screen.show(_Studies(), as_json)
 
 
 @dataclass(frozen=True)
 class _Studies:
-    """Every built-in study, a few lines each."""
+    """Built-in studies and methods."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Studies by name, and methods."""
+        """Studies by name, and the methods."""
         return {"studies": {name: load(name).to_dict() for name in builtin_names()}, "methods": [TRUE, *METHODS]}
 
     def __str__(self) -> str:
-        rows = [["study", "varies", "levels", "judged by", "trials", "about"]]
+        rows = [["study", "varies", "levels", "evaluated by", "trials", "about"]]
         for name in builtin_names():
             one = load(name)
             levels = [level.text for level in one.axis.levels]
             span = levels[0] if len(levels) == 1 else f"{levels[0]} .. {levels[-1]} ({len(levels)})"
-            judges = [*(["parameters"] if one.judges_parameters else []), *one.evaluation]
-            rows.append([name, one.axis.name, span, ", ".join(judges), str(one.trials), one.description])
+            criteria = [*(["parameters"] if one.evaluate_parameters else []), *one.evaluation.trajectories]
+            rows.append([name, one.axis.name, span, ", ".join(criteria), str(one.trials), one.description])
         return "\n".join([*aligned(rows), "", *self._methods()])
 
     def _methods(self) -> Iterator[str]:
-        """The methods of each study, one line for those that have the same, and all that there are."""
+        """Lines with the methods of each study, studies with the same methods together, and with all methods."""
         studies: dict[tuple[str, ...], list[str]] = {}
         for name in builtin_names():
             studies.setdefault(tuple(load(name).methods), []).append(name)
@@ -222,10 +221,10 @@ class _Studies:
         yield f"methods there are: {', '.join((TRUE, *METHODS))}"
 
 
-# What is shown meanwhile ---------------------------------------------------------------------------------------------
+# Progress ---------------------------------------------------------------------------------------------------------
 @contextmanager
 def _kept(store: Path) -> Iterator[Progress]:
-    """What notes how far a study is, and says it after Ctrl-C, with how to go on."""
+    """Callback that counts rows; after Ctrl-C a line with the count and how to resume is shown."""
     counts = [0, 0]
 
     def update(done: int, asked: int) -> None:
@@ -240,7 +239,7 @@ def _kept(store: Path) -> Iterator[Progress]:
 
 @contextmanager
 def _bar(label: str) -> Iterator[Progress]:
-    """What a study reports its progress to: a bar with rate and time left on a terminal's stderr, nothing elsewhere."""
+    """Progress callback: a bar with rate and time left if stderr is a terminal, else nothing."""
     if sys.stderr is None or not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
         yield lambda _done, _asked: None
         return
@@ -254,13 +253,13 @@ def _bar(label: str) -> Iterator[Progress]:
         progress.TextColumn("rows, {task.fields[rate]}"),
         progress.TimeRemainingColumn(),
     )
-    # However rarely rows come, the first of them tell a rate: since the start, which counts as a row of nothing.
+    # The rate is an average since the start, so that it is known from the first rows on.
     options: dict[str, Any] = {"console": Console(stderr=True), "transient": True, "speed_estimate_period": math.inf}
     with progress.Progress(*columns, **options) as shown:
         task = shown.add_task(label, total=None, rate="starting")
 
         def update(done: int, asked: int) -> None:
-            if shown.tasks[0].total is None:  # what an earlier run kept says nothing about the rate
+            if shown.tasks[0].total is None:  # rows of an earlier run do not count for the rate
                 shown.reset(task, total=asked, completed=done)
                 shown.advance(task, 0)
                 return

@@ -143,10 +143,10 @@ class _Task:
         criteria = self.method.criteria
         judged = judged_signals(self.model, logs, criteria)
         dataset = Dataset.of(self.model, logs, judged, pointwise=self.pointwise, given=self.given)
-        scoring = choose_scoring(dataset, criteria)
         several = len(logs) > 1
         estimate = self.method.fit(dataset, self.seed, within(progress, 0.0, 0.5 if several else 0.95))
         report(progress, "evaluating", 0.5 if several else 0.95)
+        scoring = choose_scoring(dataset, criteria)
         evaluation = evaluate(estimate, dataset, scoring, criteria)
         remarks = disagreements(self.method, dataset, self.seed, within(progress, 0.5, 1.0))
         report(progress, "done", 1.0)

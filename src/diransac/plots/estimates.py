@@ -15,7 +15,7 @@ from diransac.plots.rows import LogAxis, MarkRow, as_marks, draw_rows, name_rows
 from diransac.plots.study import axis_label, level_labels, method_looks, n_trials, title_of
 from diransac.study.specification import TRUE
 from diransac.study.store import Store
-from diransac.study.summary import Estimates, Summary, summarise
+from diransac.study.summary import ParameterErrors, Summary, summarise
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -99,7 +99,7 @@ def methods_and_errors(summary: Summary, parameter: str | None = None) -> tuple[
     if estimates is None:
         raise SettingsError("the study evaluates no parameters; run one with evaluation.parameters = true")
     best = estimates.worst if parameter is None else estimates.errors[parameter]
-    own = estimates.worst_of_own if parameter is None else estimates.errors_of_own[parameter]
+    own = estimates.worst_to_true if parameter is None else estimates.errors_to_true[parameter]
     shows_true = estimates.differs.any() or summary.methods == (TRUE,)
     kept = [k for k, label in enumerate(summary.methods) if label != TRUE or shows_true]
     is_true = np.array([summary.methods[k] == TRUE for k in kept])
@@ -114,7 +114,7 @@ def methods_and_errors(summary: Summary, parameter: str | None = None) -> tuple[
 def _row(name: str, errors: FloatArray, hidden: npt.NDArray[np.bool_], *, quiet: bool = False) -> MarkRow:
     """Row of the errors (n_methods, n_trials) that are not hidden."""
     shown = 100.0 * np.where(hidden[:, None], np.nan, errors)[None]
-    return MarkRow(name, Estimates.median(shown)[0], Estimates.largest(shown)[0], quiet)
+    return MarkRow(name, ParameterErrors.median(shown)[0], ParameterErrors.largest(shown)[0], quiet)
 
 
 def _drawn(summary: Summary, title: str) -> Figure:

@@ -11,7 +11,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.plots.figure import INK, MUTED, PAPER, RULE, SOFT, WIDTH
-from diransac.study.summary import Flights
+from diransac.study.summary import TrackingErrors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -236,7 +236,7 @@ _LEAST_ERROR = -3
 """Power of ten, m or rad, below which errors are not resolved."""
 
 
-def flight_rows_height(flights: Flights, n_levels: int, n_methods: int) -> float:
+def flight_rows_height(flights: TrackingErrors, n_levels: int, n_methods: int) -> float:
     """Height of the panels, inches."""
     return -(-len(_coordinates(flights.errors)) // _COLUMNS) * (_ABOVE + n_levels * row_height(n_methods) + _BELOW)
 
@@ -244,7 +244,7 @@ def flight_rows_height(flights: Flights, n_levels: int, n_methods: int) -> float
 def draw_flight_rows(
     figure: Figure,
     top: float,
-    flights: Flights,
+    flights: TrackingErrors,
     units: Mapping[str, str],
     levels: Sequence[str],
     axis: str,

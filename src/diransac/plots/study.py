@@ -29,7 +29,7 @@ from diransac.plots.figure import (
 )
 from diransac.plots.rows import as_marks, draw_flight_rows, flight_rows_height
 from diransac.study.specification import TRUE
-from diransac.study.summary import Flights, Summary, summarise
+from diransac.study.summary import Summary, TrackingErrors, summarise
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -143,7 +143,7 @@ def _looks(summary: Summary) -> dict[str, dict[str, Any]]:
     return looks if summary.is_numeric else as_marks(looks)
 
 
-def _block_height(summary: Summary, flights: Flights) -> float:
+def _block_height(summary: Summary, flights: TrackingErrors) -> float:
     """Height of a trajectory's panels, inches."""
     if not summary.is_numeric:
         return _NAME + flight_rows_height(flights, len(summary.levels), len(summary.methods))
@@ -151,7 +151,7 @@ def _block_height(summary: Summary, flights: Flights) -> float:
     return _NAME + n_rows * _ROW + _AXIS + _failures_height(flights.failure_share)
 
 
-def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, top: float) -> None:
+def _draw_block(figure: Figure, summary: Summary, shape: str, flights: TrackingErrors, top: float) -> None:
     full = figure.get_figheight()
     figure.text(0.1 / WIDTH, 1.0 - (top + 0.05) / full, f"Flown: {shape}", fontsize=9.5, color=INK, va="top")
     if not summary.is_numeric:
@@ -171,7 +171,7 @@ def _draw_block(figure: Figure, summary: Summary, shape: str, flights: Flights, 
     _draw_failures(figure, below + _AXIS, rows, level_labels(summary), flights.failure_share)
 
 
-def _draw_state(axes: Axes, summary: Summary, flights: Flights, state: str, logarithmic: bool) -> None:
+def _draw_state(axes: Axes, summary: Summary, flights: TrackingErrors, state: str, logarithmic: bool) -> None:
     mean, deviation, median = flights.mean(state), flights.deviation(state), flights.median(state)
     spread, hollow = np.nan_to_num(deviation), flights.failure_share > 0.0
     at = _placed(summary)
@@ -203,7 +203,7 @@ def _draw_state(axes: Axes, summary: Summary, flights: Flights, state: str, loga
     _name_levels(axes, summary)
 
 
-def _spans_decades(flights: Flights) -> bool:
+def _spans_decades(flights: TrackingErrors) -> bool:
     """True if the means of a state differ so much that a linear scale shows the largest alone."""
     seen = [mean[np.isfinite(mean)] for mean in map(flights.mean, flights.errors)]
     return any(len(x) and float(x.max()) > _MANY * float(np.median(x)) for x in seen)

@@ -16,7 +16,7 @@ from diransac.plots.figure import svg
 from diransac.plots.paths import levels_with_paths, plot_paths
 from diransac.plots.study import axis_label, level_labels, plot_study, title_of
 from diransac.report.rendering import Table, number, percent, plural, write_page
-from diransac.study.summary import Estimates, Flights, Summary, summarise
+from diransac.study.summary import ParameterErrors, Summary, TrackingErrors, summarise
 
 __all__ = ["write_study_report"]
 
@@ -104,7 +104,7 @@ def _percent(x: float) -> str:
     return "0" if x < 10.0**LEAST else f"{x:.0f}" if whole else number(x, 2)
 
 
-def _intervals(methods: Sequence[str], estimates: Estimates) -> Table:
+def _intervals(methods: Sequence[str], estimates: ParameterErrors) -> Table:
     """Fraction of each method's intervals that contain the best parameter."""
     pairs = zip(methods, estimates.coverage(disturbed=False), estimates.coverage(disturbed=True), strict=True)
     rows = [[label, *(_share(*one) for one in both)] for label, *both in pairs if any(n for _, n in both)]
@@ -117,7 +117,7 @@ def _share(contained: int, total: int) -> str:
 
 
 # Flights -------------------------------------------------------------------------------------------------------------
-def _ranges(summary: Summary, shape: str, flights: Flights) -> Iterator[Table]:
+def _ranges(summary: Summary, shape: str, flights: TrackingErrors) -> Iterator[Table]:
     """Smallest and largest mean, and median, of each method over all levels."""
     header = ["method", "failed", *(f"{state}, {unit}" for state, unit in summary.units.items())]
     for about, of in (
@@ -132,7 +132,7 @@ def _ranges(summary: Summary, shape: str, flights: Flights) -> Iterator[Table]:
         yield Table(header, rows, f"{shape}: {about}, smallest … largest of all levels")
 
 
-def _levels(summary: Summary, flights: Flights) -> Iterator[tuple[str, Table]]:
+def _levels(summary: Summary, flights: TrackingErrors) -> Iterator[tuple[str, Table]]:
     """A table per state: mean ± standard deviation, and the median."""
     for state, unit in summary.units.items():
         mean, deviation, median = flights.mean(state), flights.deviation(state), flights.median(state)
@@ -165,7 +165,7 @@ def _seconds(summary: Summary) -> Table:
     return Table(["method", *compress(summary.stages, there), "all"], rows, caption)
 
 
-def _failures(flights: Flights, k: int) -> str:
+def _failures(flights: TrackingErrors, k: int) -> str:
     ran, failed = int(flights.ran[:, k].sum()), int(flights.failed[:, k].sum())
     return f"{failed} of {ran} ({percent(failed / ran)})" if failed else "none"
 

@@ -1,35 +1,32 @@
-"""Studies: grids of Monte-Carlo trials, described by a TOML file, run anywhere, kept in a store that can be resumed.
+"""Studies: grids of Monte-Carlo trials from a TOML file, run on any executor, kept in a store that can be resumed.
 
-| file | what it holds |
+| file | contents |
 |---|---|
-| `run.py` | `run_study`, the one entry: hand out trials, keep what comes back |
-| `specification.py`, `axis.py`, `flights.py`, `arguments.py`, `tables.py` | what a study is, checked |
-| `plants.py`, `vehicles.py` | what may fly: the paper's rotorcraft, other machines, users' own |
-| `library.py`, `builtin/`, `template.toml` | where studies come from; those of the paper's figures |
-| `recording.py`, `judging.py`, `seeds.py` | the data of a trial; what estimates are judged against; seeds |
-| `trials.py` | what a worker does |
-| `workers.py`, `cluster.py` | where it does it |
-| `store.py`, `facts.py` | one SQLite file |
-| `reading.py`, `summary.py` | what is in it, and what it says, for tables and pictures |
+| `run.py` | `run_study`; workers on this machine, on an executor or on a cluster |
+| `specification.py`, `axis.py`, `plants.py`, `tables.py` | the specification of a study, as pydantic models |
+| `library.py`, `builtin/`, `template.toml` | sources of studies; those of the paper's figures |
+| `data.py`, `assessment.py` | the data of a trial; pseudo-true parameters and errors relative to them |
+| `trials.py` | the work of a worker |
+| `store.py`, `reading.py`, `summary.py` | one SQLite file, its rows, and their summary for tables and figures |
 """
 
-from diransac.study.cluster import connected
+from diransac.study.data import TrialData, trial_data
 from diransac.study.library import builtin_names, load, template
-from diransac.study.reading import Cell, Status, about, export, paths, read, status
-from diransac.study.recording import Recording, record
-from diransac.study.run import run_study
-from diransac.study.specification import Method, Study
-from diransac.study.summary import Estimates, Flights, Summary, summarise
+from diransac.study.reading import Status, TrialCounts, about, export, paths, read, status
+from diransac.study.run import connected, run_study
+from diransac.study.specification import FlightChoice, MethodChoice, Study
+from diransac.study.summary import ParameterErrors, Summary, TrackingErrors, summarise
 
 __all__ = [
-    "Cell",
-    "Estimates",
-    "Flights",
-    "Method",
-    "Recording",
+    "FlightChoice",
+    "MethodChoice",
+    "ParameterErrors",
     "Status",
     "Study",
     "Summary",
+    "TrackingErrors",
+    "TrialCounts",
+    "TrialData",
     "about",
     "builtin_names",
     "connected",
@@ -37,9 +34,9 @@ __all__ = [
     "load",
     "paths",
     "read",
-    "record",
     "run_study",
     "status",
     "summarise",
     "template",
+    "trial_data",
 ]

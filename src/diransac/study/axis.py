@@ -1,31 +1,33 @@
-"""`Axis`: what varies from point to point of a study."""
+"""`Axis`: the quantity that varies from level to level of a study."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Self
+
+from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, SerializeAsAny, model_validator
 
 from diransac.errors import SettingsError
-from diransac.study.tables import Reader, flat, is_number
+from diransac.study.tables import Table, Text, flat, is_number
 
-__all__ = ["Axis", "Level", "level_text"]
-
+__all__ = ["AnyAxis", "Axis", "Level", "level_text"]
 
 _EXACT = 2.0**53
-"""Up to here floats hold every whole number."""
+"""Every integer up to this one is a float64."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """One point of the axis.
+    """One level of an axis.
 
     Parameters
     ----------
-    text : how it is written, the same for equal values; a trial's randomness depends on it
-    value : a number, or a word
-    changes : dotted path into the study -> value there
+    text : canonical text, the same for equal values; seeds of trials derive from it
+    value : a number or a word
+    changes : dotted path in the study -> value at this level
     """
 
     text: str
@@ -33,99 +35,59 @@ class Level:
     changes: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Axis:
-    """What varies, and its levels.
-
-    Parameters
-    ----------
-    name, unit : for people
-    levels : in order
-    path : dotted path of what takes the level as its value; "" where a level stands for a value at each of some paths
-    """
-
-    name: str
-    unit: str
-    levels: tuple[Level, ...]
-    path: str = ""
-
-    @classmethod
-    def from_dict(cls, table: object) -> Axis:
-        """The axis of a study's table.
-
-        It has ``path`` and a list of ``levels``; or a list of ``levels`` and ``values.<path>``, a list each; or a table
-        of ``levels``, which are words, each with a table of what it changes.
-
-        Raises SettingsError: a key is missing, unknown or holds something else.
-        """
-        reader = Reader(table, "axis")
-        path = ""
-        if reader.holds_table("levels"):
-            levels = _named_levels(reader)
-        elif reader.has("values"):
-            levels = _levels(reader, lambda values: _changes(reader.table("values"), len(values)))
-        else:
-            path = reader.text("path")
-            levels = _levels(reader, lambda values: [{path: _as_number(value)} for value in values])
-        found = cls(reader.text("name", path or "level"), reader.text("unit", ""), levels, path)
-        reader.end()
-        return found
-
-    def to_dict(self) -> dict[str, Any]:
-        """The table that `from_dict` takes."""
-        about = {"name": self.name, "unit": self.unit}
-        values = [level.value for level in self.levels]
-        if self.path:
-            return {**about, "levels": values, "path": self.path}
-        if all(isinstance(value, str) for value in values):
-            return {**about, "levels": {level.text: dict(level.changes) for level in self.levels}}
-        paths = self.levels[0].changes
-        columns = {path: [level.changes[path] for level in self.levels] for path in paths}
-        return {**about, "levels": values, "values": columns}
-
-    def narrowed(self, texts: Sequence[str]) -> Axis:
-        """The same axis with these levels; one that takes its level as a value may get new ones.
-
-        Raises SettingsError: there is no such level.
-        """
-        known = {level.text: level for level in self.levels}
-        chosen = [known.get(text) or self._level(_value_of(text), known) for text in texts]  # a word may look like 1e3
-        if not chosen:
-            raise SettingsError(f"no level is named; there are {', '.join(known)}")
-        return replace(self, levels=tuple({level.text: level for level in chosen}.values()))
-
-    def _level(self, value: float | str, known: Mapping[str, Level]) -> Level:
-        text = level_text(_checked("a level", value))
-        if text in known:
-            return known[text]
-        same_kind = isinstance(value, str) == isinstance(self.levels[0].value, str)
-        if self.path and same_kind:
-            return Level(text, value, {self.path: _as_number(value)})
-        raise SettingsError(f'there is no level "{text}" of {self.name}; there are {", ".join(known)}')
-
-
 def level_text(value: float | str) -> str:
-    """A level as text: ``80`` for 80 and 80.0, ``1e-06`` for 0.000001."""
+    """Canonical text of a level: ``80`` for 80 and 80.0, ``1e-06`` for 0.000001."""
     if isinstance(value, str):
         return value
     short = f"{value:g}"
     return short if float(short) == value else repr(float(value))
 
 
-def _as_number(value: float | str) -> float | str:
-    """A whole number as such: some keys take nothing else."""
-    whole = isinstance(value, float) and value.is_integer() and abs(value) < _EXACT
-    return int(value) if whole else value
+class Axis(Table):
+    """The quantity that varies in a study, the table ``[axis]``: `PathAxis`, `ColumnAxis` or `WordAxis`.
+
+    Each has a ``name`` and a ``unit`` for tables and figures.
+    """
+
+    PLACE: ClassVar[str] = "axis"
+
+    name: Text = "level"
+    unit: Text = ""
+
+    @property
+    @abstractmethod
+    def levels(self) -> tuple[Level, ...]:
+        """Levels in the order of the file."""
+
+    @abstractmethod
+    def _with(self, levels: Sequence[Level]) -> Self:
+        """The same axis with other levels."""
+
+    def subset(self, texts: Sequence[str]) -> Self:
+        """The same axis at some levels; those of a `PathAxis` may be new.
+
+        Raises
+        ------
+        SettingsError
+            No level is named, or one does not exist.
+        """
+        known = {level.text: level for level in self.levels}
+        if not texts:
+            raise SettingsError(f"no level is named; there are {', '.join(known)}")
+        # The text itself is looked up first: a word may look like a number, such as 1e3.
+        chosen = [known.get(text) or self._level(_number_or_word(text), known) for text in texts]
+        return self._with(list({level.text: level for level in chosen}.values()))
+
+    def _level(self, value: float | str, known: Mapping[str, Level]) -> Level:
+        """The level of a value.  Raises SettingsError: it does not exist."""
+        text = level_text(_level_value(value, "a level"))
+        if text not in known:
+            raise SettingsError(f'there is no level "{text}" of {self.name}; there are {", ".join(known)}')
+        return known[text]
 
 
-def _value_of(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text.strip()
-
-
-def _checked(where: str, value: object) -> float | str:
+def _level_value(value: object, where: str = "axis.levels") -> float | str:
+    """Number or word of a level.  Raises SettingsError: the value is neither."""
     if is_number(value):
         return float(value) + 0.0  # type: ignore[arg-type]  # -0.0 is 0
     if isinstance(value, str) and value.strip() == value and value and "," not in value:
@@ -133,36 +95,148 @@ def _checked(where: str, value: object) -> float | str:
     raise SettingsError(f"{where} has {json.dumps(value, default=str):.60}; give numbers, or words without commas")
 
 
-def _levels(reader: Reader, changes_of: Callable[[list[float | str]], list[dict[str, Any]]]) -> tuple[Level, ...]:
-    """Levels that are a list, with the changes that belong to their values."""
-    values = [_checked(reader.path("levels"), value) for value in reader.listed("levels")]
-    levels = tuple(Level(level_text(v), v, change) for v, change in zip(values, changes_of(values), strict=True))
-    texts = [level.text for level in levels]
+def _different(values: tuple[float | str, ...]) -> tuple[float | str, ...]:
+    texts = [level_text(value) for value in values]
     if len(set(texts)) < len(texts):
         raise SettingsError(f"axis.levels has a level twice; found {', '.join(texts)}")
-    return levels
+    return values
 
 
-def _named_levels(reader: Reader) -> tuple[Level, ...]:
-    """Levels that are a table of words, each with its own changes."""
-    found, path = reader.table("levels"), reader.path("levels")
-    if not found:
-        raise SettingsError(f"{path} is empty; give a table, or a list, of one or more")
-    for word, changes in found.items():
-        _checked(path, word)
+_Values = Annotated[
+    tuple[Annotated[float | str, PlainValidator(_level_value)], ...],
+    AfterValidator(_different),
+    Field(alias="levels", min_length=1, description="a list of one or more"),
+]
+
+
+class PathAxis(Axis):
+    """One key of the study takes the levels as its values.
+
+    Parameters
+    ----------
+    path : dotted path of the key
+    levels : numbers or words
+    name : the path by default
+    unit : of the levels
+    """
+
+    path: Text
+    level_values: _Values
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named(cls, table: Any) -> Any:
+        has_path = isinstance(table, Mapping) and isinstance(table.get("path"), str)
+        return {"name": table["path"], **table} if has_path else table
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """Levels in the order of the file."""
+        return tuple(map(self._at, self.level_values))
+
+    def _at(self, value: float | str) -> Level:
+        """The level of a value; a whole number changes its key to an integer, which some keys require."""
+        whole = isinstance(value, float) and value.is_integer() and abs(value) < _EXACT
+        return Level(level_text(value), value, {self.path: int(value) if whole else value})
+
+    def _with(self, levels: Sequence[Level]) -> Self:
+        return self.model_copy(update={"level_values": tuple(level.value for level in levels)})
+
+    def _level(self, value: float | str, known: Mapping[str, Level]) -> Level:
+        of_one_kind = isinstance(value, str) == isinstance(self.level_values[0], str)
+        new = of_one_kind and level_text(_level_value(value, "a level")) not in known
+        return self._at(value) if new else super()._level(value, known)
+
+
+class ColumnAxis(Axis):
+    """Several keys of the study vary together.
+
+    Parameters
+    ----------
+    levels : numbers or words
+    values : dotted path of each key -> list of its values, one per level
+    name, unit : of the levels
+    """
+
+    level_values: _Values
+    columns: dict[str, Any] = Field(alias="values", description="a table")
+
+    @model_validator(mode="after")
+    def _columns_match(self) -> Self:
+        n_levels, columns = len(self.level_values), dict(flat(self.columns))
+        for path, column in columns.items():
+            if not isinstance(column, list | tuple) or len(column) != n_levels:
+                raise SettingsError(
+                    f"axis.values.{path} is {column!r:.60}; give a list of {n_levels} values, one per level"
+                )
+        if not columns:
+            raise SettingsError("axis.values is empty; give a list of values, one per level, for a dotted path")
+        return self
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """Levels in the order of the file."""
+        columns = dict(flat(self.columns))
+        rows = [{path: column[k] for path, column in columns.items()} for k in range(len(self.level_values))]
+        return tuple(Level(level_text(x), x, changes) for x, changes in zip(self.level_values, rows, strict=True))
+
+    def _with(self, levels: Sequence[Level]) -> Self:
+        columns = {path: [level.changes[path] for level in levels] for path in dict(flat(self.columns))}
+        return self.model_copy(update={"level_values": tuple(level.value for level in levels), "columns": columns})
+
+
+def _each_a_table(levels: object) -> object:
+    """Raises SettingsError: no level, or one that is not a word with a table."""
+    if not isinstance(levels, Mapping):
+        return levels
+    if not levels:
+        raise SettingsError("axis.levels is empty; give a table, or a list, of one or more")
+    for word, changes in levels.items():
+        _level_value(word)
         if not isinstance(changes, Mapping):
             raise SettingsError(
-                f'{path}."{word}" is {changes!r:.60}; give a table of what it changes, {{}} for nothing'
+                f'axis.levels."{word}" is {changes!r:.60}; give a table of what it changes, {{}} for nothing'
             )
-    return tuple(Level(word, word, dict(flat(changes))) for word, changes in found.items())
+    return {word: dict(flat(changes)) for word, changes in levels.items()}
 
 
-def _changes(values: Mapping[str, Any], n_levels: int) -> list[dict[str, Any]]:
-    """The changes of each level, from a list of values a path."""
-    columns = dict(flat(values))
-    for path, column in columns.items():
-        if not isinstance(column, list | tuple) or len(column) != n_levels:
-            raise SettingsError(f"axis.values.{path} is {column!r:.60}; give a list of {n_levels} values, one a level")
-    if not columns:
-        raise SettingsError("axis.values is empty; give a list of values, one a level, for a dotted path")
-    return [{path: column[k] for path, column in columns.items()} for k in range(n_levels)]
+class WordAxis(Axis):
+    """Each level is a word with a table of what it changes.
+
+    Parameters
+    ----------
+    levels : word -> changes, nested or by dotted path
+    name, unit : of the levels
+    """
+
+    tables: Annotated[dict[str, dict[str, Any]], BeforeValidator(_each_a_table)] = Field(
+        alias="levels", description="a table"
+    )
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """Levels in the order of the file."""
+        return tuple(Level(word, word, changes) for word, changes in self.tables.items())
+
+    def _with(self, levels: Sequence[Level]) -> Self:
+        return self.model_copy(update={"tables": {level.text: dict(level.changes) for level in levels}})
+
+
+def _of_its_form(table: object) -> Axis:
+    """The axis of a table, in the form that its keys have."""
+    if isinstance(table, Axis):
+        return table
+    keys = table if isinstance(table, Mapping) else {}
+    form = WordAxis if isinstance(keys.get("levels"), Mapping) else ColumnAxis if "values" in keys else PathAxis
+    return form.model_validate(table)
+
+
+AnyAxis = Annotated[SerializeAsAny[Axis], BeforeValidator(_of_its_form), Field(description="a table")]
+"""Type of a field that holds any of the three forms."""
+
+
+def _number_or_word(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip()

@@ -1,4 +1,4 @@
-"""Where studies come from: TOML files, those that the package brings, and the one to start from."""
+"""Sources of studies: TOML files, the built-in studies and the template."""
 
 from __future__ import annotations
 
@@ -18,24 +18,27 @@ _FOLDER = files("diransac.study")
 
 
 def builtin_names() -> list[str]:
-    """Names of the studies that the package brings."""
+    """Names of the built-in studies."""
     return sorted(file.name.removesuffix(".toml") for file in (_FOLDER / "builtin").iterdir())
 
 
 def template() -> str:
-    """A study with a comment at every key, to start one's own from."""
+    """Text of a study file with a comment at every key."""
     return (_FOLDER / "template.toml").read_text(encoding="utf-8")
 
 
 def load(source: Study | Mapping[str, Any] | str | Path, changes: Mapping[str, Any] | None = None) -> Study:
-    """A study by the name of one that the package brings, or of a TOML file, or from its tables.
+    """A study from a built-in name, a TOML file or tables.
 
     Parameters
     ----------
-    source : a path that has a folder or ends in ``.toml`` is a file
+    source : a string with a folder, or that ends in ``.toml``, is a file
     changes : dotted path -> value, laid over it
 
-    Raises SettingsError: there is none, or it describes no study; it says at which key.
+    Raises
+    ------
+    SettingsError
+        There is no such study or file, or a key is wrong.
     """
     if isinstance(source, Study):
         return Study.from_dict(changed(source.to_dict(), changes)) if changes else source

@@ -1,29 +1,151 @@
-"""Which plant a study flies: its kind, and every argument that makes one."""
+"""`PlantChoice`: the plant of a study, by its kind and its arguments.
+
+Kinds are the paper's rotorcraft, three further machines whose drives exert periodic forces that their models leave out,
+and functions in files of users. Each drive starts at a phase that the seed of a flight draws.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import inspect
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from math import pi
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
+
+from casadi import cos, sin
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from diransac.errors import DiransacError, ModelError, SettingsError
+from diransac.model import Model, Parameter
+from diransac.model.derivation import Symbols
 from diransac.model.library import TABLE_I, builtin, extended_rotorcraft
-from diransac.model.plant import Plant
-from diransac.study.arguments import ANY, check_signature, given_arguments
-from diransac.study.tables import Reader
-from diransac.study.vehicles import double_pendulum, pendulum, servo_axis
+from diransac.model.plant import Disturbance, Plant
+from diransac.study.tables import RANDOM, FunctionTable, Text, check_signature, function_arguments
 from diransac.user_files import blaming, definitions, file_and_name, running
 
-__all__ = ["PlantChoice"]
+__all__ = ["PlantChoice", "double_pendulum", "pendulum", "servo_axis"]
+
+SERVO_AXIS: Mapping[str, float] = MappingProxyType(
+    {"mass": 95.0, "viscous_friction": 200.0, "dry_friction": 20.0, "offset": -12.0}
+)
+"""kg, N s/m, N, N: an axis of the size of EMPS."""
+
+DOUBLE_PENDULUM: Mapping[str, float] = MappingProxyType(
+    {
+        "inertia1": 0.09,
+        "moment1": 0.3,
+        "inertia2": 0.025,
+        "moment2": 0.12,
+        "rotor_inertia": 6e-5,
+        "viscous_friction1": 0.02,
+        "dry_friction1": 0.08,
+        "viscous_friction2": 0.02,
+        "dry_friction2": 0.05,
+    }
+)
+"""kg m^2, kg m, N m s/rad and N m: a desktop machine."""
+
+PENDULUM: Mapping[str, float] = MappingProxyType({"mass": 0.5, "length": 0.6, "friction": 0.05})
+"""kg, m, N m s/rad."""
+
+MAGNET_PITCH = 0.024
+"""m, period of the cogging force."""
+
+RIPPLES = 126
+"""Periods of a motor's torque per turn of its joint: 21 pole pairs behind a gear of 6."""
+
+_RIPPLE_FREQUENCY = 200.0
+"""Hz, at a joint velocity of 10 rad/s; the integration steps resolve it."""
 
 
+def servo_axis(cogging: float = 0.0, parameters: Mapping[str, float] = SERVO_AXIS) -> Plant:
+    """`models.servo_axis` with a cogging force of amplitude `cogging`, N, and a period of 24 mm."""
+    model = builtin("servo-axis")
+
+    def magnets(q: Symbols, _v: Symbols, _u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:
+        return {"position": d.cogging * cos(2 * pi * q.position / MAGNET_PITCH + d.phase)}
+
+    cogs = Disturbance(
+        model,
+        "magnets",
+        forces=magnets,
+        constants={"cogging": cogging},
+        highest_frequency=40.0,
+        **_random_phases("phase"),
+    )
+    return Plant(model, parameters, (cogs,))
+
+
+def double_pendulum(ripple: float = 0.0, parameters: Mapping[str, float] = DOUBLE_PENDULUM) -> Plant:
+    """`models.double_pendulum` with a torque ripple of amplitude `ripple`, N m, 126 periods per turn, at each joint."""
+    model = builtin("double-pendulum")
+
+    def motors(q: Symbols, _v: Symbols, _u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:
+        return {f"q{i}": d.ripple * cos(RIPPLES * q[f"q{i}"] + d[f"phase_{i}"]) for i in (1, 2)}
+
+    ripples = Disturbance(
+        model,
+        "motors",
+        forces=motors,
+        constants={"ripple": ripple},
+        highest_frequency=_RIPPLE_FREQUENCY,
+        **_random_phases("phase_1", "phase_2"),
+    )
+    return Plant(model, parameters, (ripples,))
+
+
+def pendulum(ripple: float = 0.0, parameters: Mapping[str, float] = PENDULUM) -> Plant:
+    """``a = -g/l sin(q) + (torque - c v) / (m l^2)``: a mass on a rod of unknown length, with a torque ripple, N m.
+
+    The length enters as 1/l and 1/l^2: the model is not affine in its parameters.
+    """
+
+    def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
+        torque = u.torque - p.friction * v.angle
+        return [a.angle + 9.81 / p.length * sin(q.angle) - torque / (p.mass * p.length**2)]
+
+    def motor(q: Symbols, _v: Symbols, _u: Symbols, p: Symbols, d: Symbols) -> dict[str, Any]:
+        return {"angle": d.ripple * cos(RIPPLES * q.angle + d.phase) / (p.mass * p.length**2)}
+
+    model = Model(
+        "pendulum",
+        coordinates={"angle": "rad"},
+        inputs={"torque": "N m"},
+        parameters={
+            "mass": Parameter("kg", positive=True),
+            "length": Parameter("m", positive=True),
+            "friction": Parameter("N m s/rad", lower=0.0),
+        },
+        equations=equations,
+    )
+    ripples = Disturbance(
+        model,
+        "motor",
+        accelerations=motor,
+        constants={"ripple": ripple},
+        highest_frequency=_RIPPLE_FREQUENCY,
+        **_random_phases("phase"),
+    )
+    return Plant(model, parameters, (ripples,))
+
+
+def _random_phases(*phases: str) -> dict[str, Any]:
+    """Constant states of a disturbance, uniform in a turn by the seed of a flight."""
+    return {
+        "states": dict.fromkeys(phases, "rad"),
+        "rates": lambda *_: dict.fromkeys(phases, 0.0),
+        "start": dict.fromkeys(phases, (0.0, 2 * pi)),
+    }
+
+
+# The choice -----------------------------------------------------------------------------------------------------------
 def _undisturbed(parameters: Mapping[str, float] = TABLE_I) -> Plant:
-    """The planar rotorcraft with nothing that its model leaves out."""
+    """The planar rotorcraft without any disturbance."""
     return Plant(builtin("planar-rotorcraft"), parameters)
 
 
@@ -35,53 +157,65 @@ _KINDS: dict[str, Callable[..., Plant]] = {
     "pendulum": pendulum,
 }
 _DEFAULT_NAME = "plant"
-_DIGEST_KEY = "file_digest"
 
 
-@dataclass(frozen=True)
-class PlantChoice:
-    """A plant by its kind and all of its arguments, those that nobody gave included.
+class PlantChoice(FunctionTable):
+    """The plant of a study, the table ``[plant]``, with all of its arguments, defaults included.
 
     Parameters
     ----------
-    kind : ``extended-rotorcraft`` (`models.extended_rotorcraft`); ``planar-rotorcraft``, which has parameters alone;
-        ``servo-axis``, ``double-pendulum`` or ``pendulum`` (`study.vehicles`); or ``FILE.py:NAME``, a function of that
-        name (``plant`` if none is given) in a file that is run wherever trials are
-    arguments : by name, as TOML has them: a list for a pair, the word ``any`` for a rotor phase that is drawn;
-        parameters of the model that nobody named are the plant's own, such as those of Table I
-    file_digest : of the file, so that every worker, and every run that goes on with a store, has the same one; "" of a
-        kind that needs none
+    kind : ``extended-rotorcraft`` (`models.extended_rotorcraft`); ``planar-rotorcraft``, with parameters only;
+        ``servo-axis``, ``double-pendulum``, ``pendulum``; or ``FILE.py:NAME``, a function of that name (default
+        ``plant``) in a file, which is run wherever trials run
+    file_digest : of the file, so that every worker and every resumed run uses the same one; "" for other kinds
+    arguments : by name, as TOML has them: a list for a pair, ``random`` for a rotor phase that each flight draws;
+        model parameters that are not given have the plant's defaults, such as Table I
+
+    Raises
+    ------
+    SettingsError
+        An unknown kind or key, a value that makes no plant, a file that is missing or has changed.
     """
 
-    kind: str
-    arguments: Mapping[str, Any]
-    file_digest: str = ""
+    PLACE: ClassVar[str] = "plant"
 
+    kind: Text
+    file_digest: Text = Field("", validate_default=True)
+    arguments: dict[str, Any] = Field({})
+
+    @field_validator("kind")
     @classmethod
-    def from_dict(cls, table: Mapping[str, Any]) -> PlantChoice:
-        """The plant of a study's table.
+    def _known(cls, kind: str) -> str:
+        if kind not in _KINDS and file_and_name(kind, _DEFAULT_NAME) is None:
+            raise SettingsError(f"plant.kind is {kind!r:.60}; there are {', '.join(_KINDS)}, or give FILE.py:NAME")
+        return kind
 
-        Raises SettingsError: an unknown kind or key, a value that makes no plant, a file that is not there or not what
-        it was.
-        """
-        reader = Reader(table, "plant")
-        kind = _kind(reader.text("kind"))
-        digest = "" if kind in _KINDS else reader.text(_DIGEST_KEY, _digest(kind))
-        try:
-            arguments = given_arguments(_function(kind, digest), table, reader, "rotor_phase", pairs=True)
-            reader.end(unnamed=[_DIGEST_KEY])
-            found = cls(kind, arguments, digest)
-            found.plant  # noqa: B018  refuses what makes no plant
-        except SettingsError:
-            raise
-        except DiransacError as error:
-            raise SettingsError(f"plant: {error}") from error
-        return found
+    @field_validator("file_digest")
+    @classmethod
+    def _of_the_file(cls, digest: str, info: ValidationInfo) -> str:
+        kind = info.data.get("kind")
+        if kind is None or kind in _KINDS:
+            return digest
+        found = _digest(kind)  # also where one is given: the file must be there
+        return digest or found
 
-    def to_dict(self) -> dict[str, Any]:
-        """The table that `from_dict` takes."""
-        file = {_DIGEST_KEY: self.file_digest} if self.file_digest else {}
-        return {"kind": self.kind, **self.arguments, **file}
+    @field_validator("arguments")
+    @classmethod
+    def _complete(cls, given: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        if "kind" not in info.data:
+            return given
+        kind, digest = info.data["kind"], info.data["file_digest"]
+        if kind in _KINDS and digest:
+            given = {**given, "file_digest": digest}  # which is then refused
+        with _settings_errors():
+            function = _function(kind, digest)
+            return function_arguments(function, given, "plant", ["kind"], random="rotor_phase", pairs=True)
+
+    @model_validator(mode="after")
+    def _makes_a_plant(self) -> Self:
+        with _settings_errors():
+            self.plant  # noqa: B018  refuses arguments that make none
+        return self
 
     @property
     def plant(self) -> Plant:
@@ -90,38 +224,42 @@ class PlantChoice:
 
     @property
     def is_drawn(self) -> bool:
-        """Whether one flight differs from another by more than its controller."""
+        """True if the seed of a flight draws a start value of a disturbance."""
         return any(isinstance(start, tuple) for one in self.plant.disturbances for start in one.start.values())
+
+
+@contextlib.contextmanager
+def _settings_errors() -> Iterator[None]:
+    """Raises SettingsError in place of the other errors of a plant."""
+    try:
+        yield
+    except SettingsError:
+        raise
+    except DiransacError as error:
+        raise SettingsError(f"plant: {error}") from error
 
 
 @functools.lru_cache(maxsize=64)
 def _made(kind: str, digest: str, arguments: str) -> Plant:
-    """A plant from its arguments as JSON: levels that leave it as it is share it."""
+    """A plant from its arguments as JSON; levels with the same arguments share it."""
     function = _function(kind, digest)
-    return function(**{name: _as_meant(name, value) for name, value in json.loads(arguments).items()})
+    return function(**{name: _as_argument(name, value) for name, value in json.loads(arguments).items()})
 
 
-def _as_meant(name: str, value: Any) -> Any:
-    """An argument as the plant's function takes it."""
-    if name == "rotor_phase" and value == ANY:
+def _as_argument(name: str, value: Any) -> Any:
+    """A value of a table as the plant's function takes it."""
+    if name == "rotor_phase" and value == RANDOM:
         return None
     return tuple(value) if isinstance(value, list) else value
 
 
-# A user's own --------------------------------------------------------------------------------------------------------
-def _kind(text: str) -> str:
-    """The kind itself.  Raises SettingsError: there is none of that name, and it is no file's."""
-    if text not in _KINDS and file_and_name(text, _DEFAULT_NAME) is None:
-        raise SettingsError(f"plant.kind is {text!r:.60}; there are {', '.join(_KINDS)}, or give FILE.py:NAME")
-    return text
-
-
+# Files of users -------------------------------------------------------------------------------------------------------
 @functools.lru_cache(maxsize=8)
 def _function(kind: str, digest: str) -> Callable[..., Plant]:
-    """What makes a plant of this kind.
+    """The function that makes plants of a kind.
 
     Raises ModelError: a user's file cannot be run, or has no such function.
-    Raises SettingsError: the file is not there, or has another digest.
+    Raises SettingsError: the file is missing, or has another digest.
     """
     if kind in _KINDS:
         return _KINDS[kind]
@@ -130,7 +268,7 @@ def _function(kind: str, digest: str) -> Callable[..., Plant]:
             f"plant.kind: {kind} is not the file that the study was begun with: its digest is {_digest(kind)}, not "
             f"{digest}; give that one, or begin a new store"
         )
-    file, name = _own(kind)
+    file, name = _file_and_name(kind)
     defined = definitions(file, "plant")
     made_by = defined.get(name)
     if not callable(made_by):
@@ -140,12 +278,12 @@ def _function(kind: str, digest: str) -> Callable[..., Plant]:
         )
     with blaming(file, "plant"):
         check_signature(made_by, name)
-    return _blamed(made_by, file, name)
+    return _checked(made_by, file, name)
 
 
 def _digest(kind: str) -> str:
-    """Of the bytes of a user's file.  Raises SettingsError: the file cannot be read."""
-    file, _ = _own(kind)
+    """Digest of the bytes of a user's file.  Raises SettingsError: the file cannot be read."""
+    file, _ = _file_and_name(kind)
     try:
         return hashlib.blake2b(file.read_bytes(), digest_size=8).hexdigest()
     except OSError as error:
@@ -154,10 +292,10 @@ def _digest(kind: str) -> str:
         ) from error
 
 
-def _blamed(function: Callable[..., Any], file: Path, name: str) -> Callable[..., Plant]:
-    """The function, with a sentence for whatever goes wrong in it."""
+def _checked(function: Callable[..., Any], file: Path, name: str) -> Callable[..., Plant]:
+    """The function, with its errors and its result checked."""
 
-    @functools.wraps(function)  # the arguments of what is wrapped are those that a study may give
+    @functools.wraps(function)  # keeps the signature, whose arguments are keys
     def made(**arguments: Any) -> Plant:
         with running(file, "plant"):
             found = function(**arguments)
@@ -168,8 +306,8 @@ def _blamed(function: Callable[..., Any], file: Path, name: str) -> Callable[...
     return made
 
 
-def _own(kind: str) -> tuple[Path, str]:
-    """File and name of a user's plant."""
+def _file_and_name(kind: str) -> tuple[Path, str]:
+    """File and function of a user's plant."""
     found = file_and_name(kind, _DEFAULT_NAME)
     assert found is not None
     return found

@@ -1,4 +1,4 @@
-"""What a store holds, for tables, pictures and people."""
+"""Rows, flown paths and progress of a store."""
 
 from __future__ import annotations
 
@@ -19,23 +19,29 @@ from diransac.text_table import aligned
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Cell", "Status", "about", "export", "paths", "read", "status"]
+__all__ = ["Status", "TrialCounts", "about", "export", "paths", "read", "status"]
 
 _KINDS: dict[str, type] = {"TEXT": str, "INTEGER": int, "REAL": float}
 
 
-# A row a trial and method -------------------------------------------------------------------------------------------
+# Rows -------------------------------------------------------------------------------------------
 def read(store: str | Path) -> pl.DataFrame:
-    """Every row of a store: a level, trial and method each, in the order in which levels and methods were asked for.
+    """The rows of a store, one per level, trial and method, in the order in which they were asked for.
 
-    ``level``, ``trial``, ``method``; ``status`` is done or failed, and ``error`` says why; ``seed``;
-    ``parameter_<name>`` in the parameter's unit, and where parameters are judged the best one that the model can reach
-    in the trial's flight, ``best_<name>``, and the ends of the 95 % interval, ``low_<name>`` and ``high_<name>``;
-    ``fit_error``, ``inlier_fraction``, ``iterations``, ``stop_reason`` of the identification;
-    ``<trajectory>_<state>``, the RMS tracking error in the state's unit; ``versions``; ``seconds``, a struct by stage
-    (what is done for several trials together is divided among them); ``host``.  What isn't known is null.
+    Returns
+    -------
+    polars.DataFrame
+        ``level``, ``trial``, ``method``; ``status``, done or failed, and ``error``; ``seed``; ``parameter_<name>`` in
+        the parameter's unit; in a study that evaluates parameters the pseudo-true value ``pseudo_true_<name>`` and the
+        95 % interval, ``low_<name>`` and ``high_<name>``; ``fit_error``, ``inlier_fraction``, ``iterations`` and
+        ``stop_reason`` of the identification; ``<trajectory>_<state>``, RMS tracking error in the state's unit;
+        ``versions``; ``seconds``, a struct by stage (the time of what is done for several trials at once is divided
+        equally); ``host``. Unknown values are null.
 
-    Raises StudyError: there is no such store.
+    Raises
+    ------
+    StudyError
+        There is no such store.
     """
     import polars as pl
 
@@ -52,18 +58,24 @@ def read(store: str | Path) -> pl.DataFrame:
 
 
 def about(store: str | Path) -> dict[str, str]:
-    """The study's ``name`` and ``description``, and the ``axis`` that varies with its ``unit``.
+    """The study's ``name`` and ``description``, the name of its ``axis`` and the ``unit``.
 
-    Raises StudyError: there is no such store.
+    Raises
+    ------
+    StudyError
+        There is no such store.
     """
     with Store.existing(store) as kept:
         return kept.about
 
 
 def paths(store: str | Path, trajectory: str) -> dict[tuple[str, int, str], npt.NDArray[np.float32]]:
-    """The flown path (K, n_q), coordinates in their units, of every level, trial and method that has one.
+    """Flown paths (K, n_q), coordinates in their units, by level, trial and method.
 
-    Raises StudyError: there is no such store.
+    Raises
+    ------
+    StudyError
+        There is no such store.
     """
     with Store.existing(store) as kept:
         rows = kept.select("SELECT level, trial, method, paths FROM trials WHERE paths NOT NULL ORDER BY rowid")
@@ -76,9 +88,14 @@ def paths(store: str | Path, trajectory: str) -> dict[tuple[str, int, str], npt.
 
 
 def export(store: str | Path, path: str | Path, kind: str) -> None:
-    """Write `read`'s table as ``parquet`` or ``csv``, where the seconds by stage are JSON.
+    """Write the rows of a store as ``parquet``, or as ``csv`` with the seconds by stage as JSON.
 
-    Raises StudyError: there is no such store; SettingsError: another kind.
+    Raises
+    ------
+    StudyError
+        There is no such store.
+    SettingsError
+        Another kind.
     """
     import polars as pl
 
@@ -91,9 +108,9 @@ def export(store: str | Path, path: str | Path, kind: str) -> None:
         raise SettingsError(f'there is no kind "{kind}"; there are parquet, csv')
 
 
-# How far a study is --------------------------------------------------------------------------------------------------
-class Cell(NamedTuple):
-    """Trials of one level and method: asked for, done, failed; why the first of these failed."""
+# Progress --------------------------------------------------------------------------------------------------
+class TrialCounts(NamedTuple):
+    """Numbers of trials of one level and method that were asked for, are done and have failed; one of the errors."""
 
     asked: int
     done: int
@@ -102,43 +119,43 @@ class Cell(NamedTuple):
 
     @property
     def missing(self) -> int:
-        """Trials yet to run."""
+        """Number of trials yet to run."""
         return self.asked - self.done - self.failed
 
 
 @dataclass(frozen=True)
 class Status:
-    """How far a study is.
+    """Progress of a study.
 
     Parameters
     ----------
-    store : the file
-    name : the study's
-    cells : (level, method) -> trials, in the order in which they were asked for
+    store : path of the file
+    name : of the study
+    cells : (level, method) -> numbers of trials, in the order in which they were asked for
     """
 
     store: str
     name: str
-    cells: Mapping[tuple[str, str], Cell]
+    cells: Mapping[tuple[str, str], TrialCounts]
 
     @property
     def asked(self) -> int:
-        """Rows that were asked for."""
+        """Number of rows that were asked for."""
         return sum(cell.asked for cell in self.cells.values())
 
     @property
     def done(self) -> int:
-        """Rows with all figures."""
+        """Number of complete rows."""
         return sum(cell.done for cell in self.cells.values())
 
     @property
     def failed(self) -> int:
-        """Rows that say why they lack some."""
+        """Number of rows with an error."""
         return sum(cell.failed for cell in self.cells.values())
 
     @property
     def missing(self) -> int:
-        """Rows yet to come."""
+        """Number of rows yet to run."""
         return self.asked - self.done - self.failed
 
     def to_dict(self) -> dict[str, Any]:
@@ -156,16 +173,19 @@ class Status:
         rows = [["level", *methods]]
         rows += [[level, *(_text(self.cells.get((level, method))) for method in methods)] for level in levels]
         title = f"{self.name} in {self.store}: {self.done} done, {self.failed} failed, {self.missing} missing"
-        lines = [f"{title} of {self.asked} rows (a level, trial and method each)", *aligned(rows)]
+        lines = [f"{title} of {self.asked} rows, one per level, trial and method", *aligned(rows)]
         failures = {(method, cell.error): level for (level, method), cell in self.cells.items() if cell.error}
         lines += [f"! {method} failed, as at level {level}: {error}" for (method, error), level in _first(failures)]
         return "\n".join(lines)
 
 
 def status(store: str | Path) -> Status:
-    """How many trials of each level and method are done, failed or missing.
+    """Numbers of trials done, failed and missing, by level and method.
 
-    Raises StudyError: there is no such store.
+    Raises
+    ------
+    StudyError
+        There is no such store.
     """
     with Store.existing(store) as kept:
         name = kept.about["name"]
@@ -174,10 +194,10 @@ def status(store: str | Path) -> Status:
             "coalesce(sum(t.status = 'failed'), 0), min(t.error) "
             "FROM cells c LEFT JOIN trials t USING (level, method) GROUP BY c.level, c.method ORDER BY c.rowid"
         )
-    return Status(str(store), name, {(level, method): Cell(*counts) for level, method, *counts in rows})
+    return Status(str(store), name, {(level, method): TrialCounts(*counts) for level, method, *counts in rows})
 
 
-def _text(cell: Cell | None) -> str:
+def _text(cell: TrialCounts | None) -> str:
     if cell is None:
         return "-"
     counts = [f"{cell.done} done"]
@@ -186,5 +206,5 @@ def _text(cell: Cell | None) -> str:
 
 
 def _first(failures: Mapping[tuple[str, Any], str]) -> list[tuple[tuple[str, Any], str]]:
-    """One failure a method."""
+    """One failure per method."""
     return list({method: ((method, error), level) for (method, error), level in failures.items()}.values())

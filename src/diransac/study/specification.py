@@ -1,119 +1,318 @@
-"""`Study`: a grid of Monte-Carlo trials, as a TOML file describes it, checked."""
+"""`Study`: the specification of a grid of Monte-Carlo trials, as a TOML file describes it."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, ClassVar, Self
+
+from pydantic import (
+    BeforeValidator,
+    Field,
+    InstanceOf,
+    PlainSerializer,
+    PlainValidator,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from diransac.errors import DiransacError, SettingsError
 from diransac.flight.noise import Noise
-from diransac.identification.identify import METHODS
+from diransac.flight.planning import multisine, random_waypoints, sine, square, star
+from diransac.flight.planning.trajectories import MAX_DURATION, check_fully_actuated, check_plane
+from diransac.flight.trajectory import Trajectory
+from diransac.identification.method import Method
+from diransac.identification.methods import METHODS, default_options, factory
 from diransac.identification.settings import Settings
-from diransac.study.axis import Axis
-from diransac.study.flights import MISSIONS, Flight, check_flown
+from diransac.model import Model
+from diransac.model.plant import ModelWithParameters
+from diransac.study.axis import AnyAxis
 from diransac.study.plants import PlantChoice
-from diransac.study.tables import Reader, changed, flat
+from diransac.study.tables import (
+    RANDOM,
+    Count,
+    Flag,
+    FunctionTable,
+    OneOf,
+    Table,
+    Text,
+    Whole,
+    changed,
+    check_whole,
+    flat,
+    function_arguments,
+    is_number,
+    takes_options,
+    unknown_key,
+)
 
-__all__ = ["TRUE", "Method", "Study"]
+__all__ = [
+    "MISSIONS", "TRAJECTORIES", "TRUE", "Criteria", "FlightChoice", "MethodChoice", "Study",
+]  # fmt: skip
 
 TRUE = "true"
-"""The method that identifies nothing: it knows the true parameters."""
+"""Method that identifies nothing: its parameters are the plant's own."""
 
 PRESETS = {"default": Settings, "table-iv": Settings.table_iv}
 
-VARIABLE = ("plant", "data", "noise", "methods")
-"""Tables of a study that an axis may lead to; the others are the same at every level."""
+MISSIONS: dict[str, Callable[..., Trajectory]] = {"square": square, "star": star, "sine": sine}
+"""Trajectories that identified models are evaluated on."""
+
+TRAJECTORIES: dict[str, Callable[..., Trajectory]] = {
+    **MISSIONS,
+    "random-waypoints": random_waypoints,
+    "multisine": multisine,
+}
+"""Trajectories that may be flown for data."""
 
 _LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _+()/-]*")
+_VARIABLE = ("plant", "data", "noise", "methods")
+"""Tables that an axis may change; the others are the same at every level."""
+
 _NO_ANSWER_CHANGES = ("threads", "batch_size")
 
 
-@dataclass(frozen=True)
-class Method:
-    """A way to find parameters.
+# Tables of a study ----------------------------------------------------------------------------------------------------
+class FlightChoice(FunctionTable):
+    """The flight that is recorded, the table ``[data]``, with all of its arguments, defaults included.
 
     Parameters
     ----------
-    label : how the study calls it
-    method : one of `diransac.METHODS`, or ``true``
-    settings : of the identification
+    trajectory : a key of `TRAJECTORIES`
+    substeps : integration steps per sample, at least; None: as many as the plant requires
+    arguments : of the trajectory's function, by name; the seed may be the word ``random``
+
+    Raises
+    ------
+    SettingsError
+        An unknown trajectory or key, a value of another kind, a number that is not above 0, more than an hour.
     """
 
-    label: str
+    PLACE: ClassVar[str] = "data"
+
+    trajectory: Annotated[Text, OneOf(TRAJECTORIES)]
+    substeps: Count | None = Field(None, description="a whole number of at least 1")
+    arguments: dict[str, Any] = Field({})
+
+    @field_validator("arguments")
+    @classmethod
+    def _complete(cls, given: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        if "trajectory" not in info.data:
+            return given
+        function, keys = TRAJECTORIES[info.data["trajectory"]], ["trajectory", "substeps"]
+        arguments = function_arguments(function, given, "data", keys, random="seed")
+        for name, value in arguments.items():
+            if name != "seed" and is_number(value) and value <= 0:
+                raise SettingsError(f"data.{name} is {value:g}; give a number above 0")
+            if name == "duration" and value > MAX_DURATION:
+                raise SettingsError(f"data.duration is {value:g}; give {MAX_DURATION:g} s or less")
+        return arguments
+
+    @property
+    def is_drawn(self) -> bool:
+        """True if each trial flies another trajectory."""
+        return bool(self.arguments.get("seed") == RANDOM)
+
+    def planned(self, plant: ModelWithParameters, seed: int, **options: Any) -> Trajectory:
+        """The trajectory.
+
+        Parameters
+        ----------
+        plant : that is to fly it
+        seed : of a trajectory that is drawn; others have their own
+        options : of `plan`, such as ``time_limit``; unused by trajectories that need no plan
+
+        Raises
+        ------
+        SettingsError
+            The model cannot fly it.
+        PlanningError
+            There is no such trajectory.
+        """
+        function = TRAJECTORIES[self.trajectory]
+        arguments = {**self.arguments, "seed": seed} if self.is_drawn else self.arguments
+        return function(plant, **arguments, **(options if takes_options(function) else {}))
+
+
+@dataclass(frozen=True)
+class MethodChoice:
+    """A method of identification with its settings.
+
+    Parameters
+    ----------
+    method : one of `diransac.METHODS`, or ``true``
+    settings : of the search and the evaluation
+    options : the method's own settings that differ from their defaults, such as those of `diransac.LoDiransac`
+    """
+
     method: str
     settings: Settings
+    options: Mapping[str, Any] = field(default_factory=dict)
 
-    @classmethod
-    def from_dict(cls, label: str, table: object) -> Method:
-        """A method of a study's table; ``preset`` gives the settings that ``settings`` are laid over.
+    def __post_init__(self) -> None:
+        if self.method != TRUE:
+            self.object()
 
-        Raises SettingsError: a key is unknown or holds something else.
+    def object(self) -> Method:
+        """The method with its settings, on one thread.
+
+        Raises
+        ------
+        SettingsError
+            The method has no such setting, or a value has no meaning.
         """
-        reader = Reader(table, f"methods.{label}")
-        if not _LABEL.fullmatch(label):
-            raise SettingsError(
-                f'methods: the label "{label}" has other characters than letters, digits and _ + - ( ) /'
-            )
-        method = reader.text("method", label, choices=(TRUE, *METHODS))
-        preset = PRESETS[reader.text("preset", "default", choices=tuple(PRESETS))]()
-        given = {name: _none_where_meant(name, x) for name, x in reader.table("settings", needed=False).items()}
-        try:
-            settings = Settings.from_dict({**preset.to_dict(), **given})
-        except SettingsError as error:
-            raise SettingsError(f"methods.{label}.settings: {error}") from error
-        reader.end()
-        return cls(label, method, settings)
+        own = default_options(self.method)
+        unknown = [name for name in self.options if name not in own]
+        if unknown:
+            raise SettingsError(f'there is no option "{unknown[0]}"; there are {", ".join(own) or "none"}')
+        return factory(self.method)(replace(self.settings, threads=1), **self.options)
 
     def to_dict(self) -> dict[str, Any]:
-        """The table that `from_dict` takes."""
-        return {"method": self.method, "settings": self.settings.to_dict()}
+        """The table of the method in a study file, with all of its settings and no preset."""
+        options = {"options": dict(self.options)} if self.options else {}
+        return {"method": self.method, "settings": self.settings.to_dict(), **options}
 
 
-@dataclass(frozen=True)
-class Study:
-    """A grid of trials: at each level of an axis, so many times, data are flown, spoilt, identified from, and judged.
+class _MethodTable(Table):
+    """A table of ``[methods]``: ``settings`` are laid over those of ``preset``."""
+
+    method: Annotated[Text, OneOf((TRUE, *METHODS))]
+    preset: Annotated[Text, OneOf(PRESETS)] = "default"
+    settings: dict[str, Any] = Field({}, description="a table")
+    options: dict[str, Any] = Field({}, description="a table")
+
+
+def _methods(tables: object) -> object:
+    """The methods of a study by label, which is the default of ``method``."""
+    if not isinstance(tables, Mapping):
+        return tables
+    if not tables:
+        raise SettingsError(f"methods is empty; there are {TRUE}, {', '.join(METHODS)}")
+    return {label: _method(label, table) for label, table in tables.items()}
+
+
+def _method(label: str, table: object) -> MethodChoice:
+    if isinstance(table, MethodChoice):
+        return table
+    place = f"methods.{label}"
+    if not _LABEL.fullmatch(label):
+        raise SettingsError(f'methods: the label "{label}" has other characters than letters, digits and _ + - ( ) /')
+    named = {"method": label, **table} if isinstance(table, Mapping) else table
+    found = _MethodTable.model_validate(named, context={"place": place})
+    # TOML has no None; "none" is a value of refit itself.
+    given = {name: None if x == "none" and name != "refit" else x for name, x in found.settings.items()}
+    try:
+        settings = Settings.from_dict({**PRESETS[found.preset]().to_dict(), **given})
+        return MethodChoice(found.method, settings, found.options)
+    except SettingsError as error:
+        raise SettingsError(f"{place}.settings: {error}") from error
+
+
+def _noise(table: object) -> Noise:
+    """The noise of a table.  Raises SettingsError: an unknown key, or a value without meaning."""
+    if isinstance(table, Noise):
+        return table
+    if not isinstance(table, Mapping):
+        raise SettingsError(f"noise is {table!r:.60}; give a table")
+    known = [field.name for field in dataclasses.fields(Noise)]
+    for key in table:
+        if key not in known:
+            raise SettingsError(unknown_key("noise", key, known))
+    try:
+        return Noise(**table)
+    except SettingsError as error:
+        raise SettingsError(f"noise.{error}") from error
+
+
+class Criteria(Table):
+    """The quantities that estimates are evaluated by, the table ``[evaluation]``.
 
     Parameters
     ----------
-    name, description : for people
-    plant : what flies, disturbances included
-    data : what is flown for data, and recorded
-    noise : what spoils the record
-    methods : what identifies from it, by label
-    evaluation : trajectories that are planned, steered and flown with what was identified; none where
-        parameters alone are judged
-    keep_paths : whether the paths of these flights are kept
-    judges_parameters : whether each trial finds the best parameters that the model can reach, to judge others by
-    axis : what varies
-    trials : at each level
-    seed : trial k of a level depends on (seed, level, k) alone
-
-    Raises SettingsError: no trials, no methods.
+    trajectories : planned, steered and flown with what was identified
+    keep_paths : keep the paths of these flights
+    parameters : compare parameters with the pseudo-true ones of the flight that was recorded
     """
 
-    name: str
-    description: str
+    PLACE: ClassVar[str] = "evaluation"
+
+    trajectories: tuple[Annotated[Text, OneOf(MISSIONS)], ...] = Field(description="a list of one or more")
+    keep_paths: Flag = False
+    parameters: Flag = False
+
+    @field_validator("trajectories")
+    @classmethod
+    def _each_once(cls, trajectories: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(trajectories))
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Self:
+        if not self.trajectories and not self.parameters:
+            raise SettingsError("evaluation.trajectories is []; give a list of one or more")
+        return self
+
+
+# The study ------------------------------------------------------------------------------------------------------------
+class Study(Table):
+    """A grid of trials: at each level of an axis, data are flown, corrupted, identified from, and evaluated.
+
+    Parameters
+    ----------
+    name, description : for tables and figures
+    trials : at each level
+    seed : trial k of a level depends on (seed, level, k) alone
+    data : the flight that is recorded
+    plant : the plant that flies, disturbances included
+    noise : of the record
+    methods : of identification, by label
+    evaluation : of the estimates
+    axis : the quantity that varies
+
+    Raises
+    ------
+    SettingsError
+        A key is missing, unknown or holds something else, or the plant cannot fly a trajectory.
+    """
+
+    name: Text
+    description: Text = ""
+    trials: Count
+    seed: Whole = 0
+    data: FlightChoice
     plant: PlantChoice
-    data: Flight
-    noise: Noise
-    methods: Mapping[str, Method]
-    evaluation: tuple[str, ...]
-    keep_paths: bool
-    judges_parameters: bool
-    axis: Axis
-    trials: int
-    seed: int
+    noise: Annotated[Noise, PlainValidator(_noise), PlainSerializer(dataclasses.asdict)] = Noise()
+    methods: Annotated[
+        dict[str, Annotated[InstanceOf[MethodChoice], PlainSerializer(MethodChoice.to_dict)]], BeforeValidator(_methods)
+    ]
+    evaluation: Criteria
+    axis: AnyAxis
+
+    @model_validator(mode="after")
+    def _can_be_flown(self) -> Self:
+        flown = {
+            self.data.trajectory: "data.trajectory",
+            **dict.fromkeys(self.evaluation.trajectories, "evaluation.trajectories"),
+        }
+        for trajectory, key in flown.items():
+            try:
+                _check_flown(trajectory, self.plant.plant.model)
+            except SettingsError as error:
+                raise SettingsError(f"{key} has {trajectory!r}: {error}") from error
+        return self
 
     @classmethod
-    def from_dict(cls, table: object) -> Study:
-        """The study that a TOML file's tables describe, every level of it checked.
+    def from_dict(cls, table: object) -> Self:
+        """The study that the tables of a TOML file describe, every level checked.
 
-        Raises SettingsError: a key is missing, unknown or holds something else; it says which and what there is.
+        Raises
+        ------
+        SettingsError
+            A key is missing, unknown or holds something else; the message names it and what is valid.
         """
-        study = cls._from_dict(table)
+        study = super().from_dict(table)
         for level in study.axis.levels:
             try:
                 study.at(level.text)
@@ -121,129 +320,86 @@ class Study:
                 raise SettingsError(f"axis: at level {level.text}, {error}") from error
         return study
 
-    @classmethod
-    def _from_dict(cls, table: object) -> Study:
-        """As `from_dict`, but for the levels."""
-        reader = Reader(table)
-        data, evaluation = reader.table("data"), Reader(reader.table("evaluation"), "evaluation")
-        judges_parameters = evaluation.flag("parameters", default=False)
-        methods = reader.table("methods")
-        found = cls(
-            name=reader.text("name"),
-            description=reader.text("description", ""),
-            plant=PlantChoice.from_dict(reader.table("plant")),
-            data=Flight.from_dict(data),
-            noise=_noise(reader.table("noise", needed=False)),
-            methods={label: Method.from_dict(label, one) for label, one in methods.items()},
-            evaluation=_trajectories(evaluation.listed("trajectories", least=0 if judges_parameters else 1)),
-            keep_paths=evaluation.flag("keep_paths", default=False),
-            judges_parameters=judges_parameters,
-            axis=Axis.from_dict(reader.table("axis")),
-            trials=reader.whole("trials", 1),
-            seed=reader.whole("seed", 0, default=0),
-        )
-        for one in (reader, evaluation):
-            one.end()
-        if not found.methods:
-            raise SettingsError(f"methods is empty; there are {TRUE}, {', '.join(METHODS)}")
-        found._check_flights()
-        return found
-
-    def _check_flights(self) -> None:
-        """Raises SettingsError: the plant cannot fly what it is to fly."""
-        flown = {self.data.trajectory: "data.trajectory", **dict.fromkeys(self.evaluation, "evaluation.trajectories")}
-        for trajectory, key in flown.items():
-            try:
-                check_flown(trajectory, self.plant.plant.model)
-            except SettingsError as error:
-                raise SettingsError(f"{key} has {trajectory!r}: {error}") from error
-
-    def to_dict(self) -> dict[str, Any]:
-        """The tables that `from_dict` takes, with everything that has a default."""
-        return {
-            "name": self.name,
-            "description": self.description,
-            "trials": self.trials,
-            "seed": self.seed,
-            "plant": self.plant.to_dict(),
-            "data": self.data.to_dict(),
-            "noise": dataclasses.asdict(self.noise),
-            "methods": {label: method.to_dict() for label, method in self.methods.items()},
-            "evaluation": {
-                "trajectories": list(self.evaluation),
-                "keep_paths": self.keep_paths,
-                **({"parameters": True} if self.judges_parameters else {}),  # stores of before have no such key
-            },
-            "axis": self.axis.to_dict(),
-        }
+    @property
+    def evaluate_parameters(self) -> bool:
+        """True if estimates are compared with the pseudo-true parameters of each trial's flight."""
+        return self.evaluation.parameters
 
     def at(self, level: str) -> Study:
-        """The study as it is at one level.
+        """The study at one level.
 
-        A level that flies another trajectory for data, or another kind of plant, takes over what was given to this
-        study's, but not its defaults.
+        A level with another trajectory for data, or another kind of plant, keeps the arguments that were given, and not
+        the defaults.
 
-        Raises SettingsError: there is no such level, or what it changes has no meaning.
+        Raises
+        ------
+        SettingsError
+            There is no such level, or its changes have no meaning.
         """
-        changes = self.axis.narrowed([level]).levels[0].changes
-        known = {path: value for path, value in changes.items() if self._concerns(path)}
-        return self._from_dict(changed(self._shared(known), known))
+        changes = self.axis.subset([level]).levels[0].changes
+        own = {path: value for path, value in changes.items() if self._concerns(path)}
+        return Study.model_validate(changed(self._without_defaults(own), own))
 
-    def _shared(self, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """The study's tables, without the defaults of what changes put another in place of."""
+    def _without_defaults(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """The study's tables, without default arguments of a function that the changes replace by another."""
         table = self.to_dict()
-        for part, key, made_from in (
-            ("data", "trajectory", Flight.from_dict),
-            ("plant", "kind", PlantChoice.from_dict),
-        ):
+        for part, key, choice_type in (("data", "trajectory", FlightChoice), ("plant", "kind", PlantChoice)):
             choice = {key: table[part][key]}
             if changes.get(f"{part}.{key}", choice[key]) != choice[key]:
-                defaults = made_from(choice).to_dict()
+                defaults = choice_type.from_dict(choice).to_dict()
                 given = {name: value for name, value in table[part].items() if defaults.get(name) != value}
                 table[part] = {**choice, **given}
         return table
 
     def _concerns(self, path: str) -> bool:
-        """Whether a path of the axis leads into this study, rather than to a method that it was narrowed from.
+        """False for a path of the axis that leads to a method which is not in this subset of the study.
 
-        Raises SettingsError: it leads to what all levels share.
+        Raises SettingsError: the path leads to a table that is the same at every level.
         """
         root, *way = path.split(".")
-        if root not in VARIABLE or not way:
-            raise SettingsError(f'"{path}" cannot vary; there are {", ".join(f"{name}.*" for name in VARIABLE)}')
+        if root not in _VARIABLE or not way:
+            raise SettingsError(f'"{path}" cannot vary; there are {", ".join(f"{name}.*" for name in _VARIABLE)}')
         if root == "methods" and way[1:] == ["preset"]:
-            raise SettingsError(
-                f'"{path}" cannot vary: all settings are known by then; give two methods, a preset each'
-            )
+            raise SettingsError(f'"{path}" cannot vary: levels change settings; give two methods, a preset each')
         return root != "methods" or way[0] in self.methods
 
-    def narrowed(
+    def subset(
         self,
         trials: int | None = None,
         levels: Sequence[str | float] | None = None,
         methods: Sequence[str] | None = None,
     ) -> Study:
-        """The same study with so many trials, at these levels, of these methods; None keeps all.
+        """The same study with another number of trials, at some levels, of some methods; None keeps all.
 
-        Raises SettingsError: there is no such level or method, or fewer than one trial.
+        Raises
+        ------
+        SettingsError
+            There is no such level or method, or fewer than one trial.
         """
-        table: dict[str, Any] = {} if trials is None else {"trials": trials}
-        count = Reader(table).whole("trials", 1, default=self.trials)
-        axis = self.axis if levels is None else self.axis.narrowed([str(level) for level in levels])
         chosen = list(self.methods) if methods is None else list(methods)
         unknown = [label for label in chosen if label not in self.methods]
         if unknown or not chosen:
             which = f'no method "{unknown[0]}"' if unknown else "no method named"
             raise SettingsError(f"there is {which}; there are {', '.join(self.methods)}")
-        return replace(self, trials=count, axis=axis, methods={label: self.methods[label] for label in chosen})
+        if trials is not None:
+            check_whole("trials", trials, least=1)
+        return self.model_copy(
+            update={
+                "trials": self.trials if trials is None else trials,
+                "axis": self.axis if levels is None else self.axis.subset([str(level) for level in levels]),
+                "methods": {label: self.methods[label] for label in chosen},
+            }
+        )
 
     @property
     def configuration(self) -> dict[str, dict[str, Any]]:
-        """What decides a trial's outcome, by part and dotted path: ``study``, ``methods.<label>``, ``levels.<text>``.
+        """The values that determine rows, by part and dotted path: ``study``, ``methods.<label>``, ``levels.<text>``.
 
-        How many trials there are, and what people call things, decides nothing.
+        The number of trials, names and descriptions do not.
         """
         table = self.to_dict()
+        if not self.evaluate_parameters:
+            del table["evaluation"]["parameters"]
         decisive = {name: table[name] for name in ("seed", "plant", "data", "noise", "evaluation")}
         parts = {"study": dict(flat(decisive))}
         for label, method in table["methods"].items():
@@ -253,23 +409,6 @@ class Study:
         return parts | {f"levels.{text}": some for text, some in changes.items()}
 
 
-def _none_where_meant(name: str, value: object) -> object:
-    """None for the word ``none``, which TOML has no value for, unless it is the setting's own."""
-    return None if value == "none" and name != "refit" else value
-
-
-def _noise(table: Mapping[str, Any]) -> Noise:
-    reader = Reader(table, "noise")
-    given = {field.name: table[field.name] for field in dataclasses.fields(Noise) if reader.has(field.name)}
-    reader.end()
-    try:
-        return Noise(**given)
-    except SettingsError as error:
-        raise SettingsError(f"noise.{error}") from error
-
-
-def _trajectories(found: Sequence[object]) -> tuple[str, ...]:
-    for name in found:
-        if name not in MISSIONS:
-            raise SettingsError(f"evaluation.trajectories has {name!r}; there are {', '.join(MISSIONS)}")
-    return tuple(dict.fromkeys(map(str, found)))
+def _check_flown(trajectory: str, model: Model) -> None:
+    """Raises SettingsError: no model of this structure can fly the trajectory."""
+    (check_fully_actuated if trajectory == "multisine" else check_plane)(model)

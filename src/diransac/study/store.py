@@ -1,15 +1,15 @@
-"""`Store`: one SQLite file that keeps what trials gave.
+"""`Store`: the rows of a study in one SQLite file.
 
-| table | holds |
+| table | contents |
 |---|---|
-| ``trials`` | a row a level, trial and method |
-| ``cells`` | how many trials of a level and method were asked for |
-| ``configuration`` | what decides the outcome of trials, as JSON; only studies with the same may write |
-| ``about`` | the names of things, for people; facts about each level's plant, for whoever has not got a user's file |
+| ``trials`` | one row per level, trial and method |
+| ``cells`` | number of trials asked for, by level and method |
+| ``configuration`` | the values that determine rows, as JSON; only studies with the same values may write |
+| ``about`` | names and descriptions; properties of each level's plant, so that a user's file need not be present |
 
-It has a rollback journal, not a write-ahead log: the latter needs memory that processes share, which file systems of
-clusters don't have.  Whatever is written is written in one transaction, so that a killed process leaves all of it or
-nothing.  Columns named ``seconds`` and ``host`` hold all that may differ between equal runs.
+The file has a rollback journal: a write-ahead log needs shared memory, which network file systems lack. Every write is
+one transaction, so that a killed process leaves all of it or nothing. Values that may differ between equal runs are in
+the columns ``seconds`` and ``host`` only.
 """
 
 from __future__ import annotations
@@ -25,37 +25,56 @@ from types import TracebackType
 from typing import Any, Self
 
 from diransac.errors import StudyError
-from diransac.study.facts import PlantFacts
+from diransac.study.assessment import PlantFacts
 from diransac.study.specification import Study
 
 __all__ = ["Store"]
 
 _APPLICATION = 0x6469726E
-"""SQLite's field that tells whose file it is: "dirn"."""
+"""SQLite's application id: "dirn"."""
 
-_FORMAT = 1
-_PATIENCE = 120.0
+_FORMAT = 2
+_LOCK_TIMEOUT = 120.0
 """s to wait while another process writes."""
 
+_RENAMED_KEYS = {
+    "noise.freeze_probability": "noise.stuck_probability",
+    "noise.freeze_length": "noise.stuck_length",
+    "noise.runs": "noise.correlated",
+}
+_RENAMED_VALUES = {
+    ("data.trajectory", "places"): "random-waypoints",
+    ("data.trajectory", "sines"): "multisine",
+    ("data.seed", "any"): "random",
+    ("plant.rotor_phase", "any"): "random",
+    ("noise.runs", "independent"): False,
+    ("noise.runs", "together"): True,
+    ("noise.first_row", "hit"): "corrupted",
+}
+"""Keys and values of format 1, and what they are in format 2."""
+
 _AGAIN = "~"
-"""Follows the name of a column that differs from another in case alone: to SQLite ``m`` and ``M`` are the same."""
+"""Suffix of a column whose name differs from another in case only, which SQLite takes for the same."""
 
 _PLANTS = "plants"
-"""Key of what is no name of a thing."""
+"""Key of the properties of plants, among names."""
 
 _MANY = 6
-"""Differences that a refusal lists; it counts the others."""
+"""Differences that an error message lists; it counts the others."""
 
 
 class Store:
-    """A study's store, open.
+    """An open store.
 
     Parameters
     ----------
-    path : the file; a new one is made where there is none
-    study : what is asked for: its levels, methods and trials are added to those of the store
+    path : of the file, which is made if it does not exist
+    study : its levels, methods and trials are added to those that the store was asked for
 
-    Raises StudyError: the file is no store, or one of another configuration; it says in which keys.
+    Raises
+    ------
+    StudyError
+        The file is no store, or has another configuration; the message lists the keys that differ.
     """
 
     def __init__(self, path: str | Path, study: Study) -> None:
@@ -65,7 +84,7 @@ class Store:
             with _transaction(self._connection, self.path):
                 if _is_empty(self._connection):
                     _create(self._connection, study)
-                _check_format(self._connection, self.path)
+                _upgrade(self._connection, self.path)
                 self._ask_for(study)
         except BaseException:
             self._connection.close()
@@ -73,7 +92,7 @@ class Store:
 
     @classmethod
     def existing(cls, path: str | Path) -> Self:
-        """The store that there is, for reading.  Raises StudyError: there is none."""
+        """An existing store, for reading.  Raises StudyError: there is none."""
         store = cls.__new__(cls)
         store.path = Path(path)
         if not store.path.is_file():
@@ -81,7 +100,10 @@ class Store:
         store._connection = _connected(store.path, "rw")
         try:
             with _reported(store.path):
-                _check_format(store._connection, store.path)
+                current = _format(store._connection, store.path) == _FORMAT
+            if not current:
+                with _transaction(store._connection, store.path):
+                    _upgrade(store._connection, store.path)
         except BaseException:
             store._connection.close()
             raise
@@ -94,12 +116,12 @@ class Store:
         self._connection.close()
 
     def finished(self, level: str, trials: Sequence[int]) -> set[tuple[str, int, str]]:
-        """Level, trial and method of the rows there are of these trials."""
+        """Level, trial and method of the rows of these trials that are present."""
         query = "SELECT level, trial, method FROM trials WHERE level = ? AND trial BETWEEN ? AND ?"
         return set(self.select(query, (level, min(trials), max(trials))))
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> int:
-        """Keep rows, in one transaction; those that another process kept meanwhile stay.  How many were new."""
+        """Number of new rows, written in one transaction; rows that are present stay as they are."""
         before = self._connection.total_changes
         columns = {name: column for name, (column, _) in self.columns.items()}
         with _transaction(self._connection, self.path):
@@ -111,46 +133,46 @@ class Store:
         return self._connection.total_changes - before
 
     def select(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """What a query gives."""
+        """Rows of a query."""
         with _reported(self.path):
             return self._connection.execute(query, values).fetchall()
 
     @property
     def columns(self) -> dict[str, tuple[str, str]]:
-        """Column of each name in a row, and its SQL kind."""
+        """Name in a row -> column and its SQL type."""
         found = self.select("PRAGMA table_info(trials)")
         return {column.rstrip(_AGAIN): (column, kind) for _, column, kind, *_ in found}
 
     @property
     def about(self) -> dict[str, Any]:
-        """Names of things, by key."""
+        """The study's ``name`` and ``description``, the name of its ``axis`` and the ``unit``."""
         rows = self.select("SELECT key, value FROM about WHERE key <> ?", (_PLANTS,))
         return {key: json.loads(value) for key, value in rows}
 
     @property
     def plants(self) -> dict[str, PlantFacts]:
-        """Facts about the plant of each level; stores of before have none until they are written to again."""
+        """Properties of the plant of each level; absent in old stores until they are written to again."""
         rows = self.select("SELECT value FROM about WHERE key = ?", (_PLANTS,))
         return {level: PlantFacts(**facts) for (value,) in rows for level, facts in json.loads(value).items()}
 
     @property
     def configuration(self) -> dict[str, dict[str, Any]]:
-        """What decides a trial's outcome, as `Study.configuration` has it."""
+        """The values that determine rows, as `Study.configuration` returns them."""
         found: dict[str, dict[str, Any]] = {}
         for part, key, value in self.select("SELECT part, key, value FROM configuration"):
             found.setdefault(part, {})[key] = json.loads(value)
         return found
 
     def _ask_for(self, study: Study) -> None:
-        """Add what the study asks for.  Raises StudyError: its configuration is another."""
+        """Add the study's levels, methods and trials.  Raises StudyError: its configuration is another."""
         wanted = json.loads(json.dumps(study.configuration))
         kept = self.configuration
         differences = list(_differences(kept, wanted))
         if differences:
             more = f"; and {len(differences) - _MANY} more" if len(differences) > _MANY else ""
             raise StudyError(
-                f'store "{self.path}" was made by another configuration: {"; ".join(differences[:_MANY])}{more}. '
-                "Take another store, or ask for the same"
+                f'store "{self.path}" has another configuration: {"; ".join(differences[:_MANY])}{more}. '
+                "Use another store, or the same values"
             )
         new = [(part, key, json.dumps(x)) for part in wanted if part not in kept for key, x in wanted[part].items()]
         execute = self._connection.executemany
@@ -167,7 +189,7 @@ class Store:
 
 
 def _differences(kept: Mapping[str, Mapping[str, Any]], wanted: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
-    """Key by key, in the parts that both have: what is in one alone is an extension."""
+    """Sentences on the keys that differ, in the parts that both have; other parts are extensions."""
     for part in wanted:
         if part in kept:
             for key in {**kept[part], **wanted[part]}:
@@ -179,10 +201,10 @@ def _differences(kept: Mapping[str, Mapping[str, Any]], wanted: Mapping[str, Map
 
 # SQLite --------------------------------------------------------------------------------------------------------------
 def _connected(path: Path, mode: str) -> sqlite3.Connection:
-    """A connection that begins no transaction by itself.  Raises StudyError: the file cannot be opened."""
+    """A connection without implicit transactions.  Raises StudyError: the file cannot be opened."""
     try:
         uri = f"{path.absolute().as_uri()}?mode={mode}"
-        return sqlite3.connect(uri, timeout=_PATIENCE, isolation_level=None, uri=True)
+        return sqlite3.connect(uri, timeout=_LOCK_TIMEOUT, isolation_level=None, uri=True)
     except sqlite3.Error as error:
         raise StudyError(
             f'store "{path}" cannot be opened: {error}; does its folder exist, may you write there?'
@@ -191,7 +213,7 @@ def _connected(path: Path, mode: str) -> sqlite3.Connection:
 
 @contextmanager
 def _reported(path: Path) -> Iterator[None]:
-    """Raises StudyError instead of SQLite's own errors."""
+    """Raises StudyError in place of SQLite's errors."""
     try:
         yield
     except sqlite3.Error as error:
@@ -200,7 +222,7 @@ def _reported(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
-    """All of it or nothing; nobody else writes meanwhile."""
+    """One transaction, with the file locked for other writers."""
     with _reported(path):
         connection.execute("BEGIN IMMEDIATE")
         try:
@@ -212,21 +234,41 @@ def _transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
 
 
 def _is_empty(connection: sqlite3.Connection) -> bool:
-    """Whether the file has nothing in it: it is new, or who made it was killed at once."""
+    """True for a file without tables: it is new, or the process that made it was killed at once."""
     return not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
 
 
-def _check_format(connection: sqlite3.Connection, path: Path) -> None:
+def _format(connection: sqlite3.Connection, path: Path) -> int:
+    """Format of the store.  Raises StudyError: the file is no store, or of an unknown format."""
     application = connection.execute("PRAGMA application_id").fetchone()[0]
-    number = connection.execute("PRAGMA user_version").fetchone()[0]
+    number = int(connection.execute("PRAGMA user_version").fetchone()[0])
     if application != _APPLICATION:
         raise StudyError(f'"{path}" is no store of a study; give a file that diransac study made, or a new one')
-    if number != _FORMAT:
-        raise StudyError(f'store "{path}" has format {number}, this version reads {_FORMAT}; run the study again')
+    if not 1 <= number <= _FORMAT:
+        raise StudyError(f'store "{path}" has format {number}, this version reads 1 to {_FORMAT}; run the study again')
+    return number
+
+
+def _upgrade(connection: sqlite3.Connection, path: Path) -> None:
+    """Give a store of format 1 the names of format 2.  Raises StudyError: as `_format`."""
+    if _format(connection, path) == _FORMAT:
+        return
+    for _, column, *_ in connection.execute("PRAGMA table_info(trials)").fetchall():
+        if column.startswith("best_"):
+            new = "pseudo_true_" + column.removeprefix("best_")
+            connection.execute(f"ALTER TABLE trials RENAME COLUMN {_quoted(column)} TO {_quoted(new)}")
+    for part, key, text in connection.execute("SELECT part, key, value FROM configuration").fetchall():
+        value = json.loads(text)
+        renamed = _RENAMED_VALUES.get((key, value), value) if isinstance(value, str) else value
+        connection.execute(
+            "UPDATE configuration SET key = ?, value = ? WHERE part = ? AND key = ?",
+            (_RENAMED_KEYS.get(key, key), json.dumps(renamed), part, key),
+        )
+    connection.execute(f"PRAGMA user_version = {_FORMAT}")
 
 
 def _create(connection: sqlite3.Connection, study: Study) -> None:
-    """Tables of a new store."""
+    """Make the tables of a new store."""
     kinds = _columns(study)
     columns = ", ".join(f"{_quoted(name)} {kind}" for name, kind in zip(_apart(kinds), kinds.values(), strict=True))
     for statement in (
@@ -241,11 +283,11 @@ def _create(connection: sqlite3.Connection, study: Study) -> None:
 
 
 def _columns(study: Study) -> dict[str, str]:
-    """SQL kind of each column of a row."""
+    """SQL type of each column of a row."""
     model = study.plant.plant.model
-    kinds = ("parameter", "best", "low", "high") if study.judges_parameters else ("parameter",)
+    kinds = ("parameter", "pseudo_true", "low", "high") if study.evaluate_parameters else ("parameter",)
     parameters = {f"{kind}_{name}": "REAL" for kind in kinds for name in model.parameters}
-    errors = {f"{shape}_{state}": "REAL" for shape in study.evaluation for state in model.state}
+    errors = {f"{shape}_{state}": "REAL" for shape in study.evaluation.trajectories for state in model.state}
     return {
         "level": "TEXT NOT NULL",
         "trial": "INTEGER NOT NULL",
@@ -267,7 +309,7 @@ def _columns(study: Study) -> dict[str, str]:
 
 
 def _apart(names: Iterable[str]) -> Iterator[str]:
-    """Names that SQLite takes for different ones, too."""
+    """Column names that SQLite, which ignores case, keeps apart."""
     before = Counter[str]()
     for name in names:
         yield name + _AGAIN * before[name.lower()]

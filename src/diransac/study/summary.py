@@ -1,7 +1,4 @@
-"""What a store says, level by level and method by method.
-
-How flights were tracked and how many are missing; where a study judges parameters, how far off these are.
-"""
+"""Summary of a store by level and method: tracking errors, parameter errors, failures and run times."""
 
 from __future__ import annotations
 
@@ -17,8 +14,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import StudyError
-from diransac.study.facts import PlantFacts
-from diransac.study.judging import differ, hold, relative_errors
+from diransac.study.assessment import PlantFacts, covers, differ, relative_errors
 from diransac.study.plants import PlantChoice
 from diransac.study.reading import read, status
 from diransac.study.store import Store
@@ -27,24 +23,23 @@ from diransac.study.tables import changed
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Estimates", "Flights", "Summary", "summarise"]
+__all__ = ["ParameterErrors", "Summary", "TrackingErrors", "summarise"]
 
 _Statistic = Callable[[FloatArray], np.floating]
 
 
 @dataclass(frozen=True)
-class Flights:
-    """How one trajectory was tracked.
+class TrackingErrors:
+    """RMS tracking errors of one trajectory.
 
-    A trial without a flight (no parameters, no plan, no controller, or numbers that overflowed) has no error that a
-    mean could hold: it is counted as failed.  A flight that ends far from where it should has a large error, and is in
-    the mean like any other.
+    A trial without a flight (no parameters, no plan, no controller, or overflow) has no error and is counted as failed.
+    A flight that ends far from its reference has a large error and is part of the mean.
 
     Parameters
     ----------
-    errors : state -> RMS tracking error (n_levels, n_methods, n_trials), state's unit; NaN without a flight
-    ran : (n_levels, n_methods, n_trials), which trials there are
-    failed : the same, which of these have no flight
+    errors : state -> RMS tracking error (n_levels, n_methods, n_trials), in the state's unit; NaN without a flight
+    ran : (n_levels, n_methods, n_trials), trials that are in the store
+    failed : (n_levels, n_methods, n_trials), those of them without a flight
     """
 
     errors: Mapping[str, FloatArray]
@@ -52,77 +47,78 @@ class Flights:
     failed: BoolArray
 
     def mean(self, state: str) -> FloatArray:
-        """Mean over the flights there are, (n_levels, n_methods); NaN where there is none."""
+        """Mean over flights, (n_levels, n_methods); NaN without a flight."""
         return _over_trials(self.errors[state], ~np.isnan(self.errors[state]), np.mean)
 
     def deviation(self, state: str) -> FloatArray:
-        """Standard deviation of the flights there are, with n - 1; NaN where there are fewer than two."""
+        """Standard deviation over flights with n - 1, (n_levels, n_methods); NaN with fewer than two."""
         there = ~np.isnan(self.errors[state])
         enough = there & (there.sum(axis=2, keepdims=True) > 1)
         return _over_trials(self.errors[state], enough, _sample_deviation)
 
     def median(self, state: str) -> FloatArray:
-        """Median over all trials, of which one that failed counts as an infinite error; NaN where there is none."""
+        """Median over trials, (n_levels, n_methods), infinite errors for failed ones; NaN without a trial."""
         return _over_trials(np.where(self.failed, np.inf, self.errors[state]), self.ran, _upper_median)
 
     def largest(self, state: str) -> FloatArray:
-        """Largest error of all trials, infinite where one failed; NaN where there is none."""
+        """Largest error over trials, (n_levels, n_methods), infinite if one failed; NaN without a trial."""
         return _over_trials(np.where(self.failed, np.inf, self.errors[state]), self.ran, np.max)
 
     @property
     def failure_share(self) -> FloatArray:
-        """Fraction of the trials that failed, (n_levels, n_methods); NaN where there are none."""
+        """Fraction of trials that failed, (n_levels, n_methods); NaN without a trial."""
         return _over_trials(self.failed.astype(float), self.ran, np.mean)
 
 
 @dataclass(frozen=True)
-class Estimates:
-    """How far parameters are off, by parameter and (n_levels, n_methods, n_trials).
+class ParameterErrors:
+    """Relative errors of estimated parameters, by parameter and (n_levels, n_methods, n_trials).
 
-    An error is ``|found / reference - 1|``: infinite where nothing was found, which includes trials without data, for
-    which no best parameters are known; NaN where there is no trial, and of a parameter that is 0 in the plant.
+    An error is ``|found / reference - 1|``: infinite without an estimate, also in trials without data; NaN without a
+    trial, and for parameters that are 0 in the plant.
 
     Parameters
     ----------
-    errors : against the best parameters that the model can reach in the very flight
-    errors_of_own : against the plant's own
-    covered : 1 where the 95 % interval holds the best parameter, to a millionth; 0 where not, NaN without an interval
-    differs : (n_levels,) whether the best parameters are not the plant's own: some differ by more than 0.2 %
-    disturbed : (n_levels,) whether the plant has more to it than the model
+    errors : to the pseudo-true parameters of each trial's flight
+    errors_to_true : to the plant's parameters
+    covered : 1 where the 95 % interval contains the pseudo-true parameter, to one millionth; 0 where not, NaN without
+        an interval
+    differs : (n_levels,), True where a pseudo-true parameter differs from the true one by more than 0.2 %
+    disturbed : (n_levels,), True where the plant has a disturbance that the model leaves out
     """
 
     errors: Mapping[str, FloatArray]
-    errors_of_own: Mapping[str, FloatArray]
+    errors_to_true: Mapping[str, FloatArray]
     covered: Mapping[str, FloatArray]
     differs: BoolArray
     disturbed: BoolArray
 
     @cached_property
     def worst(self) -> FloatArray:
-        """Error of the worst parameter against the best ones, (n_levels, n_methods, n_trials)."""
+        """Largest error of a parameter to the pseudo-true ones, (n_levels, n_methods, n_trials)."""
         return _largest(self.errors)
 
     @cached_property
-    def worst_of_own(self) -> FloatArray:
-        """The same against the plant's own parameters."""
-        return _largest(self.errors_of_own)
+    def worst_to_true(self) -> FloatArray:
+        """Largest error of a parameter to the true ones, (n_levels, n_methods, n_trials)."""
+        return _largest(self.errors_to_true)
 
     @staticmethod
     def median(errors: FloatArray) -> FloatArray:
-        """Median over the trials that were judged, (n_levels, n_methods); NaN where there is none."""
+        """Median over trials, (n_levels, n_methods); NaN without a trial."""
         return _over_trials(errors, ~np.isnan(errors), np.median)
 
     @staticmethod
     def largest(errors: FloatArray) -> FloatArray:
-        """Largest error of the trials that were judged, (n_levels, n_methods); NaN where there is none."""
+        """Largest error over trials, (n_levels, n_methods); NaN without a trial."""
         return _over_trials(errors, ~np.isnan(errors), np.max)
 
     def coverage(self, *, disturbed: bool) -> list[tuple[int, int]]:
-        """Of each method's intervals, how many hold the best parameter, and how many there are.
+        """Number of intervals that contain the pseudo-true parameter, and number of intervals, by method.
 
         Parameters
         ----------
-        disturbed : at the levels whose plant has more to it than the model, or at the others
+        disturbed : count the levels whose plant has a disturbance, or the others
         """
         some = np.array([one[self.disturbed == disturbed] for one in self.covered.values()])
         held, there = np.nansum(some, axis=(0, 1, 3)), (~np.isnan(some)).sum(axis=(0, 1, 3))
@@ -131,21 +127,21 @@ class Estimates:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a store says.
+    """Contents of a store as arrays.
 
     Parameters
     ----------
-    name, description, axis, unit : the study's words, and the unit of its axis
+    name, description, axis, unit : of the study and its axis
     levels, methods : numbers in ascending order, words in the order in which they were asked for
-    units : state -> its unit
-    ran : (n_levels, n_methods, n_trials), which trials there are
-    flights : by trajectory
-    estimates : None where the study judges no parameters
-    failures : (method, why) -> how many trials, the most frequent first
+    units : state -> unit
+    ran : (n_levels, n_methods, n_trials), trials that are in the store
+    flights : tracking errors by trajectory
+    estimates : parameter errors; None in a study that does not evaluate parameters
+    failures : (method, error) -> number of trials, the most frequent first
     seconds : (n_methods, n_stages), s of one process, summed over trials
-    stages : what these are of
-    versions : of what computed the rows
-    asked, missing : rows that were asked for, and how many of these are yet to come
+    stages : names of the columns of ``seconds``
+    versions : of Python and the packages that computed the rows
+    asked, missing : number of rows that were asked for, and of those yet to run
     """
 
     name: str
@@ -156,8 +152,8 @@ class Summary:
     methods: tuple[str, ...]
     units: Mapping[str, str]
     ran: BoolArray
-    flights: Mapping[str, Flights]
-    estimates: Estimates | None
+    flights: Mapping[str, TrackingErrors]
+    estimates: ParameterErrors | None
     failures: Mapping[tuple[str, str], int]
     seconds: FloatArray
     stages: tuple[str, ...]
@@ -167,26 +163,29 @@ class Summary:
 
     @property
     def remark(self) -> str:
-        """How much of the study is not here yet, ``18 of 24 rows are missing.``; nothing once all is."""
+        """Sentence on missing rows, ``18 of 24 rows are missing.``; "" for a complete store."""
         verb = "is" if self.missing == 1 else "are"
         return f"{self.missing} of {self.asked} rows {verb} missing." if self.missing else ""
 
     @property
     def positions(self) -> FloatArray:
-        """Where the levels stand on an axis, (n_levels,): their values, or 0, 1, 2, ... if they are words."""
+        """Coordinates of the levels on an axis, (n_levels,): their values, or 0, 1, 2, ... for words."""
         values = [_value(level) for level in self.levels]
         return np.arange(len(values), dtype=float) if None in values else np.array(values, dtype=float)
 
     @property
     def is_numeric(self) -> bool:
-        """Whether all levels are numbers."""
+        """True if all levels are numbers."""
         return None not in map(_value, self.levels)
 
 
 def summarise(store: str | Path) -> Summary:
-    """What the rows of a store say.
+    """Summary of the rows of a store.
 
-    Raises StudyError: there is no such store, or it has no rows yet.
+    Raises
+    ------
+    StudyError
+        There is no such store, or it has no rows yet.
     """
     rows, progress = read(store), status(store)
     with Store.existing(store) as kept:
@@ -220,7 +219,7 @@ def summarise(store: str | Path) -> Summary:
 
 
 def _facts(level: str, parts: Mapping[str, Mapping[str, Any]]) -> PlantFacts:
-    """Facts about the plant of a level, made anew from the configuration: a store of before has not noted them."""
+    """Properties of the plant of a level from the configuration, for old stores that have not kept them."""
     table = changed(changed({}, parts["study"]), parts[f"levels.{level}"])
     return PlantFacts.of(PlantChoice.from_dict(table["plant"]).plant)
 
@@ -238,29 +237,31 @@ class _Table:
         self.ran[self._where] = True
 
     def column(self, name: str) -> FloatArray:
-        """A column of numbers, NaN where there is none."""
+        """A column of numbers; NaN for null."""
         found = np.full(self.ran.shape, np.nan)
         found[self._where] = self._rows[name].to_numpy()
         return found
 
 
-def _flights(table: _Table, shape: str, states: Sequence[str]) -> Flights:
+def _flights(table: _Table, shape: str, states: Sequence[str]) -> TrackingErrors:
     errors = {state: table.column(f"{shape}_{state}") for state in states}
-    return Flights(errors, table.ran, table.ran & np.isnan(errors[states[0]]))
+    return TrackingErrors(errors, table.ran, table.ran & np.isnan(errors[states[0]]))
 
 
-def _estimates(table: _Table, plants: Sequence[PlantFacts]) -> Estimates:
-    errors, errors_of_own, covered, differs = {}, {}, {}, np.zeros(len(plants), dtype=bool)
+def _estimates(table: _Table, plants: Sequence[PlantFacts]) -> ParameterErrors:
+    errors, errors_to_true, covered, differs = {}, {}, {}, np.zeros(len(plants), dtype=bool)
     for name in plants[0].parameters:
-        found, best, low, high = (table.column(f"{what}_{name}") for what in ("parameter", "best", "low", "high"))
-        own = np.broadcast_to(np.array([plant.parameters[name] for plant in plants])[:, None, None], best.shape)
-        judged = table.ran & (own != 0.0)
-        reached = np.where(np.isnan(best), own, best)  # without data nothing is found, whatever it is compared to
-        errors[name] = relative_errors(found, np.where(judged, reached, np.nan))
-        errors_of_own[name] = relative_errors(found, np.where(judged, own, np.nan))
-        covered[name] = hold(low, high, best)
-        differs |= (judged & differ(reached, own)).any(axis=(1, 2))
-    return Estimates(errors, errors_of_own, covered, differs, np.array([plant.disturbed for plant in plants]))
+        kinds = ("parameter", "pseudo_true", "low", "high")
+        found, pseudo_true, low, high = (table.column(f"{kind}_{name}") for kind in kinds)
+        true = np.array([plant.parameters[name] for plant in plants])[:, None, None]
+        true = np.broadcast_to(true, pseudo_true.shape)
+        defined = table.ran & (true != 0.0)
+        reached = np.where(np.isnan(pseudo_true), true, pseudo_true)  # without data the error is infinite either way
+        errors[name] = relative_errors(found, np.where(defined, reached, np.nan))
+        errors_to_true[name] = relative_errors(found, np.where(defined, true, np.nan))
+        covered[name] = covers(low, high, pseudo_true)
+        differs |= (defined & differ(reached, true)).any(axis=(1, 2))
+    return ParameterErrors(errors, errors_to_true, covered, differs, np.array([plant.disturbed for plant in plants]))
 
 
 def _largest(errors: Mapping[str, FloatArray]) -> FloatArray:
@@ -269,7 +270,7 @@ def _largest(errors: Mapping[str, FloatArray]) -> FloatArray:
 
 
 def _over_trials(values: FloatArray, counted: BoolArray, statistic: _Statistic) -> FloatArray:
-    """A statistic of those trials that count, (n_levels, n_methods); NaN where none does."""
+    """Statistic of the counted trials, (n_levels, n_methods); NaN without one."""
     found = np.full(values.shape[:2], np.nan)
     for cell in np.argwhere(counted.any(axis=2)):
         found[tuple(cell)] = statistic(values[tuple(cell)][counted[tuple(cell)]])
@@ -287,7 +288,7 @@ def _in_order(levels: Sequence[str]) -> tuple[str, ...]:
 
 
 def _value(level: str) -> float | None:
-    """The number that a level is; None for a word."""
+    """Value of a level; None for a word."""
     try:
         value = float(level)
     except ValueError:
@@ -296,10 +297,10 @@ def _value(level: str) -> float | None:
 
 
 def _upper_median(values: FloatArray) -> np.floating:
-    """The median; of an even number the upper one, so that infinities are not averaged with numbers."""
+    """Median; the upper one of an even number, so that infinities are not averaged with numbers."""
     return np.float64(np.sort(values)[len(values) // 2])
 
 
 def _sample_deviation(values: FloatArray) -> np.floating:
-    """The standard deviation with n - 1; exactly 0 of equal values, whose mean rounds."""
+    """Standard deviation with n - 1; exactly 0 for equal values, in spite of rounding of the mean."""
     return np.float64(np.std(values - values[0], ddof=1))

@@ -1,108 +1,305 @@
-"""Nested tables, as TOML and JSON have them: read by name and kind, changed by dotted paths, written flat."""
+"""Tables of a study file: their base class, the arguments of functions among them, and changes by dotted path.
+
+Each table is a pydantic model, declared once; `Table` turns a validation error into one `SettingsError` sentence.
+"""
 
 from __future__ import annotations
 
 import copy
+import inspect
 import sys
-from collections.abc import Collection, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    ModelWrapValidatorHandler,
+    SerializerFunctionWrapHandler,
+    StrictBool,
+    StrictInt,
+    StrictStr,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    conlist,
+    model_serializer,
+    model_validator,
+)
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
 from diransac.errors import SettingsError
 
-__all__ = ["Reader", "changed", "flat", "is_number"]
+__all__ = [
+    "RANDOM",
+    "Count",
+    "Flag",
+    "FunctionTable",
+    "OneOf",
+    "Table",
+    "Text",
+    "Whole",
+    "changed",
+    "check_signature",
+    "check_whole",
+    "flat",
+    "function_arguments",
+    "is_number",
+    "takes_options",
+    "unknown_key",
+]  # fmt: skip
+
+RANDOM = "random"
+"""Value of an argument that is drawn anew for each trial."""
+
+_LARGEST = int(sys.float_info.max)
+_OWN_WORDS = "own_words"
+"""Type of a validation error whose message says what to give."""
+
+# The description of a type is what its error message asks for.
+Text = Annotated[StrictStr, Field(description="text")]
+Flag = Annotated[StrictBool, Field(description="true or false")]
+Whole = Annotated[StrictInt, Field(ge=0, description="a whole number of at least 0")]
+Count = Annotated[StrictInt, Field(ge=1, description="a whole number of at least 1")]
+_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_Unconverted = Annotated[StrictInt, Field(ge=-_LARGEST, le=_LARGEST)] | _Number
+"""A finite number; a whole number stays one."""
 
 
-class Reader:
-    """A table of which every key is asked for once, by its kind; `end` refuses what nobody asked for.
+class Table(BaseModel):
+    """Base of a study's tables: immutable, without conversion of kinds, unknown keys refused.
+
+    Raises
+    ------
+    SettingsError
+        A key is missing, unknown or holds something else. The message names the key, what it holds and what is valid.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    PLACE: ClassVar[str] = ""
+    """Dotted path of the table in a study; the validation context may give another as ``place``."""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _in_one_sentence(cls, table: Any, check: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
+        place = (info.context or {}).get("place", cls.PLACE)
+        if not isinstance(table, Mapping | cls):
+            raise SettingsError(f"{place or 'the study'} is {table!r:.60}; give a table")
+        try:
+            return check(table)
+        except ValidationError as error:
+            raise SettingsError(cls._sentence(error.errors()[0], table, place)) from error
+
+    @classmethod
+    def _sentence(cls, error: ErrorDetails, table: Any, place: str) -> str:
+        """The message of one validation error."""
+        key, found = str(error["loc"][0]), error["input"]
+        path = f"{place}.{key}" if place else key
+        by_key = {field.alias or name: field for name, field in cls.model_fields.items()}
+        if error["type"] == "extra_forbidden":
+            keys = sorted(by_key, key=lambda name: not by_key[name].is_required())
+            return unknown_key(place, key, keys)
+        choices = [one.choices for one in by_key[key].metadata if isinstance(one, OneOf)]
+        wanted = f"one of {', '.join(choices[0])}" if choices else by_key[key].description or "a table"
+        if error["type"] == "missing":
+            there = f"there are {', '.join(table)}" if table else "there is nothing"
+            return f'the key "{path}", which is to hold {wanted}, is missing; in {place or "this study"} {there}'
+        what_to_do = error["msg"] if error["type"] == _OWN_WORDS else f"give {wanted}"
+        is_element = len(error["loc"]) > 1 and isinstance(error["loc"][1], int)
+        return f"{path} {'has' if is_element else 'is'} {found!r:.60}; {what_to_do}"
+
+    @classmethod
+    def from_dict(cls, table: object) -> Self:
+        """The object that a table of TOML or JSON describes.
+
+        Raises
+        ------
+        SettingsError
+            A key is missing, unknown or holds something else.
+        """
+        return cls.model_validate(table)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The table that `from_dict` takes, defaults included."""
+        return self.model_dump(mode="json", by_alias=True)
+
+
+def unknown_key(place: str, key: str, known: Collection[str]) -> str:
+    """The sentence that refuses a key of a table."""
+    return (
+        f'there is no key "{f"{place}." if place else ""}{key}"; in {place or "a study"} there are {", ".join(known)}'
+    )
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Annotation of text that is one of some choices."""
+
+    choices: Collection[str]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self._check, handler(source))
+
+    def _check(self, text: str) -> str:
+        if text not in self.choices:
+            raise PydanticCustomError(_OWN_WORDS, "there are {choices}", {"choices": ", ".join(self.choices)})
+        return text
+
+
+class FunctionTable(Table):
+    """Base of the tables that choose a function: keys without a field are ``arguments``, the last field."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gather(cls, table: Any) -> Any:
+        """The table with its further keys in one, ``arguments``."""
+        if not isinstance(table, Mapping):
+            return table
+        own = cls.model_fields.keys() - {"arguments"}
+        given = {key: value for key, value in table.items() if key in own}
+        return {**given, "arguments": {key: value for key, value in table.items() if key not in own}}
+
+    @model_serializer(mode="wrap")
+    def _spread(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """The table as users write it; what is empty has no key."""
+        kept = {key: value for key, value in serialise(self).items() if value not in (None, "")}
+        arguments = kept.pop("arguments")
+        return {**kept, **arguments}
+
+
+# Arguments of a function ----------------------------------------------------------------------------------------------
+_VARIABLE = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+_WHOLE = (int, "int")
+"""Annotations of arguments that are counts; a default of 0 alone may stand for 0.0."""
+
+
+def check_signature(function: Callable[..., Any], name: str) -> None:
+    """Raises SettingsError: an argument of a user's function has no default, or one that TOML cannot hold."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError) as error:
+        raise SettingsError(f'"{name}" has no signature that can be read; wrap it in a function') from error
+    parameters = [one for one in signature.parameters.values() if one.kind not in _VARIABLE]
+    needed = [one.name for one in parameters if one.default is one.empty]
+    if needed:
+        raise SettingsError(f'"{name}" needs {", ".join(needed)}; give every argument a default')
+    for one in parameters:
+        if not _is_writable(one.default):
+            raise SettingsError(
+                f'"{name}" has {one.name} = {one.default!r:.60} ({type(one.default).__name__}); give a default that '
+                "TOML can write: a number, a word, true or false, a tuple of either, a dict of numbers, or None"
+            )
+
+
+def function_arguments(
+    function: Callable[..., Any],
+    given: Mapping[str, Any],
+    place: str,
+    keys: Collection[str],
+    random: str = "",
+    *,
+    pairs: bool = False,
+) -> dict[str, Any]:
+    """Keyword arguments of a function from a table, completed by the function's defaults.
 
     Parameters
     ----------
-    table : to be read
-    path : where it stands, such as ``axis``; "" is the whole
+    function : an argument whose default is None has no key
+    given : the table, without the keys that are not arguments
+    place : dotted path of the table
+    keys : further keys of the table, for messages
+    random : name of the argument that may be the word ``random``
+    pairs : accept two numbers in place of one
 
-    Every method raises SettingsError: the key is missing or holds something else; it names the key and what was found.
+    Raises
+    ------
+    SettingsError
+        An unknown key, or a value that is not of its default's kind.
     """
-
-    def __init__(self, table: object, path: str = "") -> None:
-        if not isinstance(table, Mapping):
-            raise SettingsError(f"{path or 'the study'} is {table!r:.60}; give a table")
-        self._table, self._path, self._asked = table, path, dict[str, None]()
-
-    def path(self, key: str) -> str:
-        """The dotted path of a key."""
-        return f"{self._path}.{key}" if self._path else key
-
-    def has(self, key: str) -> bool:
-        """Whether the key is there; it then need not be."""
-        self._asked[key] = None
-        return key in self._table
-
-    def holds_table(self, key: str) -> bool:
-        """Whether the key is there, and holds a table."""
-        return self.has(key) and isinstance(self._table[key], Mapping)
-
-    def text(self, key: str, default: str | None = None, choices: Collection[str] = ()) -> str:
-        """Text, one of the choices if there are any."""
-        value = self._value(key, default, f"one of {', '.join(choices)}" if choices else "text")
-        if not isinstance(value, str) or (choices and value not in choices):
-            wanted = f"there are {', '.join(choices)}" if choices else "give text"
-            raise SettingsError(f"{self.path(key)} is {value!r:.60}; {wanted}")
-        return value
-
-    def whole(self, key: str, least: int, default: int | None = None) -> int:
-        """A whole number, not below the least."""
-        value = self._value(key, default, "a whole number")
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise SettingsError(f"{self.path(key)} is {value!r:.60}; give a whole number of at least {least}")
-        return value
-
-    def flag(self, key: str, default: bool) -> bool:
-        """True or false."""
-        value = self._value(key, default, "true or false")
-        if not isinstance(value, bool):
-            raise SettingsError(f"{self.path(key)} is {value!r:.60}; give true or false")
-        return value
-
-    def listed(self, key: str, least: int = 1) -> list[Any]:
-        """A list, of not less than so many."""
-        value = self._value(key, None, "a list")
-        if not isinstance(value, list | tuple) or len(value) < least:
-            raise SettingsError(f"{self.path(key)} is {value!r:.60}; give a list of one or more")
-        return list(value)
-
-    def table(self, key: str, *, needed: bool = True) -> Mapping[str, Any]:
-        """A table, empty if it isn't there and isn't needed."""
-        value = self._value(key, None if needed else {}, "a table")
-        if not isinstance(value, Mapping):
-            raise SettingsError(f"{self.path(key)} is {value!r:.60}; give a table")
-        return value
-
-    def end(self, unnamed: Collection[str] = ()) -> None:
-        """Raises SettingsError: there is a key that nobody asked for.
-
-        Parameters
-        ----------
-        unnamed : keys that people don't write, and are not told about
-        """
-        unknown = [key for key in self._table if key not in self._asked]
-        if unknown:
-            there = ", ".join(key for key in self._asked if key not in unnamed)
-            where = self._path or "a study"
-            raise SettingsError(f'there is no key "{self.path(unknown[0])}"; in {where} there are {there}')
-
-    def _value(self, key: str, default: object, wanted: str) -> object:
-        self._asked[key] = None
-        if key not in self._table and default is None:
-            found = f"there are {', '.join(self._table)}" if self._table else "there is nothing"
-            where = self._path or "this study"
-            raise SettingsError(
-                f'the key "{self.path(key)}", which is to hold {wanted}, is missing; in {where} {found}'
-            )
-        return self._table.get(key, default)
+    known = _arguments(function, random, pairs)
+    for name in given:
+        if name not in known:
+            raise SettingsError(unknown_key(place, name, [*keys, *known]))
+    found = {}
+    for name, (default, kind, wanted) in known.items():
+        try:
+            found[name] = kind.validate_python(given[name]) if name in given else copy.copy(default)
+        except ValidationError as error:
+            raise SettingsError(f"{place}.{name} is {given[name]!r:.60}; give {wanted}") from error
+    return found
 
 
+@lru_cache(maxsize=32)
+def _arguments(function: Callable[..., Any], random: str, pairs: bool) -> dict[str, tuple[Any, TypeAdapter[Any], str]]:
+    """Default, type and description of each argument that has a key."""
+    found = {}
+    for name, parameter in inspect.signature(function).parameters.items():
+        if parameter.kind in _VARIABLE or parameter.default is None or parameter.default is parameter.empty:
+            continue
+        default = _as_written(parameter.default)
+        kind, wanted = _kind(default, pairs, parameter.annotation in _WHOLE)
+        drawn: Any = Literal["random"]
+        found[name] = default, TypeAdapter[Any](kind | drawn if name == random else kind), wanted
+    return found
+
+
+def _kind(default: Any, pairs: bool, whole: bool) -> tuple[Any, str]:
+    """Type of the values that may replace a default, and its description."""
+    if isinstance(default, dict):
+        return Annotated[dict[str, _Number], AfterValidator(lambda given: {**default, **given})], "a table of numbers"
+    if isinstance(default, list):
+        if not _are_numbers(default):
+            return list[StrictStr], "a list of words"
+        return conlist(_number(default[0])), "a list of numbers"
+    if isinstance(default, bool):
+        return StrictBool, "true or false"
+    if isinstance(default, str):
+        return StrictStr, "a word"
+    if whole:
+        return Whole, "a whole number from 0"
+    number = _number(default)
+    return number | conlist(number, min_length=2, max_length=2) if pairs else number, "a number"
+
+
+def _number(default: float) -> Any:
+    """Type of a number: 2 is kept as 2.0, unless the default is whole."""
+    return _Unconverted if isinstance(default, int) else _Number
+
+
+def takes_options(function: Callable[..., Any]) -> bool:
+    """True for a function with ``**options``."""
+    return any(one.kind == inspect.Parameter.VAR_KEYWORD for one in inspect.signature(function).parameters.values())
+
+
+def _is_writable(default: object) -> bool:
+    """True for a default that TOML can hold, or None."""
+    if isinstance(default, Mapping):
+        return all(isinstance(name, str) and is_number(value) for name, value in default.items())
+    if isinstance(default, list | tuple):
+        return not default or _are_numbers(default) or all(isinstance(one, str) for one in default)
+    return default is None or isinstance(default, str | bool) or is_number(default)
+
+
+def _are_numbers(values: Collection[object]) -> bool:
+    return bool(values) and all(map(is_number, values))
+
+
+def _as_written(default: Any) -> Any:
+    """A default as TOML has it."""
+    if isinstance(default, Mapping):
+        return dict(default)
+    return list(default) if isinstance(default, tuple) else default
+
+
+# Nested tables --------------------------------------------------------------------------------------------------------
 def changed(table: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy with other values at dotted paths; tables on the way that aren't there are made.
+    """A copy of a table with other values at dotted paths; missing tables on the way are made.
 
     Raises SettingsError: a path leads through something that is no table.
     """
@@ -119,7 +316,7 @@ def changed(table: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 
 
 def flat(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted path and value of everything that is no table; an empty table is a value."""
+    """Dotted path and value of everything that is not a table; an empty table is a value."""
     for key, value in table.items():
         here = f"{path}.{key}" if path else str(key)
         if isinstance(value, Mapping) and value:
@@ -128,6 +325,12 @@ def flat(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
             yield here, value
 
 
+def check_whole(name: str, value: object, least: int) -> None:
+    """Raises SettingsError: an argument is no integer, or below the least."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise SettingsError(f"{name} is {value!r:.60}; give a whole number of at least {least}")
+
+
 def is_number(value: object) -> bool:
-    """Whether it is a number that a float can hold, finite and not as large as 10**400; true and false are none."""
+    """True for a finite number that float64 can represent; Booleans are no numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

@@ -1,7 +1,7 @@
-"""Trials of one point: fly and spoil the data, identify, plan, steer, fly, judge.
+"""Trials of one level: data, identification, and evaluation by planned, controlled and simulated flights.
 
-What can be done for many trials at a time is: flights are lanes of one simulation, controllers of one sweep.  Neither
-changes a bit of any of them, and each plan starts from the same guess, so a trial's outcome depends on itself alone.
+Flights of many trials are lanes of one simulation, their controllers columns of one sweep. Neither changes a bit of any
+of them, and each plan starts from the same guess, so that the rows of a trial do not depend on other trials.
 """
 
 from __future__ import annotations
@@ -27,80 +27,89 @@ from diransac.flight.closed_loop import tracking_error
 from diransac.flight.trajectory import Trajectory
 from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
 from diransac.identification.identify import identify
-from diransac.identification.settings import Settings
 from diransac.model.plant import Plant
-from diransac.study.flights import TRAJECTORIES
+from diransac.study.data import (
+    PLANNING_TIME_LIMIT,
+    TrialData,
+    check_ended,
+    derived_seed,
+    flown,
+    trial_data_batch,
+    trial_seed,
+)
 from diransac.study.library import load
-from diransac.study.recording import PATIENCE, Recording, check_ended, flown, record_all, trial_seed
-from diransac.study.seeds import derived_seed
-from diransac.study.specification import TRUE, Study
+from diransac.study.specification import TRAJECTORIES, TRUE, Study
 
 __all__ = ["STAGES", "run_trials"]
 
 STAGES = ("record", "identify", "plan", "steer", "fly")
-"""What `seconds` is split by."""
+"""Stages that `seconds` is divided by."""
 
 _INTERVAL = 0.95
-"""Level of the intervals that are kept where parameters are judged."""
+"""Level of the intervals that are kept where parameters are evaluated."""
 
 _PACKAGES = ("diransac", "casadi", "llvmlite", "numpy", "scipy")
 
 
 def run_trials(study: str, level: str, trials: Sequence[int], methods: Sequence[str]) -> list[dict[str, Any]]:
-    """A row for each of these trials and methods.
+    """One row per trial and method, by column of the store.
+
+    Values are plain, so that rows may come from another process or machine; None is not known. A trial that fails is a
+    row with the error.
 
     Parameters
     ----------
     study : the JSON of `Study.to_dict`
-    level, trials, methods : which of its trials, and which of its methods by label
+    level, trials : of the study
+    methods : labels
 
-    Nothing is raised for a trial that fails: its row says why.  Rows are as the store has them, by column; what isn't
-    known is None.  Everything in them is plain, so that they may come from another process or machine.
-
-    Raises StudyError: this machine cannot run the study at all, such as without the file of its plant.
+    Raises
+    ------
+    StudyError
+        This machine cannot run the study at all, such as without the file of its plant.
     """
     try:
         point = _point(study, level)
     except DiransacError as error:
         raise StudyError(f"a worker on {platform.node()} cannot run the study: {error}") from error
     cases = [_Case(point, trial, label) for trial in trials for label in methods]
-    with single_threaded():  # every core is busy with trials already
+    with single_threaded():  # all cores run trials
         point.record(cases)
         for case in cases:
             with case.attempt("identify"):
                 case.identify()
-        for shape in point.study.evaluation:
+        for shape in point.study.evaluation.trajectories:
             _evaluate(point, [case for case in cases if case.found], shape)
     return [case.row() for case in cases]
 
 
-# A point and its cases -----------------------------------------------------------------------------------------------
+# A level and its cases -----------------------------------------------------------------------------------------------
 @lru_cache(maxsize=8)
 def _point(study: str, level: str) -> _Point:
     return _Point(load(json.loads(study)).at(level), level)
 
 
 class _Point:
-    """A study at one level, and what all of its trials share."""
+    """A study at one level."""
 
     def __init__(self, study: Study, level: str) -> None:
         self.study, self.level = study, level
 
     @property
     def plant(self) -> Plant:
-        """What flies."""
+        """The plant that flies."""
         return self.study.plant.plant
 
     def record(self, cases: Sequence[_Case]) -> None:
-        """Fly for data, spoil each trial's record, and find what can be made of the flight at best."""
+        """Give each case the data of its trial."""
         by_trial: dict[int, list[_Case]] = defaultdict(list)
         for case in cases:
             by_trial[case.trial].append(case)
         begin = time.perf_counter()
-        found = record_all(self.study, self.level, list(by_trial))
-        for some, recording in zip(by_trial.values(), found, strict=True):
+        found = trial_data_batch(self.study, self.level, list(by_trial))
+        for some, data in zip(by_trial.values(), found, strict=True):
             for case in some:
-                case.receive(recording)
+                case.receive(data)
         _share(cases, "record", time.perf_counter() - begin)
 
 
@@ -120,45 +129,44 @@ class _Case:
 
     @cached_property
     def seed(self) -> int:
-        """Of all that is random in the trial, whatever the method."""
+        """Seed of everything random in the trial, the same for all methods."""
         return trial_seed(self.point.study, self.point.level, self.trial)
 
     @contextmanager
     def attempt(self, stage: str) -> Iterator[None]:
-        """Time what is done; an error is noted, and ends no other case."""
+        """Add the time of the block to a stage, and its error to the row; other cases go on."""
         begin = time.perf_counter()
         try:
             yield
-        except Exception as error:  # noqa: BLE001  a study of days must not end at one trial; its row says what it was
+        except Exception as error:  # noqa: BLE001  one failed trial must not end a long study; its row says what it was
             self.fail(error)
         self.seconds[stage] += time.perf_counter() - begin
 
     def fail(self, error: Exception) -> None:
-        """Note why there is no figure."""
+        """Add an error to the row."""
         known = isinstance(error, DiransacError)
         self.errors.append(str(error) if known else f"internal error: {type(error).__name__}: {error}")
 
-    def receive(self, recording: Recording | Exception) -> None:
-        """Take the trial's data, or note why there are none."""
-        if isinstance(recording, Exception):
-            self.fail(recording)
+    def receive(self, data: TrialData | Exception) -> None:
+        """Take the trial's data, or the error that prevented them."""
+        if isinstance(data, Exception):
+            self.fail(data)
         else:
-            self.log = recording.log
-            self.figures |= {f"best_{name}": value for name, value in recording.best.items()}
+            self.log = data.log
+            self.figures |= {f"pseudo_true_{name}": value for name, value in data.pseudo_true.items()}
 
     def identify(self) -> None:
-        """Find parameters in the log.  Raises DiransacError: nothing is found."""
+        """Identify parameters from the log.  Raises DiransacError: there is no estimate."""
         if self.log is None:
             return
         plant, method = self.point.plant, self.point.study.methods[self.label]
         if method.method == TRUE:
             self.found = Plant(plant.model, plant.parameters)
         else:
-            settings = Settings.from_dict({**method.settings.to_dict(), "threads": 1})
             seed = derived_seed(self.seed, "identify")
-            result = identify(plant.model, self.log, method.method, seed=seed, settings=settings)
+            result = identify(plant.model, self.log, method.object(), seed=seed)
             self.found = Plant(plant.model, result.parameters)
-            self.figures |= _ends(result.intervals(_INTERVAL)) if self.point.study.judges_parameters else {}
+            self.figures |= _ends(result.intervals(_INTERVAL)) if self.point.study.evaluate_parameters else {}
             self.figures |= {
                 "fit_error": result.fit_error,
                 "inlier_fraction": result.inlier_fraction,
@@ -167,8 +175,8 @@ class _Case:
             }
         self.figures |= {f"parameter_{name}": value for name, value in self.found.parameters.items()}
 
-    def judge(self, shape: str, trajectory: Trajectory, log: Log | Exception) -> None:
-        """Note the tracking error of a flight.  Raises PlanningError: it diverged; or why there is no flight."""
+    def assess(self, shape: str, trajectory: Trajectory, log: Log | Exception) -> None:
+        """Add the tracking error of a flight to the row.  Raises PlanningError: it diverged; or the flight's error."""
         if isinstance(log, Exception):
             raise log
         try:
@@ -176,11 +184,11 @@ class _Case:
         except PlanningError as error:
             raise PlanningError(f"{shape}: {error}") from error
         self.figures |= {f"{shape}_{name}": error for name, error in tracking_error(trajectory, log).items()}
-        if self.point.study.keep_paths:
+        if self.point.study.evaluation.keep_paths:
             self.paths[shape] = np.column_stack([log[name] for name in self.point.plant.model.coordinates])
 
     def row(self) -> dict[str, Any]:
-        """The case as the store has it."""
+        """The row of the case, by column of the store."""
         return {
             "level": self.point.level,
             "trial": self.trial,
@@ -198,7 +206,7 @@ class _Case:
 
 # Evaluation ----------------------------------------------------------------------------------------------------------
 def _evaluate(point: _Point, cases: Sequence[_Case], shape: str) -> None:
-    """Plan, steer and fly a trajectory with what each case found."""
+    """Plan a trajectory with the parameters of each case, and fly it on the plant under feedback."""
     plans = _plans(cases, shape)
     planned = [case for case in cases if id(case) in plans]
     controllers = _controllers(planned, plans)
@@ -209,11 +217,11 @@ def _evaluate(point: _Point, cases: Sequence[_Case], shape: str) -> None:
     _share(steered, "fly", time.perf_counter() - begin)
     for case, log in zip(steered, logs, strict=True):
         with case.attempt("fly"):
-            case.judge(shape, plans[id(case)], log)
+            case.assess(shape, plans[id(case)], log)
 
 
 def _plans(cases: Sequence[_Case], shape: str) -> dict[int, Trajectory]:
-    """The trajectory of each case that has one."""
+    """Trajectory of each case that has a plan."""
     plans = {}
     for case in cases:
         assert case.found is not None
@@ -227,26 +235,25 @@ def _plans(cases: Sequence[_Case], shape: str) -> dict[int, Trajectory]:
 
 @lru_cache(maxsize=64)
 def _planned(point: _Point, shape: str, parameters: tuple[float, ...]) -> Trajectory | DiransacError:
-    """The plan for these parameters, from the planner's own first guess, or why there is none.
+    """The plan for these parameters from the planner's own first guess, or its error.
 
-    Without other noise than imbalance, least squares finds the same parameters in each trial; the true ones are the
-    same everywhere.
+    Plans are shared: the true parameters are the same in every trial, and so are estimates from equal logs.
     """
     model = point.plant.model
     plant = Plant(model, dict(zip(model.parameters, parameters, strict=True)))
     try:
-        return TRAJECTORIES[shape](plant, time_limit=PATIENCE)
+        return TRAJECTORIES[shape](plant, time_limit=PLANNING_TIME_LIMIT)
     except DiransacError as error:
         return error
 
 
 def _controllers(cases: Sequence[_Case], plans: dict[int, Trajectory]) -> dict[int, Controller]:
-    """The controller of each case that has one: all in one sweep, or each on its own where one of them has none."""
+    """Controller of each case that has one: all in one sweep, or each on its own if that fails."""
     begin = time.perf_counter()
     plants = [case.found for case in cases if case.found is not None]
     try:
         steering = tvlqr_batch(plants, [plans[id(case)] for case in cases], threads=1)
-    except Exception:  # noqa: BLE001  it is raised again, and noted, where it belongs
+    except Exception:  # noqa: BLE001  it is raised again for the case that it belongs to
         return _controllers_alone(cases, plans)
     _share(cases, "steer", time.perf_counter() - begin)
     return {id(case): controller for case, controller in zip(cases, steering, strict=True)}
@@ -261,9 +268,9 @@ def _controllers_alone(cases: Sequence[_Case], plans: dict[int, Trajectory]) -> 
     return found
 
 
-# What a row holds ----------------------------------------------------------------------------------------------------
+# Values of a row ----------------------------------------------------------------------------------------------------
 def _ends(intervals: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """Ends of the intervals that have both."""
+    """Columns of the intervals with two finite ends."""
     found: dict[str, float] = {}
     for name, (low, high) in intervals.items():
         if np.isfinite([low, high]).all():
@@ -272,13 +279,13 @@ def _ends(intervals: Mapping[str, tuple[float, float]]) -> dict[str, float]:
 
 
 def _share(cases: Sequence[_Case], stage: str, seconds: float) -> None:
-    """Divide the time of what was done for all."""
+    """Divide a time equally among cases."""
     for case in cases:
         case.seconds[stage] += seconds / len(cases)
 
 
 def _plain(value: Any) -> float | int | str | None:
-    """A number or text; NaN is not known."""
+    """A number or text; None for NaN."""
     if isinstance(value, str | int):
         return value
     return None if np.isnan(value) else float(value)
@@ -293,6 +300,6 @@ def _packed(paths: dict[str, Any]) -> bytes:
 
 @lru_cache(maxsize=1)
 def _versions() -> str:
-    """What computed it."""
+    """Versions of Python and of the packages that results depend on."""
     found = [("python", platform.python_version()), *((name, version(name)) for name in _PACKAGES)]
     return " ".join(f"{name} {number}" for name, number in found)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.study.judging import best_parameters, mean_accelerations
+from diransac.study.assessment import mean_accelerations, pseudo_true_parameters
 from simulated import rotorcraft_acceleration, rotorcraft_regressor
 
 TRUTH = {"mass": 0.249, "inertia": 0.004, "drag": 0.025}
@@ -70,7 +70,7 @@ def by_hand(log: dr.Log) -> np.ndarray:
 
 
 def test_without_anything_unknown_the_best_parameters_are_the_plants_own():
-    best = best_parameters(dr.Plant(ROTORCRAFT, TRUTH), rotorcraft_log())
+    best = pseudo_true_parameters(dr.Plant(ROTORCRAFT, TRUTH), rotorcraft_log())
     assert best == pytest.approx(TRUTH, rel=1e-9)
     assert list(best) == list(ROTORCRAFT.parameters)
 
@@ -89,7 +89,7 @@ def test_an_excess_in_proportion_to_the_thrust_takes_exactly_its_share_of_mass_a
     def more(k: int, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
         return excess * u[0] / TRUTH["mass"] * np.array([-np.sin(q[2]), np.cos(q[2]), 0.0])
 
-    best = best_parameters(dr.Plant(ROTORCRAFT, TRUTH, (push,)), rotorcraft_log(more))
+    best = pseudo_true_parameters(dr.Plant(ROTORCRAFT, TRUTH, (push,)), rotorcraft_log(more))
     smaller = {"mass": TRUTH["mass"] / (1 + excess), "drag": TRUTH["drag"] / (1 + excess)}
     assert best == pytest.approx({**TRUTH, **smaller}, rel=1e-9)
 
@@ -97,11 +97,11 @@ def test_an_excess_in_proportion_to_the_thrust_takes_exactly_its_share_of_mass_a
 def test_a_force_without_a_mean_over_its_phase_leaves_the_plants_own_parameters():
     log = shaken_log(0.5)
     assert abs(by_hand(log)[0] / TRUTH["mass"] - 1) > 0.01, "the vibration itself would spoil them"
-    assert best_parameters(shaken(0.5), log) == pytest.approx(TRUTH, rel=1e-9)
+    assert pseudo_true_parameters(shaken(0.5), log) == pytest.approx(TRUTH, rel=1e-9)
 
 
 def test_the_mean_of_a_vibration_stays():
-    best = best_parameters(shaken(0.5, mean=0.2), shaken_log(0.5, mean=0.2))
+    best = pseudo_true_parameters(shaken(0.5, mean=0.2), shaken_log(0.5, mean=0.2))
     assert list(best.values()) == pytest.approx(by_hand(shaken_log(0.0, mean=0.2)), rel=1e-9)
     assert abs(best["mass"] / TRUTH["mass"] - 1) > 0.01
 
@@ -110,7 +110,7 @@ def test_what_no_phase_tells_is_judged_as_it_was_recorded():
     plant, log = shaken(0.5, state="slosh"), shaken_log(0.5)
     recorded = np.column_stack([log[name] for name in ROTORCRAFT.accelerations])
     assert np.array_equal(mean_accelerations(plant, log), recorded)
-    assert list(best_parameters(plant, log).values()) == pytest.approx(by_hand(log), rel=1e-9)
+    assert list(pseudo_true_parameters(plant, log).values()) == pytest.approx(by_hand(log), rel=1e-9)
 
 
 def test_a_model_that_is_not_affine_in_its_parameters_is_judged_by_its_accelerations():
@@ -121,7 +121,7 @@ def test_a_model_that_is_not_affine_in_its_parameters_is_judged_by_its_accelerat
     )  # fmt: skip
     truth = {"mass": 0.5, "length": 0.6}
     log = log_of(pendulum, lambda k, q, v, u: [-9.81 / 0.6 * np.sin(q[0]) + u[0] / (0.5 * 0.6**2)])
-    assert best_parameters(dr.Plant(pendulum, truth), log) == pytest.approx(truth, rel=1e-6)
+    assert pseudo_true_parameters(dr.Plant(pendulum, truth), log) == pytest.approx(truth, rel=1e-6)
 
 
 def test_a_flight_that_leaves_a_parameter_open_judges_nothing():
@@ -129,5 +129,5 @@ def test_a_flight_that_leaves_a_parameter_open_judges_nothing():
     at_rest = {name: np.zeros(N_ROWS) for name in ("x_dot", "z_dot", "x_ddot", "z_ddot", "theta")}
     level = {**at_rest, "thrust": np.full(N_ROWS, TRUTH["mass"] * 9.81)}
     log = dr.Log.from_arrays(still.time, {**still.signals, **level}, ROTORCRAFT.units)
-    with pytest.raises(dr.IdentificationError, match=r"does not determine drag, .* nothing can be judged"):
-        best_parameters(dr.Plant(ROTORCRAFT, TRUTH), log)
+    with pytest.raises(dr.IdentificationError, match=r"does not determine drag: .* no pseudo-true parameters"):
+        pseudo_true_parameters(dr.Plant(ROTORCRAFT, TRUTH), log)
