@@ -21,6 +21,7 @@ from diransac.model import Disturbance, Model, Parameter, Plant
 from diransac.model import library as models
 
 if TYPE_CHECKING:
+    from diransac.data.filters import FilterSpecification
     from diransac.data.log import Log
     from diransac.data.preprocessing import despike, differentiate, rename, resample, scale, shift
     from diransac.data.readers import read_log
@@ -32,10 +33,14 @@ if TYPE_CHECKING:
     from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
     from diransac.identification.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
     from diransac.identification.identify import METHODS, identify
+    from diransac.identification.method import Progress
+    from diransac.identification.methods.least_squares import LeastSquares
+    from diransac.identification.methods.lo_diransac import LoDiransac
+    from diransac.identification.methods.ransac import Diransac, IDiransac
     from diransac.identification.nonlinear import NonlinearLeastSquares
     from diransac.identification.result import Result
     from diransac.identification.settings import Settings
-    from diransac.identification.validation import Validation, validate
+    from diransac.identification.validation import CrossValidation, Validation, cross_validate, validate
     from diransac.plots import plot_flight
     from diransac.report import write_report
     from diransac.study import Study, run_study
@@ -44,9 +49,15 @@ __all__ = [
     "METHODS",
     "Controller",
     "CorruptedLog",
+    "CrossValidation",
+    "Diransac",
     "DiransacError",
     "Disturbance",
+    "FilterSpecification",
+    "IDiransac",
     "IdentificationError",
+    "LeastSquares",
+    "LoDiransac",
     "Log",
     "LogError",
     "Model",
@@ -57,6 +68,7 @@ __all__ = [
     "Parameter",
     "PlanningError",
     "Plant",
+    "Progress",
     "Result",
     "ResultError",
     "ScikitLearnEstimator",
@@ -68,6 +80,7 @@ __all__ = [
     "Trajectory",
     "Validation",
     "corrupt",
+    "cross_validate",
     "despike",
     "differentiate",
     "fly",
@@ -95,7 +108,15 @@ __all__ = [
 ]
 
 _FOUND_IN = {
+    "data.filters": ("FilterSpecification",),
+    "data.log": ("Log",),
+    "data.preprocessing": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
+    "data.readers": ("read_log",),
     "flight.closed_loop": ("fly", "fly_batch", "tracking_error"),
+    "flight.corruption": ("CorruptedLog", "corrupt"),
+    "flight.noise": ("Noise",),
+    "flight.planning": ("multisine", "plan", "random_waypoints", "sine", "square", "star"),
+    "flight.trajectory": ("Trajectory",),
     "flight.tvlqr": ("Controller", "tvlqr", "tvlqr_batch"),
     "identification.estimators": ("OrdinaryLeastSquares", "ScikitLearnEstimator", "TotalLeastSquares"),
     "identification.identify": ("METHODS", "identify"),
@@ -103,20 +124,13 @@ _FOUND_IN = {
     "identification.methods.least_squares": ("LeastSquares",),
     "identification.methods.lo_diransac": ("LoDiransac",),
     "identification.methods.ransac": ("Diransac", "IDiransac"),
-    "data.log": ("Log",),
-    "flight.corruption": ("CorruptedLog", "corrupt"),
-    "flight.noise": ("Noise",),
     "identification.nonlinear": ("NonlinearLeastSquares",),
-    "flight.planning": ("multisine", "plan", "random_waypoints", "sine", "square", "star"),
-    "plots": ("plot_flight",),
-    "data.preprocessing": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
-    "data.readers": ("read_log",),
-    "report": ("write_report",),
     "identification.result": ("Result",),
     "identification.settings": ("Settings",),
-    "study": ("Study", "run_study"),
-    "flight.trajectory": ("Trajectory",),
     "identification.validation": ("CrossValidation", "Validation", "cross_validate", "validate"),
+    "plots": ("plot_flight",),
+    "report": ("write_report",),
+    "study": ("Study", "run_study"),
 }
 _LATER = {name: module for module, names in _FOUND_IN.items() for name in names}
 _SUBMODULES = ("simulation", "study")
