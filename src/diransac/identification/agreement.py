@@ -64,7 +64,7 @@ def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callba
     """The estimate of one log, or None where that log alone gives none."""
     try:
         return method.fit(dataset.subset([i]), seed, callback)
-    except DiransacError:
+    except (DiransacError, np.linalg.LinAlgError):
         return None
 
 

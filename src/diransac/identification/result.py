@@ -99,6 +99,13 @@ class Result:
         return {name: tuple(values[own].tolist()) for (name, x), own in pairs if x.per_log}
 
     @property
+    def per_log_standard_errors(self) -> dict[str, tuple[float, ...]]:
+        """Standard errors of `per_log`."""
+        errors = np.sqrt(np.diag(self.estimate.covariance))
+        pairs = zip(self.model.parameters.items(), self.layout.index.T, strict=True)
+        return {name: tuple(errors[own].tolist()) for (name, x), own in pairs if x.per_log}
+
+    @property
     def covariance(self) -> FloatArray:
         """Covariance ``(n_p, n_p)`` of `parameters`; infinite variances where the logs do not determine one."""
         if self.layout.is_shared:
@@ -327,22 +334,24 @@ class Result:
 
     def _log_lines(self) -> list[list[str]]:
         """Rows of a table: log, duration, fit error, inliers, per-log parameters."""
-        own = self.per_log
+        own, errors = self.per_log, self.per_log_standard_errors
         rows = [["log", "s", "fit error", "inliers", *(f"{name} [{self.units[name]}]" for name in own)]]
         for i, log in enumerate(self.logs):
             inliers = f"{100.0 * log.inlier_fraction:.1f} %"
-            values = [f"{x[i]:.5g}" for x in own.values()]
+            values = [f"{x[i]:.5g} ± {errors[name][i]:.2g}" for name, x in own.items()]
             rows.append([log.source, f"{log.dt * (log.n_rows - 1):.4g}", f"{log.fit_error:.4g}", inliers, *values])
         return rows
 
     def _warnings(self) -> list[str]:
         lines = [f"! {n} = {self.estimate.parameters[n]:.6g} is outside its bounds" for n in self.violations]
         lines += self._warnings_of_search() if self.diagnosis is None else self._warnings_of_diagnosis(self.diagnosis)
+        remarks = [log.remark for log in self.logs if log.remark]
+        lines += [f"! {remark}" for remark in remarks]
         for name, (half, double) in (self.bandwidth_sensitivity or {}).items():
             lines.append(
                 f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice"
             )
-        return lines + [f"  {note}" for note in self.notes]
+        return lines + [f"  {note}" for note in self.notes if note not in remarks]
 
     def _warnings_of_search(self) -> list[str]:
         lines = []

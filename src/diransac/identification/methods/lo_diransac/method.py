@@ -121,8 +121,8 @@ def _prepared(settings: LoDiransac, dataset: Dataset) -> tuple[ShootingIntervals
         for note in said
     ]
     half = choose_half_width(model, samples, dt, settings.smoothing_half_width)
-    n_rows = sum(len(one) for one in dataset.segments)
-    if n_rows < _FEWEST_INTERVALS * half:
+    n_rows, longest = sum(map(len, dataset.segments)), max(map(len, dataset.segments))
+    if n_rows < _FEWEST_INTERVALS * half or longest < half:
         raise LogError(
             f"{dataset.source}: {n_rows} rows are too few; lo-diransac needs at least "
             f"{_FEWEST_INTERVALS * half}. Give a longer log"
