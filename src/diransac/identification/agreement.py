@@ -25,7 +25,7 @@ _NEGLIGIBLE = 1e-3
 """Relative difference that is none, however narrow the intervals are."""
 
 
-def disagreements(method: Method, dataset: Dataset, seed: int, callback: Callback | None = None) -> tuple[str, ...]:
+def disagreements(method: Method, dataset: Dataset, seed: int, callback: Callback | None = None) -> list[str]:
     """A sentence for each log whose own estimate disagrees with those of the others; empty where it agrees.
 
     Each log is identified alone.  A shared parameter of log ``i`` is compared with the precision-weighted mean of the
@@ -39,8 +39,6 @@ def disagreements(method: Method, dataset: Dataset, seed: int, callback: Callbac
     from different experiments"; Hadi and Simonoff 1993 (backward removal).
     """
     n, remarks = len(dataset.segments), [""] * len(dataset.segments)
-    if n == 1:
-        return ("",)
     found = {}
     for i in range(n):
         estimate = _alone(method, dataset, i, seed, within(callback, i / n, (i + 1) / n, f"log {i + 1} alone: "))
@@ -57,7 +55,7 @@ def disagreements(method: Method, dataset: Dataset, seed: int, callback: Callbac
         for i in named:
             remarks[i] = f"{dataset.given[i].source} disagrees with the other logs: {tests[i][1]}"
             del found[i]
-    return tuple(remarks)
+    return remarks
 
 
 def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callback | None) -> Estimate | None:

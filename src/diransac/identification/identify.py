@@ -34,6 +34,7 @@ def identify(
     estimator: object = None,
     differentiate: bool = False,
     bandwidth: float | None = None,
+    compare_logs: bool = True,
     progress: Callback | None = None,
 ) -> Result:
     """Parameters of a model from one log, or from several logs of one machine.
@@ -54,6 +55,8 @@ def identify(
         alike; the identification is then repeated at half and twice the bandwidth, for
         ``result.bandwidth_sensitivity``.  lo-diransac estimates what a log lacks, and has no such filter
     bandwidth : of that filter, Hz; None: chosen from the logs
+    compare_logs : whether each of several logs is also identified alone, so that logs that disagree with the others
+        are named; that takes about as long again
     progress : called with a `Progress` now and then
 
     Returns
@@ -83,7 +86,8 @@ def identify(
         raise SettingsError(
             "bandwidth is given without differentiate=True, which alone uses it (and lo-diransac does not)"
         )
-    task = _Task(model, given, chosen, int(seed), pointwise=chosen.needs_all_signals or not differentiate)
+    pointwise = chosen.needs_all_signals or not differentiate
+    task = _Task(model, given, chosen, int(seed), pointwise, compares=compare_logs and len(given) > 1)
     if not filtered:
         return task.run(given, progress)
     derived = _derived(model, given, bandwidth)
@@ -137,18 +141,21 @@ class _Task:
     method: Method
     seed: int
     pointwise: bool
+    compares: bool
 
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
         """Identify from prepared logs."""
         criteria = self.method.criteria
         judged = judged_signals(self.model, logs, criteria)
         dataset = Dataset.of(self.model, logs, judged, pointwise=self.pointwise, given=self.given)
-        several = len(logs) > 1
-        estimate = self.method.fit(dataset, self.seed, within(progress, 0.0, 0.5 if several else 0.95))
-        report(progress, "evaluating", 0.5 if several else 0.95)
+        fitted = 0.5 if self.compares else 0.95
+        estimate = self.method.fit(dataset, self.seed, within(progress, 0.0, fitted))
+        report(progress, "evaluating", fitted)
         scoring = choose_scoring(dataset, criteria)
         evaluation = evaluate(estimate, dataset, scoring, criteria)
-        remarks = disagreements(self.method, dataset, self.seed, within(progress, 0.5, 1.0))
+        remarks = [""] * len(logs)
+        if self.compares:
+            remarks = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
         report(progress, "done", 1.0)
         return Result(
             model=self.model,
