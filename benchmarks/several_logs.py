@@ -1,7 +1,7 @@
 """Several logs of one machine: intervals that shrink, cuts that change nothing, a deviating log that is named.
 
-Run: ``python benchmarks/several_logs.py [METHOD ...]`` (default: ols, lo-diransac).  The last table needs the real double
-pendulum of ``../shared/data`` and is left out, with a line that says so, where it is missing.
+Run: ``python benchmarks/several_logs.py [METHOD ...]`` (default: ols, lo-diransac).  The last table needs the real
+double pendulum of ``../shared/data`` and is left out, with a line that says so, where it is missing.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def five_flights(method: str) -> None:
         off = (together.parameters[name] - pooled) / together.standard_errors[name]
         wrong = (together.parameters[name] - TRUTH[name]) / together.standard_errors[name]
         print(
-            f"    {name}: standard error {ratio:.2f} of one flight's (1/sqrt(5) = 0.45), {off:+.2f} standard errors from "
-            f"the mean of single flights, {wrong:+.2f} from the truth"
+            f"    {name}: standard error {ratio:.2f} of one flight's (1/sqrt(5) = 0.45), {off:+.2f} standard errors "
+            f"from the mean of single flights, {wrong:+.2f} from the truth"
         )
     identified("with one of mass 0.27", model, [*logs[:4], flight(model, 9, 0.002, mass=0.27)], method)
     short = [flight(model, 20 + k, bias, duration=5.0) for k, bias in enumerate(BIASES[1:])]
