@@ -54,7 +54,7 @@ def identify(
     differentiate : derive the velocities and accelerations that a log lacks, and filter both sides of the equations
         alike; the identification is then repeated at half and twice the bandwidth, for
         ``result.bandwidth_sensitivity``.  lo-diransac estimates what a log lacks, and has no such filter
-    bandwidth : of that filter, Hz; None: chosen from the logs
+    bandwidth : of that filter, Hz; None: chosen from each log
     compare_logs : whether each of several logs is also identified alone, so that logs that disagree with the others
         are named; that takes about as long again
     progress : called with a `Progress` now and then
@@ -90,7 +90,7 @@ def identify(
     task = _Task(model, given, chosen, int(seed), pointwise, compares=compare_logs and len(given) > 1)
     if not filtered:
         return task.run(given, progress)
-    derived = _derived(model, given, bandwidth)
+    derived = tuple(preprocessing.differentiate(log, model, bandwidth) for log in given)
     result = task.run(derived, within(progress, 0.0, 0.4))
     return task.with_sensitivity(result, derived, progress)
 
@@ -118,18 +118,6 @@ def _check_arguments(model: object, seed: object) -> None:
         raise SettingsError(f"model is {model!r}; give a dr.Model, such as dr.models.planar_rotorcraft()")
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
         raise SettingsError(f"seed is {seed!r}; give a whole number")
-
-
-def _derived(model: Model, logs: Sequence[Log], bandwidth: float | None) -> tuple[Log, ...]:
-    """The logs with what they lack, all filtered with one bandwidth: the lowest that any of them calls for."""
-    found = [preprocessing.differentiate(log, model, bandwidth) for log in logs]
-    chosen = [log.filter.bandwidth for log in found if log.filter is not None]
-    lowest = min(chosen)
-    again = [
-        x if used == lowest else preprocessing.differentiate(log, model, lowest)
-        for x, used, log in zip(found, chosen, logs, strict=True)
-    ]
-    return tuple(again)
 
 
 @dataclass(frozen=True)
@@ -170,20 +158,22 @@ class _Task:
         )
 
     def with_sensitivity(self, result: Result, derived: Sequence[Log], progress: Callback | None) -> Result:
-        """The result with each parameter's relative change at half and twice the differentiating bandwidth."""
-        chosen = derived[0].filter
-        assert chosen is not None
+        """The result with each parameter's relative change at half and twice the bandwidth of every log."""
+        chosen = [log.filter.bandwidth for log in derived if log.filter is not None]
         changes = []
         for k, factor in enumerate((0.5, 2.0)):
             part = within(progress, 0.4 + 0.3 * k, 0.7 + 0.3 * k, f"{factor:g} x bandwidth: ")
-            changes.append(self._change(result, chosen.bandwidth * factor, part))
+            changes.append(self._change(result, [factor * x for x in chosen], part))
         pairs = {n: (changes[0][n], changes[1][n]) for n in result.parameters}
         return dataclasses.replace(result, bandwidth_sensitivity=pairs)
 
-    def _change(self, result: Result, bandwidth: float, progress: Callback | None) -> dict[str, float]:
-        """Relative change of each parameter at another bandwidth; NaN where nothing was identified there."""
+    def _change(self, result: Result, bandwidths: Sequence[float], progress: Callback | None) -> dict[str, float]:
+        """Relative change of each parameter at other bandwidths; NaN where nothing was identified there."""
+        alone = dataclasses.replace(self, compares=False)
         try:
-            other = self.run(_derived(self.model, self.given, bandwidth), progress).parameters
+            pairs = zip(self.given, bandwidths, strict=True)
+            derived = [preprocessing.differentiate(log, self.model, x) for log, x in pairs]
+            other = alone.run(derived, progress).parameters
         except DiransacError:
             return dict.fromkeys(result.parameters, np.nan)
         return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}
