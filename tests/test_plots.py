@@ -163,7 +163,7 @@ def test_each_method_has_one_look_in_every_panel():
 
 
 def test_methods_have_the_colours_of_the_reports_page():
-    css = (files("diransac.report") / "page.css").read_text().split("@media")[0]
+    css = (files("diransac.report") / "templates" / "page.css").read_text().split("@media")[0]
     page = dict(re.findall(r"--(\w+): (#\w+);", css))
     assert tuple(page[f"c{i}"] for i in range(6)) == COLOURS
     for name in ("PAPER", "INK", "MUTED", "RULE", "SOFT"):
