@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from diransac.identification.methods.consensus import Score
 
 import diransac as dr
 from diransac.errors import IdentificationError, LogError, ModelError, SettingsError
-from diransac.identification.methods.consensus import Score
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight, rollout, with_outliers
 from user_models import tumbling
