@@ -275,7 +275,8 @@ def test_progress_never_falls_and_ends_at_one(method, differentiate):
     )
     fractions = [x.fraction for x in calls]
     assert fractions == sorted(fractions)
-    assert (fractions[0], fractions[-1]) == (0.0, 1.0)
+    assert fractions[0] >= 0.0
+    assert fractions[-1] == 1.0
     assert all(isinstance(x, dr.Progress) and x.stage for x in calls)
 
 
@@ -344,10 +345,11 @@ def test_fewer_rows_than_a_sample_are_refused():
     assert dr.identify(MODEL, log, "ols").n_fitted == 50
 
 
-def test_log_in_which_nothing_moves_is_refused():
+@pytest.mark.parametrize("method", dr.METHODS)
+def test_log_in_which_nothing_moves_is_refused(method):
     columns = dict.fromkeys((*PLANE.signals, *PLANE.inputs), np.zeros(200))
-    with pytest.raises(IdentificationError, match="does not determine"):
-        dr.identify(MODEL, dr.Log.from_arrays(np.arange(200) * 0.01, columns), "i-diransac")
+    with pytest.raises(LogError, match="are constant; nothing moves in this log"):
+        dr.identify(MODEL, dr.Log.from_arrays(np.arange(200) * 0.01, columns), method)
 
 
 def test_estimate_that_is_not_finite_is_refused():
@@ -376,6 +378,9 @@ def test_nothing_accepted_says_how_many_failed_at_which_step():
 
 
 # ---------------------------------------------------------------------- arguments without meaning
+
+
+DEFAULT = {"method": "lo-diransac", "settings": None}
 
 
 @pytest.mark.parametrize(
@@ -453,7 +458,7 @@ EVERY_SETTING = (
 )
 FOR_ALL = ("initial_state", "threads", "batch_size", *(name for name, _ in JUDGING))
 USED = {
-    **dict.fromkeys(("ols", "tls", "nls"), {*FOR_ALL, "integrator", "substeps"}),
+    **{name: {*FOR_ALL, "integrator", "substeps"} for name in ("ols", "tls", "nls")},
     "diransac": {*FOR_ALL, "integrator", "substeps", "sample_size", "max_iterations", "refit"},
     "i-diransac": {name for name, _ in EVERY_SETTING},
     "lo-diransac": set(FOR_ALL),
