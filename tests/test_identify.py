@@ -380,9 +380,6 @@ def test_nothing_accepted_says_how_many_failed_at_which_step():
 # ---------------------------------------------------------------------- arguments without meaning
 
 
-DEFAULT = {"method": "lo-diransac", "settings": None}
-
-
 @pytest.mark.parametrize(
     ("changes", "error", "says"),
     [
