@@ -105,7 +105,7 @@ class LoDiransac:
             value = getattr(self, f.name)
             if f.name != "criteria":
                 object.__setattr__(self, f.name, _checked(f.name, value, f.default))
-        if not self.delay_range[0] <= 0.0 <= self.delay_range[1]:
+        if not -np.inf < self.delay_range[0] <= 0.0 <= self.delay_range[1] < np.inf:
             raise SettingsError(f"delay_range is {self.delay_range}; give (earliest, latest) in s, with 0 between them")
 
     def options(self) -> Mapping[str, Any]:
