@@ -7,7 +7,7 @@ import pytest
 
 import diransac as dr
 from diransac.data.dataset import Dataset
-from diransac.errors import IdentificationError, LogError
+from diransac.errors import IdentificationError, LogError, SettingsError
 from diransac.simulation import RolloutBatch, rollouts
 from simulated import MACHINES, as_log, flight, with_outliers
 from test_nonlinear import log_of, swing
@@ -220,6 +220,18 @@ def test_a_delay_of_inputs_that_leap_now_and_then_is_found_where_there_is_no_noi
 
 
 def test_windows_in_which_outliers_are_the_majority_are_carried_by_their_neighbours():
+    model, signals, spoilt, bad, inputs = bursts()
+    columns = dict(zip(model.signals, spoilt.T, strict=True)) | {"thrust": inputs[:, 0]}
+    result = dr.identify(model, dr.Log.from_arrays(np.arange(len(signals)) * 0.01, columns))
+    np.testing.assert_allclose(list(result.parameters.values()), truth("underwater-vehicle"), rtol=1e-3)
+    found = np.column_stack([result.diagnosis.outliers[name] for name in model.signals])
+    large = bad & (np.abs(spoilt - signals) > 1.0)
+    assert (found & large).sum() > 0.99 * large.sum()
+    assert (found & ~bad).sum() < 0.01 * bad.size
+
+
+def bursts():
+    """Model, clean and spoilt signals, which samples are outliers, and inputs: three bursts of mostly outliers."""
     machine, inputs = held(2000, seed=4)
     p = np.array(list(machine.truth.values()))
     model = dr.models.underwater_vehicle()
@@ -227,11 +239,96 @@ def test_windows_in_which_outliers_are_the_majority_are_carried_by_their_neighbo
     rng, bad = np.random.default_rng(0), np.zeros(signals.shape, bool)
     for first in (300, 900, 1500):
         bad[first : first + 120] = rng.random((120, 3)) < 0.8
-    spoilt = np.where(bad, signals + rng.uniform(0.0, 20.0, signals.shape), signals)
-    columns = dict(zip(model.signals, spoilt.T, strict=True)) | {"thrust": inputs[:, 0]}
-    result = dr.identify(model, dr.Log.from_arrays(np.arange(len(signals)) * 0.01, columns))
-    np.testing.assert_allclose(list(result.parameters.values()), p, rtol=1e-3)
-    found = np.column_stack([result.diagnosis.outliers[name] for name in model.signals])
-    large = bad & (np.abs(spoilt - signals) > 1.0)
-    assert (found & large).sum() > 0.99 * large.sum()
-    assert (found & ~bad).sum() < 0.01 * bad.size
+    return model, signals, np.where(bad, signals + rng.uniform(0.0, 20.0, signals.shape), signals), bad, inputs
+
+
+def test_progress_never_falls_though_several_delays_and_starts_are_tried():
+    model, _, spoilt, _, inputs = bursts()
+    columns = dict(zip(model.signals, spoilt[:-4].T, strict=True)) | {"thrust": inputs[4:, 0]}
+    calls = []
+    dr.identify(model, dr.Log.from_arrays(np.arange(len(spoilt) - 4) * 0.01, columns), progress=calls.append)
+    fractions = [x.fraction for x in calls]
+    assert sum(x.note == "fit 2" for x in calls) > 1
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+
+
+# ---------------------------------------------------------------------- settings
+
+
+BAD = {
+    "n_samples": (-1, 2.5, True, "many", None),
+    "substeps": (0, 1.5, False),
+    "max_starts": (0,),
+    "max_fits": (0,),
+    "max_steps": (-1,),
+    "max_delay_shifts": (-1,),
+    "input_window": (0.0, -1.0, np.inf, np.nan, "short"),
+    "smoothing_half_width": (0.0,),
+    "prior_model_error": (-1e-3, np.nan),
+    "prior_inflation": (0.0,),
+    "delay_range": ((0.01, 0.02), (-0.02, -0.01), 0.1, (0.0,), ("a", "b"), (0.0, np.nan), (-np.inf, np.inf)),
+    "outliers": (1, None, "yes"),
+    "model_error": (0,),
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(n, x) for n, values in BAD.items() for x in values])
+def test_setting_without_meaning_is_refused_by_its_name(name, value):
+    with pytest.raises(SettingsError, match=name) as caught:
+        dr.LoDiransac(**{name: value})
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_criteria_that_lo_diransac_has_no_use_for_are_refused():
+    with pytest.raises(SettingsError, match='"lo-diransac" has no use for the setting substeps = 3'):
+        dr.LoDiransac(dr.Settings(substeps=3))
+
+
+def test_settings_are_saved_with_the_result(tmp_path):
+    log = as_log(MACHINES["underwater-vehicle"], *flown("underwater-vehicle"), DT)
+    method = dr.LoDiransac(substeps=np.int64(3), n_samples=50, delay_range=(-0.01, 0.02))
+    result = dr.identify(MODELS["underwater-vehicle"], log, method)
+    assert result.options == method.options()
+    assert (result.options["substeps"], result.options["delay_range"]) == (3, [-0.01, 0.02])
+    assert result.iterations == 50
+    result.save(tmp_path / "model.json")
+    loaded = dr.Result.load(tmp_path / "model.json")
+    assert loaded == result
+    options = {n: tuple(x) if isinstance(x, list) else x for n, x in loaded.options.items()}
+    assert dr.LoDiransac(**options) == method
+
+
+def test_substeps_of_the_method_are_those_of_the_evaluation():
+    log = as_log(MACHINES["servo-axis"], *flight(MACHINES["servo-axis"], 500, DT, substeps=20), DT)
+    for substeps in (1, 7):
+        estimate = dr.LoDiransac(substeps=substeps).fit(Dataset.of(MODELS["servo-axis"], log, pointwise=False), 0)
+        assert estimate.resolution.substeps == substeps
+
+
+LEFT_OUT = [
+    {"n_samples": 0},
+    {"max_steps": 0, "instrumental_variables": False},
+    {"max_starts": 1},
+    {"neighbouring_starts": False},
+    {"outliers": False},
+    {"model_error": False},
+    {"prior_model_error": 1e-5},
+    {"prior_discrepancy": 1e-6, "initial_discrepancy": 1e-6},
+    {"prior_delay": 1e-8, "max_delay_shifts": 0, "delay_range": (0, 0)},
+    {"robust_model_error": False},
+    {"gradual_continuity": False},
+    {"instrumental_variables": False},
+    {"stuck_rows": False},
+    {"prior_model_error": 0.0},
+    {"prior_discrepancy": 0.0},
+    {"prior_delay": 0.0},
+]
+
+
+@pytest.mark.parametrize("changes", LEFT_OUT, ids=lambda x: ", ".join(x))
+def test_a_clean_log_needs_no_single_part_of_the_method(changes):
+    """Each can be left out by a setting; hypotheses alone are off by what smoothing does to the motion."""
+    log = as_log(MACHINES["underwater-vehicle"], *flown("underwater-vehicle"), DT)
+    estimate = dr.LoDiransac(**changes).fit(Dataset.of(MODELS["underwater-vehicle"], log), 0)
+    assert relative_errors("underwater-vehicle", estimate).max() < (0.2 if "max_steps" in changes else 1e-3)
