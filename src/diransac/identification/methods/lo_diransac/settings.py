@@ -134,7 +134,7 @@ def configured(settings: Settings) -> LoDiransac:
     return LoDiransac(settings)
 
 
-_MAY_BE_ZERO = ("n_samples", "max_delay_shifts", "max_steps", "prior_model_error", "prior_discrepancy", "prior_delay")
+_MAY_BE_ZERO = ("n_samples", "max_delay_shifts", "max_steps", "prior_model_error", "prior_discrepancy")
 
 
 def _checked(name: str, value: Any, default: Any) -> Any:
