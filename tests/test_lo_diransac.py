@@ -267,6 +267,7 @@ BAD = {
     "smoothing_half_width": (0.0,),
     "prior_model_error": (-1e-3, np.nan),
     "prior_inflation": (0.0,),
+    "prior_delay": (0.0,),
     "delay_range": ((0.01, 0.02), (-0.02, -0.01), 0.1, (0.0,), ("a", "b"), (0.0, np.nan), (-np.inf, np.inf)),
     "outliers": (1, None, "yes"),
     "model_error": (0,),
@@ -322,7 +323,6 @@ LEFT_OUT = [
     {"stuck_rows": False},
     {"prior_model_error": 0.0},
     {"prior_discrepancy": 0.0},
-    {"prior_delay": 0.0},
 ]
 
 
