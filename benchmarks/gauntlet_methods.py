@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from sklearn.linear_model import HuberRegressor, LinearRegression, RANSACRegressor, TheilSenRegressor
 
 import diransac as dr
-from diransac.data.dataset import observe
+from diransac.data.dataset import Dataset, bind_log
 from diransac.identification.estimators import regression
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
@@ -66,7 +66,7 @@ def hampel_i_diransac(model: dr.Model, log: dr.Log) -> Estimate:
 
 def regressed(regressor: Callable[[], Any], model: dr.Model, log: dr.Log) -> Estimate:
     """A robust regressor on all equations, each divided by its median |b|, with columns of equal size."""
-    W, b = regression(observe(model, log))
+    W, b = regression(Dataset.of(model, log))
     size = np.median(np.abs(b), axis=0)
     W, b = (W / size[:, None]).reshape(-1, model.n_p), (b / size).reshape(-1)
     scale = np.sqrt(np.mean(W**2, axis=0))
@@ -88,7 +88,7 @@ SCIKIT_LEARN = {
 def equation_error(loss: str, model: dr.Model, log: dr.Log) -> Estimate:
     """Robust loss of the residual ``r(q, v, a, u, p)`` in units of its spread at the start, Hampel + least squares."""
     start = np.array(list(hampel_least_squares(model, log).parameters.values()))
-    seen = observe(model, log)
+    seen = bind_log(model, log)
     rows = [x[seen.valid].T for x in (*seen.state_arrays(), seen.acting_inputs())]
     symbols = [ca.SX.sym(name, *model.residual.size_in(i)) for i, name in enumerate("qvaup")]
     r = model.residual(*symbols)
@@ -114,7 +114,7 @@ def output_error(model: dr.Model, log: dr.Log, max_evaluations: int = 40) -> Est
     row.  Evaluations are capped, not seconds: answers do not depend on
     the machine.
     """
-    seen, names = observe(model, log), (*model.parameters, *model.state)
+    seen, names = bind_log(model, log), (*model.parameters, *model.state)
     low, high = _bounds(model)
     first = np.clip(list(hampel_least_squares(model, log).parameters.values()), low[: model.n_p], high[: model.n_p])
     measured, valid = np.nan_to_num(seen.measured), np.isfinite(seen.measured)

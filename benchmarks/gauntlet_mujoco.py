@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from diransac import Log, Model
-from diransac.data.dataset import observe
+from diransac.data.dataset import bind_log
 
 AXIS = """
 <mujoco>
@@ -39,7 +39,7 @@ def fitted(model: Model, log: Log, start: dict[str, float]) -> dict[str, float]:
     if model.name != "servo-axis":
         raise ValueError("MuJoCo has no such parameters")
     spec = mujoco.MjSpec.from_string(AXIS.format(dt=log.dt))
-    compiled, seen = spec.compile(), observe(model, log)
+    compiled, seen = spec.compile(), bind_log(model, log)
     first, states = seen.initial_state("robust"), seen.measured[:, : len(model.state)]
     spread = 1.4826 * np.nanmedian(np.abs(states - np.nanmedian(states, axis=0)), axis=0)
     unknown = sysid.ParameterDict()

@@ -23,7 +23,7 @@ import others
 from kernel import QUADROTOR, REPETITIONS, CLoops, medians, problem_of, quadrotor, score, timed
 
 import diransac as dr
-from diransac.data.dataset import observe
+from diransac.data.dataset import Dataset, bind_log
 from diransac.identification.estimators import regression
 from diransac.identification.sampling import sample_rows
 from diransac.simulation import RolloutBatch, rollouts
@@ -65,7 +65,7 @@ def spoilt_log(n_rows: int) -> dr.Log:
 def bench_of(loops: CLoops | None) -> Bench:
     """The problem that every simulator gets: hypotheses around the truth, all nine signals scored."""
     model, log = dr.models.planar_rotorcraft(), spoilt_log(N_ROWS)
-    seen = observe(model, log)
+    seen = bind_log(model, log)
     factors = np.random.default_rng(0).uniform(0.9, 1.1, (N_HYPOTHESES, model.n_p))
     hypotheses = np.array(list(ROTORCRAFT.truth.values())) * factors
     state, thresholds = seen.initial_state("first"), np.full(len(seen.signals), 0.5)
@@ -107,7 +107,7 @@ def compare_identification(bench: Bench) -> float:
         "two": partial(score, engine, bench.problem, threads=2),
         "table iv": bench.identify,
         "defaults": lambda: dr.identify(
-            bench.model, bench.log, settings=dr.Settings(stop_inlier_fraction=None, threads=2)
+            bench.model, bench.log, "i-diransac", settings=dr.Settings(stop_inlier_fraction=None, threads=2)
         ),
     }
     agreement = ""
@@ -273,7 +273,7 @@ def compare_others(bench: Bench, seconds: float) -> None:
     note = f"{taken:.0f} s, scaled from 1 hypothesis and {ROWS_OF_SCIPY} rows"
     row("    score: SciPy, solve_ivp a row / ours on 2 threads", taken / found["ours"], note=note)
     try:
-        fit = others.scikit_learn_ransac(*regression(observe(bench.model, bench.log)), TRIALS)
+        fit = others.scikit_learn_ransac(*regression(Dataset.of(bench.model, bench.log)), TRIALS)
         theirs = medians({"theirs": fit})["theirs"] / TRIALS
     except ImportError as absent:
         row("    scikit-learn", None, note=f"{absent.name} is not installed: pip install .[bench]")

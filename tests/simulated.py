@@ -240,19 +240,19 @@ def runge_kutta_step(machine, x, u, p, dt):
     return k1, x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def rollout(machine, parameters, start, inputs, dt):
+def rollout(machine, parameters, start, inputs, dt, substeps=1):
     """All signals ``(N, n_signals)`` under recorded inputs; NaN from the row on at which one is no longer finite."""
     n = len(machine.coordinates)
     x, p = np.array(start, dtype=float), np.asarray(parameters, dtype=float)
     signals = np.full((len(inputs), 3 * n), np.nan)
     with np.errstate(all="ignore"):
         for row, u in enumerate(inputs):
-            k1, after = runge_kutta_step(machine, x, u, p, dt)
-            now = np.concatenate([x, k1[n:]])
+            now = np.concatenate([x, slope(machine, x, u, p)[n:]])
             if not np.isfinite(now).all():
                 break
             signals[row] = now
-            x = after
+            for _ in range(substeps):
+                x = runge_kutta_step(machine, x, u, p, dt / substeps)[1]
     return signals
 
 

@@ -93,7 +93,7 @@ def test_an_input_that_acts_late_is_said_with_its_delay():
     found = dr.identify(sledge(), log_of(*slide(extra=0.0, lag=6))[0], seed=0)
     assert found.diagnosis.input_delay_significant
     assert found.diagnosis.input_delay == pytest.approx(0.06, abs=1e-3)
-    assert "! inputs act 60 ms later than the log says" in str(found)
+    assert "! inputs act 60 ms later than recorded" in str(found)
     punctual = dr.identify(sledge(), log_of(*slide(extra=0.0))[0], seed=0)
     assert not punctual.diagnosis.input_delay_significant
 
@@ -125,9 +125,10 @@ def test_a_parameter_that_the_log_cannot_tell_is_printed_as_a_question(spoilt):
     result, _ = spoilt
     covariance = result.covariance.copy()
     covariance[1] = covariance[:, 1] = np.inf
-    vague = replace(result, covariance=covariance, diagnosis=replace(result.diagnosis, unidentifiable=("drag",)))
+    diagnosis = replace(result.diagnosis, unidentifiable=("drag",))
+    vague = replace(result, estimate=replace(result.estimate, covariance=covariance, diagnosis=diagnosis))
     assert re.search(r"^drag +\? +unknown +N s/m$", str(vague), re.MULTILINE)
-    assert "! the log cannot tell drag" in str(vague)
+    assert "! drag is not identifiable from this log; excite it" in str(vague)
 
 
 # ---------------------------------------------------------------------- how it is kept
@@ -150,8 +151,8 @@ def test_what_is_saved_is_what_is_loaded(spoilt, tmp_path):
 
 def test_nothing_of_it_can_be_changed(spoilt):
     result, _ = spoilt
-    for found in (result.diagnosis, Diagnosis.from_dict(json.loads(json.dumps(result.diagnosis.to_dict())), N)):
-        arrays = [found.unmodelled_time, found.smoothed_time]
+    for found in (result.diagnosis, dr.Result.from_dict(json.loads(json.dumps(result.to_dict()))).diagnosis):
+        arrays = [found.window_log, found.unmodelled_time, found.smoothed_time]
         for mapping in (found.outliers, found.unmodelled_accelerations, found.unmodelled_forces, found.smoothed_states):
             arrays += mapping.values()
             with pytest.raises(TypeError, match="item assignment"):
@@ -170,6 +171,7 @@ def test_nothing_of_it_can_be_changed(spoilt):
         ("noise_std", {"s": "loud"}),
         ("outliers", {"s": "AAAA"}),
         ("outliers", {"s": "no base 64!"}),
+        ("window_log", [0.5]),
         ("unmodelled_time", ["soon"]),
         ("smoothed_states", {"s": [[0.0], [0.0, 1.0]]}),
         ("input_delay", None),

@@ -19,7 +19,7 @@ from sklearn.neighbors import KNeighborsRegressor
 from sklearn.svm import LinearSVR
 
 import diransac as dr
-from diransac.data.dataset import observe
+from diransac.data.dataset import Dataset
 from diransac.errors import IdentificationError, SettingsError
 from diransac.identification.estimators import as_estimator, solve_definite
 from diransac.model.library import builtin
@@ -47,8 +47,8 @@ def bound(estimator, name="planar-rotorcraft", n_rows=300):
     machine = MACHINES[name]
     signals, inputs = flight(machine, n_rows, 0.02)
     noisy = signals + 0.05 * signals.std(axis=0) * np.random.default_rng(0).normal(size=signals.shape)
-    observations = observe(builtin(name), as_log(machine, noisy, inputs, 0.02))
-    return estimator.bind(observations), *machine.rows(noisy, inputs)
+    dataset = Dataset.of(builtin(name), as_log(machine, noisy, inputs, 0.02))
+    return estimator.bind(dataset), *machine.rows(noisy, inputs)
 
 
 # ---------------------------------------------------------------------- ours
@@ -141,9 +141,9 @@ def test_bound_estimator_fits_each_set_of_rows_as_if_it_were_alone(estimator):
     alone = {dr.OrdinaryLeastSquares: lambda W, b: np.linalg.lstsq(W.reshape(-1, 3), b.ravel(), rcond=None)[0]}
     if type(estimator) in alone:
         expected = [alone[type(estimator)](W[rows], b[rows]) for rows in sets]
-        assert it.fit(sets) == pytest.approx(np.array(expected), rel=1e-8)
-    one_by_one = np.concatenate([it.fit([rows]) for rows in sets])
-    assert np.array_equal(it.fit(sets), one_by_one)
+        assert it.select(sets).fit() == pytest.approx(np.array(expected), rel=1e-8)
+    one_by_one = np.concatenate([it.select([rows]).fit() for rows in sets])
+    assert np.array_equal(it.select(sets).fit(), one_by_one)
 
 
 def test_bound_total_least_squares_scales_columns_by_the_whole_log():
@@ -153,7 +153,7 @@ def test_bound_total_least_squares_scales_columns_by_the_whole_log():
     scale = np.sqrt((columns**2).mean(axis=(0, 1)))
     rows = np.arange(0, 300, 7)
     last = np.linalg.svd((columns[rows] / scale).reshape(-1, 4))[2][-1]
-    assert it.fit([rows])[0] == pytest.approx(-last[:-1] / last[-1] * scale[-1] / scale[:-1], rel=1e-8)
+    assert it.select([rows]).fit()[0] == pytest.approx(-last[:-1] / last[-1] * scale[-1] / scale[:-1], rel=1e-8)
 
 
 @pytest.mark.parametrize("estimator", [*OURS, dr.ScikitLearnEstimator(LinearRegression())])
@@ -162,7 +162,7 @@ def test_leaving_rows_out_is_fitting_the_others(estimator):
     rows = np.arange(20, 280)
     groups = np.array_split(rows, 7)
     others = [np.setdiff1d(rows, group) for group in groups]
-    assert it.fit_without(groups, rows) == pytest.approx(it.fit(others), rel=1e-9)
+    assert it.fit_without(groups, rows) == pytest.approx(it.select(others).fit(), rel=1e-9)
 
 
 def test_rows_whose_regressor_is_tiny_against_the_log_are_not_well_defined():
@@ -170,8 +170,11 @@ def test_rows_whose_regressor_is_tiny_against_the_log_are_not_well_defined():
     machine = MACHINES["planar-rotorcraft"]
     signals, inputs = flight(machine, 200, 0.02)
     signals[:5, 3:5] = 1e-34
-    it = dr.OrdinaryLeastSquares().bind(observe(builtin("planar-rotorcraft"), as_log(machine, signals, inputs, 0.02)))
-    assert it.well_defined([np.arange(5), np.arange(5, 10), np.array([], dtype=int)]).tolist() == [False, True, False]
+    it = dr.OrdinaryLeastSquares().bind(
+        Dataset.of(builtin("planar-rotorcraft"), as_log(machine, signals, inputs, 0.02))
+    )
+    sets = [np.arange(5), np.arange(5, 10), np.array([], dtype=int)]
+    assert it.select(sets).well_defined().tolist() == [False, True, False]
 
 
 def test_undetermined_parameters_are_named_and_no_others():
@@ -220,8 +223,8 @@ def test_scikit_learns_least_squares_is_ours():
     theirs, _, _ = bound(dr.ScikitLearnEstimator(LinearRegression()))
     ours, _, _ = bound(dr.OrdinaryLeastSquares())
     rows = np.arange(0, 300, 3)
-    assert theirs.fit([rows]) == pytest.approx(ours.fit([rows]), rel=1e-9)
-    assert theirs.well_defined([rows]).tolist() == [True]
+    assert theirs.select([rows]).fit() == pytest.approx(ours.select([rows]).fit(), rel=1e-9)
+    assert theirs.select([rows]).well_defined().tolist() == [True]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import pytest
 
 import diransac as dr
 from diransac.errors import IdentificationError, LogError, ModelError, SettingsError
-from diransac.identification.methods.consensus import Score
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight, rollout, with_outliers
 from user_models import tumbling
@@ -17,6 +16,14 @@ MODEL = builtin("planar-rotorcraft")
 SEARCHES = ("diransac", "i-diransac")
 QUICK = dr.Settings(sample_size=30, max_iterations=40, stop_inlier_fraction=None)
 TABLE_IV = replace(dr.Settings.table_iv(), sample_size=30, max_iterations=60, stop_inlier_fraction=None)
+OF_SEARCH = ("sample_size", "max_iterations", "stop_inlier_fraction", "refit", "acceptance_weights")
+
+
+def given_to(method, settings):
+    """The settings, of which those of a search are given to searches alone: other methods refuse them."""
+    if method in SEARCHES:
+        return settings
+    return replace(settings, **{name: getattr(dr.Settings(), name) for name in OF_SEARCH})
 
 
 def spoilt(n_rows=300, dt=0.02, probability=0.1, magnitude=80.0, seed=0, first_row="clean", gaps=()):
@@ -37,7 +44,9 @@ def test_every_method_returns_the_truth_from_a_clean_log(name, method):
     """But for what dry friction, which switches within a step, leaves to an integrator, and lo-diransac integrates."""
     machine = MACHINES[name]
     signals, inputs = flight(machine, 400, 0.01, substeps=20)
-    result = dr.identify(builtin(name), as_log(machine, signals, inputs, 0.01), method, settings=QUICK)
+    result = dr.identify(
+        builtin(name), as_log(machine, signals, inputs, 0.01), method, settings=given_to(method, QUICK)
+    )
     switches = method == "lo-diransac" and "dry" in " ".join(machine.truth)
     assert result.parameters == pytest.approx(machine.truth, rel=1e-3 if switches else 1e-8)
     assert result.inliers.all()
@@ -114,8 +123,10 @@ def tumble(truth, torques, dt):
 )
 def test_fit_error_and_inliers_are_those_of_eq_2_and_section_3d(method, settings, gaps):
     signals, inputs = spoilt(probability=0.05, magnitude=20.0, gaps=gaps)
-    result = dr.identify(MODEL, as_log(PLANE, signals, inputs, 0.02), method, settings=settings)
-    predicted = rollout(PLANE, list(result.parameters.values()), signals[0, :6], inputs, 0.02)
+    log = as_log(PLANE, signals, inputs, 0.02)
+    result = dr.identify(MODEL, log, method, settings=given_to(method, settings))
+    substeps = dr.LoDiransac().substeps if method == "lo-diransac" else 1
+    predicted = rollout(PLANE, list(result.parameters.values()), signals[0, :6], inputs, 0.02, substeps)
     usable = np.ones(len(signals), dtype=bool)
     usable[[row for row, _ in gaps]] = False
     error, inliers = 0.0, np.zeros(len(signals), dtype=int)
@@ -161,7 +172,7 @@ def test_settings_default_to_the_spread_of_each_signal():
 @pytest.mark.parametrize("method", dr.METHODS)
 def test_same_seed_gives_the_same_result(method):
     log = as_log(PLANE, *spoilt(), 0.02)
-    first, second = (dr.identify(MODEL, log, method, seed=11, settings=TABLE_IV) for _ in range(2))
+    first, second = (dr.identify(MODEL, log, method, seed=11, settings=given_to(method, TABLE_IV)) for _ in range(2))
     assert first == second
 
 
@@ -183,7 +194,7 @@ def test_systems_that_do_not_say_which_cores_are_ours_serve_too(monkeypatch):
 
 @pytest.mark.parametrize("seed", [-1, 2**80, np.int64(3)])
 def test_any_whole_number_is_a_seed(seed):
-    assert dr.identify(MODEL, as_log(PLANE, *spoilt(), 0.02), seed=seed, settings=QUICK).seed == int(seed)
+    assert dr.identify(MODEL, as_log(PLANE, *spoilt(), 0.02), "i-diransac", seed=seed, settings=QUICK).seed == int(seed)
 
 
 def test_pickled_model_gives_the_same_result():
@@ -213,7 +224,7 @@ def test_with_outliers_i_diransac_beats_diransac_beats_least_squares():
         worst, errors = [], []
         for seed in range(7):
             log = as_log(PLANE, with_outliers(signals, 0.1, 80.0, seed), inputs, 0.01)
-            result = dr.identify(MODEL, log, method, seed=seed, settings=dr.Settings.table_iv())
+            result = dr.identify(MODEL, log, method, seed=seed, settings=given_to(method, dr.Settings.table_iv()))
             worst.append(max(abs(result.parameters[n] / x - 1.0) for n, x in PLANE.truth.items()))
             errors.append(clean_error(result.parameters, signals, inputs))
         medians[method] = np.median(worst), np.median(errors)
@@ -254,13 +265,26 @@ def test_least_squares_returns_what_violates_a_bound_and_says_so():
 # ---------------------------------------------------------------------- what is told on the way
 
 
-def test_progress_is_told_up_to_the_end():
+@pytest.mark.parametrize("differentiate", [False, True])
+@pytest.mark.parametrize("method", dr.METHODS)
+def test_progress_never_falls_and_ends_at_one(method, differentiate):
     calls = []
     log = as_log(PLANE, *spoilt(), 0.02)
-    result = dr.identify(MODEL, log, "i-diransac", settings=TABLE_IV, progress=lambda *now: calls.append(now))
-    assert [k for k, _, _ in calls] == sorted({k for k, _, _ in calls})
-    assert calls[-1][:2] == (60, 60) == (result.iterations, 60)
-    assert calls[-1][2] == Score(result.fit_error, result.inlier_fraction)
+    dr.identify(
+        MODEL, log, method, settings=given_to(method, TABLE_IV), differentiate=differentiate, progress=calls.append
+    )
+    fractions = [x.fraction for x in calls]
+    assert fractions == sorted(fractions)
+    assert fractions[0] >= 0.0
+    assert fractions[-1] == 1.0
+    assert all(isinstance(x, dr.Progress) and x.stage for x in calls)
+
+
+def test_progress_of_a_search_notes_the_inliers_that_it_has_found():
+    calls = []
+    log = as_log(PLANE, *spoilt(), 0.02)
+    result = dr.identify(MODEL, log, "i-diransac", settings=TABLE_IV, progress=calls.append)
+    assert [x.note for x in calls if x.stage == "searching"][-1] == f"{result.inlier_fraction:.0%} inliers"
 
 
 def test_least_squares_says_that_it_fitted_everything():
@@ -272,7 +296,9 @@ def test_least_squares_says_that_it_fitted_everything():
 def test_result_knows_its_log():
     log = as_log(PLANE, *spoilt(), 0.02)
     result = dr.identify(MODEL, log, "ols")
-    assert (result.log.fingerprint, result.log.n_rows, result.log.dt) == (log.fingerprint, 300, log.dt)
+    (of_log,) = result.logs
+    assert (of_log.fingerprint, of_log.n_rows, of_log.dt, of_log.remark) == (log.fingerprint, 300, log.dt, "")
+    assert (of_log.fit_error, of_log.inlier_fraction) == (result.fit_error, result.inlier_fraction)
 
 
 # ---------------------------------------------------------------------- logs that can do less
@@ -292,7 +318,7 @@ def test_log_of_accelerations_and_inputs_alone_serves_pointwise_methods():
     measured = 7.0 * command + 11.0 * command**2 + 0.1 * rng.normal(size=500)
     log = dr.Log.from_arrays(np.arange(500) * 0.001, {"z_ddot": measured, "command": command})
     for method in dr.METHODS:
-        result = dr.identify(model, log, method, settings=QUICK)
+        result = dr.identify(model, log, method, settings=given_to(method, QUICK))
         assert result.parameters == pytest.approx({"linear": 7.0, "square": 11.0}, abs=0.5)
         assert result.fit_error > 0.0
 
@@ -319,10 +345,11 @@ def test_fewer_rows_than_a_sample_are_refused():
     assert dr.identify(MODEL, log, "ols").n_fitted == 50
 
 
-def test_log_in_which_nothing_moves_is_refused():
+@pytest.mark.parametrize("method", dr.METHODS)
+def test_log_in_which_nothing_moves_is_refused(method):
     columns = dict.fromkeys((*PLANE.signals, *PLANE.inputs), np.zeros(200))
-    with pytest.raises(IdentificationError, match="does not determine"):
-        dr.identify(MODEL, dr.Log.from_arrays(np.arange(200) * 0.01, columns), "i-diransac")
+    with pytest.raises(LogError, match="are constant; nothing moves in this log"):
+        dr.identify(MODEL, dr.Log.from_arrays(np.arange(200) * 0.01, columns), method)
 
 
 def test_estimate_that_is_not_finite_is_refused():
@@ -357,15 +384,26 @@ def test_nothing_accepted_says_how_many_failed_at_which_step():
     ("changes", "error", "says"),
     [
         ({"model": "planar-rotorcraft"}, SettingsError, "give a dr.Model"),
-        ({"log": "flight.csv"}, SettingsError, "give a dr.Log"),
+        ({"logs": "flight.csv"}, SettingsError, "give a dr.Log"),
         ({"method": "ransac"}, SettingsError, '"ransac"; there are ols, tls, nls'),
         ({"seed": 1.5}, SettingsError, "seed is 1.5"),
         ({"seed": True}, SettingsError, "seed is True"),
         ({"settings": {"sample_size": 30}}, SettingsError, "settings"),
-        ({"method": "ols", "estimator": dr.TotalLeastSquares()}, SettingsError, '"ols" is an estimator itself'),
+        (
+            {"method": "ols", "settings": None, "estimator": dr.TotalLeastSquares()},
+            SettingsError,
+            '"ols" is an estimator itself',
+        ),
         ({"method": "i-diransac", "estimator": "huber"}, SettingsError, "estimator is 'huber'"),
         ({"bandwidth": 5.0}, SettingsError, "without differentiate"),
-        ({"bandwidth": 5.0, "differentiate": True}, SettingsError, "lo-diransac does not"),
+        (
+            {"method": "lo-diransac", "settings": None, "bandwidth": 5.0, "differentiate": True},
+            SettingsError,
+            "lo-diransac",
+        ),
+        ({"method": dr.LoDiransac}, SettingsError, "method is .*give a name"),
+        ({"method": dr.LoDiransac()}, SettingsError, "a method object has its own"),
+        ({"logs": []}, SettingsError, "dr.Log"),
         ({"settings": replace(QUICK, error_weights={"y": 1.0})}, SettingsError, 'no signal "y"'),
         ({"settings": replace(QUICK, error_weights={"x_dot": 0.0})}, SettingsError, "every error weight is zero"),
         ({"settings": replace(QUICK, min_inlier_signals=7)}, SettingsError, "min_inlier_signals = 7, but 6"),
@@ -374,7 +412,12 @@ def test_nothing_accepted_says_how_many_failed_at_which_step():
     ids=lambda x: str(x)[:40] if not isinstance(x, type) else "",
 )
 def test_arguments_without_meaning_are_refused(changes, error, says):
-    arguments = {"model": MODEL, "log": as_log(PLANE, *spoilt(), 0.02), "settings": QUICK} | changes
+    arguments = {
+        "model": MODEL,
+        "logs": as_log(PLANE, *spoilt(), 0.02),
+        "method": "i-diransac",
+        "settings": QUICK,
+    } | changes
     with pytest.raises(error, match=says):
         dr.identify(**arguments)
 
@@ -391,3 +434,62 @@ def test_linear_estimator_in_a_search_refuses_a_nonlinear_model():
     log = as_log(machine, *flight(machine, 200, 0.05), 0.05)
     with pytest.raises(ModelError, match="not affine in k"):
         dr.identify(model, log, "i-diransac", estimator=dr.OrdinaryLeastSquares(), settings=QUICK)
+
+
+# ---------------------------------------------------------------------- settings without a use
+
+
+JUDGING = (("inlier_thresholds", {"x_dot": 0.5}), ("min_inlier_signals", 2), ("error_weights", {"x_dot": 1.0}))
+SIMULATION = (("integrator", "euler"), ("substeps", 3))
+EVERY_SETTING = (
+    ("sample_size", 30),
+    ("max_iterations", 7),
+    ("stop_inlier_fraction", 0.5),
+    ("acceptance_weights", (1.0, 0.0)),
+    ("refit", "none"),
+    *JUDGING,
+    *SIMULATION,
+    ("initial_state", "robust"),
+    ("threads", 1),
+    ("batch_size", 3),
+)
+FOR_ALL = ("initial_state", "threads", "batch_size", *(name for name, _ in JUDGING))
+USED = {
+    **{name: {*FOR_ALL, "integrator", "substeps"} for name in ("ols", "tls", "nls")},
+    "diransac": {*FOR_ALL, "integrator", "substeps", "sample_size", "max_iterations", "refit"},
+    "i-diransac": {name for name, _ in EVERY_SETTING},
+    "lo-diransac": set(FOR_ALL),
+}
+
+
+@pytest.mark.parametrize(("name", "value"), EVERY_SETTING)
+@pytest.mark.parametrize("method", dr.METHODS)
+def test_setting_that_a_method_has_no_use_for_is_refused_and_others_are_not(method, name, value):
+    log, settings = as_log(PLANE, *spoilt(n_rows=200), 0.02), dr.Settings(**{name: value})
+    if name in USED[method]:
+        assert dr.identify(MODEL, log, method, settings=settings).settings == settings
+        return
+    with pytest.raises(SettingsError, match=f'"{method}" has no use for the setting {name} = ') as caught:
+        dr.identify(MODEL, log, method, settings=settings)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_diransac_takes_no_early_stop_for_an_answer_because_it_never_stops_early():
+    log = as_log(PLANE, *spoilt(), 0.02)
+    settings = dr.Settings(sample_size=30, max_iterations=40)
+    usual = dr.identify(MODEL, log, "diransac", settings=settings)
+    never = dr.identify(MODEL, log, "diransac", settings=replace(settings, stop_inlier_fraction=None))
+    assert (never.parameters, never.iterations) == (usual.parameters, 40)
+
+
+def test_method_object_gives_what_its_name_gives():
+    log = as_log(PLANE, *spoilt(), 0.02)
+    pairs = (
+        (dr.IDiransac(QUICK), "i-diransac", QUICK),
+        (dr.Diransac(QUICK), "diransac", QUICK),
+        (dr.LeastSquares(), "ols", None),
+        (dr.LeastSquares(dr.TotalLeastSquares()), "tls", None),
+        (dr.LoDiransac(), "lo-diransac", None),
+    )
+    for method, name, settings in pairs:
+        assert dr.identify(MODEL, log, method) == dr.identify(MODEL, log, name, settings=settings)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.data.dataset import observe
-from diransac.errors import IdentificationError, LogError
-from diransac.identification.methods.lo_diransac import find
+from diransac.data.dataset import Dataset
+from diransac.errors import IdentificationError, LogError, SettingsError
 from diransac.simulation import RolloutBatch, rollouts
 from simulated import MACHINES, as_log, flight, with_outliers
 from test_nonlinear import log_of, swing
@@ -38,19 +37,19 @@ def found(name, signals, inputs, seed=0, without=()):
     columns = [n for n in MACHINES[name].signals if n not in without]
     log = as_log(MACHINES[name], signals, inputs, DT)
     log = dr.Log.from_arrays(log.time, {n: log[n] for n in (*columns, *MACHINES[name].inputs)})
-    return find(observe(MODELS[name], log, pointwise=False), seed)
+    return dr.LoDiransac().fit(Dataset.of(MODELS[name], log, pointwise=False), seed)
 
 
-def relative_errors(name, findings):
-    return np.abs(findings.parameters / truth(name) - 1.0)
+def relative_errors(name, estimate):
+    return np.abs(estimate.values / truth(name) - 1.0)
 
 
 @pytest.mark.parametrize("name", SMOOTH)
 @pytest.mark.parametrize("probability", [0.1, 0.5])
 def test_outliers_in_up_to_half_of_all_samples_leave_the_parameters_exact(name, probability):
     signals, inputs = flown(name)
-    findings = found(name, with_outliers(signals, probability, 30.0, seed=1, first_row="hit"), inputs)
-    assert relative_errors(name, findings).max() < 1e-3
+    estimate = found(name, with_outliers(signals, probability, 30.0, seed=1, first_row="hit"), inputs)
+    assert relative_errors(name, estimate).max() < 1e-3
 
 
 def test_one_sided_outliers_in_the_liveliest_third_leave_the_parameters_exact():
@@ -58,8 +57,8 @@ def test_one_sided_outliers_in_the_liveliest_third_leave_the_parameters_exact():
     rng = np.random.default_rng(2)
     lively = inputs[:, 0] > np.quantile(inputs[:, 0], 0.7)
     hit = (rng.random(signals.shape) < 0.5) & lively[:, None]
-    findings = found("planar-rotorcraft", signals + hit * rng.uniform(0.0, 80.0, signals.shape), inputs)
-    assert relative_errors("planar-rotorcraft", findings).max() < 1e-3
+    estimate = found("planar-rotorcraft", signals + hit * rng.uniform(0.0, 80.0, signals.shape), inputs)
+    assert relative_errors("planar-rotorcraft", estimate).max() < 1e-3
 
 
 @pytest.mark.parametrize("kind", ["missing", "frozen"])
@@ -76,26 +75,26 @@ def test_coordinates_alone_are_enough(name):
     signals, inputs = flown(name, 2500)
     n = len(MACHINES[name].coordinates)
     noisy = signals + 1e-3 * signals.std(axis=0) * np.random.default_rng(3).normal(size=signals.shape)
-    findings = found(name, noisy, inputs, without=MACHINES[name].signals[n:])
-    errors = np.sqrt(np.diag(findings.covariance)) / np.abs(truth(name))
-    assert (relative_errors(name, findings) < 4.0 * errors).all()
+    estimate = found(name, noisy, inputs, without=MACHINES[name].signals[n:])
+    errors = np.sqrt(np.diag(estimate.covariance)) / np.abs(truth(name))
+    assert (relative_errors(name, estimate) < 4.0 * errors).all()
     assert np.median(errors) < 0.02
 
 
 def test_input_delay_is_found_and_taken_out():
     signals, inputs = flown("planar-rotorcraft")
     late = np.vstack([inputs[3:], np.repeat(inputs[-1:], 3, axis=0)])  # what was recorded acts three rows later
-    findings = found("planar-rotorcraft", with_outliers(signals, 0.1, 30.0, seed=4), late)
-    assert findings.input_delay == pytest.approx(0.03, abs=2e-4)
-    assert relative_errors("planar-rotorcraft", findings).max() < 2e-3
+    estimate = found("planar-rotorcraft", with_outliers(signals, 0.1, 30.0, seed=4), late)
+    assert estimate.diagnosis.input_delay == pytest.approx(0.03, abs=2e-4)
+    assert relative_errors("planar-rotorcraft", estimate).max() < 2e-3
 
 
 def test_parameters_that_do_not_enter_affinely_are_found():
     log = swing(n=1500)
     signals = np.column_stack([log["angle"], log["angle_dot"], log["angle_ddot"]])
     spoilt = log_of(with_outliers(signals, 0.3, 20.0, seed=5), np.column_stack([log["pivot"], log["torque"]]), DT)
-    findings = find(observe(hanging_mass(), spoilt, pointwise=False), 0)
-    assert findings.parameters == pytest.approx([0.43, 1.7, 0.06], rel=1e-3)
+    estimate = dr.LoDiransac().fit(Dataset.of(hanging_mass(), spoilt, pointwise=False), 0)
+    assert estimate.values == pytest.approx([0.43, 1.7, 0.06], rel=1e-3)
 
 
 def test_noise_and_outliers_are_told_apart():
@@ -103,21 +102,23 @@ def test_noise_and_outliers_are_told_apart():
     rng, sigma = np.random.default_rng(6), 0.05 * signals.std(axis=0)
     hit = rng.random(signals.shape) < 0.2
     spoilt = signals + sigma * rng.normal(size=signals.shape) + hit * rng.uniform(-30.0, 30.0, signals.shape)
-    findings = found("planar-rotorcraft", spoilt, inputs)
-    assert findings.noise_std == pytest.approx(sigma, rel=0.06)
-    assert findings.outlier_fraction == pytest.approx(hit.mean(axis=0), abs=0.02)
-    assert (findings.outliers == hit).mean() > 0.98
+    estimate = found("planar-rotorcraft", spoilt, inputs)
+    diagnosis = estimate.diagnosis
+    assert list(diagnosis.noise_std.values()) == pytest.approx(sigma, rel=0.06)
+    assert list(diagnosis.outlier_fraction.values()) == pytest.approx(hit.mean(axis=0), abs=0.02)
+    assert (np.column_stack(list(diagnosis.outliers.values())) == hit).mean() > 0.98
 
 
 def test_a_gust_is_an_acceleration_that_the_model_does_not_explain_not_a_sensor_fault():
     machine, gust = MACHINES["underwater-vehicle"], np.zeros(2500)
     gust[1000:1100] = 0.5
     pushed, inputs = flight_with(machine, gust)
-    findings = found("underwater-vehicle", pushed, inputs)
-    inside = (findings.latent_middles >= 1000) & (findings.latent_middles < 1100)
-    assert findings.unmodelled_accelerations[inside] == pytest.approx(0.5, abs=0.1)
-    assert np.abs(findings.unmodelled_accelerations[~inside]).max() < 0.1
-    assert findings.outliers.mean() < 0.02
+    estimate = found("underwater-vehicle", pushed, inputs)
+    diagnosis = estimate.diagnosis
+    inside = (diagnosis.unmodelled_time >= 10.0) & (diagnosis.unmodelled_time < 11.0)
+    assert diagnosis.unmodelled_accelerations["x_ddot"][inside] == pytest.approx(0.5, abs=0.1)
+    assert np.abs(diagnosis.unmodelled_accelerations["x_ddot"][~inside]).max() < 0.1
+    assert np.mean(list(diagnosis.outliers.values())) < 0.02
 
 
 def flight_with(machine, push):
@@ -142,9 +143,9 @@ def test_one_wild_input_does_not_matter():
     signals, inputs = flown("planar-rotorcraft")
     wild = inputs.copy()
     wild[[300, 900], 0] = [4000.0, -700.0]
-    findings = found("planar-rotorcraft", signals, wild)
-    assert relative_errors("planar-rotorcraft", findings).max() < 5e-3
-    assert any("inputs leap" in note for note in findings.notes)
+    estimate = found("planar-rotorcraft", signals, wild)
+    assert relative_errors("planar-rotorcraft", estimate).max() < 5e-3
+    assert any("inputs leap" in note for note in estimate.notes)
 
 
 def climb(moment):
@@ -160,9 +161,9 @@ def climb(moment):
 
 
 def test_parameters_that_the_motion_does_not_show_are_named():
-    findings = found("planar-rotorcraft", *climb(moment=1e-6))
-    assert findings.unidentifiable.tolist() == [False, True, True]
-    assert findings.parameters[0] == pytest.approx(truth("planar-rotorcraft")[0], rel=1e-3)
+    estimate = found("planar-rotorcraft", *climb(moment=1e-6))
+    assert estimate.diagnosis.unidentifiable == ("inertia", "drag")
+    assert estimate.parameters["mass"] == pytest.approx(truth("planar-rotorcraft")[0], rel=1e-3)
 
 
 def test_a_log_that_cannot_give_a_parameter_at_all_is_refused():
@@ -174,7 +175,7 @@ def test_same_seed_same_answer():
     signals, inputs = flown("planar-rotorcraft")
     spoilt = with_outliers(signals, 0.3, 30.0, seed=8)
     first, second = (found("planar-rotorcraft", spoilt, inputs, seed=3) for _ in range(2))
-    assert np.array_equal(first.parameters, second.parameters)
+    assert first.parameters == second.parameters
     assert np.array_equal(first.covariance, second.covariance)
 
 
@@ -191,9 +192,9 @@ def test_intervals_cover_under_noise_and_outliers():
     for seed in range(30):
         rng = np.random.default_rng(100 + seed)
         noisy = signals + sigma * rng.normal(size=signals.shape)
-        findings = found("underwater-vehicle", with_outliers(noisy, 0.2, 10.0, seed=seed), inputs, seed=seed)
-        span = 1.96 * np.sqrt(np.diag(findings.covariance))
-        missed += (np.abs(findings.parameters - truth("underwater-vehicle")) > span).sum()
+        estimate = found("underwater-vehicle", with_outliers(noisy, 0.2, 10.0, seed=seed), inputs, seed=seed)
+        span = 1.96 * np.sqrt(np.diag(estimate.covariance))
+        missed += (np.abs(estimate.values - truth("underwater-vehicle")) > span).sum()
     assert missed <= 15
 
 
@@ -219,6 +220,18 @@ def test_a_delay_of_inputs_that_leap_now_and_then_is_found_where_there_is_no_noi
 
 
 def test_windows_in_which_outliers_are_the_majority_are_carried_by_their_neighbours():
+    model, signals, spoilt, bad, inputs = bursts()
+    columns = dict(zip(model.signals, spoilt.T, strict=True)) | {"thrust": inputs[:, 0]}
+    result = dr.identify(model, dr.Log.from_arrays(np.arange(len(signals)) * 0.01, columns))
+    np.testing.assert_allclose(list(result.parameters.values()), truth("underwater-vehicle"), rtol=1e-3)
+    found = np.column_stack([result.diagnosis.outliers[name] for name in model.signals])
+    large = bad & (np.abs(spoilt - signals) > 1.0)
+    assert (found & large).sum() > 0.99 * large.sum()
+    assert (found & ~bad).sum() < 0.01 * bad.size
+
+
+def bursts():
+    """Model, clean and spoilt signals, which samples are outliers, and inputs: three bursts of mostly outliers."""
     machine, inputs = held(2000, seed=4)
     p = np.array(list(machine.truth.values()))
     model = dr.models.underwater_vehicle()
@@ -226,11 +239,96 @@ def test_windows_in_which_outliers_are_the_majority_are_carried_by_their_neighbo
     rng, bad = np.random.default_rng(0), np.zeros(signals.shape, bool)
     for first in (300, 900, 1500):
         bad[first : first + 120] = rng.random((120, 3)) < 0.8
-    spoilt = np.where(bad, signals + rng.uniform(0.0, 20.0, signals.shape), signals)
-    columns = dict(zip(model.signals, spoilt.T, strict=True)) | {"thrust": inputs[:, 0]}
-    result = dr.identify(model, dr.Log.from_arrays(np.arange(len(signals)) * 0.01, columns))
-    np.testing.assert_allclose(list(result.parameters.values()), p, rtol=1e-3)
-    found = np.column_stack([result.diagnosis.outliers[name] for name in model.signals])
-    large = bad & (np.abs(spoilt - signals) > 1.0)
-    assert (found & large).sum() > 0.99 * large.sum()
-    assert (found & ~bad).sum() < 0.01 * bad.size
+    return model, signals, np.where(bad, signals + rng.uniform(0.0, 20.0, signals.shape), signals), bad, inputs
+
+
+def test_progress_never_falls_though_several_delays_and_starts_are_tried():
+    model, _, spoilt, _, inputs = bursts()
+    columns = dict(zip(model.signals, spoilt[:-4].T, strict=True)) | {"thrust": inputs[4:, 0]}
+    calls = []
+    dr.identify(model, dr.Log.from_arrays(np.arange(len(spoilt) - 4) * 0.01, columns), progress=calls.append)
+    fractions = [x.fraction for x in calls]
+    assert sum(x.note == "fit 2" for x in calls) > 1
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+
+
+# ---------------------------------------------------------------------- settings
+
+
+BAD = {
+    "n_samples": (-1, 2.5, True, "many", None),
+    "substeps": (0, 1.5, False),
+    "max_starts": (0,),
+    "max_fits": (0,),
+    "max_steps": (-1,),
+    "max_delay_shifts": (-1,),
+    "input_window": (0.0, -1.0, np.inf, np.nan, "short"),
+    "smoothing_half_width": (0.0,),
+    "prior_model_error": (-1e-3, np.nan),
+    "prior_inflation": (0.0,),
+    "prior_delay": (0.0,),
+    "delay_range": ((0.01, 0.02), (-0.02, -0.01), 0.1, (0.0,), ("a", "b"), (0.0, np.nan), (-np.inf, np.inf)),
+    "outliers": (1, None, "yes"),
+    "model_error": (0,),
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(n, x) for n, values in BAD.items() for x in values])
+def test_setting_without_meaning_is_refused_by_its_name(name, value):
+    with pytest.raises(SettingsError, match=name) as caught:
+        dr.LoDiransac(**{name: value})
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_criteria_that_lo_diransac_has_no_use_for_are_refused():
+    with pytest.raises(SettingsError, match='"lo-diransac" has no use for the setting substeps = 3'):
+        dr.LoDiransac(dr.Settings(substeps=3))
+
+
+def test_settings_are_saved_with_the_result(tmp_path):
+    log = as_log(MACHINES["underwater-vehicle"], *flown("underwater-vehicle"), DT)
+    method = dr.LoDiransac(substeps=np.int64(3), n_samples=50, delay_range=(-0.01, 0.02))
+    result = dr.identify(MODELS["underwater-vehicle"], log, method)
+    assert result.options == method.options()
+    assert (result.options["substeps"], result.options["delay_range"]) == (3, [-0.01, 0.02])
+    assert result.iterations == 50
+    result.save(tmp_path / "model.json")
+    loaded = dr.Result.load(tmp_path / "model.json")
+    assert loaded == result
+    options = {n: tuple(x) if isinstance(x, list) else x for n, x in loaded.options.items()}
+    assert dr.LoDiransac(**options) == method
+
+
+def test_substeps_of_the_method_are_those_of_the_evaluation():
+    log = as_log(MACHINES["servo-axis"], *flight(MACHINES["servo-axis"], 500, DT, substeps=20), DT)
+    for substeps in (1, 7):
+        estimate = dr.LoDiransac(substeps=substeps).fit(Dataset.of(MODELS["servo-axis"], log, pointwise=False), 0)
+        assert estimate.resolution.substeps == substeps
+
+
+LEFT_OUT = [
+    {"n_samples": 0},
+    {"max_steps": 0, "instrumental_variables": False},
+    {"max_starts": 1},
+    {"neighbouring_starts": False},
+    {"outliers": False},
+    {"model_error": False},
+    {"prior_model_error": 1e-5},
+    {"prior_discrepancy": 1e-6, "initial_discrepancy": 1e-6},
+    {"prior_delay": 1e-8, "max_delay_shifts": 0, "delay_range": (0, 0)},
+    {"robust_model_error": False},
+    {"gradual_continuity": False},
+    {"instrumental_variables": False},
+    {"stuck_rows": False},
+    {"prior_model_error": 0.0},
+    {"prior_discrepancy": 0.0},
+]
+
+
+@pytest.mark.parametrize("changes", LEFT_OUT, ids=lambda x: ", ".join(x))
+def test_a_clean_log_needs_no_single_part_of_the_method(changes):
+    """Each can be left out by a setting; hypotheses alone are off by what smoothing does to the motion."""
+    log = as_log(MACHINES["underwater-vehicle"], *flown("underwater-vehicle"), DT)
+    estimate = dr.LoDiransac(**changes).fit(Dataset.of(MODELS["underwater-vehicle"], log), 0)
+    assert relative_errors("underwater-vehicle", estimate).max() < (0.2 if "max_steps" in changes else 1e-3)

@@ -6,56 +6,71 @@ import numpy as np
 import pytest
 
 import diransac as dr
+from diransac.data.dataset import ParameterLayout
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
-from diransac.identification.methods.lo_diransac.freed import freed
-from diransac.identification.methods.lo_diransac.gate import mended_inputs, stuck_rows
+from diransac.identification.methods.lo_diransac.augmented_model import augmented_model
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
-from diransac.identification.methods.lo_diransac.normal_equations import Fit, cost, linearize
-from diransac.identification.methods.lo_diransac.smoothing import choose_half_width, running_median, smooth
-from diransac.identification.methods.lo_diransac.windows import Windows
+from diransac.identification.methods.lo_diransac.normal_equations import Fit, cost, linearize, with_residuals
+from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+from diransac.identification.methods.lo_diransac.smoothing import (
+    Samples,
+    choose_half_width,
+    running_median,
+    screened_inputs,
+    smooth,
+    stuck_rows,
+)
 from simulated import MACHINES, flight, rollout
 
 ROTORCRAFT = dr.models.planar_rotorcraft()
 TRUTH = np.array(list(MACHINES["planar-rotorcraft"].truth.values()))
 
 
-def windows_of(n_rows=200, length=25, dt=0.01):
+def intervals_over(measured, inputs, model=ROTORCRAFT, dt=0.01, length=25):
+    """Intervals of one log in which everything is measured, with the default integration steps."""
+    layout, known = ParameterLayout(model.parameters), np.ones(measured.shape, bool)
+    substeps = dr.LoDiransac().substeps
+    return ShootingIntervals.of(model, layout, [(measured, known, inputs)], dt, length, substeps)
+
+
+def intervals_of(n_rows=200, length=25, dt=0.01):
     signals, inputs = flight(MACHINES["planar-rotorcraft"], n_rows, dt, substeps=5)
-    return Windows(ROTORCRAFT, signals, np.ones(signals.shape, bool), inputs, dt, length), signals
+    return intervals_over(signals, inputs, dt=dt, length=length), signals
 
 
 def smoothed(measured, known):
     """The motion of a log at 100 Hz, from 25 rows to either side."""
-    return smooth(ROTORCRAFT, measured, known, running_median(measured, known), 0.01, 25)
+    samples = Samples(measured, known, running_median(measured, known, 31))
+    return smooth(ROTORCRAFT, [samples], 0.01, 25)[0]
 
 
 # ---------------------------------------------------------------------- arrowhead
 
 
-def dense_arrowhead(n_windows, k, m, seed):
+def dense_arrowhead(n_blocks, k, m, seed):
     """A random one as a full matrix, its unknowns in units that differ by decades, and its blocks."""
     rng = np.random.default_rng(seed)
-    n = n_windows * k + m
+    n = n_blocks * k + m
     A = np.zeros((n, n))
-    for w in range(n_windows):
-        own = np.r_[w * k : min(w + 2, n_windows) * k, n_windows * k : n]
+    for w in range(n_blocks):
+        own = np.r_[w * k : min(w + 2, n_blocks) * k, n_blocks * k : n]
         J = rng.normal(size=(5 * len(own), len(own))) * np.exp(2.0 * rng.normal(size=len(own)))
         A[np.ix_(own, own)] += J.T @ J
-    z = [slice(w * k, (w + 1) * k) for w in range(n_windows)]
-    p = slice(n_windows * k, n)
-    below = np.array([A[z[w + 1], z[w]] for w in range(n_windows - 1)]).reshape(-1, k, k)
+    z = [slice(w * k, (w + 1) * k) for w in range(n_blocks)]
+    p = slice(n_blocks * k, n)
+    below = np.array([A[z[w + 1], z[w]] for w in range(n_blocks - 1)]).reshape(-1, k, k)
     blocks = Arrowhead(np.array([A[s, s] for s in z]), below, np.array([A[s, p] for s in z]), A[p, p])
     return A, blocks, z, p
 
 
-@pytest.mark.parametrize("n_windows", [1, 2, 3, 4, 5, 8, 13, 50])
-def test_arrowhead_gives_what_dense_algebra_gives(n_windows):
+@pytest.mark.parametrize("n_blocks", [1, 2, 3, 4, 5, 8, 13, 50])
+def test_arrowhead_gives_what_dense_algebra_gives(n_blocks):
     k, m = 4, 3
-    A, blocks, z, p = dense_arrowhead(n_windows, k, m, seed=n_windows)
+    A, blocks, z, p = dense_arrowhead(n_blocks, k, m, seed=n_blocks)
     right = np.random.default_rng(0).normal(size=len(A))
     solution, inverse = np.linalg.solve(A, right), np.linalg.inv(A)
-    found = blocks.solve(right[: n_windows * k].reshape(-1, k), right[p])
+    found = blocks.solve(right[: n_blocks * k].reshape(-1, k), right[p])
     assert np.allclose(np.append(found.step_z, found.step_p), solution, rtol=1e-7, atol=1e-9 * np.abs(solution).max())
     assert np.allclose(found.var_p, inverse[p, p], rtol=1e-6)
     for w, s in enumerate(z):
@@ -137,16 +152,17 @@ def test_half_width_is_wider_where_the_motion_is_slower():
     known = np.zeros((4000, 9), bool)
     known[:, :3] = True
     logs = [np.repeat(np.sin(w * t)[:, None], 9, axis=1) + noise for w in (10.0, 0.5)]
-    widths = [choose_half_width(ROTORCRAFT, log, known, running_median(log, known), 0.01) for log in logs]
+    samples = [Samples(log, known, running_median(log, known, 31)) for log in logs]
+    widths = [choose_half_width(ROTORCRAFT, [log], 0.01, 0.25) for log in samples]
     assert widths[0] == 25
     assert widths[1] > 25
 
 
-# ---------------------------------------------------------------------- the freed model
+# ---------------------------------------------------------------------- the augmented model
 
 
-def test_freed_model_is_the_model_where_nothing_deviates():
-    model, rng = freed(ROTORCRAFT).model, np.random.default_rng(7)
+def test_augmented_model_is_the_model_where_nothing_deviates():
+    model, rng = augmented_model(ROTORCRAFT).model, np.random.default_rng(7)
     x, u = rng.normal(size=6), rng.normal(size=2)
     free = np.concatenate([TRUTH, np.zeros(model.n_p - 3)])
     assert np.allclose(
@@ -154,8 +170,8 @@ def test_freed_model_is_the_model_where_nothing_deviates():
     )
 
 
-def test_freed_model_adds_latent_accelerations_and_forces_that_go_with_the_inputs():
-    parts = freed(ROTORCRAFT)
+def test_augmented_model_adds_unmodelled_accelerations_and_forces_that_go_with_the_inputs():
+    parts = augmented_model(ROTORCRAFT)
     rng = np.random.default_rng(8)
     x, u, d, push = rng.normal(size=6), rng.normal(size=2), rng.normal(size=3), rng.normal(size=(3, 3))
     found = parts.model.dynamics(x, [*u, 0, 0], [*TRUTH, *push.ravel(), 0.0, *d])[1].full().ravel()
@@ -165,62 +181,62 @@ def test_freed_model_adds_latent_accelerations_and_forces_that_go_with_the_input
     assert np.allclose(found, expected, rtol=1e-12)
 
 
-def test_freed_model_delays_its_inputs_to_first_order():
-    parts = freed(ROTORCRAFT)
+def test_augmented_model_delays_its_inputs_to_first_order():
+    parts = augmented_model(ROTORCRAFT)
     x, u, later = np.zeros(6), np.array([2.0, 0.1]), np.array([-0.3, 0.02])
-    free = np.concatenate([TRUTH, np.zeros(parts.n_pushes), [0.5], np.zeros(3)])
+    free = np.concatenate([TRUTH, np.zeros(parts.n_discrepancies), [0.5], np.zeros(3)])
     found = parts.model.dynamics(x, [*u, *later], free)[1].full()
     assert np.allclose(found, ROTORCRAFT.dynamics(x, u + 0.5 * later, TRUTH)[1].full(), rtol=1e-13)
 
 
-def test_windows_from_true_states_reproduce_the_log():
-    windows, signals = windows_of()
-    shared = np.append(TRUTH, np.zeros(windows.freed.n_shared - 3))
-    x, d = signals[windows.starts, :6], np.zeros((len(windows), 3))
-    assert np.abs(windows.residuals(shared, x, d)).max() < 1e-11
+def test_intervals_from_true_states_reproduce_the_log():
+    intervals, signals = intervals_of()
+    shared = np.append(TRUTH, np.zeros(intervals.n_shared - 3))
+    x, d = signals[intervals.starts, :6], np.zeros((len(intervals), 3))
+    assert np.abs(intervals.residuals(shared, x, d)).max() < 1e-11
 
 
-def test_a_last_window_that_is_not_full_has_rows_in_which_nothing_is_known():
-    windows, _ = windows_of(n_rows=210)
-    assert len(windows) == 9
-    assert not windows.known[210:].any()
+def test_a_last_interval_that_is_not_full_has_rows_in_which_nothing_is_known():
+    intervals, _ = intervals_of(n_rows=210)
+    assert len(intervals) == 9
+    assert not intervals.known[210:].any()
 
 
 def test_delay_moves_the_inputs_by_rows():
-    windows, _ = windows_of()
-    assert np.array_equal(windows.delayed(2).inputs[2:], windows.inputs[:-2])
-    assert np.array_equal(windows.delayed(-3).inputs[:-3], windows.inputs[3:])
+    intervals, _ = intervals_of()
+    assert np.array_equal(intervals.delayed(2).inputs[2:], intervals.inputs[:-2])
+    assert np.array_equal(intervals.delayed(-3).inputs[:-3], intervals.inputs[3:])
 
 
 # ---------------------------------------------------------------------- normal equations
 
 
-def perturbed_fit(windows, signals, seed=9):
+def perturbed_fit(intervals, signals, seed=9):
     rng = np.random.default_rng(seed)
-    x = signals[windows.starts, :6] + 0.01 * rng.normal(size=(len(windows), 6))
-    d = 0.05 * rng.normal(size=(len(windows), 3))
-    n = windows.freed.n_shared
+    x = signals[intervals.starts, :6] + 0.01 * rng.normal(size=(len(intervals), 6))
+    d = 0.05 * rng.normal(size=(len(intervals), 3))
+    n = intervals.n_shared
     shared = np.append(TRUTH, np.zeros(n - 3)) * 1.05 + np.r_[0, 0, 0, 1e-3 * rng.normal(size=n - 3)]
     noise = Mixture(np.full(9, 0.1), np.full(9, 0.1), np.full(9, 10.0), np.full(9, 1e-6))
     prior = np.r_[np.full(3, np.inf), np.full(n - 3, 0.01)]
     sizes = (np.full(3, 0.1), np.full(6, 0.02), prior)
-    return windows.judged(Fit(shared, x, d, np.zeros_like(signals), noise, *sizes))
+    return with_residuals(intervals, Fit(shared, x, d, np.zeros_like(signals), noise, *sizes))
 
 
-def moved(windows, fit, dz, ds):
-    return windows.judged(replace(fit, shared=fit.shared + ds, x=fit.x + dz[:, :6], d=fit.d + dz[:, 6:]))
+def moved(intervals, fit, dz, ds):
+    return with_residuals(intervals, replace(fit, shared=fit.shared + ds, x=fit.x + dz[:, :6], d=fit.d + dz[:, 6:]))
 
 
 def test_right_hand_side_is_minus_half_the_slope_of_the_cost():
-    windows, signals = windows_of(n_rows=100)
-    fit = perturbed_fit(windows, signals)
+    intervals, signals = intervals_of(n_rows=100)
+    fit = perturbed_fit(intervals, signals)
     weights = np.random.default_rng(10).uniform(0.0, 5.0, signals.shape)
-    at = linearize(windows, fit, weights)
+    at = linearize(intervals, fit, weights)
     rng = np.random.default_rng(11)
     for _ in range(6):
         dz, ds = rng.normal(size=at.right_z.shape), rng.normal(size=at.right_s.shape) * 1e-2
         h = 1e-5
-        ahead, behind = (cost(windows, moved(windows, fit, s * h * dz, s * h * ds), weights) for s in (1, -1))
+        ahead, behind = (cost(intervals, moved(intervals, fit, s * h * dz, s * h * ds), weights) for s in (1, -1))
         assert (ahead - behind) / (4 * h) == pytest.approx(-(at.right_z * dz).sum() - at.right_s @ ds, rel=1e-5)
 
 
@@ -236,16 +252,18 @@ def test_a_gauss_newton_step_solves_a_linear_problem_at_once():
     rng = np.random.default_rng(12)
     n, dt = 100, 0.01
     measured, inputs = rng.normal(size=(n, 3)), rng.normal(size=(n, 1))
-    windows = Windows(model, measured, np.ones((n, 3), bool), inputs, dt, 20)
+    intervals = intervals_over(measured, inputs, model, dt, 20)
     noise = Mixture(np.ones(3), np.full(3, 0.1), np.full(3, 10.0), np.full(3, 1e-6))
-    shared = np.zeros(windows.freed.n_shared)
+    shared = np.zeros(intervals.n_shared)
     sizes = (np.array([0.3]), np.array([0.1, 0.1]), np.r_[np.inf, 0.1, 0.1, 1e-9])
-    fit = windows.judged(Fit(shared, np.zeros((5, 2)), np.zeros((5, 1)), measured, noise, *sizes))
+    fit = with_residuals(intervals, Fit(shared, np.zeros((5, 2)), np.zeros((5, 1)), measured, noise, *sizes))
     weights = rng.uniform(0.5, 2.0, (n, 3))
-    first = linearize(windows, fit, weights)
+    first = linearize(intervals, fit, weights)
     step = first.system.solve(first.right_z, first.right_s)
-    there = windows.judged(replace(fit, shared=shared + step.step_p, x=step.step_z[:, :2], d=step.step_z[:, 2:]))
-    again = linearize(windows, there, weights)
+    there = with_residuals(
+        intervals, replace(fit, shared=shared + step.step_p, x=step.step_z[:, :2], d=step.step_z[:, 2:])
+    )
+    again = linearize(intervals, there, weights)
     assert np.abs(again.right_z).max() < 1e-6 * np.abs(first.right_z).max()
     assert np.abs(again.right_s[:1]).max() < 1e-6 * np.abs(first.right_s).max()
 
@@ -255,39 +273,40 @@ def test_a_gauss_newton_step_solves_a_linear_problem_at_once():
 
 def test_weak_form_of_a_clean_log_is_near_the_parameters():
     """Within what smoothing does to a motion as lively as this one."""
-    windows, signals = windows_of(n_rows=600)
-    motion = smoothed(signals, windows.known)
-    weak = weak_form(windows, motion)
+    intervals, signals = intervals_of(n_rows=600)
+    motion = smoothed(signals, intervals.known)
+    weak = weak_form(intervals, motion)
     everything = np.ones((1, *weak.b.shape), bool)
     assert weak.solve(everything)[0] == pytest.approx(TRUTH, rel=0.1)
 
 
 def test_consensus_ranks_the_truth_first_though_half_of_the_samples_are_wrong():
-    windows, signals = windows_of(n_rows=1000)
+    intervals, signals = intervals_of(n_rows=1000)
     rng = np.random.default_rng(13)
     hit = rng.random(signals.shape) < 0.5
     measured = signals + hit * rng.uniform(-50.0, 50.0, signals.shape)
-    windows = Windows(ROTORCRAFT, measured, windows.known, windows.inputs, 0.01, 25)
-    motion = smoothed(measured, windows.known)
+    intervals = intervals_over(measured, intervals.inputs)
+    motion = smoothed(measured, intervals.known)
     others = TRUTH * np.exp(rng.normal(scale=0.2, size=(50, 3)))
-    scores = robust_scores(windows, motion, np.vstack([others, TRUTH]), np.arange(len(windows)))
+    scores = robust_scores(intervals, motion, np.vstack([others, TRUTH]), np.arange(len(intervals)))
     assert np.argmin(scores) == 50
 
 
 def test_consensus_is_the_sum_of_log_scales_of_a_plain_simulation():
-    windows, signals = windows_of(n_rows=100)
-    motion = smoothed(signals, windows.known)
+    intervals, signals = intervals_of(n_rows=100)
+    motion = smoothed(signals, intervals.known)
     p = TRUTH * [1.1, 0.9, 1.3]
     machine = MACHINES["planar-rotorcraft"]
-    starts = motion.signals[windows.starts, :6]
+    starts = motion.signals[intervals.starts, :6]
     simulated = [
-        rollout(machine, p, x, windows.inputs[a : a + 25], 0.01) for x, a in zip(starts, windows.starts, strict=True)
+        rollout(machine, p, x, intervals.inputs[a : a + 25], 0.01)
+        for x, a in zip(starts, intervals.starts, strict=True)
     ]
     size = np.sort(np.abs(np.vstack(simulated) - signals), axis=0)[35] / 0.4538
-    assert robust_scores(windows, motion, p[None], np.arange(4))[0] == pytest.approx(np.log(size).sum(), rel=1e-9)
+    assert robust_scores(intervals, motion, p[None], np.arange(4))[0] == pytest.approx(np.log(size).sum(), rel=1e-9)
 
 
-# ---------------------------------------------------------------------- gate
+# ---------------------------------------------------------------------- screening
 
 
 def test_rows_that_repeat_exactly_are_stuck_and_others_are_not():
@@ -297,12 +316,12 @@ def test_rows_that_repeat_exactly_are_stuck_and_others_are_not():
     assert np.flatnonzero(stuck_rows(measured)).tolist() == [5, 6, 7]
 
 
-def test_momentary_leaps_of_an_input_are_mended_and_steps_are_not():
+def test_momentary_leaps_of_an_input_are_replaced_and_steps_are_not():
     t = np.arange(300)
     clean = np.column_stack([np.sin(0.05 * t), np.where(t // 40 % 2, 1.0, -1.0)])
     spoilt = clean.copy()
     spoilt[[50, 123], 0] = [500.0, -80.0]
-    mended, n = mended_inputs(spoilt)
+    screened, n = screened_inputs(spoilt, 15, 8.0)
     assert n == 2
-    assert np.abs(mended - clean).max() < 0.1
-    assert np.array_equal(mended[:, 1], clean[:, 1])
+    assert np.abs(screened - clean).max() < 0.1
+    assert np.array_equal(screened[:, 1], clean[:, 1])

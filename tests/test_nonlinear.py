@@ -1,10 +1,12 @@
 """Nonlinear least squares: models that are not affine in their parameters, with no starting values."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.data.dataset import observe
+from diransac.data.dataset import Dataset
 from diransac.errors import IdentificationError, ModelError
 from diransac.model import Parameter
 from diransac.model.library import builtin
@@ -135,29 +137,27 @@ def still_swing(inputs, dt):
 
 
 def test_fits_do_not_depend_on_how_many_are_made_at_a_time():
-    bound = dr.NonlinearLeastSquares().bind(observe(hanging_mass(), swing(noise=0.05)))
+    bound = dr.NonlinearLeastSquares().bind(Dataset.of(hanging_mass(), swing(noise=0.05)))
     rng = np.random.default_rng(0)
     sets = [rng.permutation(400)[:n] for n in (8, 8, 8, 30, 8, 200)]
-    one_by_one = np.concatenate([bound.fit([rows]) for rows in sets])
-    assert bound.fit(sets).tobytes() == one_by_one.tobytes()
-    assert bound.fit(sets[:4]).tobytes() == one_by_one[:4].tobytes()
+    one_by_one = np.concatenate([bound.select([rows]).fit() for rows in sets])
+    assert bound.select(sets).fit().tobytes() == one_by_one.tobytes()
+    assert bound.select(sets[:4]).fit().tobytes() == one_by_one[:4].tobytes()
 
 
 @pytest.mark.parametrize("batch_size", [1, 3, 64])
 def test_search_gives_the_same_bits_for_every_batch_size(batch_size):
     log = swing(noise=0.05)
     settings = dr.Settings(sample_size=8, max_iterations=6, stop_inlier_fraction=None)
-    usual = dr.identify(hanging_mass(), log, settings=settings)
-    other = dr.identify(
-        hanging_mass(), log, settings=dr.Settings.from_dict({**settings.to_dict(), "batch_size": batch_size})
-    )
+    usual = dr.identify(hanging_mass(), log, "i-diransac", settings=settings)
+    other = dr.identify(hanging_mass(), log, "i-diransac", settings=replace(settings, batch_size=batch_size))
     assert other.parameters == usual.parameters
     assert (other.fit_error, other.n_hypotheses) == (usual.fit_error, usual.n_hypotheses)
 
 
 def test_leaving_rows_out_is_fitting_the_others():
-    bound = dr.NonlinearLeastSquares().bind(observe(hanging_mass(), swing(noise=0.02)))
+    bound = dr.NonlinearLeastSquares().bind(Dataset.of(hanging_mass(), swing(noise=0.02)))
     rows = np.arange(400)
     groups = np.array_split(rows, 5)
-    others = bound.fit([np.setdiff1d(rows, group) for group in groups])
+    others = bound.select([np.setdiff1d(rows, group) for group in groups]).fit()
     assert bound.fit_without(groups, rows) == pytest.approx(others, rel=1e-6)

@@ -49,6 +49,10 @@ def test_every_exported_name_exists_and_nothing_else_is_public():
     )
 
 
+def test_names_that_are_imported_when_asked_for_are_exported():
+    assert set(diransac._LATER) <= set(diransac.__all__)
+
+
 @pytest.mark.parametrize("name", diransac.__all__)
 def test_exported_name_is_documented(name: str):
     exported = getattr(diransac, name)

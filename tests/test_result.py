@@ -23,7 +23,8 @@ def identified(method="i-diransac", signals=None, **changes):
     if signals is not None:
         columns = {n: log[n] for n in (*signals, *machine.inputs)}
         log = dr.Log.from_arrays(log.time, columns, source="partial log")
-    return dr.identify(dr.models.planar_rotorcraft(), log, method, settings=SETTINGS, **changes)
+    settings = SETTINGS if method == "i-diransac" else None
+    return dr.identify(dr.models.planar_rotorcraft(), log, method, settings=settings, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +36,16 @@ def result():
 def results(result):
     """Results of every kind: a search, least squares that violates a bound, no simulation, infinite variances."""
     without_start = identified("ols", ("theta", "x_dot", "z_dot", "x_ddot", "z_ddot", "theta_ddot"))
+    negative = dataclasses.replace(
+        result.estimate, parameters=result.parameters | {"mass": -0.1}, covariance=np.full((3, 3), np.inf)
+    )
+    shifted = ({"step": "shift", "seconds": 0.01, "names": ["thrust"]},)
     odd = dataclasses.replace(
         result,
-        covariance=np.full((3, 3), np.inf),
-        fit_error=np.inf,
-        sensitivity=dict.fromkeys(result.parameters, (0.01, np.nan)),
-        violations=("mass",),
-        preparation=({"step": "shift", "seconds": 0.01, "names": ("thrust",)},),
+        estimate=negative,
+        evaluation=dataclasses.replace(result.evaluation, fit_error=np.inf),
+        bandwidth_sensitivity=dict.fromkeys(result.parameters, (0.01, np.nan)),
+        logs=(dataclasses.replace(result.logs[0], preparation=shifted),),
         notes=("two rows were skipped",),
     )
     return {"search": result, "tls": identified("tls"), "no simulation": without_start, "odd": odd}
@@ -89,8 +93,11 @@ def test_saved_file_is_json_that_any_program_reads(results, tmp_path):
 def test_equality_is_of_everything_but_identity(result):
     assert result == dr.Result.from_dict(result.to_dict())
     assert result != dataclasses.replace(result, seed=5)
-    assert result != dataclasses.replace(result, inliers=~result.inliers)
-    assert result != dataclasses.replace(result, covariance=2.0 * result.covariance)
+    others = dataclasses.replace(result.evaluation, inliers=~result.inliers)
+    assert result != dataclasses.replace(result, evaluation=others)
+    wider = dataclasses.replace(result.estimate, covariance=2.0 * result.covariance)
+    assert result != dataclasses.replace(result, estimate=wider)
+    assert result != dataclasses.replace(result, options={"substeps": 5})
     assert result != "a result"
 
 
@@ -181,6 +188,15 @@ def test_binary_file_is_refused_by_name(tmp_path, content):
         dr.Result.load(path)
 
 
+@pytest.mark.parametrize("number", [1, 2, 3, "4", None])
+def test_result_of_an_older_format_is_refused_in_one_sentence(result, tmp_path, number):
+    path = tmp_path / "model.json"
+    path.write_text(changed(result, ["format"], number))
+    with pytest.raises(ResultError, match=r"model\.json: .*no diransac result of format 4; identify again$") as caught:
+        dr.Result.load(path)
+    assert len(str(caught.value).splitlines()) == 1
+
+
 def test_missing_file_is_refused_by_name(tmp_path):
     with pytest.raises(ResultError, match=r"nothing\.json: cannot be read: No such file"):
         dr.Result.load(tmp_path / "nothing.json")
@@ -188,7 +204,7 @@ def test_missing_file_is_refused_by_name(tmp_path):
 
 def test_every_key_is_needed(result, tmp_path):
     data = json.loads(json.dumps(result.to_dict()))
-    derived = {"units", "standard_errors", "intervals_95"}
+    derived = {"units", "standard_errors", "intervals_95", "violations"}
     for key in data.keys() - derived:
         path = tmp_path / "model.json"
         path.write_text(json.dumps({k: x for k, x in data.items() if k != key}))
@@ -208,8 +224,11 @@ def test_every_key_is_needed(result, tmp_path):
         (["inliers"], "####"),
         (["inliers"], "AAAA"),
         (["inliers"], 7),
-        (["log", "n_rows"], 10**6),
-        (["log", "extra"], 1),
+        (["logs", 0, "n_rows"], 10**6),
+        (["logs", 0, "dt"], "fast"),
+        (["logs", 0], 3),
+        (["logs"], []),
+        (["logs"], None),
         (["settings", "sample_size"], 0),
         (["settings", "unknown"], 0),
         (["settings"], [1]),
@@ -275,7 +294,10 @@ def test_printed_result_says_what_is_not_as_it_should_be(results):
 
 
 def test_printed_result_warns_of_a_fit_that_explains_little_of_the_log(result):
-    poor = dataclasses.replace(result, inlier_fraction=0.2, covariance=np.full((3, 3), np.inf), n_fitted=2)
+    vague = dataclasses.replace(result.estimate, covariance=np.full((3, 3), np.inf), n_fitted=2)
+    poor = dataclasses.replace(
+        result, estimate=vague, evaluation=dataclasses.replace(result.evaluation, inlier_fraction=0.2)
+    )
     warnings = [line for line in str(poor).splitlines() if line.startswith("!")]
     for part in ("less than half of the log", "short of the 85 % inliers", "2 fitted rows are too few"):
         assert any(part in line for line in warnings), part

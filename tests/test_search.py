@@ -1,5 +1,6 @@
 """Algorithm 1: ours against a slow and literal one, which shares nothing with it but what it is given."""
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -7,14 +8,24 @@ from hashlib import sha256
 
 import numpy as np
 import pytest
-from diransac.identification.methods.consensus import Diransac, InlierBiasedDiransac, Score
-from diransac.identification.methods.search import Outcome, search
+from hypothesis import given
+from hypothesis import strategies as st
 
 from algorithm1 import Choices, Problem, Story, algorithm1
-from diransac.data.dataset import observe
+from diransac.data.dataset import Dataset
 from diransac.errors import IdentificationError
 from diransac.identification.estimators import OrdinaryLeastSquares
-from diransac.identification.evaluation import Simulation, choose_scoring, judged_signals
+from diransac.identification.evaluation import choose_scoring, judged_signals, mean_squared_error, rms_error
+from diransac.identification.method import Progress
+from diransac.identification.methods.ransac import (
+    Diransac,
+    Evaluator,
+    IDiransac,
+    Score,
+    ScoredBatch,
+    SearchState,
+    search,
+)
 from diransac.identification.settings import Settings
 from diransac.model.library import builtin
 from diransac.simulation import RolloutBatch, rollouts
@@ -90,15 +101,27 @@ def shuffled(seed, iterations, n_rows, start, stop):
 class Recorder:
     """An evaluator that keeps the inlier sets it is asked for."""
 
-    def __init__(self, simulation: Simulation) -> None:
-        self._simulation = simulation
-        self.admits, self.scores = simulation.admits, simulation.scores
+    def __init__(self, evaluator: Evaluator) -> None:
+        self._evaluator = evaluator
+        self.admits = evaluator.admits
         self.inlier_sets: list[np.ndarray] = []
 
-    def inliers(self, parameters):
-        """As the simulation says, and kept."""
-        self.inlier_sets.append(self._simulation.inliers(parameters))
-        return self.inlier_sets[-1]
+    def score(self, parameters):
+        """As the evaluator says, in a batch that is watched."""
+        return RecordedBatch(self._evaluator.score(parameters), self.inlier_sets)
+
+
+class RecordedBatch:
+    """A scored batch that keeps the inlier sets it is asked for."""
+
+    def __init__(self, batch: ScoredBatch, inlier_sets: list[np.ndarray]) -> None:
+        self._batch, self._inlier_sets = batch, inlier_sets
+        self.scores = batch.scores
+
+    def inliers(self, lane):
+        """As the batch says, and kept."""
+        self._inlier_sets.append(self._batch.inliers(lane))
+        return self._inlier_sets[-1]
 
 
 @cache
@@ -118,22 +141,29 @@ def recorded(case: Case):
 def observed(case: Case, settings: Settings | None = None):
     machine, model, settings = MACHINES[case.machine], builtin(case.machine), settings or case.settings
     log = as_log(machine, *recorded(case), case.size[1])
-    observations = observe(model, log, judged_signals(model, log, settings))
-    return observations, choose_scoring(observations, settings)
+    dataset = Dataset.of(model, log, judged_signals(model, [log], settings))
+    return dataset, choose_scoring(dataset, settings)
 
 
-def run_ours(case: Case, variant: str, **changes) -> tuple[Outcome | str, list[np.ndarray]]:
+def variant_of(name: str, settings: Settings) -> IDiransac | Diransac:
+    """The variant; DIRANSAC has no acceptance weights, and refuses any."""
+    if name == "i-diransac":
+        return IDiransac(settings)
+    return Diransac(replace(settings, acceptance_weights=Settings().acceptance_weights))
+
+
+def run_ours(case: Case, name: str, **changes) -> tuple[SearchState | str, list[np.ndarray]]:
     """What our search found, or what it says where it found nothing, and the inlier sets that it asked for."""
     settings = replace(case.settings, **changes)
-    observations, scoring = observed(case, settings)
-    object_of = {"i-diransac": InlierBiasedDiransac(settings.acceptance_weights), "diransac": Diransac()}
-    evaluator = Recorder(Simulation(observations, scoring, settings, object_of[variant]))
-    estimator = OrdinaryLeastSquares().bind(observations)
+    dataset, scoring = observed(case, settings)
+    variant = variant_of(name, settings)
+    evaluator = Recorder(Evaluator(dataset, scoring, variant))
+    estimator = OrdinaryLeastSquares().bind(dataset)
     try:
-        outcome = search(object_of[variant], settings, estimator, evaluator, shuffled, case.seed)
+        state = search(variant, estimator, evaluator, shuffled, case.seed)
     except IdentificationError as error:
         return str(error), evaluator.inlier_sets
-    return outcome, evaluator.inlier_sets
+    return state, evaluator.inlier_sets
 
 
 @cache
@@ -177,21 +207,21 @@ def run_literal(case: Case, variant: str, simulator: str) -> Story:
     return algorithm1(problem, choices)
 
 
-def assert_agree(outcome: Outcome | str, inlier_sets: list[np.ndarray], story: Story) -> None:
+def assert_agree(state: SearchState | str, inlier_sets: list[np.ndarray], story: Story) -> None:
     offered = [h.inliers for h in story.hypotheses if h.offers_refit]
     assert len(inlier_sets) == len(offered)
     assert all(np.array_equal(ours, theirs) for ours, theirs in zip(inlier_sets, offered, strict=True))
     if story.best is None:
         counts = ", ".join(f"{n} {reason}" for reason, n in story.fates.most_common())
-        assert f"no hypothesis was accepted in {story.k} samples ({counts})" in outcome
+        assert f"no hypothesis was accepted in {story.k} samples ({counts})" in state
         return
-    assert outcome.iterations == story.k
-    assert outcome.n_hypotheses == len(story.hypotheses)
-    assert outcome.rejected == story.fates
-    assert np.array_equal(np.sort(outcome.best.rows), np.sort(story.best.rows))
-    assert outcome.best.score.inlier_fraction == story.best.fraction
-    assert outcome.best.score.error == pytest.approx(story.best.error, rel=1e-9)
-    assert outcome.best.parameters == pytest.approx(story.best.parameters, rel=1e-9)
+    assert state.iterations == story.k
+    assert state.n_hypotheses == len(story.hypotheses)
+    assert state.rejected == story.fates
+    assert np.array_equal(np.sort(state.best.rows), np.sort(story.best.rows))
+    assert state.best.score.inlier_fraction == story.best.fraction
+    assert state.best.score.error == pytest.approx(story.best.error, rel=1e-9)
+    assert state.best.parameters == pytest.approx(story.best.parameters, rel=1e-9)
 
 
 # ---------------------------------------------------------------------- agreement
@@ -264,28 +294,51 @@ class Script:
     smallest: int = 1
     fitted: list[tuple[int, ...]] = field(default_factory=list)
 
-    def well_defined(self, row_sets):
-        """By the number of rows."""
-        return np.array([len(rows) >= self.smallest for rows in row_sets])
-
-    def fit(self, row_sets):
-        """As it is written down."""
-        keys = [tuple(sorted(np.asarray(rows).tolist())) for rows in row_sets]
-        self.fitted += keys
-        return np.array([[self.fits.get(key, 0.0)] for key in keys])
+    def select(self, row_sets):
+        """The sets, to be checked and fitted."""
+        return ScriptedSelection(self, [tuple(sorted(np.asarray(rows).tolist())) for rows in row_sets])
 
     def admits(self, parameters):
         """Nothing negative."""
         return parameters[:, 0] >= 0.0
 
-    def scores(self, parameters):
+    def score(self, parameters):
         """As it is written down."""
-        found = [self.found.get(p, (np.inf, [])) for p in parameters[:, 0]]
-        return [Score(error, len(rows) / self.n_rows) for error, rows in found]
+        return ScriptedBatch([self.found.get(p, (np.inf, [])) for p in parameters[:, 0]], self.n_rows)
 
-    def inliers(self, parameters):
+
+@dataclass
+class ScriptedSelection:
+    """Sets of rows, as their script has them."""
+
+    script: Script
+    keys: list[tuple[int, ...]]
+
+    def well_defined(self):
+        """By the number of rows."""
+        return np.array([len(key) >= self.script.smallest for key in self.keys])
+
+    def fit(self):
         """As it is written down."""
-        return np.array(self.found[parameters[0]][1], dtype=np.int64)
+        self.script.fitted += self.keys
+        return np.array([[self.script.fits.get(key, 0.0)] for key in self.keys])
+
+
+@dataclass
+class ScriptedBatch:
+    """Errors and inliers, as their script has them."""
+
+    found: list[tuple[float, list[int]]]
+    n_rows: int
+
+    @property
+    def scores(self):
+        """Of every hypothesis."""
+        return [Score(error, len(rows) / self.n_rows) for error, rows in self.found]
+
+    def inliers(self, lane):
+        """Of one."""
+        return np.array(self.found[lane][1], dtype=np.int64)
 
 
 def first_two(seed, iterations, n_rows, start, stop):
@@ -293,48 +346,48 @@ def first_two(seed, iterations, n_rows, start, stop):
     return np.array([[(k + j) % n_rows for j in range(start, stop)] for k in np.atleast_1d(iterations)])
 
 
-def run_script(script, variant=None, **changes):
+def run_script(script, variant=IDiransac, sampler=first_two, callback=None, **changes):
     settings = Settings(**{"sample_size": 2, "max_iterations": 1, "stop_inlier_fraction": None, **changes})
-    return search(variant or InlierBiasedDiransac((1.0, 0.06)), settings, script, script, first_two, seed=0)
+    return search(variant(settings), script, script, sampler, 0, callback)
 
 
 def test_refit_that_is_pending_at_the_iteration_limit_never_runs():
     script = Script({(0, 1): 1.0, (2, 3, 4): 2.0}, {1.0: (5.0, [2, 3, 4]), 2.0: (1.0, [2, 3, 4])})
-    outcome = run_script(script)
-    assert outcome.best.parameters == [1.0]
-    assert (outcome.iterations, outcome.n_hypotheses) == (1, 1)
+    state = run_script(script)
+    assert state.best.parameters == [1.0]
+    assert (state.iterations, state.n_hypotheses) == (1, 1)
 
 
 def test_refit_runs_before_the_next_sample_and_does_not_count():
     script = Script(
         {(0, 1): 1.0, (2, 3, 4): 2.0, (1, 2): 3.0}, {1.0: (5.0, [2, 3, 4]), 2.0: (1.0, [2, 3, 4]), 3.0: (9.0, [])}
     )
-    outcome = run_script(script, max_iterations=2, batch_size=1)
+    state = run_script(script, max_iterations=2, batch_size=1)
     assert script.fitted == [(0, 1), (2, 3, 4), (1, 2)]
-    assert outcome.best.parameters == [2.0]
-    assert (outcome.iterations, outcome.n_hypotheses) == (2, 3)
+    assert state.best.parameters == [2.0]
+    assert (state.iterations, state.n_hypotheses) == (2, 3)
 
 
 def test_refit_that_is_pending_when_the_inlier_fraction_is_reached_never_runs():
     script = Script({(0, 1): 1.0, (2, 3, 4): 2.0}, {1.0: (5.0, [2, 3, 4]), 2.0: (1.0, [2, 3, 4])})
-    outcome = run_script(script, max_iterations=5, batch_size=1, stop_inlier_fraction=0.3)
-    assert outcome.best.parameters == [1.0]
-    assert (outcome.iterations, outcome.n_hypotheses, outcome.stop_reason) == (1, 1, "inlier fraction reached")
+    state = run_script(script, max_iterations=5, batch_size=1, stop_inlier_fraction=0.3)
+    assert state.best.parameters == [1.0]
+    assert (state.iterations, state.n_hypotheses, state.stop_reason) == (1, 1, "inlier fraction reached")
 
 
 def test_refit_that_fails_the_preliminary_test_ends_its_chain():
     script = Script({(0, 1): 1.0, (2, 3, 4): -1.0, (1, 2): 3.0}, {1.0: (5.0, [2, 3, 4]), 3.0: (9.0, [])})
-    outcome = run_script(script, max_iterations=2)
-    assert outcome.best.parameters == [1.0]
-    assert outcome.rejected == {"out of bounds": 1, "no improvement": 1}
+    state = run_script(script, max_iterations=2)
+    assert state.best.parameters == [1.0]
+    assert state.rejected == {"out of bounds": 1, "no improvement": 1}
 
 
 def test_chain_that_meets_a_set_again_ends():
     fits = {(0, 1): 1.0, (2, 3, 4): 2.0, (5, 6, 7, 8): 3.0, (2, 3, 4, 5): 2.0}
     found = {1.0: (1.0, [2, 3, 4]), 2.0: (9.0, [5, 6, 7, 8]), 3.0: (9.0, [2, 3, 4, 5])}
     script = Script(fits, found)
-    outcome = run_script(script, InlierBiasedDiransac((1.0, 0.0)), max_iterations=2)
-    assert (outcome.iterations, outcome.best.parameters) == (2, [1.0])
+    state = run_script(script, acceptance_weights=(1.0, 0.0), max_iterations=2)
+    assert (state.iterations, state.best.parameters) == (2, [1.0])
     assert script.fitted == [(0, 1), (1, 2), (2, 3, 4), (5, 6, 7, 8), (2, 3, 4, 5)]
 
 
@@ -343,30 +396,31 @@ def test_inliers_that_are_the_sample_itself_in_whatever_order_are_not_fitted_aga
         return first_two(*arguments)[:, ::-1]
 
     script = Script({(0, 1): 1.0}, {1.0: (5.0, [0, 1])})
-    settings = Settings(sample_size=2, max_iterations=2, stop_inlier_fraction=None)
-    search(InlierBiasedDiransac(), settings, script, script, backwards, seed=0)
+    run_script(script, sampler=backwards, max_iterations=2)
     assert script.fitted == [(0, 1), (1, 2)]
 
 
-@pytest.mark.parametrize("variant", [InlierBiasedDiransac((1.0, 0.0)), Diransac()], ids=lambda v: v.name)
-def test_no_inliers_at_all_lead_to_a_new_sample(variant):
+@pytest.mark.parametrize(
+    ("variant", "changes"), [(IDiransac, {"acceptance_weights": (1.0, 0.0)}), (Diransac, {})], ids=VARIANTS
+)
+def test_no_inliers_at_all_lead_to_a_new_sample(variant, changes):
     script = Script({(0, 1): 1.0, (1, 2): 2.0}, {1.0: (5.0, []), 2.0: (4.0, [])})
-    outcome = run_script(script, variant, max_iterations=2)
-    assert outcome.best.parameters == [2.0]
+    state = run_script(script, variant, max_iterations=2, **changes)
+    assert state.best.parameters == [2.0]
     assert () not in script.fitted
 
 
 def test_no_inliers_are_never_stored_while_inliers_have_weight():
     script = Script({(0, 1): 1.0, (1, 2): 2.0}, {1.0: (5.0, []), 2.0: (6.0, [1])})
-    outcome = run_script(script, max_iterations=2)
-    assert outcome.best.parameters == [2.0]
-    assert outcome.rejected["not accepted"] == 1
+    state = run_script(script, max_iterations=2)
+    assert state.best.parameters == [2.0]
+    assert state.rejected["not accepted"] == 1
 
 
 def test_sample_grows_by_as_few_observations_as_it_needs():
     script = Script({(0, 1, 2, 3, 4): 1.0}, {1.0: (5.0, [1]), 0.0: (9.0, [])}, smallest=5)
-    outcome = run_script(script)
-    assert outcome.best.rows.tolist() == [0, 1, 2, 3, 4]
+    state = run_script(script)
+    assert state.best.rows.tolist() == [0, 1, 2, 3, 4]
 
 
 def test_log_that_never_becomes_well_defined_is_refused():
@@ -383,9 +437,120 @@ def test_nothing_accepted_says_how_many_failed_at_which_step():
         assert count in str(caught.value)
 
 
-def test_progress_is_told_after_every_batch():
+def test_progress_is_reported_after_every_batch():
     calls = []
     script = Script({}, {0.0: (5.0, [1])})
-    settings = Settings(sample_size=2, max_iterations=10, stop_inlier_fraction=None, batch_size=4)
-    search(Diransac(), settings, script, script, first_two, 0, lambda *now: calls.append(now))
-    assert calls == [(k, 10, Score(5.0, 0.1)) for k in (4, 8, 10)]
+    run_script(script, Diransac, callback=calls.append, max_iterations=10, batch_size=4)
+    assert calls == [Progress("searching", k / 10, "10% inliers") for k in (4, 8, 10)]
+
+
+# ---------------------------------------------------------------------- eq. (2)
+
+SQUARES = np.array([[8.0, 18.0, 2.0], [0.0, 50.0, 32.0]])
+WEIGHTS = np.array([1.0, 0.0, 0.5])
+FINITE = st.floats(0.0, 1e200)
+FRACTIONS = st.integers(0, 100).map(lambda n: n / 100)
+
+
+def test_rms_error_is_eq_2():
+    assert rms_error(SQUARES, 2, WEIGHTS) == pytest.approx([2.0 + 0.5 * 1.0, 0.0 + 0.5 * 4.0], rel=1e-15)
+
+
+def test_mean_squared_error_is_eq_2_without_the_root():
+    assert mean_squared_error(SQUARES, 2, WEIGHTS) == pytest.approx([4.0 + 0.5 * 1.0, 0.5 * 16.0], rel=1e-15)
+
+
+@pytest.mark.parametrize("error", [rms_error, mean_squared_error])
+def test_signal_of_zero_weight_adds_no_zero_times_infinity(error):
+    assert error(np.array([[2.0, np.inf]]), 2, np.array([1.0, 0.0])) == [1.0]
+
+
+@pytest.mark.parametrize("error", [rms_error, mean_squared_error])
+def test_divergence_in_a_signal_of_any_weight_is_infinite(error):
+    assert error(np.array([[2.0, np.inf]]), 2, np.array([1.0, 1e-12])) == [np.inf]
+
+
+@pytest.mark.parametrize("error", [rms_error, mean_squared_error])
+def test_error_of_a_hypothesis_does_not_depend_on_its_neighbours(error):
+    squares = np.random.default_rng(0).uniform(size=(33, 5))
+    weights = np.array([1.0, 0.3, 0.0, 0.7, 0.1])
+    one_by_one = np.concatenate([error(row[None], 7, weights) for row in squares])
+    assert np.array_equal(error(squares, 7, weights), one_by_one)
+
+
+# ---------------------------------------------------------------------- eq. (3)
+
+
+@given(e=FINITE, f=FRACTIONS, best_e=FINITE, best_f=FRACTIONS, nu=st.tuples(FINITE, FINITE).filter(any))
+def test_acceptance_is_eq_3_wherever_it_has_a_meaning(e, f, best_e, best_f, nu):
+    accepted = IDiransac(Settings(acceptance_weights=nu)).accepts(Score(e, f), Score(best_e, best_f))
+    with np.errstate(all="ignore"):
+        new, best = (
+            np.float64(nu[0]) * np.float64(error) ** 2 + np.float64(nu[1]) * np.float64(1.0) / np.float64(part) ** 2
+            for error, part in ((e, f), (best_e, best_f))
+        )
+    if np.isfinite(new) and np.isfinite(best) and abs(new - best) > 1e-9 * max(new, best):
+        assert accepted == (new < best)
+
+
+def test_the_first_hypothesis_is_accepted_over_nothing():
+    assert IDiransac().accepts(Score(1e6, 0.001), Score())
+
+
+@pytest.mark.parametrize(
+    ("nu", "new", "best", "accepted"),
+    [
+        ((1.0, 0.06), Score(1.0, 0.0), Score(), False),
+        ((1.0, 0.0), Score(1.0, 0.0), Score(), True),
+        ((0.0, 1.0), Score(math.inf, 0.1), Score(), True),
+        ((0.0, 1.0), Score(math.inf, 0.1), Score(1.0, 0.2), False),
+        ((0.0, 1.0), Score(1.0, 0.0), Score(), False),
+        ((1.0, 0.0), Score(math.inf, 0.9), Score(), False),
+        ((1.0, 0.06), Score(math.inf, 0.9), Score(), False),
+        ((1.0, 0.06), Score(2.0, 0.5), Score(2.0, 0.5), False),
+        ((1.0, 1.0), Score(1.0, 0.5), Score(2.0, 0.5), True),
+        ((1.0, 1.0), Score(2.0, 0.9), Score(2.0, 0.5), True),
+        ((1.0, 1.0), Score(1.0, 0.1), Score(2.0, 0.5), False),
+    ],
+)
+def test_acceptance_at_its_edges(nu, new, best, accepted):
+    assert IDiransac(Settings(acceptance_weights=nu)).accepts(new, best) is accepted
+
+
+@pytest.mark.parametrize("huge", [1e155, 1e200, 1.7e308])
+def test_error_whose_square_overflows_is_worse_than_any(huge):
+    variant = IDiransac()
+    assert not variant.accepts(Score(huge, 0.5), Score(1.0, 0.5))
+    assert variant.accepts(Score(1.0, 0.5), Score(huge, 0.5))
+
+
+# ---------------------------------------------------------------------- the variants
+
+
+def test_more_inliers_or_less_error_improve_i_diransac():
+    variant, best = IDiransac(), Score(1.0, 0.5)
+    assert variant.improves(Score(2.0, 0.6), best)
+    assert variant.improves(Score(0.9, 0.1), best)
+    assert not variant.improves(Score(1.0, 0.5), best)
+    assert not variant.improves(Score(2.0, 0.4), best)
+
+
+def test_less_error_alone_improves_diransac_and_is_stored():
+    variant, best = Diransac(), Score(1.0, 0.5)
+    assert not variant.improves(Score(2.0, 0.9), best)
+    assert variant.improves(Score(0.9, 0.0), best)
+    assert variant.accepts(Score(0.9, 0.0), best)
+    assert not variant.improves(Score(), Score())
+
+
+def test_near_misses_are_refitted_by_i_diransac_alone():
+    assert IDiransac().refits(stored=False)
+    assert not Diransac().refits(stored=False)
+    assert Diransac().refits(stored=True)
+
+
+def test_inlier_fraction_ends_i_diransac_alone():
+    assert IDiransac().is_finished(Score(1.0, 0.85), 0.85)
+    assert not IDiransac().is_finished(Score(1.0, 0.84), 0.85)
+    assert not IDiransac().is_finished(Score(1.0, 1.0), None)
+    assert not Diransac().is_finished(Score(1.0, 1.0), 0.85)

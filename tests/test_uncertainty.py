@@ -9,7 +9,7 @@ from scipy.stats import binom
 from scipy.stats import t as student
 
 import diransac as dr
-from diransac.data.dataset import observe
+from diransac.data.dataset import Dataset
 from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight
@@ -75,10 +75,10 @@ def test_intervals_of_nonlinear_least_squares_hold_the_truth_as_often():
     for trial in range(trials):
         noisy = signals.copy()
         noisy[:, 2] += 0.1 * np.random.default_rng([3, trial]).normal(size=200)
-        bound = quick.bind(observe(builtin("underwater-vehicle"), as_log(machine, noisy, inputs, 0.05)))
+        bound = quick.bind(Dataset.of(builtin("underwater-vehicle"), as_log(machine, noisy, inputs, 0.05)))
         rows = np.arange(200)
         errors = np.sqrt(np.diag(jackknife_covariance(bound, rows)))
-        hits += np.abs(bound.fit([rows])[0] - truth) <= width * errors
+        hits += np.abs(bound.select([rows]).fit()[0] - truth) <= width * errors
     lowest, highest = binom.ppf([0.001, 0.999], trials, 0.95)
     assert hits.min() >= lowest
     assert hits.max() <= highest
@@ -121,11 +121,11 @@ def test_variance_is_infinite_where_one_stretch_alone_determines_a_parameter():
 @pytest.mark.parametrize("n", [2, 7])
 def test_fewer_rows_than_stretches_leave_out_one_row_at_a_time(n):
     a = np.random.default_rng(1).normal(size=n)
-    bound = dr.OrdinaryLeastSquares().bind(observe(level(), dr.Log.from_arrays(np.arange(n) * 0.1, {"x_ddot": a})))
+    bound = dr.OrdinaryLeastSquares().bind(Dataset.of(level(), dr.Log.from_arrays(np.arange(n) * 0.1, {"x_ddot": a})))
     expected = a.var(ddof=1) / n
     assert jackknife_covariance(bound, np.arange(n)) == pytest.approx(np.array([[expected]]), rel=1e-9)
 
 
 def test_single_row_has_no_standard_error():
-    bound = dr.OrdinaryLeastSquares().bind(observe(level(), dr.Log.from_arrays([0.0, 0.1], {"x_ddot": [1.0, 2.0]})))
+    bound = dr.OrdinaryLeastSquares().bind(Dataset.of(level(), dr.Log.from_arrays([0.0, 0.1], {"x_ddot": [1.0, 2.0]})))
     assert np.isinf(jackknife_covariance(bound, np.array([0]))).all()

@@ -24,6 +24,9 @@ _LEVEL = 1e-3
 _NEGLIGIBLE = 1e-3
 """Relative difference that is none, however narrow the intervals are."""
 
+_ROUNDING = 1e-12
+"""Relative standard deviation that any estimate has."""
+
 
 def disagreements(method: Method, dataset: Dataset, seed: int, callback: Callback | None = None) -> list[str]:
     """A sentence for each log whose own estimate disagrees with those of the others; empty where it agrees.
@@ -98,7 +101,9 @@ def _marginal(estimate: Estimate, name: str) -> tuple[float, float]:
 def _combined(values: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
     """Precision-weighted mean of (value, variance) pairs, its variance, and the Birge ratio, at least 1."""
     p, v = np.array(values).T
-    weights = 1.0 / np.maximum(v, np.finfo(float).tiny)
+    v = np.maximum(v, np.square(_ROUNDING * np.abs(p).max()) + np.finfo(float).tiny)
+    least = v.min()
+    weights = least / v
     mean = float(weights @ p / weights.sum())
-    chi_squared = float(weights @ np.square(p - mean)) / max(1, len(p) - 1)
-    return mean, float(1.0 / weights.sum()), max(1.0, chi_squared)
+    chi_squared = float(weights @ np.square(p - mean) / least) / max(1, len(p) - 1)
+    return mean, float(least / weights.sum()), max(1.0, chi_squared)

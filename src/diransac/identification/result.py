@@ -224,9 +224,10 @@ class Result:
         """Everything, ready for JSON; `from_dict` reads it back."""
         return {
             "format": _FORMAT,
-            **dump(_Provenance(**{n: getattr(self, n) for n in _Provenance.__dataclass_fields__})),
             **dump(self.estimate),
             **dump(self.evaluation),
+            # Its notes hold the estimate's, too.
+            **dump(_Provenance(**{n: getattr(self, n) for n in _Provenance.__dataclass_fields__})),
             **dump(_Derived(self.units, self.standard_errors, self.intervals(), self.violations)),
             "settings": self.settings.to_dict(),
             "model": self.model.to_dict(),
@@ -253,7 +254,7 @@ class Result:
         model, plain = Model.from_dict(data["model"]), load(_Provenance, data)
         estimate, evaluation = load(Estimate, data), load(Evaluation, data)
         layout = ParameterLayout(model.parameters, len(plain.logs))
-        if tuple(estimate.parameters) != layout.names:
+        if tuple(estimate.parameters) != layout.names or not np.isfinite(estimate.values).all():
             raise ValueError(f"parameters {', '.join(estimate.parameters)}")
         n_rows = sum(log.n_rows for log in plain.logs)
         masks = [] if estimate.diagnosis is None else estimate.diagnosis.outliers.values()

@@ -127,12 +127,14 @@ def load(kind: type[T], data: Mapping[str, Any]) -> T:
 
     Raises
     ------
+    KeyError
+        A key is missing.
     ValueError
-        A key is missing, or holds something else; one line says which.
+        A key holds something else; one line says which.
     """
     from pydantic import ValidationError
 
-    own = {f.name: data[f.name] for f in dataclasses.fields(kind) if f.name in data}  # type: ignore[arg-type]
+    own = {f.name: data[f.name] for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     adapter: Any = _adapter(kind)  # type: ignore[arg-type]  # a class is hashable
     try:
         found: T = adapter.validate_python(own)

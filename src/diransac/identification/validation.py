@@ -302,7 +302,7 @@ class CrossValidation:
             estimates = ["" if isinstance(result, str) else f"{result.parameters[n]:.5g}" for n in parameters]
             errors = ["" if isinstance(found, str) else f"{found.rmse.get(n, np.nan):.4g}" for n in signals]
             rows.append([source, *estimates, *errors])
-            remarks += [f"{source}: {x}" for x in dict.fromkeys((result, found)) if isinstance(x, str)]
+            remarks += [f"{source}: {x}" for x in (result, found) if isinstance(x, str)]
         return "\n".join([*aligned(rows), *remarks])
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Resolution
-from diransac.identification.method import report
+from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, robust_scores
 from diransac.identification.methods.lo_diransac.instrumental_variables import (
     InstrumentalEstimate,
@@ -172,7 +172,7 @@ class _LocalSearch:
     prior: Prior
     callback: Callback | None
 
-    def best(self, intervals: ShootingIntervals) -> Refinement:
+    def best(self, intervals: ShootingIntervals, callback: Callback | None = None) -> Refinement:
         """Local optimisation from the best hypothesis; where it is doubtful, from others; the likeliest of these.
 
         Doubtful is a fit that takes most of an interval for outliers: sensors may have failed there, or the fit.  It
@@ -183,7 +183,7 @@ class _LocalSearch:
         found: list[Refinement] = []
         while waiting and len(found) < self.settings.max_fits:
             share = len(found) / self.settings.max_fits
-            report(self.callback, "local optimisation", 0.3 + 0.5 * share, f"fit {len(found) + 1}")
+            report(callback, "local optimisation", share, f"fit {len(found) + 1}")
             begin = start(self.settings, intervals, self.motion, waiting.pop(0), self.prior)
             found.append(refine(self.settings, intervals, begin, self.prior))
             again = any(abs(found[-1].loss - x.loss) < _AS_LIKELY for x in found[:-1])
@@ -201,15 +201,19 @@ class _LocalSearch:
         """
         report(self.callback, "searching for a delay", 0.25)
         delay = self._likeliest_delay(intervals)
-        fits = {delay: self.best(intervals.delayed(delay))}
+        fits = {delay: self.best(intervals.delayed(delay), self._progress(0))}
         for step in (-1, 1) if delay else ():
             while abs(delay + step) < intervals.length:
-                other = self.best(intervals.delayed(delay + step))
+                other = self.best(intervals.delayed(delay + step), self._progress(len(fits)))
                 fits[delay + step] = other
                 if other.loss >= fits[delay].loss:
                     break
                 delay += step
         return delay, fits[delay]
+
+    def _progress(self, k: int) -> Callback | None:
+        """The callback of the k-th delay, which takes half of what is left: nobody knows how many there will be."""
+        return within(self.callback, 0.8 - 0.5 ** (k + 1), 0.8 - 0.5 ** (k + 2))
 
     def _likeliest_delay(self, intervals: ShootingIntervals) -> int:
         """Delay in samples with which simulations by the best hypothesis agree best with the log.

@@ -106,7 +106,7 @@ class LoDiransac:
             value = getattr(self, f.name)
             if f.name != "criteria":
                 object.__setattr__(self, f.name, _checked(f.name, value, f.default))
-        if not self.delay_range[0] <= 0.0 <= self.delay_range[1]:
+        if not -np.inf < self.delay_range[0] <= 0.0 <= self.delay_range[1] < np.inf:
             raise SettingsError(f"delay_range is {self.delay_range}; give (earliest, latest) in s, with 0 between them")
 
     def options(self) -> Mapping[str, Any]:
@@ -135,7 +135,7 @@ def configured(settings: Settings, **options: Any) -> LoDiransac:
     return LoDiransac(settings, **options)
 
 
-_MAY_BE_ZERO = ("n_samples", "max_delay_shifts", "max_steps", "prior_model_error", "prior_discrepancy", "prior_delay")
+_MAY_BE_ZERO = ("n_samples", "max_delay_shifts", "max_steps", "prior_model_error", "prior_discrepancy")
 
 
 def _checked(name: str, value: Any, default: Any) -> Any:

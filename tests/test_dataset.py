@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.data.dataset import observe
+from diransac.data.dataset import Dataset, bind_log
 from diransac.errors import LogError, SettingsError
 from diransac.identification.estimators import regression
 from diransac.model.library import builtin
@@ -33,66 +33,66 @@ def plane_log(changes=None, without=(), units=None, more=None):
 
 
 def test_every_row_of_a_whole_log_counts():
-    observations = observe(MODEL, plane_log())
-    assert (len(observations), observations.n_rows, observations.offset) == (N, N, 0)
-    assert observations.notes == ()
+    segment = bind_log(MODEL, plane_log())
+    assert (len(segment), segment.n_rows, segment.offset) == (N, N, 0)
+    assert segment.notes == ()
 
 
 def test_row_with_nan_in_a_signal_in_use_is_skipped_counted_and_said():
     changes = {(7, "x_ddot"): np.nan, (7, "theta"): np.nan, (20, "z_dot"): np.nan}
-    observations = observe(MODEL, plane_log(changes))
-    assert np.flatnonzero(~observations.valid).tolist() == [7, 20]
-    assert observations.n_rows == N - 2
-    assert any("2 of 80 rows were skipped" in note for note in observations.notes)
+    segment = bind_log(MODEL, plane_log(changes))
+    assert np.flatnonzero(~segment.valid).tolist() == [7, 20]
+    assert segment.n_rows == N - 2
+    assert any("2 of 80 rows were skipped" in note for note in segment.notes)
 
 
 def test_nan_in_a_signal_that_nothing_uses_is_harmless():
     """Position is in no equation; a column of another name in none at all, not even where it is infinite."""
     log = plane_log({(7, "x"): np.nan}, more={"battery": np.full(N, np.inf)})
-    assert observe(MODEL, log).valid.all()
+    assert bind_log(MODEL, log).valid.all()
 
 
 def test_signal_that_judges_is_in_use():
-    assert not observe(MODEL, plane_log({(7, "x"): np.nan}), also=("x",)).valid[7]
+    assert not bind_log(MODEL, plane_log({(7, "x"): np.nan}), also=("x",)).valid[7]
 
 
 def test_nan_of_an_input_is_held_from_the_last_good_sample_and_counted():
     changes = {(10, "thrust"): np.nan, (11, "thrust"): np.nan, (11, "moment"): np.nan}
     log = plane_log(changes)
-    observations = observe(MODEL, log)
-    assert observations.valid.all()
-    assert observations.inputs[11].tolist() == [log["thrust"][9], log["moment"][10]]
-    assert any("held" in note and "2 rows" in note for note in observations.notes)
+    segment = bind_log(MODEL, log)
+    assert segment.valid.all()
+    assert segment.inputs[11].tolist() == [log["thrust"][9], log["moment"][10]]
+    assert any("held" in note and "2 rows" in note for note in segment.notes)
 
 
 def test_gap_in_the_inputs_is_said_with_what_it_spoils():
     """A few samples are bridged; where more are missing, what is simulated is no longer what flew."""
     two, ten = tuple(range(5, 7)), tuple(range(30, 40))
-    notes = observe(MODEL, plane_log({(two, "thrust"): np.nan, (ten, "moment"): np.nan})).notes
+    notes = bind_log(MODEL, plane_log({(two, "thrust"): np.nan, (ten, "moment"): np.nan})).notes
     assert notes[-2] == "inputs were held from the last good sample in 12 rows, where they are NaN"
     assert notes[-1].startswith(
         "inputs are unknown in 1 gap, the longest 0.22 s after t = 0.58 s: a simulation through it"
     )
-    assert not any("gap" in note for note in observe(MODEL, plane_log({(two, "thrust"): np.nan})).notes)
+    assert not any("gap" in note for note in bind_log(MODEL, plane_log({(two, "thrust"): np.nan})).notes)
 
 
 def test_input_unknown_from_the_start_is_not_held():
-    assert not any("held" in note for note in observe(MODEL, plane_log({(range(5), "thrust"): np.nan})).notes)
+    assert not any("held" in note for note in bind_log(MODEL, plane_log({(range(5), "thrust"): np.nan})).notes)
 
 
 def test_log_starts_where_everything_in_use_is_known():
     """An input that has no good sample yet cannot be held; a simulation cannot start without a state."""
-    observations = observe(MODEL, plane_log({(0, "thrust"): np.nan, (1, "z_dot"): np.nan}))
-    assert observations.offset == 2
-    assert len(observations) == N - 2
-    assert observations.valid.all()
+    segment = bind_log(MODEL, plane_log({(0, "thrust"): np.nan, (1, "z_dot"): np.nan}))
+    assert segment.offset == 2
+    assert len(segment) == N - 2
+    assert segment.valid.all()
 
 
 def test_log_without_one_whole_row_is_refused():
     even, odd = tuple(range(0, N, 2)), tuple(range(1, N, 2))
     log = plane_log({(even, "x_ddot"): np.nan, (odd, "z_ddot"): np.nan})
     with pytest.raises(LogError, match=r'log "flight.csv": no row has a value in every signal'):
-        observe(MODEL, log)
+        bind_log(MODEL, log)
 
 
 @pytest.mark.parametrize(
@@ -100,13 +100,13 @@ def test_log_without_one_whole_row_is_refused():
 )
 def test_signal_that_cannot_serve_is_refused_by_name(value, says):
     with pytest.raises(LogError, match=f'"x_ddot".*{says}'):
-        observe(MODEL, plane_log({(EVERY_ROW, "x_ddot"): value}))
+        bind_log(MODEL, plane_log({(EVERY_ROW, "x_ddot"): value}))
 
 
 @pytest.mark.parametrize(("name", "hint"), [("theta_ddot", "--differentiate"), ("thrust", "--map"), ("theta", "--map")])
 def test_missing_signal_is_refused_with_what_was_found_and_what_to_try(name, hint):
     with pytest.raises(LogError, match=f'"{name}" is missing; found t, x, .*{hint}') as caught:
-        observe(MODEL, plane_log(without=[name]))
+        bind_log(MODEL, plane_log(without=[name]))
     assert len(str(caught.value).splitlines()) == 1
 
 
@@ -114,18 +114,18 @@ def test_missing_signal_is_refused_with_what_was_found_and_what_to_try(name, hin
 def test_column_that_is_no_signal_is_refused_with_the_reason(name, hint):
     log = replace(plane_log(without=[name]), unusable={name: 'is not numeric: line 9 holds "--"'})
     with pytest.raises(LogError, match=f'signal "{name}" is not numeric: line 9 holds "--"; .*{hint}'):
-        observe(MODEL, log)
+        bind_log(MODEL, log)
 
 
 def test_signals_that_no_equation_names_may_be_missing():
-    observations = observe(MODEL, plane_log(without=["x", "z"]))
-    assert observations.signals == MODEL.signals[2:]
+    segment = bind_log(MODEL, plane_log(without=["x", "z"]))
+    assert segment.signals == MODEL.signals[2:]
 
 
 def test_log_and_its_arrays_are_left_alone():
     log = plane_log({(3, "thrust"): np.nan})
     before = log.fingerprint
-    regression(observe(MODEL, log))
+    regression(Dataset.of(MODEL, log))
     assert log.fingerprint == before
 
 
@@ -143,11 +143,11 @@ def test_log_and_its_arrays_are_left_alone():
 )
 def test_unit_that_is_not_the_models_is_refused_with_the_scale_to_pass(name, unit, hint):
     with pytest.raises(LogError, match=f'"{name}" is in {unit}, the model needs .*{hint}'):
-        observe(MODEL, plane_log(units={name: unit}))
+        bind_log(MODEL, plane_log(units={name: unit}))
 
 
 def test_unit_in_another_spelling_is_the_same():
-    observe(MODEL, plane_log(units={"x_ddot": "m s^-2", "theta_dot": "rad s^-1", "x": "m"}))
+    bind_log(MODEL, plane_log(units={"x_ddot": "m s^-2", "theta_dot": "rad s^-1", "x": "m"}))
 
 
 def test_angle_that_jumps_by_a_turn_is_unwrapped():
@@ -155,8 +155,8 @@ def test_angle_that_jumps_by_a_turn_is_unwrapped():
     signals[:, 2] += np.linspace(0.0, 20.0, N)
     wrapped = signals.copy()
     wrapped[:, 2] = (wrapped[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    observations = observe(MODEL, as_log(PLANE, wrapped, inputs, DT))
-    assert observations.column("theta") == pytest.approx(signals[:, 2], abs=1e-12)
+    segment = bind_log(MODEL, as_log(PLANE, wrapped, inputs, DT))
+    assert segment.column("theta") == pytest.approx(signals[:, 2], abs=1e-12)
 
 
 # ---------------------------------------------------------------------- regression and scales
@@ -166,7 +166,7 @@ def test_angle_that_jumps_by_a_turn_is_unwrapped():
 def test_regression_is_that_of_the_rows_written_by_hand(name):
     machine = MACHINES[name]
     signals, inputs = flight(machine, 60, DT)
-    W, b = regression(observe(builtin(name), as_log(machine, signals, inputs, DT)))
+    W, b = regression(Dataset.of(builtin(name), as_log(machine, signals, inputs, DT)))
     by_hand = machine.rows(signals, inputs)
     assert pytest.approx(by_hand[0], rel=1e-12, abs=1e-12) == W
     assert b == pytest.approx(by_hand[1], rel=1e-12, abs=1e-12)
@@ -174,8 +174,8 @@ def test_regression_is_that_of_the_rows_written_by_hand(name):
 
 def test_regression_leaves_skipped_rows_out():
     changes = {(7, "x_ddot"): np.nan, (0, "z_dot"): np.nan}
-    W, b = regression(observe(MODEL, plane_log(changes)))
-    whole_W, whole_b = regression(observe(MODEL, plane_log()))
+    W, b = regression(Dataset.of(MODEL, plane_log(changes)))
+    whole_W, whole_b = regression(Dataset.of(MODEL, plane_log()))
     kept = np.delete(np.arange(N), [0, 7])
     assert np.array_equal(W, whole_W[kept])
     assert np.array_equal(b, whole_b[kept])
@@ -188,7 +188,7 @@ def test_scale_of_a_signal_is_the_spread_of_its_bulk():
     hit = clean + (rng.random(4000) < 0.1) * rng.uniform(-80, 80, 4000)
     time = np.arange(4000) * 0.01
     scales = [
-        observe(
+        Dataset.of(
             builtin("underwater-vehicle"),
             dr.Log.from_arrays(time, {"x_dot": clean, "x_ddot": values, "thrust": clean}),
         ).scales["x_ddot"]
@@ -208,16 +208,16 @@ def test_scale_of_a_signal_that_rests(values, scale):
     log = dr.Log.from_arrays(
         np.arange(1000) * 0.01, {"x_dot": rng.normal(size=1000), "x_ddot": column, "thrust": np.ones(1000)}
     )
-    assert observe(builtin("underwater-vehicle"), log).scales["x_ddot"] == pytest.approx(scale, rel=0.6)
+    assert Dataset.of(builtin("underwater-vehicle"), log).scales["x_ddot"] == pytest.approx(scale, rel=0.6)
 
 
 def test_setting_that_names_no_signal_is_refused():
-    observations = observe(MODEL, plane_log(without=["x"]))
+    dataset = Dataset.of(MODEL, plane_log(without=["x"]))
     with pytest.raises(SettingsError, match='no signal "y_dot"; it has x, z, theta'):
-        observations.by_signal({"y_dot": 1.0})
+        dataset.by_signal({"y_dot": 1.0})
     with pytest.raises(SettingsError, match='"x", which the log lacks'):
-        observations.by_signal({"x": 1.0})
-    assert observations.by_signal({"x": 0.0, "z": 2.0})[0] == 2.0
+        dataset.by_signal({"x": 1.0})
+    assert dataset.by_signal({"x": 0.0, "z": 2.0})[0] == 2.0
 
 
 # ---------------------------------------------------------------------- initial states
@@ -226,25 +226,25 @@ def test_setting_that_names_no_signal_is_refused():
 def test_first_row_is_where_a_simulation_starts():
     log = plane_log()
     expected = [log[name][0] for name in MODEL.state]
-    assert observe(MODEL, log).initial_state("first").tolist() == expected
+    assert bind_log(MODEL, log).initial_state("first").tolist() == expected
 
 
 def test_given_values_replace_those_of_the_first_row():
-    start = observe(MODEL, plane_log()).initial_state({"z_dot": 3.0, "theta": -1.0})
-    expected = observe(MODEL, plane_log()).initial_state("first")
+    start = bind_log(MODEL, plane_log()).initial_state({"z_dot": 3.0, "theta": -1.0})
+    expected = bind_log(MODEL, plane_log()).initial_state("first")
     expected[[2, 4]] = [-1.0, 3.0]
     assert start.tolist() == expected.tolist()
 
 
 def test_given_name_that_is_no_state_is_refused():
     with pytest.raises(SettingsError, match='"x_ddot"; the state is x, z, theta'):
-        observe(MODEL, plane_log()).initial_state({"x_ddot": 1.0})
+        bind_log(MODEL, plane_log()).initial_state({"x_ddot": 1.0})
 
 
 def test_robust_start_is_not_moved_by_outliers_in_the_first_rows():
     clean = plane_log()
     changes = {(row, name): 60.0 for row in (0, 4, 9) for name in MODEL.state}
-    spoilt = observe(MODEL, plane_log(changes))
+    spoilt = bind_log(MODEL, plane_log(changes))
     truth = np.array([clean[name][0] for name in MODEL.state])
     usual_change = np.array([np.abs(np.diff(clean[name][:25])).max() for name in MODEL.state])
     assert (np.abs(spoilt.initial_state("robust") - truth) < 10 * usual_change).all()
@@ -255,22 +255,22 @@ def test_robust_start_takes_a_missing_velocity_from_its_coordinate():
     signals, inputs = flight(VEHICLE, 100, 0.002)
     log = as_log(VEHICLE, signals, inputs, 0.002)
     positions = dr.Log.from_arrays(log.time, {"x": log["x"], "thrust": log["thrust"]})
-    observations = observe(builtin("underwater-vehicle"), positions, pointwise=False)
-    assert observations.initial_state("robust") == pytest.approx(signals[0, :2], abs=0.03)
+    segment = bind_log(builtin("underwater-vehicle"), positions, pointwise=False)
+    assert segment.initial_state("robust") == pytest.approx(signals[0, :2], abs=0.03)
     with pytest.raises(LogError, match='needs the initial value of "x_dot", which the log lacks'):
-        observations.initial_state("first")
+        segment.initial_state("first")
 
 
 def test_missing_state_on_which_nothing_measured_depends_starts_at_zero():
-    observations = observe(MODEL, plane_log(without=["x", "z"]))
-    assert observations.initial_state("first")[:2].tolist() == [0.0, 0.0]
+    segment = bind_log(MODEL, plane_log(without=["x", "z"]))
+    assert segment.initial_state("first")[:2].tolist() == [0.0, 0.0]
 
 
 def test_missing_state_on_which_something_measured_depends_is_refused_by_name():
-    observations = observe(MODEL, plane_log(without=["theta_dot"]))
+    segment = bind_log(MODEL, plane_log(without=["theta_dot"]))
     with pytest.raises(LogError, match='"theta_dot", which the log lacks'):
-        observations.initial_state("first")
-    assert observations.initial_state({"theta_dot": 0.5})[5] == 0.5
+        segment.initial_state("first")
+    assert segment.initial_state({"theta_dot": 0.5})[5] == 0.5
 
 
 def test_start_of_a_model_with_velocities_of_its_own_is_named_as_the_model_names_it():
@@ -278,6 +278,6 @@ def test_start_of_a_model_with_velocities_of_its_own_is_named_as_the_model_names
     model = tumbling()
     rng = np.random.default_rng(0)
     columns = {name: rng.normal(size=30) for name in (*model.coordinates, *model.inputs)}
-    observations = observe(model, dr.Log.from_arrays(np.arange(30) * 0.01, columns), pointwise=False)
+    segment = bind_log(model, dr.Log.from_arrays(np.arange(30) * 0.01, columns), pointwise=False)
     with pytest.raises(LogError, match='"wx"'):
-        observations.initial_state("robust")
+        segment.initial_state("robust")
