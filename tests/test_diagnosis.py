@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.identification.estimate import Diagnosis
 
 DT, N = 0.01, 1500
 MASS, DRAG, EXTRA = 1.5, 2.0, 0.3

@@ -14,6 +14,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.atomic import write_text
 from diransac.data.dataset import ParameterLayout
+from diransac.data.log import Log
 from diransac.errors import DiransacError, ResultError, SettingsError
 from diransac.identification.estimate import Diagnosis, Estimate, Evaluation, LogSummary
 from diransac.identification.serialization import NumberPairs, Values, dump, load
@@ -97,6 +98,13 @@ class Result:
         values = self.estimate.values
         pairs = zip(self.model.parameters.items(), self.layout.index.T, strict=True)
         return {name: tuple(values[own].tolist()) for (name, x), own in pairs if x.per_log}
+
+    def parameters_in(self, log: Log) -> dict[str, float]:
+        """Parameters that hold in a log: per-log ones of that log if it was identified from, else their mean."""
+        index = next((i for i, one in enumerate(self.logs) if one.fingerprint == log.fingerprint), None)
+        if index is None:
+            return self.parameters
+        return {**self.parameters, **{name: values[index] for name, values in self.per_log.items()}}
 
     @property
     def per_log_standard_errors(self) -> dict[str, tuple[float, ...]]:

@@ -17,12 +17,11 @@ from diransac.identification.evaluation import Simulation
 from diransac.identification.identify import identify
 from diransac.identification.method import Callback, Method, within
 from diransac.identification.methods import DEFAULT
-from diransac.model.plant import ModelWithParameters, Plant, as_plant
+from diransac.identification.result import Result
+from diransac.model.plant import ModelWithParameters, as_plant
 from diransac.text_table import aligned
 
 if TYPE_CHECKING:
-    from diransac.identification.estimate import Estimate
-    from diransac.identification.result import Result
     from diransac.model import Model
 
 __all__ = ["CrossValidation", "HorizonScores", "Validation", "cross_validate", "validate"]
@@ -117,7 +116,8 @@ def validate(
 
     Parameters
     ----------
-    logs : one log, or several, whose errors are pooled
+    logs : one log, or several, whose errors are pooled.  A per-log parameter takes its own value in a log that the
+        result was identified from, and the mean of these in others
     horizon : s; the simulation restarts from the measured state after each.  None: two that suit the length of the
         logs.  The whole of each log from its first complete state on is always scored, too
     integrator, substeps : as in `Settings`; None: those of the method that identified a result, else "rk4" and 1
@@ -138,11 +138,11 @@ def validate(
     if horizon is not None and not isinstance(horizon, (int, float, np.number)):
         raise SettingsError(f"horizon is {horizon!r:.60}; give seconds")
     known = as_plant(plant)
-    estimate: Estimate | None = getattr(plant, "estimate", None)
-    fitted = Resolution() if estimate is None else estimate.resolution
+    fitted = plant.estimate.resolution if isinstance(plant, Result) else Resolution()
     resolution = Resolution(integrator or fitted.integrator, substeps or fitted.substeps)
     dataset = Dataset.of(known.model, several, pointwise=False)
-    predictions = [_OpenLoop(dataset, i, known, resolution) for i in range(len(several))]
+    own = [plant.parameters_in(log) if isinstance(plant, Result) else known.parameters for log in several]
+    predictions = [_OpenLoop(dataset, i, parameters, resolution) for i, parameters in enumerate(own)]
     dt = max(log.dt for log in several)
     if horizon is not None and not horizon > 0.5 * dt:
         raise SettingsError(f"horizon is {horizon} s; give at least one sample, {dt:g} s")
@@ -158,10 +158,10 @@ def validate(
 class _OpenLoop:
     """Predictions of one log: its complete states, and simulations that restart from them."""
 
-    def __init__(self, dataset: Dataset, log: int, plant: Plant, resolution: Resolution) -> None:
+    def __init__(self, dataset: Dataset, log: int, parameters: Mapping[str, float], resolution: Resolution) -> None:
         self._log, self._segment = log, dataset.segments[log]
         self._simulation = Simulation(dataset, resolution=resolution)
-        self._parameters = plant.model.parameter_vector(plant.parameters)
+        self._parameters = dataset.model.parameter_vector(parameters)
         self._states = _states(self._segment)
         self._complete: BoolArray = np.asarray(np.isfinite(self._states).all(axis=1))
         self._n_steps = len(self._states) - 1 - int(np.argmax(self._complete))

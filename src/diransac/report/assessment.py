@@ -264,7 +264,7 @@ def _logs(runs: Sequence[Run]) -> Iterator[Finding]:
     """Logs that disagree with the others, excluded rows, and the relation of the logs to the identification."""
     for run in runs:
         if run.view.remark:
-            yield Finding("care", f"{run.log_name}: {run.view.remark}")
+            yield Finding("bad", f"{run.view.remark}. One set of parameters does not describe all logs.")
     missing = sum(run.n_excluded for run in runs)
     if missing:
         total = plural(sum(len(run.observations) + run.observations.offset for run in runs), "row")

@@ -87,7 +87,7 @@ def log_view(result: Result, log: Log) -> LogView:
     if index is None:
         return LogView(None, result.parameters, (), None, result.logs[0].preparation, None, np.nan, "")
     summary, rows = result.logs[index], result.log_rows(index)
-    parameters = {**result.parameters, **{name: values[index] for name, values in result.per_log.items()}}
+    parameters = result.parameters_in(log)
     diagnosis = None if result.diagnosis is None else _restricted(result.diagnosis, rows, index)
     inliers = result.inliers[rows]
     steps = summary.preparation
