@@ -307,6 +307,15 @@ def test_substeps_of_the_method_are_those_of_the_evaluation():
         assert estimate.resolution.substeps == substeps
 
 
+def test_without_outliers_in_the_noise_no_sample_is_an_outlier():
+    signals, inputs = flown("underwater-vehicle")
+    log = as_log(MACHINES["underwater-vehicle"], with_outliers(signals, 0.1, 30.0, seed=1), inputs, DT)
+    estimate = dr.LoDiransac(outliers=False).fit(Dataset.of(MODELS["underwater-vehicle"], log), 0)
+    assert not any(mask.any() for mask in estimate.diagnosis.outliers.values())
+    assert set(estimate.diagnosis.outlier_fraction.values()) == {0.0}
+    assert relative_errors("underwater-vehicle", estimate).max() > 1e-3
+
+
 LEFT_OUT = [
     {"n_samples": 0},
     {"max_steps": 0, "instrumental_variables": False},

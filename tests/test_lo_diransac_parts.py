@@ -97,6 +97,14 @@ def test_mixture_weighs_a_sample_by_bayes_rule():
     assert not noise.inlying(residuals, np.zeros((3, 1), bool)).any()
 
 
+def test_mixture_without_outliers_is_a_gaussian_however_far_a_sample_is():
+    noise = Mixture(np.array([0.5]), np.array([0.0]), np.array([10.0]), np.array([1e-6]))
+    residuals, known = np.array([[0.0], [1.0], [4.0], [1e4]]), np.array([[True], [True], [True], [True]])
+    assert noise.inlying(residuals, known).ravel().tolist() == [1.0, 1.0, 1.0, 1.0]
+    expected = 0.5 * (residuals / 0.5) ** 2 + np.log(0.5 * np.sqrt(2.0 * np.pi))
+    assert noise.negative_log_likelihood(residuals, known) == pytest.approx(expected, rel=1e-12)
+
+
 def test_mixture_finds_a_planted_scale_and_fraction():
     rng = np.random.default_rng(3)
     hit = rng.random((4000, 1)) < 0.4

@@ -36,11 +36,15 @@ class Mixture:
     def inlying(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Probability ``(N, n_s)`` that each sample is no outlier; 0 where there is none (the E step)."""
         core = self._core(residuals)
-        return np.where(known, core / (core + self.pi / (2.0 * self.span)), 0.0)
+        total = core + self.pi / (2.0 * self.span)
+        return np.where(known, np.divide(core, total, out=np.ones_like(core), where=total > 0.0), 0.0)
 
     def negative_log_likelihood(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Of each sample, ``(N, n_s)``; 0 where there is none."""
-        return np.where(known, -np.log(self._core(residuals) + self.pi / (2.0 * self.span)), 0.0)
+        total = self._core(residuals) + self.pi / (2.0 * self.span)
+        with np.errstate(over="ignore"):
+            gaussian = 0.5 * np.square(residuals / self.sigma) + np.log(self.sigma * np.sqrt(2.0 * np.pi))
+        return np.where(known, np.negative(np.log(total, out=-gaussian, where=total > 0.0)), 0.0)
 
     def _core(self, residuals: FloatArray) -> FloatArray:
         """Density of the Gaussian with its share; exactly 0 beyond 40 sigma, whose squares might overflow."""
