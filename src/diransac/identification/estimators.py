@@ -21,7 +21,8 @@ from diransac.simulation.compiler import compile_map
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from diransac.data.dataset import Dataset, Segment
+    from diransac.data.dataset import Dataset
+    from diransac.data.segment import Segment
 
 __all__ = [
     "BoundEstimator",

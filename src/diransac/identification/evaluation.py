@@ -15,8 +15,9 @@ from diransac.identification.estimate import Evaluation, Resolution
 from diransac.simulation import Measurements, RolloutBatch, default_threads, rollouts
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset, Segment
+    from diransac.data.dataset import Dataset
     from diransac.data.log import Log
+    from diransac.data.segment import Segment
     from diransac.identification.estimate import Diagnosis, Estimate
     from diransac.identification.settings import Settings
     from diransac.model import Model

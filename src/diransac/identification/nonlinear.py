@@ -24,7 +24,8 @@ from diransac.identification.estimators import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from diransac.data.dataset import Dataset, Segment
+    from diransac.data.dataset import Dataset
+    from diransac.data.segment import Segment
     from diransac.model import Model, Parameter
     from diransac.simulation.compiler import Map
 

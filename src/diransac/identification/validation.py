@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.data.dataset import Dataset, Segment, as_logs
+from diransac.data.dataset import Dataset, as_logs
 from diransac.data.log import Log
+from diransac.data.segment import Segment
 from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.identification.estimate import Resolution
 from diransac.identification.evaluation import Simulation

@@ -42,7 +42,8 @@ from diransac.identification.methods.lo_diransac.smoothing import (
 )
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset, Segment
+    from diransac.data.dataset import Dataset
+    from diransac.data.segment import Segment
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
