@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +12,7 @@ from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, as_logs
 from diransac.data.log import Log
 from diransac.errors import DiransacError, SettingsError
-from diransac.identification.agreement import disagreements
-from diransac.identification.estimate import Evaluation, LogSummary
+from diransac.identification.estimate import Estimate, Evaluation, LogSummary
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
 from diransac.identification.method import Callback, Method, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, factory
@@ -22,6 +21,12 @@ from diransac.identification.settings import Settings
 from diransac.model import Model
 
 __all__ = ["METHODS", "identify"]
+
+_LEVEL = 1e-3
+"""Probability, over all logs together, of naming a log that agrees."""
+
+_NEGLIGIBLE = 1e-3
+"""Relative difference that is none, however narrow the intervals are."""
 
 
 def identify(
@@ -148,7 +153,7 @@ class _Task:
         report(progress, "evaluating", 0.5 if several else 0.95)
         scoring = choose_scoring(dataset, criteria)
         evaluation = evaluate(estimate, dataset, scoring, criteria)
-        remarks = disagreements(self.method, dataset, self.seed, within(progress, 0.5, 1.0))
+        remarks = _disagreements(self.method, dataset, self.seed, within(progress, 0.5, 1.0))
         report(progress, "done", 1.0)
         return Result(
             model=self.model,
@@ -199,3 +204,87 @@ def _summaries(dataset: Dataset, evaluation: Evaluation, remarks: Sequence[str])
         )
         for log, one, (error, fraction), remark in parts
     )
+
+
+# ---------------------------------------------------------------------- agreement of several logs
+
+
+def _disagreements(method: Method, dataset: Dataset, seed: int, callback: Callback | None = None) -> tuple[str, ...]:
+    """A sentence for each log whose own estimate disagrees with those of the others; empty where it agrees.
+
+    Each log is identified alone.  A shared parameter of log ``i`` is compared with the precision-weighted mean of the
+    other logs: ``|p_i - p| > t sqrt(B (C_i + C))``, with Student's ``t`` at the level shared among all comparisons and
+    the Birge ratio ``B >= 1`` of the others' scatter to their intervals.  The worst log is set aside and the others are
+    compared again, so that one deviating log does not make the rest disagree.
+
+    References
+    ----------
+    Birge 1932, "The calculation of errors by the method of least squares"; Cochran 1954, "The combination of estimates
+    from different experiments"; Hadi and Simonoff 1993 (backward removal).
+    """
+    n, remarks = len(dataset.segments), [""] * len(dataset.segments)
+    if n == 1:
+        return ("",)
+    found = {}
+    for i in range(n):
+        estimate = _alone(method, dataset, i, seed, within(callback, i / n, (i + 1) / n, f"log {i + 1} alone: "))
+        if estimate is not None:
+            found[i] = estimate
+    shared = [name for name, x in dataset.model.parameters.items() if not x.per_log]
+    level = _LEVEL / max(1, 2 * len(shared) * n)
+    while len(found) > 1:
+        tests = {i: _worst(found, i, shared, level) for i in found}
+        worst = max(found, key=lambda i: tests[i][0])
+        if tests[worst][0] <= 1.0:
+            break
+        named = list(found) if len(found) == 2 else [worst]
+        for i in named:
+            remarks[i] = f"{dataset.given[i].source} disagrees with the other logs: {tests[i][1]}"
+            del found[i]
+    return tuple(remarks)
+
+
+def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callback | None) -> Estimate | None:
+    """The estimate of one log, or None where that log alone gives none."""
+    try:
+        return method.fit(dataset.subset([i]), seed, callback)
+    except DiransacError:
+        return None
+
+
+def _worst(found: Mapping[int, Estimate], i: int, names: Sequence[str], level: float) -> tuple[float, str]:
+    """Largest difference of log ``i`` from the others over what is allowed, and a sentence on it."""
+    from scipy.special import stdtrit
+
+    worst, sentence = 0.0, ""
+    t = float(stdtrit(min(x.degrees_of_freedom for x in found.values()), 1.0 - level))
+    for name in names:
+        own, variance = _marginal(found[i], name)
+        others = [_marginal(x, name) for j, x in found.items() if j != i]
+        others = [(p, v) for p, v in others if np.isfinite(v)]
+        if not np.isfinite(variance) or not others:
+            continue
+        mean, spread, ratio = _combined(others)
+        allowed = max(t * np.sqrt(ratio * (variance + spread)), _NEGLIGIBLE * abs(mean))
+        surprise = abs(own - mean) / allowed if allowed > 0.0 else 0.0
+        if surprise > worst:
+            worst = float(surprise)
+            sentence = (
+                f"{name} {own:.4g} ± {np.sqrt(variance):.2g} here, {mean:.4g} ± {np.sqrt(ratio * spread):.2g} there"
+            )
+    return worst, sentence
+
+
+def _marginal(estimate: Estimate, name: str) -> tuple[float, float]:
+    """A parameter and its variance."""
+    k = list(estimate.parameters).index(name)
+    return estimate.parameters[name], float(estimate.covariance[k, k])
+
+
+def _combined(values: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
+    """Precision-weighted mean of (value, variance) pairs, its variance, and the Birge ratio, at least 1."""
+    p, v = np.array(values).T
+    weights = 1.0 / np.maximum(v, np.finfo(float).tiny)
+    mean = float(weights @ p / weights.sum())
+    chi_squared = float(weights @ np.square(p - mean)) / max(1, len(p) - 1)
+    return mean, float(1.0 / weights.sum()), max(1.0, chi_squared)
