@@ -26,7 +26,10 @@ __all__ = ["load_methods", "load_model", "load_settings", "model_file", "names",
 def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
     """``["a=b,c=d", "e=f"]`` as a mapping.
 
-    Raises typer.BadParameter: an item is no pair, or a name is given twice.
+    Raises
+    ------
+    typer.BadParameter
+        An item is no pair, or a name is given twice.
     """
     found: dict[str, str] = {}
     for item in (item.strip() for text in texts for item in text.split(",")):
@@ -47,7 +50,10 @@ def names(text: str) -> list[str]:
 def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
     """``["a=1,b=2.5"]`` as numbers by name.
 
-    Raises typer.BadParameter: a value is no number.
+    Raises
+    ------
+    typer.BadParameter
+        A value is no number.
     """
     found = pairs(option, texts)
     try:
@@ -147,7 +153,10 @@ def model_file(text: str) -> Path | None:
 def load_model(text: str) -> Model:
     """The built-in model of that name, or the one that ``file.py[:name]`` defines.
 
-    Raises ModelError: there is none of that name, the file cannot be run, or what it defines is no model.
+    Raises
+    ------
+    ModelError
+        There is none of that name, the file cannot be run, or what it defines is no model.
     """
     found = file_and_name(text, "model")
     if found is None:

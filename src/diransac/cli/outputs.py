@@ -18,10 +18,15 @@ def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -
 
     Parameters
     ----------
-    outputs : where to write; a None has a temporary file of no meaning, which is never asked for
-    inputs : files that the command reads, none of which may be written; a None is none
+    outputs : sequence of Path
+        Where to write; a None has a temporary file of no meaning, which is never asked for.
+    inputs : sequence of Path, optional
+        Files that the command reads, none of which may be written; a None is none.
 
-    Raises ResultError: an output's folder is missing or closed to us, it is no ordinary file, or an input.
+    Raises
+    ------
+    ResultError
+        An output's folder is missing or closed to us, it is no ordinary file, or an input.
     """
     sources = {path.resolve() for path in inputs if path is not None}
     targets = [None if path is None else _checked(path, sources) for path in outputs]

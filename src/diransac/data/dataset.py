@@ -29,14 +29,19 @@ class ParameterLayout:
 
     Parameters
     ----------
-    parameters : of the model
-    n_logs : logs that are identified together
+    parameters : mapping of str to Parameter
+        Parameters of the model by name.
+    n_logs : int, optional
+        Number of logs that are identified together.
 
     Attributes
     ----------
-    names : (n,)   the model's names; ``bias[0]``, ``bias[1]``, ... for a per-log parameter of several logs
-    bounds : (n,)   the `Parameter` of each
-    index : (n_logs, n_p)   positions of each log's parameters in the vector
+    names : tuple of str
+        The n names: the model's; ``bias[0]``, ``bias[1]``, ... for a per-log parameter of several logs.
+    bounds : tuple of Parameter
+        Unit and bounds of each of the n.
+    index : (n_logs, n_p) int array
+        Positions of each log's parameters in the vector.
     """
 
     def __init__(self, parameters: Mapping[str, Parameter], n_logs: int = 1) -> None:
@@ -56,7 +61,7 @@ class ParameterLayout:
 
     @property
     def is_shared(self) -> bool:
-        """Whether every log has the same parameters."""
+        """True if every log has the same parameters."""
         return len(self.names) == len(self.parameters)
 
     def of_log(self, values: FloatArray, i: int) -> FloatArray:
@@ -80,7 +85,7 @@ class ParameterLayout:
         return mean
 
     def admits(self, values: FloatArray) -> BoolArray:
-        """Whether every parameter of vectors ``(n_vectors, n)`` is within its bounds, ``(n_vectors,)``."""
+        """Mask ``(n_vectors,)`` of the vectors ``(n_vectors, n)`` whose parameters are all within their bounds."""
         return np.asarray(np.all([x.admits(values[:, i]) for i, x in enumerate(self.bounds)], axis=0))
 
     def violations(self, values: FloatArray) -> tuple[str, ...]:
@@ -91,10 +96,18 @@ class ParameterLayout:
 def as_logs(logs: Log | Iterable[Log]) -> tuple[Log, ...]:
     """One log, or a sequence of logs, as a tuple.
 
+    Parameters
+    ----------
+    logs : Log or iterable of Log
+
+    Returns
+    -------
+    tuple of Log
+
     Raises
     ------
     SettingsError
-        It is something else, or empty.
+        The argument is something else, or empty.
     """
     several = (logs,) if isinstance(logs, Log) or not isinstance(logs, Iterable) else tuple(logs)
     for one in several:
@@ -107,14 +120,18 @@ def as_logs(logs: Log | Iterable[Log]) -> tuple[Log, ...]:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Logs bound to a model: segments that are never tied across a boundary; made by `Dataset.of`.
+    """Logs bound to a model: independent segments, one per log; made by `Dataset.of`.
 
     Parameters
     ----------
-    model : what is identified
-    given : logs as the user gave them
-    segments : one per log, in the same order; all have the same ``signals``
-    layout : where each log's parameters stand in the vector of all parameters
+    model : Model
+        Equations with the parameters to be estimated.
+    given : tuple of Log
+        Logs as the user gave them.
+    segments : tuple of Segment
+        One per log, in the same order; all have the same ``signals``.
+    layout : ParameterLayout
+        Positions of each log's parameters in the vector of all parameters.
     """
 
     model: Model
@@ -136,14 +153,23 @@ class Dataset:
 
         Parameters
         ----------
-        also : signals that are in use beside those that the equations name (weights, thresholds)
-        pointwise : whether the equations are evaluated at each row, which needs every signal that they name
-        given : the logs as the user gave them, where ``logs`` were derived from them
+        model : Model
+        logs : Log or iterable of Log
+        also : sequence of str, optional
+            Signals in use besides those that the equations name: those with a weight or a threshold.
+        pointwise : bool, optional
+            Whether the equations are evaluated at each row, which needs every signal that they name.
+        given : sequence of Log, optional
+            Logs as the user gave them, where ``logs`` were derived from them.
+
+        Returns
+        -------
+        Dataset
 
         Raises
         ------
         LogError
-            As `bind_log`, naming the log.
+            As `bind_log`; the message names the log.
         """
         several = as_logs(logs)
         segments = [bind_log(model, log, also, pointwise=pointwise) for log in several]
@@ -170,7 +196,7 @@ class Dataset:
 
     @property
     def source(self) -> str:
-        """How messages name the logs."""
+        """Names of the logs in messages."""
         return ", ".join(dict.fromkeys(one.source for one in self.given))
 
     @cached_property
@@ -198,7 +224,7 @@ class Dataset:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was found and done, a sentence each; with the log's name where there are several."""
+        """Findings and changes, a sentence each; with the log's name where there are several."""
         if len(self.segments) == 1:
             return self.segments[0].notes
         return tuple(f"{one.log.source}: {note}" for one in self.segments for note in one.notes)
@@ -236,7 +262,7 @@ class Dataset:
         return replace(self, given=given, segments=narrowed, layout=ParameterLayout(self.model.parameters, len(logs)))
 
     def on_given_logs(self, masks: Sequence[BoolArray]) -> BoolArray:
-        """Masks over the segments' rows as one over the rows of the logs that the user gave, log after log."""
+        """Mask over the rows of all given logs, log after log, from one mask per segment."""
         whole = []
         for one, log, mask in zip(self.segments, self.given, masks, strict=True):
             begin = one.log.time[one.offset]

@@ -35,13 +35,21 @@ class Segment:
 
     Parameters
     ----------
-    model, log : what was put together
-    offset : row of the log that is row 0 here; rows before it have no usable initial state or input
-    signals : signals of the model that the dataset has, in the model's order
-    measured : (N, n_s)   them, NaN where missing
-    inputs : (N, n_u)   inputs, held over NaN
-    valid : (N,)   rows in which every signal in use is finite
-    notes : what was found and done, a sentence each
+    model : Model
+    log : Log
+        The log, with its angles unwrapped.
+    offset : int
+        Row of the log that is row 0 of the arrays: the first that counts.
+    signals : tuple of str
+        Names of the n_s signals of the model that the dataset has, in the model's order.
+    measured : (N, n_s) array
+        Measured signals, each in its unit; NaN where missing.
+    inputs : (N, n_u) array
+        Inputs, each in its unit; NaN is replaced by the last good sample.
+    valid : (N,) bool array
+        Rows in which every signal in use is finite.
+    notes : tuple of str
+        Findings and changes, a sentence each.
     """
 
     model: Model
@@ -86,8 +94,14 @@ class Segment:
     def initial_state(self, rule: str | Mapping[str, float]) -> FloatArray:
         """State ``(n_x,)`` at row 0, by ``Settings.initial_state``'s rule.
 
-        A state that the log lacks and on which nothing measured depends starts at 0, a quaternion at (1, 0, 0, 0).
-        Raises LogError: another state is missing; it is named.
+        A state that the log lacks and on which no measured signal depends starts at 0, a quaternion at (1, 0, 0, 0).
+
+        Raises
+        ------
+        LogError
+            A state is missing on which a measured signal depends.
+        SettingsError
+            The rule names an unknown state.
         """
         given = rule if isinstance(rule, Mapping) else {}
         unknown = [n for n in given if n not in self.model.state]
@@ -147,7 +161,20 @@ class Segment:
 
 
 def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: bool = True) -> Segment:
-    """The arrays of ``model`` over ``log``; arguments as in `Dataset.of`.
+    """Segment of ``log`` under ``model``.
+
+    Parameters
+    ----------
+    model : Model
+    log : Log
+    also : sequence of str, optional
+        Signals in use besides those that the equations name.
+    pointwise : bool, optional
+        Whether the equations are evaluated at each row, which needs every signal that they name.
+
+    Returns
+    -------
+    Segment
 
     Raises
     ------
@@ -223,7 +250,7 @@ def _row_notes(log: Log, valid: BoolArray, held: BoolArray) -> list[str]:
 
 
 def _gap_notes(log: Log, held: BoolArray) -> list[str]:
-    """That inputs were held for too long to believe a simulation from there on, where they were."""
+    """A note on the gaps over which inputs were held for 3 rows or more; none without gaps."""
     edges = np.flatnonzero(np.diff(np.r_[False, held, False]))
     first, length = edges[::2], edges[1::2] - edges[::2]
     n_gaps = int((length >= _LONG_HOLD).sum())

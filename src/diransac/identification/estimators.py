@@ -1,6 +1,6 @@
 """``W p = b -> p``: estimators as small frozen objects, each bound to the rows of a log before it is used.
 
-An estimator says of a set of rows whether it is well-defined, and fits it.  Where a fit needs sums alone, each
+An estimator tests whether a set of rows is well-defined, and fits it.  Where a fit needs sums alone, each
 observation's block of ``[W b]^T [W b]`` is formed once, and a sample or a set of inliers is a sum of blocks, taken in
 the order of its rows: no result depends on how many hypotheses are fitted at a time.
 """
@@ -41,10 +41,10 @@ _MIN_EIGENVALUE = 1e-6
 
 
 class Selection(Protocol):
-    """Sets of rows, gathered once: whether each determines the parameters, and the parameters."""
+    """Sets of rows, gathered once, to be tested and fitted."""
 
     def well_defined(self) -> BoolArray:
-        """Whether each set of rows determines the parameters: smallest eigenvalue of the column-scaled ``W^T W``."""
+        """Mask of the sets that determine the parameters, by the smallest eigenvalue of the column-scaled ``W^T W``."""
 
     def fit(self) -> FloatArray:
         """Parameters ``(n_sets, n)``; not finite where a set determines none."""
@@ -62,11 +62,11 @@ class BoundEstimator(Protocol):
         """Parameters ``(n_groups, n)`` from ``rows`` (ascending) less each group of them."""
 
     def unidentifiable(self) -> tuple[int, ...]:
-        """Indices of the parameters that the whole dataset does not determine."""
+        """Indices of the parameters that are not identifiable from the whole dataset."""
 
 
 class Estimator(Protocol):
-    """What identifies parameters from rows."""
+    """An unbound estimator: its settings, without data."""
 
     def bind(self, dataset: Dataset) -> BoundEstimator:
         """The estimator over the usable rows of a dataset."""
@@ -74,12 +74,13 @@ class Estimator(Protocol):
 
 @dataclass(frozen=True)
 class _SumsEstimator:
-    """An estimator that needs no more of a set of rows than the sum of ``[W b]^T [W b]``.
+    """An estimator whose fit depends on a set of rows through the sum of ``[W b]^T [W b]`` alone.
 
     Parameters
     ----------
-    min_eigenvalue : the smallest eigenvalue of ``W^T W`` must exceed it, with the columns of ``W`` divided by their RMS
-        over the whole log, so that it has no unit
+    min_eigenvalue : float, optional
+        The smallest eigenvalue of ``W^T W`` must exceed it, with the columns of ``W`` divided by their RMS over the
+        whole log, so that it has no unit.
     """
 
     min_eigenvalue: float = _MIN_EIGENVALUE
@@ -90,7 +91,7 @@ class _SumsEstimator:
         return np.asarray(bound.select([np.arange(bound.n_rows)]).fit()[0])
 
     def well_defined(self, W: npt.ArrayLike, b: npt.ArrayLike) -> bool:
-        """Whether ``W (..., n_p)``, ``b (...)`` determine the parameters, with the columns scaled by their own RMS."""
+        """True if ``W (..., n_p)``, ``b (...)`` determine the parameters, with the columns scaled by their own RMS."""
         bound = self._bind(*_flat(W, b))
         return bool(bound.select([np.arange(bound.n_rows)]).well_defined()[0])
 
@@ -110,7 +111,15 @@ class _SumsEstimator:
 class OrdinaryLeastSquares(_SumsEstimator):
     """``p = (W^T W)^-1 W^T b``: least squares of the equation error.
 
-    References: Dimmig et al. 2023, section III.C (whose printed formula lacks the transpose).
+    Parameters
+    ----------
+    min_eigenvalue : float, optional
+        Threshold of a well-defined set of rows: the smallest eigenvalue of its ``W^T W`` must exceed it, with the
+        columns of ``W`` divided by their RMS over the whole log; no unit.
+
+    References
+    ----------
+    Dimmig et al. 2023, section III.C (whose printed formula lacks the transpose).
     """
 
     def solve(self, gram: FloatArray) -> FloatArray:
@@ -122,9 +131,16 @@ class OrdinaryLeastSquares(_SumsEstimator):
 class TotalLeastSquares(_SumsEstimator):
     """The ``p`` of the smallest change of ``W`` and ``b`` that makes ``W p = b`` exact, in columns of unit RMS.
 
-    Every column is taken to be as noisy as any other, relative to its RMS.
+    All columns are assumed to have the same noise relative to their RMS.
 
-    References: Golub and Van Loan 1980, "An analysis of the total least squares problem".
+    Parameters
+    ----------
+    min_eigenvalue : float, optional
+        As in `OrdinaryLeastSquares`.
+
+    References
+    ----------
+    Golub and Van Loan 1980, "An analysis of the total least squares problem".
     """
 
     def solve(self, gram: FloatArray) -> FloatArray:
@@ -164,7 +180,7 @@ class _BoundSums:
 
     @property
     def min_eigenvalue(self) -> float:
-        """Of the estimator."""
+        """Threshold of a well-defined set of rows."""
         return self._estimator.min_eigenvalue
 
     def solve(self, gram: FloatArray) -> FloatArray:
@@ -201,7 +217,7 @@ class _SelectedSums:
 
 
 class LinearRegressor(Protocol):
-    """What scikit-learn's linear regressors share."""
+    """Interface of scikit-learn's linear regressors."""
 
     def fit(self, X: FloatArray, y: FloatArray) -> Self:
         """Fit coefficients."""
@@ -219,10 +235,15 @@ class ScikitLearnEstimator:
 
     Parameters
     ----------
-    regressor : an estimator with ``fit`` and ``coef_`` (or an ``estimator_`` that has it), such as ``HuberRegressor()``
-    min_eigenvalue : as in `OrdinaryLeastSquares`
+    regressor : LinearRegressor
+        Regressor with ``fit`` and ``coef_`` (or an ``estimator_`` that has it), such as ``HuberRegressor()``.
+    min_eigenvalue : float, optional
+        As in `OrdinaryLeastSquares`.
 
-    Raises SettingsError: the regressor cannot be fitted without an intercept.
+    Raises
+    ------
+    SettingsError
+        The regressor cannot be fitted without an intercept.
     """
 
     regressor: LinearRegressor
@@ -237,7 +258,7 @@ class ScikitLearnEstimator:
 
 
 class _BoundScikitLearn:
-    """Rows of ``W`` and ``b`` for a scikit-learn regressor; whether they are enough is judged by their sums."""
+    """Rows of ``W`` and ``b`` for a scikit-learn regressor; their sums decide whether a set is well-defined."""
 
     def __init__(self, estimator: ScikitLearnEstimator, W: FloatArray, b: FloatArray) -> None:
         self._regressor = estimator.regressor
@@ -314,7 +335,18 @@ def _without_intercept(regressor: LinearRegressor) -> LinearRegressor:
 def as_estimator(candidate: object) -> Estimator:
     """The estimator itself, or a scikit-learn regressor wrapped as one.
 
-    Raises SettingsError: it is neither.
+    Parameters
+    ----------
+    candidate : object
+
+    Returns
+    -------
+    Estimator
+
+    Raises
+    ------
+    SettingsError
+        The candidate is neither.
     """
     if hasattr(candidate, "bind") and not isinstance(candidate, type):
         return cast("Estimator", candidate)
@@ -327,7 +359,7 @@ def as_estimator(candidate: object) -> Estimator:
 
 
 def name_of(estimator: Estimator) -> str:
-    """What users call it: its class, or the scikit-learn class that it wraps."""
+    """Name of an estimator's class, or of the scikit-learn class that it wraps."""
     named = estimator.regressor if isinstance(estimator, ScikitLearnEstimator) else estimator
     return type(named).__name__
 
@@ -337,6 +369,17 @@ def regression(dataset: Dataset) -> tuple[FloatArray, FloatArray]:
 
     Where a log's signals were derived by a filter, the same filter acts on both sides of the equation.  A per-log
     parameter has a column per log, which is zero in the rows of the others.
+
+    Parameters
+    ----------
+    dataset : Dataset
+
+    Returns
+    -------
+    W : (N, r, n) array
+        Regressors of the r equations at each row, with respect to n parameters.
+    b : (N, r) array
+        Right-hand sides.
     """
     parts = [_segment_regression(one) for one in dataset.segments]
     W = [dataset.layout.scattered(W, i) for i, (W, _) in enumerate(parts)]
@@ -377,7 +420,7 @@ def loose_parameters(gram: FloatArray, min_eigenvalue: float) -> tuple[int, ...]
 def solve_definite(A: FloatArray, g: FloatArray) -> FloatArray:
     """``A^-1 g`` for symmetric positive definite ``A (..., n, n)``, by LDL^T; NaN where it breaks down.
 
-    Written out over the leading axes: the same bits for every batch and on every machine, as LAPACK does not promise.
+    Written out over the leading axes: the same bits for every batch size and machine, which LAPACK does not guarantee.
     """
     A, x = A.copy(), g.copy()
     n = A.shape[-1]

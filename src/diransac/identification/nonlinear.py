@@ -56,12 +56,18 @@ class NonlinearLeastSquares:
 
     Parameters
     ----------
-    n_starts : starting points evaluated
-    n_followed : of them, those that are followed
-    max_steps : steps of each
-    min_eigenvalue : as in `OrdinaryLeastSquares`, for the Jacobian at the fit of the whole log
+    n_starts : int, optional
+        Starting points evaluated.
+    n_followed : int, optional
+        Of them, those that are followed.
+    max_steps : int, optional
+        Steps of each.
+    min_eigenvalue : float, optional
+        As in `OrdinaryLeastSquares`, for the Jacobian at the fit of the whole log.
 
-    References: Levenberg 1944; Marquardt 1963; Transtrum and Sethna 2012 for the damping.
+    References
+    ----------
+    Levenberg 1944; Marquardt 1963; Transtrum and Sethna 2012 for the damping.
     """
 
     n_starts: int = 200

@@ -57,13 +57,20 @@ class Result:
 
     Parameters
     ----------
-    model : the model, equations included
-    method, seed, settings, options : how it was made; ``options`` are the method's own settings
-    estimate : parameters, covariance, and what the method found beside them
-    evaluation : agreement of a simulation of every log with the measured signals
-    logs : the logs that it was made from
-    notes : findings on the way, a sentence each
-    bandwidth_sensitivity : name -> relative change at half and at twice the differentiating filter's bandwidth
+    model : Model
+        The model, equations included.
+    method, seed, settings, options : str, optional
+        How it was made; ``options`` are the method's own settings.
+    estimate : Estimate
+        Parameters, covariance, and what the method found beside them.
+    evaluation : Evaluation
+        Agreement of a simulation of every log with the measured signals.
+    logs : tuple of LogSummary
+        The logs that it was made from.
+    notes : tuple of str, optional
+        Findings on the way, a sentence each.
+    bandwidth_sensitivity : mapping of str to (float, float), optional
+        Name -> relative change at half and at twice the differentiating filter's bandwidth.
     """
 
     model: Model
@@ -258,7 +265,10 @@ class Result:
     def save(self, path: str | Path) -> None:
         """Write JSON, whole or not at all.
 
-        Raises ResultError: it cannot be written there.
+        Raises
+        ------
+        ResultError
+            It cannot be written there.
         """
         try:
             write_text(path, self._text())
@@ -269,7 +279,10 @@ class Result:
     def load(cls, path: str | Path) -> Result:
         """The result that `save` wrote.
 
-        Raises ResultError: there is no such file, or it holds no result; it names the file.
+        Raises
+        ------
+        ResultError
+            There is no such file, or it holds no result; it names the file.
         """
         try:
             return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))

@@ -4,9 +4,11 @@ Sample ``k`` is the beginning of a pseudo-random permutation of the rows that ``
 from one sample to the next, a sample is extended by reading on, and integers alone are involved, so every machine draws
 the same.
 
-References: Luby and Rackoff 1988 (a Feistel network of random round functions is a random permutation); Black and
-Rogaway 2002 (cycle walking to a domain of any size); Steele, Lea, Flood 2014 (the SplitMix64 mixer); Salmon et al. 2011
-(counter-based random numbers).
+References
+----------
+Luby and Rackoff 1988 (a Feistel network of random round functions is a random permutation); Black and Rogaway 2002
+(cycle walking to a domain of any size); Steele, Lea, Flood 2014 (the SplitMix64 mixer); Salmon et al. 2011 (counter-
+based random numbers).
 """
 
 from __future__ import annotations
@@ -35,10 +37,14 @@ def sample_rows(seed: int, iterations: npt.ArrayLike, n_rows: int, start: int, s
 
     Parameters
     ----------
-    seed : any integer
-    iterations : (n,)   k of each sample
-    n_rows : length of the permutation
-    start, stop : places read, ``0 <= start <= stop <= n_rows``
+    seed : int
+        Any integer.
+    iterations : (n,) array_like
+        K of each sample.
+    n_rows : int
+        Length of the permutation.
+    start, stop : int
+        Places read, ``0 <= start <= stop <= n_rows``.
 
     Returns (n, stop - start): row ``i`` holds distinct rows of the log, and no place read elsewhere repeats them.
     """

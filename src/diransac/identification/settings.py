@@ -33,27 +33,46 @@ class Settings:
 
     Parameters
     ----------
-    sample_size : s, observations in a sample at least
-    max_iterations : k_m, samples drawn at most
-    stop_inlier_fraction : f_I,t, stop once the stored model has this fraction of inliers; None forces all iterations
-    inlier_thresholds : epsilon by signal, in its unit; an error is an inlier's if strictly below.  A signal that is not
-        named has 0, which switches it off.  None: a fifth of each signal's spread in the log
-    min_inlier_signals : xi, signals of an observation that must be inliers; None: half of those with a threshold
-    error_weights : w by signal in eq. (2), one over its unit; a signal that is not named has 0.  None: 1 over the
-        spread for velocities, 0.1 over it for accelerations (Table IV's ratio), coordinates only where the log has no
-        velocity of theirs
-    acceptance_weights : nu = (nu_e, nu_f) of eq. (3)
-    refit : "inliers" (Algorithm 1, lines 25-31) or "none"
-    integrator : "rk4", "euler" or "semi-implicit-euler"
-    substeps : integration steps per sample
-    initial_state : Y_0; "first" (the paper's: the first row), "robust" (the same, but a first sample far from the line
-        through the first seven gives way to it), or values by name, which replace those of the first row
-    threads : threads of the simulation; None: one a core, one in a worker process (`simulate.default_threads`).  Never
-        changes an answer
-    batch_size : hypotheses simulated at once.  Never changes an answer
+    sample_size : int, optional
+        s, observations in a sample at least.
+    max_iterations : int, optional
+        k_m, samples drawn at most.
+    stop_inlier_fraction : float, optional
+        f_I,t, stop once the stored model has this fraction of inliers; None forces all iterations.
+    inlier_thresholds : mapping of str to float, optional
+        epsilon by signal, in its unit; an error is an inlier's if strictly below.  A signal that is not named has 0,
+        which switches it off.  None: a fifth of each signal's spread in the log.
+    min_inlier_signals : int, optional
+        xi, signals of an observation that must be inliers; None: half of those with a threshold.
+    error_weights : mapping of str to float, optional
+        W by signal in eq. (2), one over its unit; a signal that is not named has 0.  None: 1 over the spread for
+        velocities, 0.1 over it for accelerations (Table IV's ratio), coordinates only where the log has no velocity of
+        theirs.
+    acceptance_weights : (float, float), optional
+        nu = (nu_e, nu_f) of eq. (3).
+    refit : str, optional
+        "inliers" (Algorithm 1, lines 25-31) or "none".
+    integrator : str, optional
+        "rk4", "euler" or "semi-implicit-euler".
+    substeps : int, optional
+        Integration steps per sample.
+    initial_state : str or Mapping[str, float], optional
+        Y_0; "first" (the paper's: the first row), "robust" (the same, but a first sample far from the line through the
+        first seven gives way to it), or values by name, which replace those of the first row.
+    threads : int, optional
+        Threads of the simulation; None: one a core, one in a worker process (`simulate.default_threads`).  Never
+        changes an answer.
+    batch_size : int, optional
+        Hypotheses simulated at once.  Never changes an answer.
 
-    Raises SettingsError: a value has no meaning.
-    References: Dimmig et al. 2023, Algorithm 1 and Table IV.
+    Raises
+    ------
+    SettingsError
+        A value has no meaning.
+
+    References
+    ----------
+    Dimmig et al. 2023, Algorithm 1 and Table IV.
     """
 
     sample_size: int = 75
@@ -124,7 +143,10 @@ class Settings:
     def from_dict(cls, data: Mapping[str, Any]) -> Settings:
         """Settings from a mapping, such as a TOML table or `to_dict`'s.
 
-        Raises SettingsError: an unknown name; it lists those there are.
+        Raises
+        ------
+        SettingsError
+            An unknown name; it lists those there are.
         """
         known = [f.name for f in dataclasses.fields(cls)]
         unknown = [name for name in data if name not in known]

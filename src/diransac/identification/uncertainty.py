@@ -28,11 +28,15 @@ def jackknife_covariance(estimator: BoundEstimator, rows: IntArray) -> FloatArra
 
     Parameters
     ----------
-    rows : (n,)   usable rows that the estimate was fitted to, ascending
+    rows : (n,) int array
+        Usable rows that the estimate was fitted to, ascending.
 
     Returns infinite variances where leaving out a stretch leaves a parameter unidentifiable.
-    References: Künsch 1989, "The jackknife and the bootstrap for general stationary observations"; Busing, Meijer, van
-    der Leeden 1999, "Delete-m jackknife for unequal m".
+
+    References
+    ----------
+    Künsch 1989, "The jackknife and the bootstrap for general stationary observations"; Busing, Meijer, van der Leeden
+    1999, "Delete-m jackknife for unequal m".
     """
     groups = [g for g in np.array_split(rows, min(N_BLOCKS, len(rows))) if len(g)]
     fits = estimator.fit_without(groups, rows)

@@ -37,12 +37,18 @@ class HorizonScores:
 
     Parameters
     ----------
-    horizon : s after which the simulation restarts from the measured state; infinite: never
-    windows : simulations that were scored
-    diverged : of them, those that became infinite; they leave every score infinitely bad
-    rmse : root of the mean squared error, the signal's unit
-    fit_percent : ``100 (1 - |y - y_sim| / |y - mean(y)|)``
-    r_squared : ``1 - sum (y - y_sim)^2 / sum (y - mean(y))^2``
+    horizon : float
+        s after which the simulation restarts from the measured state; infinite: never.
+    windows : int
+        Simulations that were scored.
+    diverged : int
+        Of them, those that became infinite; they leave every score infinitely bad.
+    rmse : mapping of str to float
+        Root of the mean squared error, the signal's unit.
+    fit_percent : mapping of str to float
+        ``100 (1 - |y - y_sim| / |y - mean(y)|)``.
+    r_squared : mapping of str to float
+        ``1 - sum (y - y_sim)^2 / sum (y - mean(y))^2``.
     """
 
     horizon: float
@@ -59,10 +65,14 @@ class Validation:
 
     Parameters
     ----------
-    source : how messages name the log
-    units : unit of each signal
-    asked : index of the horizon that was asked for; the whole log if none was
-    notes : what was found in the log
+    source : str
+        How messages name the log.
+    units : mapping of str to str
+        Unit of each signal.
+    asked : int
+        Index of the horizon that was asked for; the whole log if none was.
+    notes : tuple of str, optional
+        What was found in the log.
     """
 
     source: str
@@ -118,10 +128,13 @@ def validate(
 
     Parameters
     ----------
-    logs : one log, or several, whose errors are pooled
-    horizon : s; the simulation restarts from the measured state after each.  None: two that suit the length of the
-        logs.  The whole of each log from its first complete state on is always scored, too
-    integrator, substeps : as in `Settings`; None: those of the method that identified a result, else "rk4" and 1
+    logs : Log or Iterable[Log]
+        One log, or several, whose errors are pooled.
+    horizon : float, optional
+        s; the simulation restarts from the measured state after each.  None: two that suit the length of the logs.  The
+        whole of each log from its first complete state on is always scored, too.
+    integrator, substeps : str, optional
+        As in `Settings`; None: those of the method that identified a result, else "rk4" and 1.
 
     Returns
     -------
@@ -263,9 +276,12 @@ class CrossValidation:
 
     Parameters
     ----------
-    sources : how messages name each log
-    results : of all logs but that one; or why there is none
-    validations : prediction of that log; or why there is none
+    sources : tuple of str
+        How messages name each log.
+    results : tuple of Result or str
+        Of all logs but that one; or why there is none.
+    validations : tuple of Validation or str
+        Prediction of that log; or why there is none.
     """
 
     sources: tuple[str, ...]
@@ -322,9 +338,12 @@ def cross_validate(
 
     Parameters
     ----------
-    logs : two or more
-    method, progress, arguments : as `identify` has them
-    horizon : s, as `validate` has it
+    logs : iterable of Log
+        Two or more.
+    method, progress, arguments : str or Method, optional
+        As `identify` has them.
+    horizon : float, optional
+        s, as `validate` has it.
 
     Raises
     ------

@@ -39,14 +39,16 @@ class LeastSquares:
 
     Parameters
     ----------
-    estimator : `OrdinaryLeastSquares` (default), `TotalLeastSquares`, `NonlinearLeastSquares`, or any scikit-learn
-        linear regressor
-    criteria : settings of the evaluation: `Settings` of which those of a search are refused
+    estimator : object, optional
+        `OrdinaryLeastSquares` (default), `TotalLeastSquares`, `NonlinearLeastSquares`, or any scikit-learn linear
+        regressor.
+    criteria : Settings, optional
+        Settings of the evaluation; settings of a search are refused.
 
     Raises
     ------
     SettingsError
-        A setting has no use here, or the estimator is none.
+        A setting is not used by least squares, or the estimator is not an estimator.
     """
 
     estimator: object = field(default_factory=OrdinaryLeastSquares)
@@ -69,7 +71,7 @@ class LeastSquares:
         return self.estimator  # type: ignore[return-value]  # as_estimator made it one
 
     def options(self) -> Mapping[str, Any]:
-        """None beside the estimator."""
+        """An empty mapping: the estimator has the settings."""
         return {}
 
     def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
@@ -78,7 +80,7 @@ class LeastSquares:
         Raises
         ------
         IdentificationError
-            The dataset does not determine the parameters, or no finite ones are found.
+            A parameter is not identifiable from the dataset, or the solution is not finite.
         """
         report(callback, "fitting", 0.0)
         bound = bound_to(self._estimator, dataset)
@@ -107,12 +109,21 @@ def nonlinear(settings: Settings) -> LeastSquares:
 
 
 def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
-    """The estimator over the dataset.
+    """The estimator over a dataset.
+
+    Parameters
+    ----------
+    estimator : Estimator
+    dataset : Dataset
+
+    Returns
+    -------
+    BoundEstimator
 
     Raises
     ------
     IdentificationError
-        The dataset as a whole does not determine the parameters; they are named.
+        A parameter is not identifiable from the whole dataset; the message names it.
     """
     bound = estimator.bind(dataset)
     if bound.select([np.arange(bound.n_rows)]).well_defined()[0]:
@@ -126,7 +137,23 @@ def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
 
 
 def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows: np.ndarray, **about: Any) -> Estimate:
-    """The estimate of parameters ``(n,)`` that were fitted to rows, with its jackknife covariance."""
+    """Estimate of fitted parameters, with its jackknife covariance.
+
+    Parameters
+    ----------
+    bound : BoundEstimator
+    dataset : Dataset
+    parameters : (n,) array
+        Each in its unit.
+    rows : (n_fitted,) int array
+        Usable rows that the parameters were fitted to, ascending.
+    about : object
+        Other fields of the estimate.
+
+    Returns
+    -------
+    Estimate
+    """
     return Estimate(
         parameters=dict(zip(dataset.layout.names, parameters.tolist(), strict=True)),
         covariance=jackknife_covariance(bound, rows),

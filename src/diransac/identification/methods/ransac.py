@@ -1,7 +1,7 @@
-"""Algorithm 1: random minimal samples, simulated over all logs, judged by consensus, refitted to their inliers.
+"""Algorithm 1: random minimal samples, scored by simulation of all logs, refitted to their inliers.
 
 Samples do not depend on earlier results, so hypotheses are fitted and simulated a batch at a time ("speculate"); their
-scores are then walked in order exactly as the algorithm says ("replay"), and only a chain of refits runs on its own.
+scores are then walked in order exactly as in the algorithm ("replay"), and only a chain of refits runs on its own.
 The answer is that of the sequential algorithm, whatever the batch size.
 """
 
@@ -62,7 +62,15 @@ _SEARCH = ("sample_size", "max_iterations", "refit")
 
 @dataclass(frozen=True)
 class Score:
-    """A hypothesis' ``error`` (eq. (2) or its square sibling; infinite where it diverged) and ``inlier_fraction``."""
+    """Score of a hypothesis.
+
+    Parameters
+    ----------
+    error : float, optional
+        Eq. (2), or its mean square; infinite where the simulation diverged.
+    inlier_fraction : float, optional
+        Number of inliers over the number of rows that count.
+    """
 
     error: float = np.inf
     inlier_fraction: float = 0.0
@@ -70,18 +78,20 @@ class Score:
 
 @dataclass(frozen=True)
 class RansacMethod(ABC):
-    """Algorithm 1; a variant says which hypotheses improve, are stored, are refitted, and end the search.
+    """Algorithm 1; variants differ in which hypotheses improve, are stored, are refitted, and end the search.
 
     Parameters
     ----------
-    criteria : settings of the search and of the evaluation
-    estimator : inside the search; None: `OrdinaryLeastSquares`, or `NonlinearLeastSquares` where the model is not
-        affine in its parameters
+    criteria : Settings, optional
+        Settings of the search and of the evaluation.
+    estimator : object, optional
+        Estimator of a sample; None: `OrdinaryLeastSquares`, or `NonlinearLeastSquares` where the model is not affine in
+        its parameters.
 
     Raises
     ------
     SettingsError
-        A setting has no use here, or the estimator is none.
+        A setting is not used by the method, or the estimator is not an estimator.
     """
 
     criteria: Settings = field(default_factory=Settings)
@@ -96,18 +106,30 @@ class RansacMethod(ABC):
         check_used(self.criteria, self.uses, self.name)
 
     def options(self) -> Mapping[str, Any]:
-        """None beside the criteria and the estimator."""
+        """An empty mapping: the criteria and the estimator have the settings."""
         return {}
 
     def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
         """The best hypothesis of the search, with its jackknife covariance.
 
+        Parameters
+        ----------
+        dataset : Dataset
+        seed : int
+            Sample k depends on (seed, k) alone.
+        callback : callable, optional
+            Called with a `Progress` after every batch of hypotheses.
+
+        Returns
+        -------
+        Estimate
+
         Raises
         ------
         IdentificationError
-            The dataset does not determine the parameters, or no hypothesis was accepted.
+            A parameter is not identifiable from the dataset, or no hypothesis was accepted.
         LogError
-            There are fewer rows than a sample has, or an initial state is missing.
+            There are fewer rows than in a sample, or an initial state is missing.
         """
         settings, estimator = self.criteria, self._estimator(dataset.model)
         bound = bound_to(estimator, dataset)
@@ -234,7 +256,18 @@ class Diransac(RansacMethod):
 
 
 class ScoredBatch:
-    """Scores of a batch of hypotheses, and the rows that are their inliers."""
+    """Scores of a batch of hypotheses, and the rows that are their inliers.
+
+    Parameters
+    ----------
+    scores : Scores
+    errors : (n_lanes,) array
+        Model-fit error of each hypothesis.
+    n_rows : int
+        Number of rows that count.
+    valid : sequence of (N,) bool array
+        Rows of each log that count.
+    """
 
     def __init__(self, scores: Scores, errors: FloatArray, n_rows: int, valid: Sequence[BoolArray]) -> None:
         self._scores, self._valid = scores, valid
@@ -248,7 +281,15 @@ class ScoredBatch:
 
 
 class Evaluator:
-    """Bounds, simulation, error and inliers of hypotheses over a dataset.
+    """Preliminary test, simulation, error and inliers of hypotheses over a dataset.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    scoring : Scoring
+        Weights and thresholds.
+    variant : RansacMethod
+        Method whose error and criteria are used.
 
     Raises
     ------
@@ -281,7 +322,19 @@ class Evaluator:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Parameters ``(n,)``, the usable rows that they were fitted to, ascending, and their place in a scored batch."""
+    """A hypothesis and its place in a scored batch.
+
+    Parameters
+    ----------
+    parameters : (n,) array
+        Each in its unit.
+    rows : (n_fitted,) int array
+        Usable rows that the parameters were fitted to, ascending.
+    batch : ScoredBatch
+        Scores of the batch that the hypothesis belongs to.
+    lane : int
+        Index of the hypothesis in the batch.
+    """
 
     parameters: FloatArray
     rows: IntArray
@@ -303,11 +356,16 @@ class SearchState:
 
     Parameters
     ----------
-    best : the stored hypothesis; None while nothing was accepted
-    iterations : k, samples drawn
-    n_hypotheses : hypotheses looked at, refits included
-    rejected : hypotheses that went no further, by reason
-    stop_reason : why it ended
+    best : Hypothesis, optional
+        Stored hypothesis; None while nothing was accepted.
+    iterations : int, optional
+        Number of samples drawn, the paper's k.
+    n_hypotheses : int, optional
+        Number of hypotheses evaluated, refits included.
+    rejected : Counter of str, optional
+        Number of rejected hypotheses by reason.
+    stop_reason : str, optional
+        Reason why the search ended.
     """
 
     best: Hypothesis | None = None
@@ -330,15 +388,33 @@ def search(
     seed: int,
     callback: Callback | None = None,
 ) -> SearchState:
-    """Algorithm 1 in the given variant.
+    """State at the end of Algorithm 1 in the given variant.
 
     Parameters
     ----------
-    sampler : ``(seed, iterations, n_rows, start, stop) -> rows``, as `sampling.sample_rows`
-    callback : called after every batch
+    variant : RansacMethod
+    estimator : BoundEstimator
+        Fit of samples and inlier sets.
+    evaluator : Evaluator
+        Preliminary test and scores of hypotheses.
+    sampler : callable
+        ``(seed, iterations, n_rows, start, stop) -> rows``, as `sampling.sample_rows`.
+    seed : int
+    callback : callable, optional
+        Called with a `Progress` after every batch.
 
-    Raises IdentificationError: the whole log is not well-defined, or nothing was ever accepted.
-    References: Dimmig et al. 2023, Algorithm 1.
+    Returns
+    -------
+    SearchState
+
+    Raises
+    ------
+    IdentificationError
+        The whole log is not well-defined, or no hypothesis was accepted.
+
+    References
+    ----------
+    Dimmig et al. 2023, Algorithm 1.
     """
     settings, state = variant.criteria, SearchState()
     for batch in _batches(settings):
@@ -360,7 +436,7 @@ def search(
 
 
 def _batches(settings: Settings) -> Iterator[IntArray]:
-    """Iterations in batches that grow from a few to ``batch_size`` where the search may stop early, as many do."""
+    """Iterations in batches, which grow from 16 to ``batch_size`` where the search may stop early."""
     may_stop = settings.stop_inlier_fraction is not None
     start, size = 0, min(_FIRST_BATCH, settings.batch_size) if may_stop else settings.batch_size
     while start < settings.max_iterations:
@@ -444,14 +520,14 @@ def _replay(
 
 
 def _fingerprint(rows: IntArray, n_rows: int) -> bytes:
-    """A bit a row: a chain may be thousands of refits long, and knows every set of inliers that it has met."""
+    """One bit per row: a chain of thousands of refits keeps all its inlier sets."""
     chosen = np.zeros(n_rows, bool)
     chosen[rows] = True
     return np.packbits(chosen).tobytes()
 
 
 def _judge(hypothesis: Hypothesis, state: SearchState, variant: RansacMethod) -> bool | None:
-    """Whether a hypothesis was stored; None where it does not even improve (lines 19-23)."""
+    """True if a hypothesis was stored, False if it improves only, None otherwise (lines 19-23)."""
     score = hypothesis.score
     if not variant.improves(score, state.score):
         state.rejected["diverged" if np.isinf(score.error) else "no improvement"] += 1

@@ -9,7 +9,9 @@ Every window meets its neighbours and the parameters, nothing else, so a solutio
 matter cost O(W).  Blocks are eliminated by cyclic reduction: all odd ones at once, then every other one of what is
 left, so that each of the log2(W) levels is a handful of operations on stacks of small matrices.
 
-References: Hockney 1965 and Heller 1976 (cyclic reduction); Takahashi, Fagan, Chen 1973 (selected inverse).
+References
+----------
+Hockney 1965 and Heller 1976 (cyclic reduction); Takahashi, Fagan, Chen 1973 (selected inverse).
 """
 
 from __future__ import annotations
@@ -29,10 +31,14 @@ class Factored:
 
     Parameters
     ----------
-    step_z, step_p : (W, k), (m,)   the solution
-    var_z : (W, k, k)   diagonal blocks of the inverse
-    var_p : (m, m)   its corner
-    gain : (W, k, m)   ``A^-1 B``, so that a shift of p moves z by ``-gain`` times it
+    step_z, step_p : (W, k), (m,) array
+        The solution.
+    var_z : (W, k, k) array
+        Diagonal blocks of the inverse.
+    var_p : (m, m) array
+        Its corner.
+    gain : (W, k, m) array
+        ``A^-1 B``, so that a shift of p moves z by ``-gain`` times it.
     """
 
     step_z: FloatArray

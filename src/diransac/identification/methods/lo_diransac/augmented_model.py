@@ -37,10 +37,11 @@ class AugmentedModel:
 
     Parameters
     ----------
-    model : its parameters are the model's ``p``; the discrepancies, equation by equation the bias and one gain per
-        input; the delay in samples; the unmodelled accelerations.  Its inputs are u, and the change of u per sample of
-        delay
-    n_p, n_v, n_u : of the model
+    model : Model
+        Its parameters are the model's ``p``; the discrepancies, equation by equation the bias and one gain per input;
+        the delay in samples; the unmodelled accelerations.  Its inputs are u, and the change of u per sample of delay.
+    n_p, n_v, n_u : int
+        Of the model.
     """
 
     model: Model

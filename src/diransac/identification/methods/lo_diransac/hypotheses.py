@@ -5,8 +5,10 @@ averaged under a bump of a window's length: vibration and noise average out, and
 parts, little depends on the accelerations.  A sample of few averages of each equation gives a first guess, and every
 guess is scored by simulation.
 
-References: Fischler, Bolles 1981 (RANSAC); Messenger, Bortz 2021 (weak form); Nister 2005 (judging many on little, few
-on all); Torr, Zisserman 2000.
+References
+----------
+Fischler, Bolles 1981 (RANSAC); Messenger, Bortz 2021 (weak form); Nister 2005 (judging many on little, few on all);
+Torr, Zisserman 2000.
 """
 
 from __future__ import annotations

@@ -54,9 +54,12 @@ class InstrumentalEstimate:
 
     Parameters
     ----------
-    parameters, covariance : (n,), (n, n)   per-log parameters of every log included
-    unexplained : (W, n_v)   mean of each interval's accelerations that the model with these parameters does not make
-    delay_error : standard error of the delay, samples
+    parameters, covariance : (n,), (n, n) array
+        Per-log parameters of every log included.
+    unexplained : (W, n_v) array
+        Mean of each interval's accelerations that the model with these parameters does not make.
+    delay_error : float
+        Standard error of the delay, samples.
     """
 
     parameters: FloatArray

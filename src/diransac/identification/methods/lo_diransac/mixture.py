@@ -1,6 +1,8 @@
 """Noise of each signal: a Gaussian, and a uniform of outliers over the signal's range.
 
-References: Torr and Zisserman 2000, "MLESAC"; Dempster, Laird, Rubin 1977 (EM).
+References
+----------
+Torr and Zisserman 2000, "MLESAC"; Dempster, Laird, Rubin 1977 (EM).
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ class Mixture:
 
         Parameters
         ----------
-        outliers : whether the fraction of outliers is estimated; it stays as it is without
+        outliers : bool, optional
+            Whether the fraction of outliers is estimated; it stays as it is without.
         """
         weight = inlying.sum(axis=0)
         squares = (inlying * np.square(residuals)).sum(axis=0)

@@ -8,7 +8,9 @@ state x_w and an unmodelled acceleration d_w that acts over the interval.  With 
 
 The second sum is over neighbours within one log.
 
-References: Bock 1987 (multiple shooting); Tremolet 2006 (weak-constraint 4D-Var).
+References
+----------
+Bock 1987 (multiple shooting); Tremolet 2006 (weak-constraint 4D-Var).
 """
 
 from __future__ import annotations
@@ -34,13 +36,20 @@ class Fit:
 
     Parameters
     ----------
-    shared : (n_s,)   parameters, discrepancies, input delay in samples
-    x, d : (W, n_x), (W, n_v)   states at the intervals' starts, unmodelled accelerations
-    residuals : (N, n_signals)   simulated less measured
-    noise : of each signal
-    tau : (n_v,)   size of the unmodelled accelerations
-    continuity_std : (n_x,)   size of the jumps from interval to interval
-    prior : (n_s,)   size of the discrepancies and of the delay; infinite for the parameters
+    shared : (n_s,) array
+        Parameters, discrepancies, input delay in samples.
+    x, d : (W, n_x), (W, n_v) array
+        States at the intervals' starts, unmodelled accelerations.
+    residuals : (N, n_signals) array
+        Simulated less measured.
+    noise : Mixture
+        Of each signal.
+    tau : (n_v,) array
+        Size of the unmodelled accelerations.
+    continuity_std : (n_x,) array
+        Size of the jumps from interval to interval.
+    prior : (n_s,) array
+        Size of the discrepancies and of the delay; infinite for the parameters.
     """
 
     shared: FloatArray

@@ -55,11 +55,14 @@ class Prior:
 
     Parameters
     ----------
-    tau : (n_v,)   unmodelled accelerations
-    unit : (n_s,)   a discrepancy that makes all of an equation's inertial force; a sample of delay; infinite for
-        parameters
-    discrepancy : in those units, once the fit has converged; ``guarded`` until then
-    delay : samples
+    tau : (n_v,) array
+        Unmodelled accelerations.
+    unit : (n_s,) array
+        A discrepancy that makes all of an equation's inertial force; a sample of delay; infinite for parameters.
+    discrepancy : float
+        In those units, once the fit has converged; ``guarded`` until then.
+    delay : float
+        Samples.
     """
 
     tau: FloatArray
@@ -75,10 +78,14 @@ class Refinement:
 
     Parameters
     ----------
-    fit : the most probable motion and parameters
-    loss : minus the log of the likelihood of all samples
-    steps : Gauss-Newton steps
-    converged : whether they ended before the limit
+    fit : Fit
+        The most probable motion and parameters.
+    loss : float
+        Minus the log of the likelihood of all samples.
+    steps : int
+        Gauss-Newton steps.
+    converged : bool
+        Whether they ended before the limit.
     """
 
     fit: Fit

@@ -30,36 +30,57 @@ class LoDiransac:
 
     Parameters
     ----------
-    criteria : settings of the evaluation: weights, thresholds and initial state, threads
-    stuck_rows : whether rows that repeat the row before in every signal are taken as missing
-    input_window : s, window of the Hampel filter that replaces momentary leaps of inputs; the shorter of it and 15
-        samples
-    input_threshold : of that filter, in local standard deviations
-    median_window : s, window of the running median that residuals of the smoothing start from; the shorter of it and 31
-        samples
-    smoothing_half_width : s, narrowest half width of the smoothing polynomials, and of the shooting intervals; the
-        shorter of it and 25 samples.  Three times, nine times, ... as wide ones are chosen by cross-validation
-    n_samples, n_nonlinear_samples : random samples of a model that is affine in its parameters, and of others
-    largest_sample : rows of each equation in a sample at most, over the number of parameters
-    n_screening_intervals, n_finalists : intervals on which all hypotheses are scored; hypotheses that are scored on all
-    delay_range : s, delays of the inputs that are tried before local optimisation, in whole samples
-    max_delay_shifts : how often inputs are shifted by whole samples after it
-    substeps : integration steps per sample: one is off by a percent where dry friction changes sign between samples or
-        links are light
-    max_starts, max_fits : hypotheses that may be optimised, and local optimisations at most
-    max_steps : Gauss-Newton steps of each at most; 0: the best hypothesis is the estimate
-    outliers : whether the noise of each signal has outliers; it is Gaussian without
-    neighbouring_starts : whether intervals may begin where their neighbours end, where that explains them better
-    gradual_continuity : whether the motion is made continuous gradually rather than from the start
-    robust_model_error : whether the size of unmodelled accelerations follows the median interval at first
-    model_error : whether unmodelled accelerations follow the evidence; they vanish without
-    prior_model_error : their size before the log is seen, over the spread of the accelerations
-    prior_discrepancy, initial_discrepancy : size of input gain and bias discrepancies, over that which makes all of an
-        equation's inertial force, before the log is seen and on the way down
-    prior_delay : s, standard deviation of the input delay before the log is seen
-    instrumental_variables : whether parameters are read from the fitted motion by instrumental variables, rather than
-        from the fit
-    prior_inflation : factor of the prior on model error whose effect on the parameters is added to their covariance
+    criteria : Settings, optional
+        Settings of the evaluation: weights, thresholds and initial state, threads.
+    stuck_rows : bool, optional
+        Whether rows that repeat the row before in every signal are taken as missing.
+    input_window : float, optional
+        s, window of the Hampel filter that replaces momentary leaps of inputs; the shorter of it and 15 samples.
+    input_threshold : float, optional
+        Of that filter, in local standard deviations.
+    median_window : float, optional
+        s, window of the running median that residuals of the smoothing start from; the shorter of it and 31 samples.
+    smoothing_half_width : float, optional
+        s, narrowest half width of the smoothing polynomials, and of the shooting intervals; the shorter of it and 25
+        samples.  Three times, nine times, ... as wide ones are chosen by cross-validation.
+    n_samples, n_nonlinear_samples : int, optional
+        Random samples of a model that is affine in its parameters, and of others.
+    largest_sample : int, optional
+        Rows of each equation in a sample at most, over the number of parameters.
+    n_screening_intervals, n_finalists : int, optional
+        Intervals on which all hypotheses are scored; hypotheses that are scored on all.
+    delay_range : (float, float), optional
+        s, delays of the inputs that are tried before local optimisation, in whole samples.
+    max_delay_shifts : int, optional
+        How often inputs are shifted by whole samples after it.
+    substeps : int, optional
+        Integration steps per sample: one is off by a percent where dry friction changes sign between samples or links
+        are light.
+    max_starts, max_fits : int, optional
+        Hypotheses that may be optimised, and local optimisations at most.
+    max_steps : int, optional
+        Gauss-Newton steps of each at most; 0: the best hypothesis is the estimate.
+    outliers : bool, optional
+        Whether the noise of each signal has outliers; it is Gaussian without.
+    neighbouring_starts : bool, optional
+        Whether intervals may begin where their neighbours end, where that explains them better.
+    gradual_continuity : bool, optional
+        Whether the motion is made continuous gradually rather than from the start.
+    robust_model_error : bool, optional
+        Whether the size of unmodelled accelerations follows the median interval at first.
+    model_error : bool, optional
+        Whether unmodelled accelerations follow the evidence; they vanish without.
+    prior_model_error : float, optional
+        Their size before the log is seen, over the spread of the accelerations.
+    prior_discrepancy, initial_discrepancy : float, optional
+        Size of input gain and bias discrepancies, over that which makes all of an equation's inertial force, before the
+        log is seen and on the way down.
+    prior_delay : float, optional
+        s, standard deviation of the input delay before the log is seen.
+    instrumental_variables : bool, optional
+        Whether parameters are read from the fitted motion by instrumental variables, rather than from the fit.
+    prior_inflation : float, optional
+        Factor of the prior on model error whose effect on the parameters is added to their covariance.
 
     Raises
     ------

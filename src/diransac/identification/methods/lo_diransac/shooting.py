@@ -31,15 +31,23 @@ class ShootingIntervals:
 
     Parameters
     ----------
-    model : what is identified
-    layout : places of each log's parameters
-    measured, known : (N, n_s)   every signal of the model, in its order; nothing is known of rows that fill up
-    inputs : (N, n_u)
-    is_logged : (N,)   rows of the logs, as opposed to those that fill up
-    log_of : (W,)   log of each interval
-    dt : s
-    length : rows of an interval
-    substeps : integration steps from row to row
+    model : Model
+        What is identified.
+    layout : ParameterLayout
+        Places of each log's parameters.
+    measured, known : (N, n_s) array
+        Every signal of the model, in its order; nothing is known of rows that fill up.
+    inputs : (N, n_u) array
+    is_logged : (N,) bool array
+        Rows of the logs, as opposed to those that fill up.
+    log_of : (W,) int array
+        Log of each interval.
+    dt : float
+        s.
+    length : int
+        Rows of an interval.
+    substeps : int
+        Integration steps from row to row.
     """
 
     model: Model

@@ -109,7 +109,8 @@ def smooth(model: Model, logs: Sequence[Samples], dt: float, half: int) -> list[
 
     Parameters
     ----------
-    half : samples that a polynomial covers to either side of its knot
+    half : int
+        Samples that a polynomial covers to either side of its knot.
     """
     signals = [_smoothed(model, log, dt, half) for log in logs]
     middle = np.concatenate(
@@ -147,7 +148,8 @@ def choose_half_width(model: Model, logs: Sequence[Samples], dt: float, narrowes
 
     Parameters
     ----------
-    narrowest : s; the first candidate is the shorter of it and 25 samples, others are three times as wide each
+    narrowest : float
+        s; the first candidate is the shorter of it and 25 samples, others are three times as wide each.
     """
     longest = max(len(log.measured) for log in logs)
     first = max(_FEWEST, min(round(narrowest / dt), _ENOUGH_SAMPLES))
