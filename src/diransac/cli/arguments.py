@@ -1,4 +1,4 @@
-"""From what a user typed to a model, settings and a prepared log."""
+"""Models, methods and settings from the text of command-line arguments."""
 
 from __future__ import annotations
 
@@ -26,10 +26,21 @@ __all__ = ["load_methods", "load_model", "load_settings", "model_file", "names",
 def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
     """``["a=b,c=d", "e=f"]`` as a mapping.
 
+    Parameters
+    ----------
+    option : str
+        Name of the option in messages.
+    texts : sequence of str
+        Pairs, separated by commas.
+
+    Returns
+    -------
+    dict of str to str
+
     Raises
     ------
     typer.BadParameter
-        An item is no pair, or a name is given twice.
+        An item is not a pair, or a name is given twice.
     """
     found: dict[str, str] = {}
     for item in (item.strip() for text in texts for item in text.split(",")):
@@ -50,10 +61,21 @@ def names(text: str) -> list[str]:
 def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
     """``["a=1,b=2.5"]`` as numbers by name.
 
+    Parameters
+    ----------
+    option : str
+        Name of the option in messages.
+    texts : sequence of str
+        Pairs, separated by commas.
+
+    Returns
+    -------
+    dict of str to float
+
     Raises
     ------
     typer.BadParameter
-        A value is no number.
+        As `pairs`; a value is not a number.
     """
     found = pairs(option, texts)
     try:
@@ -66,7 +88,17 @@ def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
 
 
 def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, Any]:
-    """Settings by name from a TOML file, with ``key=value`` assignments laid over them in order.
+    """Settings by name from a TOML file, replaced by ``key=value`` assignments in order.
+
+    Parameters
+    ----------
+    file : Path, optional
+    assignments : sequence of str
+        As ``sample_size=50`` or ``inlier_thresholds.x_dot=0.5``.
+
+    Returns
+    -------
+    dict of str to object
 
     Raises
     ------
@@ -86,14 +118,23 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, An
 
 
 def load_methods(names: Sequence[str], settings: Mapping[str, Any]) -> list[Method]:
-    """Methods by name, each with those of the settings that it has; every setting is one of at least one of them.
+    """Methods by name, each with those of the given settings that it has.
+
+    Parameters
+    ----------
+    names : sequence of str
+    settings : mapping of str to object
+
+    Returns
+    -------
+    list of Method
 
     Raises
     ------
     typer.BadParameter
         A setting belongs to none of the methods.
     SettingsError
-        A value has no meaning.
+        A value is out of range, or of another type.
     """
     known = {name: setting_names(name) for name in names}
     for key in settings:
@@ -153,10 +194,18 @@ def model_file(text: str) -> Path | None:
 def load_model(text: str) -> Model:
     """The built-in model of that name, or the one that ``file.py[:name]`` defines.
 
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    Model
+
     Raises
     ------
     ModelError
-        There is none of that name, the file cannot be run, or what it defines is no model.
+        There is no such model, the file cannot be run, or the name is not that of a model.
     """
     found = file_and_name(text, "model")
     if found is None:

@@ -420,7 +420,7 @@ def mean_squared_error(sum_squares: FloatArray, n_rows: int, weights: FloatArray
     sum_squares : (n_hypotheses, n_signals) array
     n_rows : int
     weights : (n_signals,) array
-        As in `rms_error`; weights are one over each signal's unit squared.
+        As in `rms_error`.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""How well a plant predicts a log that it was not identified from: open-loop simulation at several horizons."""
+"""Validation: open-loop prediction of logs by a plant at several horizons; leave-one-log-out cross-validation."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class HorizonScores:
     Parameters
     ----------
     horizon : float
-        s after which the simulation restarts from the measured state; infinite: never.
+        Time after which the simulation restarts from the measured state, s; infinite: never.
     windows : int
-        Simulations that were scored.
+        Number of simulations that were scored.
     diverged : int
-        Of them, those that became infinite; they leave every score infinitely bad.
+        Number of simulations that became infinite, which makes the scores infinite.
     rmse : mapping of str to float
-        Root of the mean squared error, the signal's unit.
+        Root mean squared error of each signal, its unit.
     fit_percent : mapping of str to float
         ``100 (1 - |y - y_sim| / |y - mean(y)|)``.
     r_squared : mapping of str to float
@@ -61,18 +61,20 @@ class HorizonScores:
 
 @dataclass(frozen=True)
 class Validation:
-    """Scores at several horizons, shortest first; ``rmse`` and the like are those of the horizon that was asked for.
+    """Scores at several horizons, shortest first; `rmse`, `fit_percent` and `r_squared` are those of the requested one.
 
     Parameters
     ----------
     source : str
-        How messages name the log.
+        Names of the logs in messages.
     units : mapping of str to str
         Unit of each signal.
+    horizons : tuple of HorizonScores
+        Scores of each horizon.
     asked : int
-        Index of the horizon that was asked for; the whole log if none was.
+        Index of the requested horizon; of the whole log if none was requested.
     notes : tuple of str, optional
-        What was found in the log.
+        Findings in the logs, a sentence each.
     """
 
     source: str
@@ -124,29 +126,32 @@ def validate(
     integrator: str | None = None,
     substeps: int | None = None,
 ) -> Validation:
-    """Open-loop prediction of logs by a plant (a `Plant`, or a `Result`), as far as its model goes.
+    """Scores of the open-loop prediction of logs by a plant.
 
     Parameters
     ----------
-    logs : Log or Iterable[Log]
+    plant : Plant or Result
+        Model with its parameters.
+    logs : Log or iterable of Log
         One log, or several, whose errors are pooled.
     horizon : float, optional
-        s; the simulation restarts from the measured state after each.  None: two that suit the length of the logs.  The
-        whole of each log from its first complete state on is always scored, too.
-    integrator, substeps : str, optional
-        As in `Settings`; None: those of the method that identified a result, else "rk4" and 1.
+        Time after which the simulation restarts from the measured state, s.  None: two that suit the length of the
+        logs.  The whole of each log from its first complete state on is always scored, too.
+    integrator : str, optional
+    substeps : int, optional
+        As in `Settings`; None: those of the identification of a result, else "rk4" and 1.
 
     Returns
     -------
     Validation
-        Scores by signal.  The first row of a window, whose state is the measured one, is not scored.
+        Scores by signal.  The first row of a window, whose state is measured, is not scored.
 
     Raises
     ------
     LogError
         A log lacks an input or an initial state.
     SettingsError
-        An argument is of another kind, or a horizon shorter than a sample.
+        An argument is of another type, or a horizon is shorter than a sample.
     """
     several = as_logs(logs)
     if horizon is not None and not isinstance(horizon, (int, float, np.number)):
@@ -277,11 +282,11 @@ class CrossValidation:
     Parameters
     ----------
     sources : tuple of str
-        How messages name each log.
+        Name of each log in messages.
     results : tuple of Result or str
-        Of all logs but that one; or why there is none.
+        Result of all logs but that one; or the reason why there is none.
     validations : tuple of Validation or str
-        Prediction of that log; or why there is none.
+        Validation with that log; or the reason why there is none.
     """
 
     sources: tuple[str, ...]
@@ -332,23 +337,32 @@ def cross_validate(
     progress: Callback | None = None,
     **arguments: Any,
 ) -> CrossValidation:
-    """Leave-one-log-out cross-validation: identify from all logs but one, and predict that one, for each in turn.
+    """Leave-one-log-out cross-validation: prediction of each log by the model identified from the others.
 
-    A per-log parameter of the log that is left out takes the mean over the others.
+    A per-log parameter of the log that is left out is the mean over the others.
 
     Parameters
     ----------
+    model : Model
     logs : iterable of Log
         Two or more.
-    method, progress, arguments : str or Method, optional
-        As `identify` has them.
+    method : str or Method, optional
+        As in `identify`.
     horizon : float, optional
-        s, as `validate` has it.
+        As in `validate`, s.
+    progress : callable, optional
+        Called with a `Progress` at every stage.
+    arguments : object
+        Other arguments of `identify`.
+
+    Returns
+    -------
+    CrossValidation
 
     Raises
     ------
     SettingsError
-        There are fewer than two logs, or an argument has no meaning.
+        There are fewer than two logs, or an argument is out of range.
     """
     several = as_logs(logs)
     if len(several) < 2:

@@ -1,9 +1,9 @@
 """The steps of lo-diransac in their order.
 
 1. `smoothing`: screening of samples; the motion without a model.
-2. `hypotheses`: parameters from random samples of the equations in weak form, judged by simulation.
+2. `hypotheses`: parameters from random samples of the equations in weak form, scored by simulation.
 3. `refinement`: the most probable motion and parameters, noise and discrepancies, from the best of them.
-4. `instrumental_variables`: parameters that hold for the whole motion, and their covariance.
+4. `instrumental_variables`: parameters of the whole motion, and their covariance.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ _GAUSSIAN = 10_000
 
 
 def estimate(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
-    """Parameters of the dataset's model; raises as `LoDiransac.fit`."""
+    """Parameters of the dataset's model; arguments and errors as those of `LoDiransac.fit`."""
     report(callback, "smoothing", 0.0)
     intervals, motion, notes = _prepared(settings, dataset)
     report(callback, "drawing hypotheses", 0.1)
@@ -90,7 +90,7 @@ def estimate(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callba
     if not settings.instrumental_variables:
         result = replace(result, parameters=kept, unexplained=unexplained(intervals, refined.fit, kept))
     elif not intervals.layout.admits(result.parameters[None])[0]:
-        # The fit keeps to the bounds, least squares on its motion need not.
+        # The fit satisfies the bounds; least squares on its motion may violate them.
         result = replace(result, parameters=kept, unexplained=unexplained(intervals, refined.fit, kept))
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
     if _explains_nothing(intervals, motion, refined):
@@ -102,7 +102,7 @@ def estimate(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callba
 
 
 def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
-    """Whether the noise of every signal is as large as the signal."""
+    """True if the noise of every signal is as large as the signal."""
     seen = intervals.known.any(axis=0)
     return bool((refined.fit.noise.sigma > _ALL_OF_IT * motion.spread)[seen].all())
 
@@ -141,7 +141,7 @@ def _to_length(values: FloatArray, n_rows: int) -> FloatArray:
 
 
 def _screened(settings: LoDiransac, one: Segment, dt: float) -> tuple[Samples, FloatArray, list[str]]:
-    """Samples and inputs of one log, and what was found."""
+    """Samples and inputs of one log, and findings, a sentence each."""
     model, notes = one.model, []
     measured = np.full((len(one), len(model.signals)), np.nan)
     measured[:, [model.signals.index(n) for n in one.signals]] = one.measured
@@ -176,9 +176,9 @@ class _LocalSearch:
     def best(self, intervals: ShootingIntervals) -> Refinement:
         """Local optimisation from the best hypothesis; where it is doubtful, from others; the likeliest of these.
 
-        Doubtful is a fit that takes most of an interval for outliers: sensors may have failed there, or the fit.  It
-        becomes a hypothesis itself if it is the likeliest so far, or else the next one has its turn; doubt ends with a
-        second fit that is as likely.
+        A fit is doubtful if most samples of an interval are outliers: either sensors failed there, or the fit did.  The
+        likeliest fit so far becomes a hypothesis itself; otherwise the next hypothesis is optimised.  The search ends
+        with a second fit that is as likely.
         """
         waiting = list(self.hypotheses[: self.settings.max_starts])
         found: list[Refinement] = []
@@ -197,8 +197,8 @@ class _LocalSearch:
     def best_delayed(self, intervals: ShootingIntervals) -> tuple[int, Refinement]:
         """Delay of the inputs in samples, and the best fit then.
 
-        Where the hypotheses favour a delay at all, the neighbouring samples are tried, too, and theirs, as long as the
-        fit becomes likelier: hypotheses come from inputs without a delay.
+        Where the best hypothesis favours a delay, neighbouring delays are tried as long as the fit becomes likelier,
+        because hypotheses were drawn from inputs without a delay.
         """
         report(self.callback, "searching for a delay", 0.25)
         delay = self._likeliest_delay(intervals)
@@ -215,8 +215,8 @@ class _LocalSearch:
     def _likeliest_delay(self, intervals: ShootingIntervals) -> int:
         """Delay in samples with which simulations by the best hypothesis agree best with the log.
 
-        Inputs that are held for many samples and then step make few outliers under a wrong delay, and local
-        optimisation would rest there; so whole samples are settled before it begins.
+        Inputs that are held for many samples and then step cause few outliers under a wrong delay, which is a local
+        optimum; so the number of whole samples is chosen before local optimisation.
         """
         every, scores = np.arange(len(intervals)), dict[int, float]()
         low, high = (round(x / intervals.dt) for x in self.settings.delay_range)
@@ -254,7 +254,7 @@ class _LocalSearch:
 
 
 def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:
-    """Whether some interval has too few inlying samples for a robust scale to stand on."""
+    """True if an interval has too few inlying samples for a robust scale."""
     fit, n = refined.fit, len(intervals)
     inlying = (fit.noise.inlying(fit.residuals, intervals.known) > _OUTLIER).reshape(n, -1).sum(axis=1)
     return bool((inlying < BREAKDOWN * intervals.known.reshape(n, -1).sum(axis=1)).any())
@@ -265,7 +265,7 @@ def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:
 
 @dataclass(frozen=True)
 class _Found:
-    """Everything that an estimate is made of; the delay is in samples."""
+    """Parts of an estimate; the delay is in samples."""
 
     dataset: Dataset
     intervals: ShootingIntervals
@@ -301,7 +301,7 @@ def _estimate(
 
 
 def _diagnosis(found: _Found, unidentifiable: tuple[str, ...]) -> Diagnosis:
-    """Noise, faults and unmodelled forces, by name and over the rows of the logs as they were given."""
+    """Noise, faults and unmodelled forces, by name and over the rows of the given logs."""
     dataset, intervals, fit, result = found.dataset, found.intervals, found.fit, found.result
     model, dt = dataset.model, intervals.dt
     columns = {name: model.signals.index(name) for name in dataset.signals}
@@ -339,7 +339,7 @@ def _on_given_logs(dataset: Dataset, intervals: ShootingIntervals, mask: BoolArr
 
 
 def _unmodelled_forces(intervals: ShootingIntervals, fit: Fit, result: InstrumentalEstimate) -> FloatArray | None:
-    """Generalised forces (W, n_v) that make the unmodelled accelerations, at the intervals' starts; or None."""
+    """Generalised forces (W, n_v) of the unmodelled accelerations at the intervals' starts, or None."""
     model = intervals.model
     try:
         response = model.force_response

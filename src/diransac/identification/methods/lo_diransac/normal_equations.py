@@ -38,12 +38,14 @@ class Fit:
     ----------
     shared : (n_s,) array
         Parameters, discrepancies, input delay in samples.
-    x, d : (W, n_x), (W, n_v) array
-        States at the intervals' starts, unmodelled accelerations.
+    x : (W, n_x) array
+        States at the intervals' starts.
+    d : (W, n_v) array
+        Unmodelled accelerations.
     residuals : (N, n_signals) array
-        Simulated less measured.
+        Simulated less measured signals.
     noise : Mixture
-        Of each signal.
+        Noise of each signal.
     tau : (n_v,) array
         Size of the unmodelled accelerations.
     continuity_std : (n_x,) array
@@ -64,7 +66,15 @@ class Fit:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Blocks of the system at a fit, and its right-hand side: minus the gradient."""
+    """Gauss-Newton system at a fit.
+
+    Parameters
+    ----------
+    system : Arrowhead
+    right_z : (W, n_x + n_v) array
+    right_s : (n_s,) array
+        Right-hand side, minus the gradient: of states and unmodelled accelerations, and of the shared unknowns.
+    """
 
     system: Arrowhead
     right_z: FloatArray
@@ -72,12 +82,34 @@ class NormalEquations:
 
 
 def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
-    """The fit with its residuals over these intervals."""
+    """The fit with its residuals over the given intervals.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    Fit
+    """
     return replace(fit, residuals=intervals.residuals(fit.shared, fit.x, fit.d))
 
 
 def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> NormalEquations:
-    """Gauss-Newton normal equations; ``weights (N, n_signals)`` are those of the measurements."""
+    """Gauss-Newton normal equations of the cost at a fit.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    weights : (N, n_signals) array
+        Weights of the measurements, one over each signal's unit squared.
+
+    Returns
+    -------
+    NormalEquations
+    """
     n_x, k = fit.x.shape[1], fit.x.shape[1] + fit.d.shape[1]
     sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights)
     order = _order(sums.gradient.shape[1] - k, n_x, k)
@@ -130,7 +162,13 @@ def _order(n_s: int, n_x: int, k: int) -> IntArray:
 
 
 def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
-    """Twice the cost with the weights held; infinite where a rollout diverges."""
+    """Twice the cost of a fit with fixed weights; arguments as `linearize`.
+
+    Returns
+    -------
+    float
+        Infinite where a rollout diverges.
+    """
     ends = intervals.ends(fit.shared, fit.x, fit.d)
     terms = (
         (weights * np.square(fit.residuals)).sum(),

@@ -25,8 +25,7 @@ __all__ = ["LoDiransac", "configured"]
 class LoDiransac:
     """Locally optimised DIRANSAC: random samples, consensus by simulation, one weak-constraint fit of all logs.
 
-    Every default works for any model and any subset of signals.  Times are in seconds; a window of less than 5 samples
-    is widened to them.
+    Every default works for any model and any subset of signals.  Windows have at least 5 samples.
 
     Parameters
     ----------
@@ -35,57 +34,58 @@ class LoDiransac:
     stuck_rows : bool, optional
         Whether rows that repeat the row before in every signal are taken as missing.
     input_window : float, optional
-        s, window of the Hampel filter that replaces momentary leaps of inputs; the shorter of it and 15 samples.
+        Window of the Hampel filter that replaces momentary leaps of inputs, s; at most 15 samples.
     input_threshold : float, optional
-        Of that filter, in local standard deviations.
+        Threshold of the Hampel filter, in local standard deviations.
     median_window : float, optional
-        s, window of the running median that residuals of the smoothing start from; the shorter of it and 31 samples.
+        Window of the running median from which smoothing starts, s; at most 31 samples.
     smoothing_half_width : float, optional
-        s, narrowest half width of the smoothing polynomials, and of the shooting intervals; the shorter of it and 25
-        samples.  Three times, nine times, ... as wide ones are chosen by cross-validation.
+        Smallest half width of the smoothing polynomials and length of the shooting intervals, s; at most 25 samples.
+        Cross-validation chooses between it and three, nine, ... times its value.
     n_samples, n_nonlinear_samples : int, optional
-        Random samples of a model that is affine in its parameters, and of others.
+        Number of random samples of a model that is affine in its parameters, and of others.
     largest_sample : int, optional
-        Rows of each equation in a sample at most, over the number of parameters.
+        Largest number of rows of each equation in a sample, over the number of parameters.
     n_screening_intervals, n_finalists : int, optional
-        Intervals on which all hypotheses are scored; hypotheses that are scored on all.
+        Number of intervals on which all hypotheses are scored; number of hypotheses that are scored on all intervals.
     delay_range : (float, float), optional
-        s, delays of the inputs that are tried before local optimisation, in whole samples.
+        Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation.
     max_delay_shifts : int, optional
-        How often inputs are shifted by whole samples after it.
+        Largest number of shifts of the inputs by whole samples after local optimisation.
     substeps : int, optional
-        Integration steps per sample: one is off by a percent where dry friction changes sign between samples or links
-        are light.
+        Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
+        samples or links are light.
     max_starts, max_fits : int, optional
-        Hypotheses that may be optimised, and local optimisations at most.
+        Largest number of hypotheses that are optimised, and of local optimisations.
     max_steps : int, optional
-        Gauss-Newton steps of each at most; 0: the best hypothesis is the estimate.
+        Largest number of Gauss-Newton steps of a local optimisation; 0: the best hypothesis is the estimate.
     outliers : bool, optional
-        Whether the noise of each signal has outliers; it is Gaussian without.
+        Whether the noise of each signal has outliers; otherwise it is Gaussian.
     neighbouring_starts : bool, optional
-        Whether intervals may begin where their neighbours end, where that explains them better.
+        Whether initial states are propagated from neighbouring intervals where that has a higher likelihood.
     gradual_continuity : bool, optional
         Whether the motion is made continuous gradually rather than from the start.
     robust_model_error : bool, optional
-        Whether the size of unmodelled accelerations follows the median interval at first.
+        Whether the size of unmodelled accelerations follows the median interval until the first convergence.
     model_error : bool, optional
-        Whether unmodelled accelerations follow the evidence; they vanish without.
+        Whether the size of unmodelled accelerations is estimated; otherwise they vanish.
     prior_model_error : float, optional
-        Their size before the log is seen, over the spread of the accelerations.
+        Prior size of the unmodelled accelerations, over the spread of the accelerations.
     prior_discrepancy, initial_discrepancy : float, optional
-        Size of input gain and bias discrepancies, over that which makes all of an equation's inertial force, before the
-        log is seen and on the way down.
+        Prior size of input gain and bias discrepancies, over that which equals an equation's inertial force: after, and
+        until the first convergence.
     prior_delay : float, optional
-        s, standard deviation of the input delay before the log is seen.
+        Prior standard deviation of the input delay, s.
     instrumental_variables : bool, optional
-        Whether parameters are read from the fitted motion by instrumental variables, rather than from the fit.
+        Whether parameters are estimated from the fitted motion by instrumental variables; otherwise they are those of
+        the fit.
     prior_inflation : float, optional
         Factor of the prior on model error whose effect on the parameters is added to their covariance.
 
     Raises
     ------
     SettingsError
-        A value has no meaning.
+        A value is out of range, or of another type.
     """
 
     criteria: Settings = field(default_factory=Settings)
@@ -138,6 +138,18 @@ class LoDiransac:
     def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
         """Parameters of the model from the logs, without starting values or thresholds.
 
+        Parameters
+        ----------
+        dataset : Dataset
+        seed : int
+            Seed of all random samples.
+        callback : callable, optional
+            Called with a `Progress` at every stage.
+
+        Returns
+        -------
+        Estimate
+
         Raises
         ------
         LogError
@@ -147,12 +159,24 @@ class LoDiransac:
         """
         from diransac.identification.methods.lo_diransac.method import estimate
 
-        with single_threaded():  # matrices are small: other cores would only wait
+        with single_threaded():  # matrices are small: more threads would only add waiting
             return estimate(self, dataset, int(seed), callback)
 
 
 def configured(settings: Settings, **options: Any) -> LoDiransac:
-    """The method with these options, evaluated by the given settings."""
+    """The method with its own options, and criteria of the evaluation.
+
+    Parameters
+    ----------
+    settings : Settings
+        Criteria.
+    options : object
+        Other fields of `LoDiransac`.
+
+    Returns
+    -------
+    LoDiransac
+    """
     return LoDiransac(settings, **options)
 
 
