@@ -54,7 +54,16 @@ def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
 
 
 def names(text: str) -> list[str]:
-    """``"a, b"`` as a list."""
+    """``"a, b"`` as a list.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    list of str
+    """
     return [name for name in (part.strip() for part in text.split(",")) if name]
 
 
@@ -164,7 +173,16 @@ def _assign(table: dict[str, Any], keys: Sequence[str], value: object) -> None:
 
 
 def toml_value(text: str) -> object:
-    """A TOML value; a bare word is itself."""
+    """A TOML value; a bare word is itself.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    object
+    """
     for candidate in (text, text.lower(), f"[{text}]" if "," in text else text):
         try:
             return tomllib.loads(f"value = {candidate}")["value"]
@@ -186,7 +204,16 @@ def _none_where_meant(key: str, value: object) -> object:
 
 
 def model_file(text: str) -> Path | None:
-    """The file of ``file.py[:name]``; None for a built-in model's name."""
+    """The file of ``file.py[:name]``; None for a built-in model's name.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    Path or None
+    """
     found = file_and_name(text, "model")
     return None if found is None else found[0]
 

@@ -211,7 +211,7 @@ class Dataset:
         Raises
         ------
         LogError
-            Logs are sampled at different rates.
+            The logs are sampled at different rates.
         """
         steps = [one.log.dt for one in self.segments]
         for one in self.segments:
@@ -236,12 +236,22 @@ class Dataset:
         return {n: _spread(values[:, i]) for i, n in enumerate(self.signals)}
 
     def by_signal(self, values: Mapping[str, float]) -> FloatArray:
-        """Values ``(n_s,)`` in the signals' order, 0 for what is not named.
+        """Values in the signals' order.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Values of some of the signals by name.
+
+        Returns
+        -------
+        (n_s,) array
+            0 for signals that are not named.
 
         Raises
         ------
         SettingsError
-            A name that the model or the logs do not have.
+            The model, or a log, has no signal of that name.
         """
         for name, value in values.items():
             if name not in self.model.signals:

@@ -92,7 +92,7 @@ class Segment:
         return preprocessing.acting_inputs(self.log.filter, self.inputs)
 
     def initial_state(self, rule: str | Mapping[str, float]) -> FloatArray:
-        """State ``(n_x,)`` at row 0, by ``Settings.initial_state``'s rule.
+        """State ``(n_x,)`` at row 0 by a rule of ``Settings.initial_state``.
 
         A state that the log lacks and on which no measured signal depends starts at 0, a quaternion at (1, 0, 0, 0).
 

@@ -59,7 +59,19 @@ class BoundEstimator(Protocol):
         """Sets of rows, to be checked and fitted."""
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        """Parameters ``(n_groups, n)`` from ``rows`` (ascending) less each group of them."""
+        """Parameters from rows without each of several groups.
+
+        Parameters
+        ----------
+        groups : sequence of int array
+            Rows that are left out, one group at a time.
+        rows : (n_rows,) int array
+            Ascending.
+
+        Returns
+        -------
+        (n_groups, n) array
+        """
 
     def unidentifiable(self) -> tuple[int, ...]:
         """Indices of the parameters that are not identifiable from the whole dataset."""
@@ -86,12 +98,42 @@ class _SumsEstimator:
     min_eigenvalue: float = _MIN_EIGENVALUE
 
     def fit(self, W: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:
-        """Parameters ``(n_p,)`` from ``W (..., n_p)`` and ``b (...)``."""
+        """Solution of ``W p = b``.
+
+        Parameters
+        ----------
+        W : (..., n_p) array_like
+        b : (...) array_like
+
+        Returns
+        -------
+        (n_p,) array
+
+        Raises
+        ------
+        IdentificationError
+            Shapes do not match, or a value is not finite.
+        """
         bound = self._bind(*_flat(W, b))
         return np.asarray(bound.select([np.arange(bound.n_rows)]).fit()[0])
 
     def well_defined(self, W: npt.ArrayLike, b: npt.ArrayLike) -> bool:
-        """True if ``W (..., n_p)``, ``b (...)`` determine the parameters, with the columns scaled by their own RMS."""
+        """True if ``W`` and ``b`` determine the parameters, with the columns scaled by their own RMS.
+
+        Parameters
+        ----------
+        W : (..., n_p) array_like
+        b : (...) array_like
+
+        Returns
+        -------
+        bool
+
+        Raises
+        ------
+        IdentificationError
+            Shapes do not match, or a value is not finite.
+        """
         bound = self._bind(*_flat(W, b))
         return bool(bound.select([np.arange(bound.n_rows)]).well_defined()[0])
 
@@ -359,7 +401,16 @@ def as_estimator(candidate: object) -> Estimator:
 
 
 def name_of(estimator: Estimator) -> str:
-    """Name of an estimator's class, or of the scikit-learn class that it wraps."""
+    """Name of an estimator's class, or of the scikit-learn class that it wraps.
+
+    Parameters
+    ----------
+    estimator : Estimator
+
+    Returns
+    -------
+    str
+    """
     named = estimator.regressor if isinstance(estimator, ScikitLearnEstimator) else estimator
     return type(named).__name__
 
@@ -398,29 +449,68 @@ def _segment_regression(one: Segment) -> tuple[FloatArray, FloatArray]:
 
 
 def column_scale(columns: FloatArray) -> FloatArray:
-    """RMS ``(n,)`` of the columns of ``(N, r, n)``."""
+    """RMS of each column.
+
+    Parameters
+    ----------
+    columns : (N, r, n) array
+
+    Returns
+    -------
+    (n,) array
+    """
     flat = columns.reshape(-1, columns.shape[-1])
     return np.asarray(np.sqrt(np.square(flat).mean(axis=0)))
 
 
 def smallest_eigenvalue(gram: FloatArray) -> FloatArray:
-    """Smallest eigenvalue of each ``(..., n, n)``; -inf where it is not finite."""
+    """Smallest eigenvalue of each symmetric matrix.
+
+    Parameters
+    ----------
+    gram : (..., n, n) array
+
+    Returns
+    -------
+    (...) array
+        -inf where a matrix is not finite.
+    """
     finite = np.all(np.isfinite(gram), axis=(-2, -1))
     values = np.linalg.eigvalsh(np.where(finite[..., None, None], gram, 0.0))[..., 0]
     return np.where(finite, values, -np.inf)
 
 
 def loose_parameters(gram: FloatArray, min_eigenvalue: float) -> tuple[int, ...]:
-    """Indices of the parameters that take part in a direction whose eigenvalue is too small."""
+    """Indices of the parameters in the eigenvectors whose eigenvalue is too small.
+
+    Parameters
+    ----------
+    gram : (n, n) array
+    min_eigenvalue : float
+        Largest eigenvalue that is too small.
+
+    Returns
+    -------
+    tuple of int
+    """
     values, vectors = np.linalg.eigh(gram)
     weak = values <= min_eigenvalue
     return tuple(int(i) for i in np.flatnonzero((np.abs(vectors[:, weak]) > 0.1).any(axis=1)))
 
 
 def solve_definite(A: FloatArray, g: FloatArray) -> FloatArray:
-    """``A^-1 g`` for symmetric positive definite ``A (..., n, n)``, by LDL^T; NaN where it breaks down.
+    """``A^-1 g`` of symmetric positive definite ``A``, by LDL^T; NaN where the factorisation breaks down.
 
     Written out over the leading axes: the same bits for every batch size and machine, which LAPACK does not guarantee.
+
+    Parameters
+    ----------
+    A : (..., n, n) array
+    g : (..., n) array
+
+    Returns
+    -------
+    (..., n) array
     """
     A, x = A.copy(), g.copy()
     n = A.shape[-1]

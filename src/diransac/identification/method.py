@@ -76,7 +76,16 @@ class Method(Protocol):
 
 
 def report(callback: Callback | None, stage: str, fraction: float, note: str = "") -> None:
-    """Call the callback, if there is one, with a `Progress`; parameters as those of `Progress`."""
+    """Call the callback, if there is one, with a `Progress`.
+
+    Parameters
+    ----------
+    callback : callable, optional
+    stage : str
+    fraction : float
+    note : str, optional
+        Fields of the `Progress`.
+    """
     if callback is not None:
         callback(Progress(stage, fraction, note))
 

@@ -51,8 +51,8 @@ class NonlinearLeastSquares:
     """Least squares of ``(a - a_model(q, v, u, p)) / rms(a)`` within the parameters' bounds.
 
     No starting value is required: ``n_starts`` points spread over six decades, or over the bounds, are evaluated on
-    the rows to be fitted, and the best few are refined by Levenberg and Marquardt's method.  Where the model is affine in
-    its parameters, the solution of the linear regression is refined, too.
+    the rows to be fitted, and the best few are refined by Levenberg and Marquardt's method.  Where the model is affine
+    in its parameters, the solution of the linear regression is refined, too.
 
     Parameters
     ----------

@@ -58,12 +58,32 @@ def factory(name: str) -> Callable[..., Method]:
 
 
 def default_options(name: str) -> Mapping[str, Any]:
-    """Default values of a method's own settings; empty for a method that is not in the registry."""
+    """Default values of a method's own settings; empty for a method that is not in the registry.
+
+    Parameters
+    ----------
+    name : str
+        Name of the method.
+
+    Returns
+    -------
+    mapping of str to object
+    """
     return factory(name)(Settings()).options() if name in _REGISTRY else {}
 
 
 def setting_names(name: str) -> tuple[str, ...]:
-    """Names of all settings of a method: its own, and those of `Settings` that it uses."""
+    """Names of all settings of a method: its own, and those of `Settings` that it uses.
+
+    Parameters
+    ----------
+    name : str
+        Name of the method, one of `METHODS`.
+
+    Returns
+    -------
+    tuple of str
+    """
     method = factory(name)(Settings())
     return tuple(dict.fromkeys((*method.options(), *method.uses, *EXECUTION)))
 

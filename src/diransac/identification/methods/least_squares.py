@@ -77,6 +77,18 @@ class LeastSquares:
     def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
         """Parameters by least squares of all rows.
 
+        Parameters
+        ----------
+        dataset : Dataset
+        seed : int
+            Not used.
+        callback : callable, optional
+            Called with a `Progress` at every stage.
+
+        Returns
+        -------
+        Estimate
+
         Raises
         ------
         IdentificationError

@@ -198,12 +198,20 @@ def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArra
 
 
 def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
-    """Change of each parameter that equals the inertial force of an equation; arguments as `discrepancy_units`.
+    """Change of each parameter that equals the inertial force of an equation.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+    p : (n,) array
+        Parameters of a hypothesis.
 
     Returns
     -------
     (n,) array
-        The smallest over the equations.
+        The smallest over the equations, each in its parameter's unit.
     """
     W = _residual_map(intervals.model)(*_smoothed(intervals, motion), _row_parameters(intervals, p, logged=True))[1]
     logs = intervals.log_of_row[intervals.is_logged]
@@ -212,7 +220,20 @@ def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
 
 
 def inertial_forces(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
-    """RMS ``(n_v,)`` of ``M a`` of each equation; arguments as `discrepancy_units`."""
+    """RMS of ``M a`` of each equation.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+    p : (n,) array
+        Parameters of a hypothesis.
+
+    Returns
+    -------
+    (n_v,) array
+    """
     q, v, a, u = _smoothed(intervals, motion)
     n_v = intervals.model.n_v
     own = _row_parameters(intervals, p, logged=True)

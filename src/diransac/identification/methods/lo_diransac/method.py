@@ -70,7 +70,20 @@ _GAUSSIAN = 10_000
 
 
 def estimate(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
-    """Parameters of the dataset's model; arguments and errors as those of `LoDiransac.fit`."""
+    """Parameters of the dataset's model.
+
+    Parameters
+    ----------
+    settings : LoDiransac
+    dataset : Dataset
+    seed : int
+    callback : callable, optional
+        As in `LoDiransac.fit`, whose errors are raised.
+
+    Returns
+    -------
+    Estimate
+    """
     report(callback, "smoothing", 0.0)
     intervals, motion, notes = _prepared(settings, dataset)
     report(callback, "drawing hypotheses", 0.1)

@@ -162,7 +162,14 @@ def _order(n_s: int, n_x: int, k: int) -> IntArray:
 
 
 def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
-    """Twice the cost of a fit with fixed weights; arguments as `linearize`.
+    """Twice the cost of a fit with fixed weights.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    weights : (N, n_signals) array
+        Weights of the measurements, one over each signal's unit squared.
 
     Returns
     -------

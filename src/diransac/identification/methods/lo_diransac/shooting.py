@@ -212,12 +212,12 @@ class ShootingIntervals:
         return Measurements(self.measured, np.ones(len(self.measured), bool))
 
     def residuals(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
-        """Simulated less measured, (N, n_s); huge from a divergence on."""
+        """Simulated less measured signals ``(N, n_s)``, huge from a divergence on; arguments as `batch`."""
         errors = self.rollouts.errors(self.batch(shared, x, d), self.measurements).reshape(self.measured.shape)
         return np.nan_to_num(errors, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
 
     def gauss_newton(self, shared: FloatArray, x: FloatArray, d: FloatArray, weights: FloatArray) -> GaussNewtonBatch:
-        """Least-squares sums of every interval; ``weights (N, n_s)``."""
+        """Least-squares sums of every interval with ``weights (N, n_s)``; other arguments as `batch`."""
         return self.rollouts.gauss_newton(self.batch(shared, x, d), self.measurements, weights)
 
     def ends(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
