@@ -211,7 +211,7 @@ def _raise_missing(model: Model, log: Log, name: str) -> None:
         "pass --differentiate to estimate velocities and accelerations" if derivable else "name its column with --map"
     )
     if name in log.unusable:
-        raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; mend the column, or {hint}')
+        raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; correct the column, or {hint}')
     found = ", ".join(("t", *log.names))
     raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}.')
 
@@ -259,6 +259,6 @@ def _gap_notes(log: Log, held: BoolArray) -> list[str]:
     longest = int(length.argmax())
     return [
         f"inputs are unknown in {n_gaps} gap{'s' * (n_gaps > 1)}, the longest {(length[longest] + 1) * log.dt:.4g} s "
-        f"after t = {log.time[first[longest] - 1]:.6g} s: a simulation through it drifts, which fit error and "
-        "inliers count; a log cut there is scored without it"
+        f"after t = {log.time[first[longest] - 1]:.6g} s: a simulation through it drifts, which affects fit error "
+        "and inliers; split the log there to avoid it"
     ]

@@ -127,7 +127,9 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     weights, thresholds = settings.error_weights, settings.inlier_thresholds
     if weights is None or thresholds is None:
         if len(constant) == len(scales):
-            raise LogError(f"{dataset.source}: {', '.join(scales)} are constant; nothing moves in this log")
+            raise LogError(
+                f"{dataset.source}: {', '.join(scales)} are constant; nothing moves in this log. Record a motion"
+            )
         moving = {n: scale for n, scale in scales.items() if scale > 0.0}
         slow = dataset.model.accelerations
         if weights is None:
@@ -141,11 +143,12 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     needed = settings.min_inlier_signals or max(1, -(-n_signals // 2))
     if needed > n_signals:
         raise SettingsError(
-            f"min_inlier_signals = {needed}, but {n_signals} signals have an inlier threshold: nothing can be an inlier"
+            f"min_inlier_signals = {needed}, but {n_signals} signals have an inlier threshold; lower it, or give more "
+            "thresholds"
         )
-    judging = ", ".join(n for n, x in zip(dataset.signals, eps, strict=True) if x > 0.0)
-    notes = [f"{n} is constant and judges nothing" for n in constant]
-    notes.append(f"a row is an inlier if {needed} of its {n_signals} judging signals are near: {judging}")
+    compared = ", ".join(n for n, x in zip(dataset.signals, eps, strict=True) if x > 0.0)
+    notes = [f"{n} is constant and is not compared" for n in constant]
+    notes.append(f"a row is an inlier if {needed} of {n_signals} signals are within their thresholds: {compared}")
     return Scoring(w, eps, needed, tuple(notes))
 
 

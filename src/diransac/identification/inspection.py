@@ -242,13 +242,13 @@ def _fitness(log: Log, model: Model) -> Fitness:
     if model.nonlinear_parameters:
         names = ", ".join(model.nonlinear_parameters)
         return Fitness(
-            model.name, missing, derivable, {}, f"not affine in {names}: only a search can tell what is excited"
+            model.name, missing, derivable, {}, f"not affine in {names}: excitation is known only after identification"
         )
     try:
         dataset = Dataset.of(model, derived)
         excitation, reason = _excitation(OrdinaryLeastSquares().bind(dataset), model)
         if not reason:
-            choose_scoring(dataset, Settings())  # refuses a log in which nothing moves, as identify does
+            choose_scoring(dataset, Settings())  # raises for a log in which nothing moves, as identify does
     except LogError as error:
         return Fitness(model.name, missing, derivable, {}, str(error))
     return Fitness(model.name, missing, derivable, excitation, reason)
@@ -259,7 +259,7 @@ def _caveat(signals: Mapping[str, SignalFacts], model: Model) -> str:
     spiked = [name for name in model.required_signals if name in signals and signals[name].n_spikes]
     if not spiked:
         return ""
-    return f"spikes in {', '.join(spiked)} bend these estimates and errors: --despike them, or trust identify alone"
+    return f"spikes in {', '.join(spiked)} bias these estimates and errors: pass --despike, or use those of identify"
 
 
 def _derived(log: Log, model: Model) -> Log:
@@ -278,7 +278,10 @@ def _excitation(bound: BoundEstimator, model: Model) -> tuple[dict[str, Excitati
     if not selected.well_defined()[0]:
         loose = bound.unidentifiable() or range(len(names))
         found = {names[i]: Excitation(units[i], np.nan, np.inf) for i in loose}
-        return found, f"the motion that would show {', '.join(found)} is missing, or moves with another"
+        return (
+            found,
+            f"{', '.join(found)}: not excited by this motion, or only in combination; record another",
+        )
     estimates = selected.fit()[0]
     errors = np.sqrt(np.diag(jackknife_covariance(bound, rows)))
     relative = np.divide(errors, np.abs(estimates), out=np.full(len(names), np.inf), where=estimates != 0.0)

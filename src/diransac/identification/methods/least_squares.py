@@ -141,10 +141,11 @@ def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
     if bound.select([np.arange(bound.n_rows)]).well_defined()[0]:
         return bound
     names = [dataset.layout.names[i] for i in bound.unidentifiable()] or list(dataset.layout.names)
+    one, logs = len(names) == 1, "this log" if len(dataset.segments) == 1 else "these logs"
     raise IdentificationError(
-        f"{dataset.source}: the log does not determine {', '.join(names)}: the motion that would show "
-        f"{'it' if len(names) == 1 else 'them'} is missing or moves with another; record a livelier motion, or fix "
-        "parameters in the model"
+        f"{dataset.source}: {', '.join(names)} {'is' if one else 'are'} not identifiable from {logs}: the motion does "
+        f"not excite {'it' if one else 'them, or only in combination'}; record a motion that does, or fix "
+        f"{'it' if one else 'one of them'} in the model"
     )
 
 
