@@ -479,7 +479,7 @@ def _grow(sample: IntArray, k: IntArray, estimator: BoundEstimator, sampler: Sam
     while not estimator.select([whole]).well_defined()[0]:
         low = len(whole)
         if low == estimator.n_rows:
-            raise IdentificationError("parameters are not identifiable from this log; record a richer motion")
+            raise IdentificationError("the whole log is not well-defined: parameters are not identifiable; excite them")
         more = sampler(seed, k, estimator.n_rows, low, min(2 * low, estimator.n_rows))[0]
         whole = np.concatenate([whole, more])
     high = len(whole)
