@@ -233,7 +233,7 @@ def test_interrupt_ends_with_130_and_one_line(folder: Path, monkeypatch: pytest.
 
 def test_an_error_that_nobody_foresaw_is_one_line(capsys: pytest.CaptureFixture[str]):
     cli = importlib.import_module("diransac.cli")
-    cli._say_that_it_is_our_fault(KeyError, KeyError("x"), None)
+    cli._report_internal_error(KeyError, KeyError("x"), None)
     assert capsys.readouterr().err.count("\n") == 1
 
 

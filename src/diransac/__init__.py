@@ -1,7 +1,7 @@
-"""From the messy log of a real machine to a dynamical model that can be simulated, flown and trusted.
+"""Robust identification of dynamical models from logs with noise, outliers and unmodelled forces.
 
-``import diransac as dr``: equations in a `Model`, measurements in a `Log`, `identify` in between, a `Result` out.
-Models and errors are here at once; everything else is imported when it is first asked for.
+``import diransac as dr``: `identify` estimates the parameters of a `Model` from a `Log` and returns a `Result`.  Models
+and errors are imported with the package, everything else on first access.
 """
 
 import importlib
@@ -137,7 +137,7 @@ _SUBMODULES = ("simulation", "study")
 
 
 def __getattr__(name: str) -> Any:
-    """What is imported when it is first asked for."""
+    """Module or object of the public interface, imported on first access."""
     if name in _SUBMODULES:
         return importlib.import_module(f"diransac.{name}")
     if name not in _LATER:
@@ -148,5 +148,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Everything, imported or not."""
+    """Names of the public interface, imported or not."""
     return sorted({*globals(), *__all__} - {"TYPE_CHECKING", "Any"})

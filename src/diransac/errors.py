@@ -1,17 +1,17 @@
-"""Every error that diransac raises on purpose.
+"""Exceptions of diransac.
 
 ::
 
-    DiransacError              anything below: one clear sentence a user can act on
+    DiransacError              base class
     ├── ModelError             the equations of motion cannot be used as written
     ├── LogError               a log, or a file that should hold one, cannot be used
-    ├── SettingsError          a setting, or an argument of a call, has no meaning here
-    ├── IdentificationError    the search ended without parameters
-    ├── PlanningError          no trajectory, or no controller, does what was asked for
-    ├── ResultError            a saved result cannot be read back, or does not fit what it is used with
+    ├── SettingsError          a setting or an argument is invalid
+    ├── IdentificationError    parameters are not identifiable, or no hypothesis was accepted
+    ├── PlanningError          no trajectory or controller satisfies the request
+    ├── ResultError            a saved result cannot be read or written, or does not match its use
     └── StudyError             a study's store cannot be used for it, or its workers are lost
 
-A message says what was wrong, what was found, and what to try.
+Messages state the problem, the value found, and the remedy.
 """
 
 __all__ = [
@@ -27,7 +27,7 @@ __all__ = [
 
 
 class DiransacError(Exception):
-    """Base of every error that diransac raises on purpose."""
+    """Base class of the exceptions of diransac."""
 
 
 class ModelError(DiransacError):
@@ -39,19 +39,19 @@ class LogError(DiransacError):
 
 
 class SettingsError(DiransacError):
-    """A setting, or an argument of a call, has no meaning here."""
+    """A setting or an argument is invalid."""
 
 
 class IdentificationError(DiransacError):
-    """The search ended without parameters."""
+    """Parameters are not identifiable, or no hypothesis was accepted."""
 
 
 class PlanningError(DiransacError):
-    """No trajectory, or no controller, does what was asked for."""
+    """No trajectory or controller satisfies the request."""
 
 
 class ResultError(DiransacError):
-    """A saved result cannot be read back, or does not fit what it is used with."""
+    """A saved result cannot be read or written, or does not match its use."""
 
 
 class StudyError(DiransacError):

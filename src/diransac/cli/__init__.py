@@ -9,7 +9,7 @@ __all__ = ["main"]
 def main() -> None:
     """Run the command line of this process, and end the process with its exit code."""
     if "--debug" not in sys.argv:
-        sys.excepthook = _say_that_it_is_our_fault
+        sys.excepthook = _report_internal_error
     from diransac.cli.commands import app
     from diransac.user_files import leave_stdout
 
@@ -19,8 +19,8 @@ def main() -> None:
         leave_stdout()
 
 
-def _say_that_it_is_our_fault(kind: type[BaseException], error: BaseException, _: TracebackType | None) -> None:
-    """One line for an error that nobody foresaw."""
+def _report_internal_error(kind: type[BaseException], error: BaseException, _: TracebackType | None) -> None:
+    """Print one line for an unexpected error."""
     if issubclass(kind, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)  # noqa: T201  before there is a command line to print with
         sys.exit(130)

@@ -1,4 +1,4 @@
-"""From what a user typed to a model, settings and a prepared log."""
+"""Models, methods and settings from the text of command-line arguments."""
 
 from __future__ import annotations
 
@@ -26,7 +26,21 @@ __all__ = ["load_methods", "load_model", "load_settings", "model_file", "names",
 def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
     """``["a=b,c=d", "e=f"]`` as a mapping.
 
-    Raises typer.BadParameter: an item is no pair, or a name is given twice.
+    Parameters
+    ----------
+    option : str
+        Name of the option in messages.
+    texts : sequence of str
+        Pairs, separated by commas.
+
+    Returns
+    -------
+    dict of str to str
+
+    Raises
+    ------
+    typer.BadParameter
+        An item is not a pair, or a name is given twice.
     """
     found: dict[str, str] = {}
     for item in (item.strip() for text in texts for item in text.split(",")):
@@ -40,14 +54,37 @@ def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
 
 
 def names(text: str) -> list[str]:
-    """``"a, b"`` as a list."""
+    """``"a, b"`` as a list.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    list of str
+    """
     return [name for name in (part.strip() for part in text.split(",")) if name]
 
 
 def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
     """``["a=1,b=2.5"]`` as numbers by name.
 
-    Raises typer.BadParameter: a value is no number.
+    Parameters
+    ----------
+    option : str
+        Name of the option in messages.
+    texts : sequence of str
+        Pairs, separated by commas.
+
+    Returns
+    -------
+    dict of str to float
+
+    Raises
+    ------
+    typer.BadParameter
+        As `pairs`; a value is not a number.
     """
     found = pairs(option, texts)
     try:
@@ -60,7 +97,17 @@ def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
 
 
 def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, Any]:
-    """Settings by name from a TOML file, with ``key=value`` assignments laid over them in order.
+    """Settings by name from a TOML file, replaced by ``key=value`` assignments in order.
+
+    Parameters
+    ----------
+    file : Path, optional
+    assignments : sequence of str
+        As ``sample_size=50`` or ``inlier_thresholds.x_dot=0.5``.
+
+    Returns
+    -------
+    dict of str to object
 
     Raises
     ------
@@ -80,14 +127,23 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, An
 
 
 def load_methods(names: Sequence[str], settings: Mapping[str, Any]) -> list[Method]:
-    """Methods by name, each with those of the settings that it has; every setting is one of at least one of them.
+    """Methods by name, each with those of the given settings that it has.
+
+    Parameters
+    ----------
+    names : sequence of str
+    settings : mapping of str to object
+
+    Returns
+    -------
+    list of Method
 
     Raises
     ------
     typer.BadParameter
         A setting belongs to none of the methods.
     SettingsError
-        A value has no meaning.
+        A value is out of range, or of another type.
     """
     known = {name: setting_names(name) for name in names}
     for key in settings:
@@ -117,7 +173,16 @@ def _assign(table: dict[str, Any], keys: Sequence[str], value: object) -> None:
 
 
 def toml_value(text: str) -> object:
-    """A TOML value; a bare word is itself."""
+    """A TOML value; a bare word is itself.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    object
+    """
     for candidate in (text, text.lower(), f"[{text}]" if "," in text else text):
         try:
             return tomllib.loads(f"value = {candidate}")["value"]
@@ -139,7 +204,16 @@ def _none_where_meant(key: str, value: object) -> object:
 
 
 def model_file(text: str) -> Path | None:
-    """The file of ``file.py[:name]``; None for a built-in model's name."""
+    """The file of ``file.py[:name]``; None for a built-in model's name.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    Path or None
+    """
     found = file_and_name(text, "model")
     return None if found is None else found[0]
 
@@ -147,7 +221,18 @@ def model_file(text: str) -> Path | None:
 def load_model(text: str) -> Model:
     """The built-in model of that name, or the one that ``file.py[:name]`` defines.
 
-    Raises ModelError: there is none of that name, the file cannot be run, or what it defines is no model.
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    Model
+
+    Raises
+    ------
+    ModelError
+        There is no such model, the file cannot be run, or the name is not that of a model.
     """
     found = file_and_name(text, "model")
     if found is None:

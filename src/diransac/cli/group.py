@@ -1,4 +1,4 @@
-"""How every command ends, and how commands share options."""
+"""Exit codes and error messages of all commands, and groups of shared options."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ UsageError: type[Any] = typer.BadParameter.__mro__[1]
 
 
 _LATER = {"study": "diransac.cli.study"}
-"""Groups of commands that are imported when they are first asked for, by name: module."""
+"""Module of each group of commands that is imported on first use."""
 
 
 class Group(TyperGroup):
-    """Commands that end with 0, 1 (it could not be done), 2 (wrong usage) or 130 (Ctrl-C), and a short message."""
+    """Commands with exit code 0, 1 (failure), 2 (wrong usage) or 130 (Ctrl-C), and a message of at most three lines."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Names of all commands."""
         return [*super().list_commands(ctx), *_LATER]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """A command by name, imported now if it was not before."""
+        """A command by name, imported on first use."""
         if cmd_name in _LATER and cmd_name not in self.commands:
             found = typer.main.get_command(getattr(importlib.import_module(_LATER[cmd_name]), cmd_name))
             found.name = cmd_name
@@ -42,7 +42,7 @@ class Group(TyperGroup):
         return super().get_command(ctx, cmd_name)
 
     def main(self, args: Sequence[str] | None = None, *positional: Any, **extra: Any) -> NoReturn:
-        """Run the command line; ``--debug`` is understood wherever it stands."""
+        """Run the command line; ``--debug`` may stand anywhere."""
         given = list(sys.argv[1:] if args is None else args)
         words = [word for word in given if word != "--debug"]
         extra["standalone_mode"] = False
@@ -76,7 +76,16 @@ def _say(message: str, code: int) -> int:
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose dataclass parameters are options of their own, one for each field."""
+    """A command in which each field of a dataclass parameter is an option.
+
+    Parameters
+    ----------
+    command : callable
+
+    Returns
+    -------
+    callable
+    """
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, Any] = {
         n: p.annotation for n, p in signature.parameters.items() if dataclasses.is_dataclass(p.annotation)

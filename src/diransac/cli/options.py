@@ -1,4 +1,4 @@
-"""The options that several commands share."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ __all__ = [
 
 
 def known_method(name: str) -> str:
-    """The name itself.  Raises typer.BadParameter: no method goes by it."""
+    """The name itself.  Raises typer.BadParameter: there is no method of that name."""
     if name not in METHODS:
         raise typer.BadParameter(f"there is no method {name!r}; there are {', '.join(METHODS)}")
     return name
@@ -55,7 +55,7 @@ def _rate(text: str | None) -> str | float | None:
 
 
 def known_methods(text: str) -> list[str]:
-    """``"a, b"`` as methods.  Raises typer.BadParameter: no method goes by a name, or none is named."""
+    """Names of methods from ``"a, b"``.  Raises typer.BadParameter: a name is unknown, or there is none."""
     wanted = [known_method(name) for name in names(text)]
     if not wanted:
         raise typer.BadParameter(f"--methods: none is named; there are {', '.join(METHODS)}")
@@ -63,7 +63,7 @@ def known_methods(text: str) -> list[str]:
 
 
 def output_file(text: str) -> Path:
-    """A file to write.  Raises typer.BadParameter: the name is empty, which `Path` takes for the folder we are in."""
+    """Path of a file to write.  Raises typer.BadParameter: empty, which `Path` takes for the current folder."""
     if not text:
         raise typer.BadParameter("the name is empty; give the name of a file")
     return Path(text)
@@ -103,7 +103,7 @@ def _option(*names: str, **about: Any) -> Any:
 
 @dataclass(frozen=True)
 class Search:
-    """How to search."""
+    """Options of the method: seed and settings."""
 
     seed: Annotated[int, typer.Option(help="The same seed gives the same answer.")] = 0
     settings: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Settings by name.")] = None
@@ -119,7 +119,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Derivation:
-    """How signals come about that the log lacks."""
+    """Options of the differentiation of signals that the log lacks."""
 
     differentiate: Annotated[
         bool, typer.Option("--differentiate", help="Derive the velocities and accelerations that the log lacks.")
@@ -129,12 +129,12 @@ class Derivation:
     ] = None
 
     def arguments(self) -> dict[str, Any]:
-        """What `diransac.identify` is called with.  Raises SettingsError: there is a bandwidth of nothing."""
+        """Arguments of `diransac.identify`.  Raises SettingsError: a bandwidth without differentiation."""
         self._check()
         return {"differentiate": self.differentiate, "bandwidth": self.bandwidth}
 
     def derive(self, log: Log, model: Model) -> Log:
-        """The log with what it lacks, if that is wanted.  Raises LogError: it cannot; SettingsError: as `arguments`."""
+        """The log, with derived signals if requested.  Raises LogError: not derivable; SettingsError: `arguments`."""
         self._check()
         return preprocessing.differentiate(log, model, self.bandwidth) if self.differentiate else log
 
@@ -145,7 +145,7 @@ class Derivation:
 
 @dataclass(frozen=True)
 class Preparation:
-    """What is done to a log before it is used."""
+    """Options of the preparation of a log, applied in this order."""
 
     rename: Annotated[
         list[str] | None,
@@ -177,7 +177,7 @@ class Preparation:
         return [self.read(file) for file in files]
 
     def read(self, file: Path) -> Log:
-        """The log of a file, prepared.  Raises LogError: it cannot be read, or not be prepared like that."""
+        """The prepared log of a file.  Raises LogError: it cannot be read or prepared."""
         rename, scale = pairs("--map", self.rename or ()), numbers("--scale", self.scale or ())
         delays, rate = numbers("--shift", self.shift or ()), _rate(self.resample)
         log = read_log(file, rename=rename, scale=scale, resample=rate)
@@ -188,7 +188,7 @@ class Preparation:
         return preprocessing.shift(log, delays) if delays else log
 
     def read_uneven(self, file: Path) -> Log:
-        """As `read`, but a log whose clock is uneven is resampled at its usual rate, and says so."""
+        """As `read`, but an unevenly sampled log is resampled at its median rate, with a note."""
         try:
             return self.read(file)
         except LogError as error:

@@ -1,4 +1,4 @@
-"""Files that a command writes: checked before the long work, complete or not there at all after it."""
+"""Output files: checked before the work, and either complete or absent after it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,24 @@ __all__ = ["staged"]
 
 @contextmanager
 def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -> Iterator[list[Path]]:
-    """Temporary files beside the outputs that are asked for; they replace them together once the block has succeeded.
+    """Context with temporary files beside the outputs, which they replace together when the block succeeds.
 
     Parameters
     ----------
-    outputs : where to write; a None has a temporary file of no meaning, which is never asked for
-    inputs : files that the command reads, none of which may be written; a None is none
+    outputs : sequence of Path or None
+        Files to write; None where an output is not requested.
+    inputs : sequence of Path or None, optional
+        Files that the command reads, none of which may be an output.
 
-    Raises ResultError: an output's folder is missing or closed to us, it is no ordinary file, or an input.
+    Yields
+    ------
+    list of Path
+        Temporary file of each output; an empty path where it is not requested.
+
+    Raises
+    ------
+    ResultError
+        An output's folder is missing or not writable, or an output is not an ordinary file, or is an input.
     """
     sources = {path.resolve() for path in inputs if path is not None}
     targets = [None if path is None else _checked(path, sources) for path in outputs]

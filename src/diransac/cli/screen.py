@@ -1,4 +1,4 @@
-"""What is printed: results on stdout, progress on stderr."""
+"""Printed output: results on stdout, progress on stderr."""
 
 from __future__ import annotations
 
@@ -22,16 +22,23 @@ _FIRST_LINE, _LINE_EVERY = 5.0, 10.0
 
 
 class Showable(Protocol):
-    """What prints as text and as JSON."""
+    """An object that prints as text and as JSON."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything that the text shows."""
+        """The contents of the text."""
 
     def __str__(self) -> str: ...
 
 
 def show(shown: Showable, as_json: bool) -> None:
-    """Print on stdout, as JSON if that is wanted; what is not finite is null there."""
+    """Print on stdout.
+
+    Parameters
+    ----------
+    shown : Showable
+    as_json : bool
+        Whether to print JSON, in which numbers that are not finite are null.
+    """
     if as_json:
         typer.echo(json.dumps(_finite(shown.to_dict()), indent=1, ensure_ascii=False, allow_nan=False))
     else:
@@ -50,7 +57,18 @@ def _finite(data: object) -> object:
 
 @contextmanager
 def bar(label: str) -> Iterator[Callback]:
-    """The callback of a long piece of work: a bar on a terminal's stderr, a line now and then elsewhere."""
+    """Context with a callback for progress: a bar on a terminal's stderr, a line every ten seconds elsewhere.
+
+    Parameters
+    ----------
+    label : str
+        Name of the work.
+
+    Yields
+    ------
+    callable
+        Takes a `Progress`.
+    """
     if sys.stderr is None or not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
         yield _Lines(label)
         return
@@ -74,7 +92,7 @@ def bar(label: str) -> Iterator[Callback]:
 
 
 class _Lines:
-    """Progress where there is no terminal: nothing of short work, a line on stderr every ten seconds of long work."""
+    """Progress without a terminal: nothing for the first five seconds, then a line on stderr every ten seconds."""
 
     def __init__(self, label: str) -> None:
         self._label, self._begin = label, time.monotonic()

@@ -1,4 +1,4 @@
-"""What commands show that no other part of the package prints: methods side by side, and models."""
+"""Tables of the command line alone: methods side by side, and models."""
 
 from __future__ import annotations
 
@@ -23,7 +23,19 @@ __all__ = ["Comparison", "Equations", "ModelList", "compare_methods"]
 
 @dataclass(frozen=True)
 class Comparison:
-    """Several methods on one log: what each found and how long it took (s), or why it refused."""
+    """Results of several methods from the same logs, printed side by side.
+
+    Parameters
+    ----------
+    model : Model
+    logs : sequence of Log
+    results : mapping of str to Result
+        Result of each method that succeeded.
+    seconds : mapping of str to float
+        Run time of each method, s.
+    refusals : mapping of str to str
+        Message of each method that failed.
+    """
 
     model: Model
     logs: Sequence[Log]
@@ -56,7 +68,7 @@ class Comparison:
         diagnosed = {name: result for name, result in self.results.items() if result.diagnosis is not None}
         preparations = {json.dumps([log.preparation for log in x.logs]) for x in self.results.values()}
         if diagnosed and len(preparations) > 1:
-            yield f"{', '.join(diagnosed)} is judged by what was measured, the others by what was derived, too"
+            yield f"{', '.join(diagnosed)} is evaluated on measured signals, the others on derived ones, too"
         elif diagnosed and len(self.results) > 1:
             yield "fit error and inliers are those of one simulation of the whole log, outliers and drift included"
         for name, result in diagnosed.items():
@@ -70,9 +82,9 @@ class Comparison:
     def _row(self, name: str, result: Result) -> list[str]:
         errors = result.standard_errors
         outside = {n: "!" if n in result.violations else "" for n in result.parameters}
-        untold = () if result.diagnosis is None else result.diagnosis.unidentifiable
+        unknown = () if result.diagnosis is None else result.diagnosis.unidentifiable
         estimates = [
-            "?" if n in untold else f"{x:.5g} ± {errors[n]:.2g}{outside[n]}" for n, x in result.parameters.items()
+            "?" if n in unknown else f"{x:.5g} ± {errors[n]:.2g}{outside[n]}" for n, x in result.parameters.items()
         ]
         inliers = f"{100.0 * result.inlier_fraction:.1f} %"
         return [
@@ -90,10 +102,22 @@ def compare_methods(
 ) -> Comparison:
     """Results of each method from the same logs, with the same arguments of `identify`.
 
+    Parameters
+    ----------
+    model : Model
+    logs : sequence of Log
+    methods : sequence of Method
+    arguments : mapping of str to object
+        Other arguments of `identify`.
+
+    Returns
+    -------
+    Comparison
+
     Raises
     ------
     DiransacError
-        The first refusal, where every method refuses.
+        Every method failed; the error is that of the first.
     """
     results, seconds, refusals = {}, {}, {}
     first: DiransacError | None = None
@@ -116,7 +140,7 @@ class ModelList:
     """Every built-in model, a line each."""
 
     def to_dict(self) -> dict[str, Any]:
-        """What `Equations` shows of each model, by name."""
+        """Names, units, bounds and equations of each model, by name."""
         return {name: Equations(make()).to_dict() for name, make in BUILTIN.items()}
 
     def __str__(self) -> str:
@@ -129,7 +153,12 @@ class ModelList:
 
 @dataclass(frozen=True)
 class Equations:
-    """One model: its signals, its parameters with their bounds, its equations."""
+    """Signals, parameters with their bounds, and equations of a model.
+
+    Parameters
+    ----------
+    model : Model
+    """
 
     model: Model
 

@@ -1,4 +1,4 @@
-"""`Dataset`: one or more logs bound to a model, as arrays that every method reads."""
+"""`Dataset`: one or more logs bound to a model."""
 
 from __future__ import annotations
 
@@ -10,23 +10,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.data import preprocessing
 from diransac.data.log import Log
-from diransac.data.units import conversion, same_unit
+from diransac.data.segment import Segment, bind_log
 from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
     from diransac.model import Model, Parameter
 
-__all__ = ["Dataset", "ParameterLayout", "Segment", "as_logs", "bind_log"]
+__all__ = ["Dataset", "ParameterLayout", "as_logs"]
 
 
-# A line through seven samples bears two outliers, and is short against any motion that is sampled well; the slope that
-# stands for a missing velocity needs a longer one.
-_ROWS_FOR_VALUE, _ROWS_FOR_SLOPE = 7, 25
-_FAR = 5.0
-# Rows that an input is held for, beyond which the motion is no longer the one that it made.
-_LONG_HOLD = 3
 # Relative difference of two sampling times below which they are one rate with another jitter.
 _SAME_RATE = 1e-3
 
@@ -36,14 +29,19 @@ class ParameterLayout:
 
     Parameters
     ----------
-    parameters : of the model
-    n_logs : logs that are identified together
+    parameters : mapping of str to Parameter
+        Parameters of the model by name.
+    n_logs : int, optional
+        Number of logs that are identified together.
 
     Attributes
     ----------
-    names : (n,)   the model's names; ``bias[0]``, ``bias[1]``, ... for a per-log parameter of several logs
-    bounds : (n,)   the `Parameter` of each
-    index : (n_logs, n_p)   positions of each log's parameters in the vector
+    names : tuple of str
+        The n names: the model's; ``bias[0]``, ``bias[1]``, ... for a per-log parameter of several logs.
+    bounds : tuple of Parameter
+        Unit and bounds of each of the n.
+    index : (n_logs, n_p) int array
+        Positions of each log's parameters in the vector.
     """
 
     def __init__(self, parameters: Mapping[str, Parameter], n_logs: int = 1) -> None:
@@ -63,7 +61,7 @@ class ParameterLayout:
 
     @property
     def is_shared(self) -> bool:
-        """Whether every log has the same parameters."""
+        """True if every log has the same parameters."""
         return len(self.names) == len(self.parameters)
 
     def of_log(self, values: FloatArray, i: int) -> FloatArray:
@@ -87,7 +85,7 @@ class ParameterLayout:
         return mean
 
     def admits(self, values: FloatArray) -> BoolArray:
-        """Whether every parameter of vectors ``(n_vectors, n)`` is within its bounds, ``(n_vectors,)``."""
+        """Mask ``(n_vectors,)`` of the vectors ``(n_vectors, n)`` whose parameters are all within their bounds."""
         return np.asarray(np.all([x.admits(values[:, i]) for i, x in enumerate(self.bounds)], axis=0))
 
     def violations(self, values: FloatArray) -> tuple[str, ...]:
@@ -95,120 +93,21 @@ class ParameterLayout:
         return tuple(n for n, x, value in zip(self.names, self.bounds, values, strict=True) if not x.admits(value))
 
 
-@dataclass(frozen=True)
-class Segment:
-    """Arrays of one model over one log.
+def as_logs(logs: Log | Iterable[Log]) -> tuple[Log, ...]:
+    """One log, or a sequence of logs, as a tuple.
 
     Parameters
     ----------
-    model, log : what was put together
-    offset : row of the log that is row 0 here; rows before it have no usable initial state or input
-    signals : signals of the model that the dataset has, in the model's order
-    measured : (N, n_s)   them, NaN where missing
-    inputs : (N, n_u)   inputs, held over NaN
-    valid : (N,)   rows in which every signal in use is finite
-    notes : what was found and done, a sentence each
-    """
+    logs : Log or iterable of Log
 
-    model: Model
-    log: Log
-    offset: int
-    signals: tuple[str, ...]
-    measured: FloatArray
-    inputs: FloatArray
-    valid: BoolArray
-    notes: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.valid)
-
-    @property
-    def n_rows(self) -> int:
-        """Rows that count."""
-        return int(self.valid.sum())
-
-    def column(self, name: str) -> FloatArray:
-        """A measured signal (N,)."""
-        return self.measured[:, self.signals.index(name)]
-
-    @cached_property
-    def present(self) -> tuple[str, ...]:
-        """Signals of which this log has at least one sample."""
-        some: BoolArray = np.asarray(np.isfinite(self.measured).any(axis=0))
-        return tuple(n for n, x in zip(self.signals, some, strict=True) if x)
-
-    def state_arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Coordinates ``(N, n_q)``, velocities and accelerations ``(N, n_v)``; 0 in what the log lacks."""
-        full = np.zeros((len(self), len(self.model.signals)))
-        for name in self.present:
-            full[:, self.model.signals.index(name)] = self.column(name)
-        n_q, n_v = self.model.n_q, self.model.n_v
-        return full[:, :n_q], full[:, n_q : n_q + n_v], full[:, n_q + n_v :]
-
-    def acting_inputs(self) -> FloatArray:
-        """Inputs ``(N, n_u)`` that belong to each row's accelerations; see `preprocessing.acting_inputs`."""
-        return preprocessing.acting_inputs(self.log.filter, self.inputs)
-
-    def initial_state(self, rule: str | Mapping[str, float]) -> FloatArray:
-        """State ``(n_x,)`` at row 0, by ``Settings.initial_state``'s rule.
-
-        A state that the log lacks and on which nothing measured depends starts at 0, a quaternion at (1, 0, 0, 0).
-        Raises LogError: another state is missing; it is named.
-        """
-        given = rule if isinstance(rule, Mapping) else {}
-        unknown = [n for n in given if n not in self.model.state]
-        if unknown:
-            raise SettingsError(f'initial_state names "{unknown[0]}"; the state is {", ".join(self.model.state)}')
-        matter = self.model.states_behind(self.present)
-        start = np.zeros(len(self.model.state))
-        start[[four[0] for four in self.model.quaternions]] = 1.0
-        for i, name in enumerate(self.model.state):
-            if name in given:
-                start[i] = given[name]
-            elif name in self.present:
-                start[i] = self._first(name) if rule != "robust" else self._robust(name)
-            elif name in matter:
-                start[i] = self._start_of_missing(name, rule)
-        return start
-
-    def _start_of_missing(self, name: str, rule: str | Mapping[str, float]) -> float:
-        coordinate = name.removesuffix("_dot")
-        if rule == "robust" and self.model.kinematics is None and coordinate in self.present:
-            return self._line(coordinate, _ROWS_FOR_SLOPE)[1]
-        raise LogError(
-            f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; pass '
-            f"--differentiate, or give initial_state = {{{name} = ...}}"
-        )
-
-    def _first(self, name: str) -> float:
-        column = self.column(name)
-        return float(column[np.flatnonzero(np.isfinite(column))[0]])
-
-    def _robust(self, name: str) -> float:
-        """The first sample, unless it is far from the line through the first few: then the line's value at row 0."""
-        column = self.column(name)
-        rows = np.flatnonzero(np.isfinite(column))[:_ROWS_FOR_VALUE]
-        value, slope = self._line(name, _ROWS_FOR_VALUE)
-        distances = np.abs(column[rows] - value - slope * rows * self.log.dt)
-        return float(column[rows[0]]) if distances[0] <= _FAR * np.median(distances) else value
-
-    def _line(self, name: str, n_rows: int) -> tuple[float, float]:
-        """Value and slope at row 0 of the line through a signal's first samples, by Theil and Sen."""
-        from scipy.stats import theilslopes
-
-        column = self.column(name)
-        rows = np.flatnonzero(np.isfinite(column))[:n_rows]
-        slope, intercept, *_ = theilslopes(column[rows], rows * self.log.dt)
-        return float(intercept), float(slope)
-
-
-def as_logs(logs: Log | Iterable[Log]) -> tuple[Log, ...]:
-    """One log, or a sequence of logs, as a tuple.
+    Returns
+    -------
+    tuple of Log
 
     Raises
     ------
     SettingsError
-        It is something else, or empty.
+        The argument is something else, or empty.
     """
     several = (logs,) if isinstance(logs, Log) or not isinstance(logs, Iterable) else tuple(logs)
     for one in several:
@@ -221,14 +120,18 @@ def as_logs(logs: Log | Iterable[Log]) -> tuple[Log, ...]:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Logs bound to a model: segments that are never tied across a boundary; made by `Dataset.of`.
+    """Logs bound to a model: independent segments, one per log; made by `Dataset.of`.
 
     Parameters
     ----------
-    model : what is identified
-    given : logs as the user gave them
-    segments : one per log, in the same order; all have the same ``signals``
-    layout : where each log's parameters stand in the vector of all parameters
+    model : Model
+        Equations with the parameters to be estimated.
+    given : tuple of Log
+        Logs as the user gave them.
+    segments : tuple of Segment
+        One per log, in the same order; all have the same ``signals``.
+    layout : ParameterLayout
+        Positions of each log's parameters in the vector of all parameters.
     """
 
     model: Model
@@ -250,14 +153,23 @@ class Dataset:
 
         Parameters
         ----------
-        also : signals that are in use beside those that the equations name (weights, thresholds)
-        pointwise : whether the equations are evaluated at each row, which needs every signal that they name
-        given : the logs as the user gave them, where ``logs`` were derived from them
+        model : Model
+        logs : Log or iterable of Log
+        also : sequence of str, optional
+            Signals in use besides those that the equations name: those with a weight or a threshold.
+        pointwise : bool, optional
+            Whether the equations are evaluated at each row, which needs every signal that they name.
+        given : sequence of Log, optional
+            Logs as the user gave them, where ``logs`` were derived from them.
+
+        Returns
+        -------
+        Dataset
 
         Raises
         ------
         LogError
-            As `bind_log`, naming the log.
+            As `bind_log`; the message names the log.
         """
         several = as_logs(logs)
         segments = [bind_log(model, log, also, pointwise=pointwise) for log in several]
@@ -265,7 +177,7 @@ class Dataset:
         signals = tuple(name for name in model.signals if name in found)
         layout = ParameterLayout(model.parameters, len(several))
         return cls(
-            model, several if given is None else tuple(given), tuple(_widened(x, signals) for x in segments), layout
+            model, several if given is None else tuple(given), tuple(x.with_signals(signals) for x in segments), layout
         )
 
     def __len__(self) -> int:
@@ -284,7 +196,7 @@ class Dataset:
 
     @property
     def source(self) -> str:
-        """How messages name the logs."""
+        """Names of the logs in messages."""
         return ", ".join(dict.fromkeys(one.source for one in self.given))
 
     @cached_property
@@ -299,7 +211,7 @@ class Dataset:
         Raises
         ------
         LogError
-            Logs are sampled at different rates.
+            The logs are sampled at different rates.
         """
         steps = [one.log.dt for one in self.segments]
         for one in self.segments:
@@ -312,7 +224,7 @@ class Dataset:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was found and done, a sentence each; with the log's name where there are several."""
+        """Findings and changes, a sentence each; with the log's name where there are several."""
         if len(self.segments) == 1:
             return self.segments[0].notes
         return tuple(f"{one.log.source}: {note}" for one in self.segments for note in one.notes)
@@ -324,12 +236,22 @@ class Dataset:
         return {n: _spread(values[:, i]) for i, n in enumerate(self.signals)}
 
     def by_signal(self, values: Mapping[str, float]) -> FloatArray:
-        """Values ``(n_s,)`` in the signals' order, 0 for what is not named.
+        """Values in the signals' order.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Values of some of the signals by name.
+
+        Returns
+        -------
+        (n_s,) array
+            0 for signals that are not named.
 
         Raises
         ------
         SettingsError
-            A name that the model or the logs do not have.
+            The model, or a log, has no signal of that name.
         """
         for name, value in values.items():
             if name not in self.model.signals:
@@ -345,12 +267,12 @@ class Dataset:
         segments = tuple(self.segments[i] for i in logs)
         found = {n for one in segments for n in one.present}
         signals = tuple(n for n in self.signals if n in found)
-        narrowed = tuple(_widened(one, signals) for one in segments)
+        narrowed = tuple(one.with_signals(signals) for one in segments)
         given = tuple(self.given[i] for i in logs)
         return replace(self, given=given, segments=narrowed, layout=ParameterLayout(self.model.parameters, len(logs)))
 
     def on_given_logs(self, masks: Sequence[BoolArray]) -> BoolArray:
-        """Masks over the segments' rows as one over the rows of the logs that the user gave, log after log."""
+        """Mask over the rows of all given logs, log after log, from one mask per segment."""
         whole = []
         for one, log, mask in zip(self.segments, self.given, masks, strict=True):
             begin = one.log.time[one.offset]
@@ -359,108 +281,6 @@ class Dataset:
             rows[first : first + len(mask)] = mask
             whole.append(rows)
         return np.concatenate(whole)
-
-
-def _widened(segment: Segment, signals: tuple[str, ...]) -> Segment:
-    """The segment with exactly these signals, NaN where its log has none."""
-    if segment.signals == signals:
-        return segment
-    measured = np.full((len(segment), len(signals)), np.nan)
-    for i, name in enumerate(signals):
-        if name in segment.signals:
-            measured[:, i] = segment.column(name)
-    return replace(segment, signals=signals, measured=measured)
-
-
-def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: bool = True) -> Segment:
-    """The arrays of ``model`` over ``log``; arguments as in `Dataset.of`.
-
-    Raises
-    ------
-    LogError
-        A signal is missing, all NaN, infinite, too large to square, or in another unit; too few rows.
-    """
-    needed = model.required_signals if pointwise else tuple(model.inputs)
-    for name in needed:
-        if name not in log:
-            _raise_missing(model, log, name)
-    signals = tuple(n for n in model.signals if n in log)
-    if not signals:
-        _raise_missing(model, log, model.signals[0])
-    used = [n for n in (*signals, *model.inputs) if n in log]
-    log.check(used)
-    _check_units(model, log, used)
-    log = preprocessing.unwrap(log, [n for n in model.coordinates if n in log and model.coordinates[n] == "rad"])
-    inputs, held = _held_inputs(model, log)
-    measured = np.column_stack([log[n] for n in signals])
-    critical = [i for i, n in enumerate(signals) if n in needed or n in also]
-    valid = np.all(np.isfinite(np.hstack([measured[:, critical], inputs])), axis=1)
-    if not valid.any():
-        raise LogError(
-            f"{log.source}: no row has a value in every signal in use ({', '.join(used)}); found NaN in each"
-        )
-    offset = int(np.argmax(valid))
-    notes = [*log.notes, *_row_notes(log, valid, held)]
-    return Segment(model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], tuple(notes))
-
-
-def _raise_missing(model: Model, log: Log, name: str) -> None:
-    derivable = name in model.velocities or name in model.accelerations
-    hint = (
-        "pass --differentiate to estimate velocities and accelerations" if derivable else "name its column with --map"
-    )
-    if name in log.unusable:
-        raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; mend the column, or {hint}')
-    found = ", ".join(("t", *log.names))
-    raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}.')
-
-
-def _check_units(model: Model, log: Log, names: Sequence[str]) -> None:
-    for name in names:
-        found, wanted = log.units.get(name), model.units[name]
-        if found is None or same_unit(found, wanted):
-            continue
-        factor = conversion(found, wanted)
-        hint = f"pass --scale {name}={factor:.6g}" if factor is not None else "check the column"
-        raise LogError(f'{log.source}: signal "{name}" is in {found}, the model needs {wanted}; {hint}')
-
-
-def _held_inputs(model: Model, log: Log) -> tuple[FloatArray, BoolArray]:
-    """Inputs ``(N, n_u)`` with NaN held from the last good sample, and in which rows (N,) one was."""
-    held = np.zeros(len(log), dtype=bool)
-    columns = []
-    for name in model.inputs:
-        column = log[name] if name in log else np.zeros(len(log))
-        good = np.isfinite(column)
-        last = np.maximum.accumulate(np.where(good, np.arange(len(column)), -1))
-        held |= ~good & (last >= 0)
-        columns.append(np.where(last >= 0, column[last], np.nan))
-    return np.column_stack(columns) if columns else np.zeros((len(log), 0)), held
-
-
-def _row_notes(log: Log, valid: BoolArray, held: BoolArray) -> list[str]:
-    notes = []
-    skipped = int((~valid).sum())
-    if skipped:
-        notes.append(f"{skipped} of {len(valid)} rows were skipped: a signal in use is NaN there")
-    if held.any():
-        notes.append(f"inputs were held from the last good sample in {held.sum()} rows, where they are NaN")
-    return [*notes, *_gap_notes(log, held)]
-
-
-def _gap_notes(log: Log, held: BoolArray) -> list[str]:
-    """That inputs were held for too long to believe a simulation from there on, where they were."""
-    edges = np.flatnonzero(np.diff(np.r_[False, held, False]))
-    first, length = edges[::2], edges[1::2] - edges[::2]
-    n_gaps = int((length >= _LONG_HOLD).sum())
-    if not n_gaps:
-        return []
-    longest = int(length.argmax())
-    return [
-        f"inputs are unknown in {n_gaps} gap{'s' * (n_gaps > 1)}, the longest {(length[longest] + 1) * log.dt:.4g} s "
-        f"after t = {log.time[first[longest] - 1]:.6g} s: a simulation through it drifts, which fit error and "
-        "inliers count; a log cut there is scored without it"
-    ]
 
 
 def _spread(values: FloatArray) -> float:

@@ -1,4 +1,4 @@
-"""`Estimate`: the parameters that a method found, with everything that it found beside them."""
+"""`Estimate`: parameters, covariance and diagnosis that a method returns; `Evaluation`: its simulation's agreement."""
 
 from __future__ import annotations
 
@@ -24,7 +24,15 @@ __all__ = ["Diagnosis", "Estimate", "Evaluation", "LogSummary", "Resolution"]
 
 @dataclass(frozen=True)
 class Resolution:
-    """Integrator and integration steps per sample of a simulation."""
+    """Resolution of a simulation.
+
+    Parameters
+    ----------
+    integrator : str, optional
+        "rk4", "euler" or "semi-implicit-euler".
+    substeps : int, optional
+        Integration steps per sample.
+    """
 
     integrator: str = "rk4"
     substeps: int = 1
@@ -32,26 +40,38 @@ class Resolution:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Faults of the logs, and forces that the model lacks, as lo-diransac separates them.
+    """Sensor noise, outliers, unmodelled forces and input delay, as lo-diransac separates them.
 
     Samples are the rows of the logs as they were given, log after log.  Windows are the W intervals over which
     unmodelled accelerations are constant.
 
     Parameters
     ----------
-    noise_std : signal -> standard deviation of its Gaussian noise, its unit; of the measured signals
-    outlier_fraction : signal -> fraction of its samples that are outliers
-    outliers : signal -> (N,) samples that are more likely outliers than not: sensor faults
-    window_log : (W,)   index of the log that each window belongs to
-    unmodelled_time : (W,)   s, middle of each window, time of its log
-    unmodelled_accelerations : acceleration -> (W,), its unit: the part that the model does not explain
-    unmodelled_forces : the same as generalised forces, N where a coordinate is in m, N m where it is in rad; empty
-        where the model's equations are no balance of forces
-    smoothed_time : (W,)   s, first row of each window
-    smoothed_states : state -> (W,)   the most probable states at those times, measured or not
-    input_delay, input_delay_error : s by which the inputs act later than the log has them; its standard error
-    input_delay_significant : whether that exceeds errors of estimation
-    unidentifiable : names of the parameters that the logs do not determine
+    noise_std : mapping of str to float
+        Standard deviation of the Gaussian noise of each measured signal, its unit.
+    outlier_fraction : mapping of str to float
+        Fraction of the samples of each signal that are outliers.
+    outliers : mapping of str to (N,) bool array
+        Samples of each signal that are outliers with a probability above one half.
+    window_log : (W,) int array
+        Index of the log of each window.
+    unmodelled_time : (W,) array
+        Middle of each window in the time of its log, s.
+    unmodelled_accelerations : mapping of str to (W,) array
+        Part of each acceleration that the model does not explain, its unit.
+    unmodelled_forces : mapping of str to (W,) array
+        The generalised force of each, N where the coordinate is in m, N m where it is in rad; empty where the model's
+        equations are not a balance of forces.
+    smoothed_time : (W,) array
+        First row of each window, s.
+    smoothed_states : mapping of str to (W,) array
+        Most probable value of each state at those times, measured or not.
+    input_delay, input_delay_error : float
+        Delay of the inputs with respect to the log, and its standard error, s.
+    input_delay_significant : bool
+        Whether the delay exceeds three standard errors and a quarter of a sample.
+    unidentifiable : tuple of str
+        Names of the parameters that the logs do not determine.
     """
 
     noise_std: Values
@@ -98,7 +118,12 @@ class Diagnosis:
 
         Parameters
         ----------
-        units : unit of each signal
+        units : mapping of str to str
+            Unit of each signal.
+
+        Returns
+        -------
+        list of list of str
         """
         rows = [["signal", "noise", "outliers", "unexplained", "unit"]]
         for name in dict.fromkeys((*self.noise_std, *self.unmodelled_accelerations)):
@@ -112,23 +137,36 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Parameters of a model, their covariance, and how a method came to them.
+    """Parameters of a model, their covariance, and the search that found them.
 
     Parameters
     ----------
-    parameters : name -> value; ``bias[0]``, ``bias[1]``, ... for a per-log parameter of several logs
-    covariance : (n, n)   of these; infinite where the logs do not determine a parameter
-    degrees_of_freedom : of that covariance, for intervals
-    n_fitted : observations that the parameters were fitted to
-    estimator : name of what fitted them
-    iterations : k, samples drawn
-    n_hypotheses : hypotheses judged, refits included
-    stop_reason : why the search ended
-    rejected : hypotheses that went no further, by reason
-    resolution : of the simulation that fitted, in which an evaluation simulates
-    squared_error : whether the fit error is DIRANSAC's mean square rather than eq. (2)
-    notes : what was found and done, a sentence each
-    diagnosis : lo-diransac's
+    parameters : mapping of str to float
+        Value of each parameter in its unit; ``bias[0]``, ``bias[1]``, ... for a per-log parameter of several logs.
+    covariance : (n, n) array
+        Covariance of the parameters; infinite where one is not identifiable.
+    degrees_of_freedom : int
+        Degrees of freedom of the covariance, for intervals.
+    n_fitted : int
+        Number of observations that the parameters were fitted to.
+    estimator : str
+        Name of the estimator.
+    iterations : int, optional
+        Number of samples drawn, the paper's k.
+    n_hypotheses : int, optional
+        Number of hypotheses evaluated, refits included.
+    stop_reason : str, optional
+        Reason why the search ended.
+    rejected : mapping of str to int, optional
+        Number of rejected hypotheses by reason.
+    resolution : Resolution, optional
+        Resolution of the simulation in the fit; `evaluate` simulates with the same.
+    squared_error : bool, optional
+        Whether the fit error is DIRANSAC's mean square rather than eq. (2).
+    notes : tuple of str, optional
+        Findings and changes, a sentence each.
+    diagnosis : Diagnosis, optional
+        Noise, outliers and unmodelled forces; of lo-diransac alone.
     """
 
     parameters: Values
@@ -162,11 +200,15 @@ class Evaluation:
 
     Parameters
     ----------
-    fit_error : eq. (2) over all logs (DIRANSAC's mean square with its method); NaN where nothing could be simulated,
-        infinite where the simulation diverged
-    inlier_fraction : inliers over the rows that count
-    inliers : (N,)   over the rows of the logs that were given, log after log
-    fit_errors, inlier_fractions : (n_logs,)   the same of each log alone
+    fit_error : float
+        Error of eq. (2) over all logs, for DIRANSAC its mean square; NaN where a log lacks its initial state, infinite
+        where the simulation diverged.
+    inlier_fraction : float
+        Number of inliers over the number of rows that count.
+    inliers : (N,) bool array
+        Inliers among the rows of the given logs, log after log.
+    fit_errors, inlier_fractions : (n_logs,) array
+        Fit error and inlier fraction of each log alone.
     """
 
     fit_error: Number
@@ -183,17 +225,24 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class LogSummary:
-    """A log that was identified from.
+    """Provenance and scores of one log of an identification.
 
     Parameters
     ----------
-    source : how messages name it
-    fingerprint : SHA-256 of its samples
-    start, dt : first time and sampling time, s
-    n_rows : rows
-    preparation : what was done to it, in order
-    fit_error, inlier_fraction : of the simulation of this log
-    remark : empty, or how its own estimate disagrees with those of the other logs
+    source : str
+        Name of the log in messages.
+    fingerprint : str
+        SHA-256 of the samples.
+    start, dt : float
+        First time and sampling time, s.
+    n_rows : int
+        Number of rows.
+    preparation : tuple of mapping of str to object, optional
+        Preparation steps in order.
+    fit_error, inlier_fraction : float, optional
+        Scores of the simulation of this log.
+    remark : str, optional
+        Disagreement of this log's own estimate with those of the other logs; empty where they agree.
     """
 
     source: str

@@ -1,6 +1,6 @@
 """``W p = b -> p``: estimators as small frozen objects, each bound to the rows of a log before it is used.
 
-An estimator says of a set of rows whether it is well-defined, and fits it.  Where a fit needs sums alone, each
+An estimator tests whether a set of rows is well-defined, and fits it.  Where a fit needs sums alone, each
 observation's block of ``[W b]^T [W b]`` is formed once, and a sample or a set of inliers is a sum of blocks, taken in
 the order of its rows: no result depends on how many hypotheses are fitted at a time.
 """
@@ -21,7 +21,8 @@ from diransac.simulation.compiler import compile_map
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from diransac.data.dataset import Dataset, Segment
+    from diransac.data.dataset import Dataset
+    from diransac.data.segment import Segment
 
 __all__ = [
     "BoundEstimator",
@@ -40,10 +41,10 @@ _MIN_EIGENVALUE = 1e-6
 
 
 class Selection(Protocol):
-    """Sets of rows, gathered once: whether each determines the parameters, and the parameters."""
+    """Sets of rows, gathered once, to be tested and fitted."""
 
     def well_defined(self) -> BoolArray:
-        """Whether each set of rows determines the parameters: smallest eigenvalue of the column-scaled ``W^T W``."""
+        """Mask of the sets that determine the parameters, by the smallest eigenvalue of the column-scaled ``W^T W``."""
 
     def fit(self) -> FloatArray:
         """Parameters ``(n_sets, n)``; not finite where a set determines none."""
@@ -58,14 +59,26 @@ class BoundEstimator(Protocol):
         """Sets of rows, to be checked and fitted."""
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        """Parameters ``(n_groups, n)`` from ``rows`` (ascending) less each group of them."""
+        """Parameters from rows without each of several groups.
+
+        Parameters
+        ----------
+        groups : sequence of int array
+            Rows that are left out, one group at a time.
+        rows : (n_rows,) int array
+            Ascending.
+
+        Returns
+        -------
+        (n_groups, n) array
+        """
 
     def unidentifiable(self) -> tuple[int, ...]:
-        """Indices of the parameters that the whole dataset does not determine."""
+        """Indices of the parameters that are not identifiable from the whole dataset."""
 
 
 class Estimator(Protocol):
-    """What identifies parameters from rows."""
+    """An unbound estimator: its settings, without data."""
 
     def bind(self, dataset: Dataset) -> BoundEstimator:
         """The estimator over the usable rows of a dataset."""
@@ -73,23 +86,54 @@ class Estimator(Protocol):
 
 @dataclass(frozen=True)
 class _SumsEstimator:
-    """An estimator that needs no more of a set of rows than the sum of ``[W b]^T [W b]``.
+    """An estimator whose fit depends on a set of rows through the sum of ``[W b]^T [W b]`` alone.
 
     Parameters
     ----------
-    min_eigenvalue : the smallest eigenvalue of ``W^T W`` must exceed it, with the columns of ``W`` divided by their RMS
-        over the whole log, so that it has no unit
+    min_eigenvalue : float, optional
+        The smallest eigenvalue of ``W^T W`` must exceed it, with the columns of ``W`` divided by their RMS over the
+        whole log, so that it has no unit.
     """
 
     min_eigenvalue: float = _MIN_EIGENVALUE
 
     def fit(self, W: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:
-        """Parameters ``(n_p,)`` from ``W (..., n_p)`` and ``b (...)``."""
+        """Solution of ``W p = b``.
+
+        Parameters
+        ----------
+        W : (..., n_p) array_like
+        b : (...) array_like
+
+        Returns
+        -------
+        (n_p,) array
+
+        Raises
+        ------
+        IdentificationError
+            Shapes do not match, or a value is not finite.
+        """
         bound = self._bind(*_flat(W, b))
         return np.asarray(bound.select([np.arange(bound.n_rows)]).fit()[0])
 
     def well_defined(self, W: npt.ArrayLike, b: npt.ArrayLike) -> bool:
-        """Whether ``W (..., n_p)``, ``b (...)`` determine the parameters, with the columns scaled by their own RMS."""
+        """True if ``W`` and ``b`` determine the parameters, with the columns scaled by their own RMS.
+
+        Parameters
+        ----------
+        W : (..., n_p) array_like
+        b : (...) array_like
+
+        Returns
+        -------
+        bool
+
+        Raises
+        ------
+        IdentificationError
+            Shapes do not match, or a value is not finite.
+        """
         bound = self._bind(*_flat(W, b))
         return bool(bound.select([np.arange(bound.n_rows)]).well_defined()[0])
 
@@ -109,7 +153,15 @@ class _SumsEstimator:
 class OrdinaryLeastSquares(_SumsEstimator):
     """``p = (W^T W)^-1 W^T b``: least squares of the equation error.
 
-    References: Dimmig et al. 2023, section III.C (whose printed formula lacks the transpose).
+    Parameters
+    ----------
+    min_eigenvalue : float, optional
+        Threshold of a well-defined set of rows: the smallest eigenvalue of its ``W^T W`` must exceed it, with the
+        columns of ``W`` divided by their RMS over the whole log; no unit.
+
+    References
+    ----------
+    Dimmig et al. 2023, section III.C (whose printed formula lacks the transpose).
     """
 
     def solve(self, gram: FloatArray) -> FloatArray:
@@ -121,9 +173,16 @@ class OrdinaryLeastSquares(_SumsEstimator):
 class TotalLeastSquares(_SumsEstimator):
     """The ``p`` of the smallest change of ``W`` and ``b`` that makes ``W p = b`` exact, in columns of unit RMS.
 
-    Every column is taken to be as noisy as any other, relative to its RMS.
+    All columns are assumed to have the same noise relative to their RMS.
 
-    References: Golub and Van Loan 1980, "An analysis of the total least squares problem".
+    Parameters
+    ----------
+    min_eigenvalue : float, optional
+        As in `OrdinaryLeastSquares`.
+
+    References
+    ----------
+    Golub and Van Loan 1980, "An analysis of the total least squares problem".
     """
 
     def solve(self, gram: FloatArray) -> FloatArray:
@@ -163,7 +222,7 @@ class _BoundSums:
 
     @property
     def min_eigenvalue(self) -> float:
-        """Of the estimator."""
+        """Threshold of a well-defined set of rows."""
         return self._estimator.min_eigenvalue
 
     def solve(self, gram: FloatArray) -> FloatArray:
@@ -200,7 +259,7 @@ class _SelectedSums:
 
 
 class LinearRegressor(Protocol):
-    """What scikit-learn's linear regressors share."""
+    """Interface of scikit-learn's linear regressors."""
 
     def fit(self, X: FloatArray, y: FloatArray) -> Self:
         """Fit coefficients."""
@@ -218,10 +277,15 @@ class ScikitLearnEstimator:
 
     Parameters
     ----------
-    regressor : an estimator with ``fit`` and ``coef_`` (or an ``estimator_`` that has it), such as ``HuberRegressor()``
-    min_eigenvalue : as in `OrdinaryLeastSquares`
+    regressor : LinearRegressor
+        Regressor with ``fit`` and ``coef_`` (or an ``estimator_`` that has it), such as ``HuberRegressor()``.
+    min_eigenvalue : float, optional
+        As in `OrdinaryLeastSquares`.
 
-    Raises SettingsError: the regressor cannot be fitted without an intercept.
+    Raises
+    ------
+    SettingsError
+        The regressor cannot be fitted without an intercept.
     """
 
     regressor: LinearRegressor
@@ -236,7 +300,7 @@ class ScikitLearnEstimator:
 
 
 class _BoundScikitLearn:
-    """Rows of ``W`` and ``b`` for a scikit-learn regressor; whether they are enough is judged by their sums."""
+    """Rows of ``W`` and ``b`` for a scikit-learn regressor; their sums decide whether a set is well-defined."""
 
     def __init__(self, estimator: ScikitLearnEstimator, W: FloatArray, b: FloatArray) -> None:
         self._regressor = estimator.regressor
@@ -313,7 +377,18 @@ def _without_intercept(regressor: LinearRegressor) -> LinearRegressor:
 def as_estimator(candidate: object) -> Estimator:
     """The estimator itself, or a scikit-learn regressor wrapped as one.
 
-    Raises SettingsError: it is neither.
+    Parameters
+    ----------
+    candidate : object
+
+    Returns
+    -------
+    Estimator
+
+    Raises
+    ------
+    SettingsError
+        The candidate is neither.
     """
     if hasattr(candidate, "bind") and not isinstance(candidate, type):
         return cast("Estimator", candidate)
@@ -326,7 +401,16 @@ def as_estimator(candidate: object) -> Estimator:
 
 
 def name_of(estimator: Estimator) -> str:
-    """What users call it: its class, or the scikit-learn class that it wraps."""
+    """Name of an estimator's class, or of the scikit-learn class that it wraps.
+
+    Parameters
+    ----------
+    estimator : Estimator
+
+    Returns
+    -------
+    str
+    """
     named = estimator.regressor if isinstance(estimator, ScikitLearnEstimator) else estimator
     return type(named).__name__
 
@@ -336,6 +420,17 @@ def regression(dataset: Dataset) -> tuple[FloatArray, FloatArray]:
 
     Where a log's signals were derived by a filter, the same filter acts on both sides of the equation.  A per-log
     parameter has a column per log, which is zero in the rows of the others.
+
+    Parameters
+    ----------
+    dataset : Dataset
+
+    Returns
+    -------
+    W : (N, r, n) array
+        Regressors of the r equations at each row, with respect to n parameters.
+    b : (N, r) array
+        Right-hand sides.
     """
     parts = [_segment_regression(one) for one in dataset.segments]
     W = [dataset.layout.scattered(W, i) for i, (W, _) in enumerate(parts)]
@@ -354,29 +449,68 @@ def _segment_regression(one: Segment) -> tuple[FloatArray, FloatArray]:
 
 
 def column_scale(columns: FloatArray) -> FloatArray:
-    """RMS ``(n,)`` of the columns of ``(N, r, n)``."""
+    """RMS of each column.
+
+    Parameters
+    ----------
+    columns : (N, r, n) array
+
+    Returns
+    -------
+    (n,) array
+    """
     flat = columns.reshape(-1, columns.shape[-1])
     return np.asarray(np.sqrt(np.square(flat).mean(axis=0)))
 
 
 def smallest_eigenvalue(gram: FloatArray) -> FloatArray:
-    """Smallest eigenvalue of each ``(..., n, n)``; -inf where it is not finite."""
+    """Smallest eigenvalue of each symmetric matrix.
+
+    Parameters
+    ----------
+    gram : (..., n, n) array
+
+    Returns
+    -------
+    (...) array
+        -inf where a matrix is not finite.
+    """
     finite = np.all(np.isfinite(gram), axis=(-2, -1))
     values = np.linalg.eigvalsh(np.where(finite[..., None, None], gram, 0.0))[..., 0]
     return np.where(finite, values, -np.inf)
 
 
 def loose_parameters(gram: FloatArray, min_eigenvalue: float) -> tuple[int, ...]:
-    """Indices of the parameters that take part in a direction whose eigenvalue is too small."""
+    """Indices of the parameters in the eigenvectors whose eigenvalue is too small.
+
+    Parameters
+    ----------
+    gram : (n, n) array
+    min_eigenvalue : float
+        Largest eigenvalue that is too small.
+
+    Returns
+    -------
+    tuple of int
+    """
     values, vectors = np.linalg.eigh(gram)
     weak = values <= min_eigenvalue
     return tuple(int(i) for i in np.flatnonzero((np.abs(vectors[:, weak]) > 0.1).any(axis=1)))
 
 
 def solve_definite(A: FloatArray, g: FloatArray) -> FloatArray:
-    """``A^-1 g`` for symmetric positive definite ``A (..., n, n)``, by LDL^T; NaN where it breaks down.
+    """``A^-1 g`` of symmetric positive definite ``A``, by LDL^T; NaN where the factorisation breaks down.
 
-    Written out over the leading axes: the same bits for every batch and on every machine, as LAPACK does not promise.
+    Written out over the leading axes: the same bits for every batch size and machine, which LAPACK does not guarantee.
+
+    Parameters
+    ----------
+    A : (..., n, n) array
+    g : (..., n) array
+
+    Returns
+    -------
+    (..., n) array
     """
     A, x = A.copy(), g.copy()
     n = A.shape[-1]

@@ -1,4 +1,4 @@
-"""Evaluation: the one place that simulates a dataset with parameters and judges the simulation."""
+"""Evaluation of parameters by simulation of a dataset: errors, inliers, and their weights and thresholds."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from diransac.identification.estimate import Evaluation, Resolution
 from diransac.simulation import Measurements, RolloutBatch, default_threads, rollouts
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset, Segment
+    from diransac.data.dataset import Dataset
     from diransac.data.log import Log
+    from diransac.data.segment import Segment
     from diransac.identification.estimate import Diagnosis, Estimate
     from diransac.identification.settings import Settings
     from diransac.model import Model
@@ -39,12 +40,24 @@ _ACCELERATION_WEIGHT = 0.1
 _DEFAULT_RESOLUTION = Resolution()
 
 
-# ---------------------------------------------------------------------- what judges
+# ---------------------------------------------------------------------- weights and thresholds
 
 
 @dataclass(frozen=True)
 class Scoring:
-    """Error weights and inlier thresholds ``(n_s,)`` of a dataset's signals, and how many signals make an inlier."""
+    """Error weights and inlier thresholds of a dataset's signals.
+
+    Parameters
+    ----------
+    weights : (n_s,) array
+        Weights of eq. (2), one over each signal's unit.
+    thresholds : (n_s,) array
+        Errors below which a signal is an inlier, each signal's unit; 0 switches a signal off.
+    min_inlier_signals : int
+        Number of signals of a row that must be inliers for the row to be one.
+    notes : tuple of str, optional
+        Findings, a sentence each.
+    """
 
     weights: FloatArray
     thresholds: FloatArray
@@ -58,10 +71,19 @@ class Scoring:
 
 
 def judged_signals(model: Model, logs: Sequence[Log], settings: Settings) -> tuple[str, ...]:
-    """Names of the signals whose simulation is judged: those that the settings name, or the default ones.
+    """Names of the signals that are compared with their simulation: those in the settings, or the default ones.
 
-    By default velocities and accelerations, and coordinates of which no velocity is measured, as far as every log has
-    them.
+    Parameters
+    ----------
+    model : Model
+    logs : sequence of Log
+    settings : Settings
+        Weights and thresholds; where either is None, the default signals are compared: velocities and accelerations,
+        and coordinates whose velocity is not measured, as far as every log has them.
+
+    Returns
+    -------
+    tuple of str
     """
     named = {**(settings.error_weights or {}), **(settings.inlier_thresholds or {})}
     chosen = {n for n, x in named.items() if x > 0.0}
@@ -83,10 +105,19 @@ def _judged_by_default(model: Model, measured: Sequence[str]) -> tuple[str, ...]
 def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     """Weights and thresholds from the settings, or from each signal's spread in the dataset where they are None.
 
+    Parameters
+    ----------
+    dataset : Dataset
+    settings : Settings
+
+    Returns
+    -------
+    Scoring
+
     Raises
     ------
     SettingsError
-        The settings name a signal that is not there, or leave nothing to judge by.
+        The settings name a signal that a log lacks, or every weight is zero, or there are too few thresholds.
     LogError
         Every signal is constant.
     """
@@ -96,7 +127,9 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     weights, thresholds = settings.error_weights, settings.inlier_thresholds
     if weights is None or thresholds is None:
         if len(constant) == len(scales):
-            raise LogError(f"{dataset.source}: {', '.join(scales)} are constant; nothing moves in this log")
+            raise LogError(
+                f"{dataset.source}: {', '.join(scales)} are constant; nothing moves in this log. Record a motion"
+            )
         moving = {n: scale for n, scale in scales.items() if scale > 0.0}
         slow = dataset.model.accelerations
         if weights is None:
@@ -110,11 +143,12 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     needed = settings.min_inlier_signals or max(1, -(-n_signals // 2))
     if needed > n_signals:
         raise SettingsError(
-            f"min_inlier_signals = {needed}, but {n_signals} signals have an inlier threshold: nothing can be an inlier"
+            f"min_inlier_signals = {needed}, but {n_signals} signals have an inlier threshold; lower it, or give more "
+            "thresholds"
         )
-    judging = ", ".join(n for n, x in zip(dataset.signals, eps, strict=True) if x > 0.0)
-    notes = [f"{n} is constant and judges nothing" for n in constant]
-    notes.append(f"a row is an inlier if {needed} of its {n_signals} judging signals are near: {judging}")
+    compared = ", ".join(n for n, x in zip(dataset.signals, eps, strict=True) if x > 0.0)
+    notes = [f"{n} is constant and is not compared" for n in constant]
+    notes.append(f"a row is an inlier if {needed} of {n_signals} signals are within their thresholds: {compared}")
     return Scoring(w, eps, needed, tuple(notes))
 
 
@@ -123,13 +157,16 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
 
 @dataclass(frozen=True)
 class Scores:
-    """Agreement of hypotheses with a dataset; a hypothesis is a lane.
+    """Agreement of hypotheses with a dataset; each hypothesis is a lane.
 
     Parameters
     ----------
-    sum_squares : (n_lanes, n_s)   sum over the rows that count of squared errors, infinite where a rollout diverged
-    inlier_count : (n_lanes,)   rows that are inliers
-    batches : one per log
+    sum_squares : (n_lanes, n_s) array
+        Squared errors summed over the rows that count, each signal's unit squared; infinite where a rollout diverged.
+    inlier_count : (n_lanes,) int array
+        Number of inliers.
+    batches : tuple of ScoreBatch
+        Scores of each log.
     """
 
     sum_squares: FloatArray
@@ -137,20 +174,24 @@ class Scores:
     batches: tuple[ScoreBatch, ...]
 
     def inlier_masks(self, lane: int) -> list[BoolArray]:
-        """Inliers ``(N,)`` of one hypothesis over all rows of each log; a row that does not count is none."""
+        """Inliers ``(N,)`` of one hypothesis over all rows of each log; False in rows that do not count."""
         return [batch.inliers(lane) for batch in self.batches]
 
 
 class Simulation:
-    """Simulations of a dataset; in `score`, each log from an initial state of its own.
+    """Simulations of the logs of a dataset, driven by their inputs.
 
     Parameters
     ----------
-    dataset : logs, whose inputs drive the simulation
-    signals : (n_s,)   Boolean: signals of the dataset that are compared with the measured ones; None: all
-    resolution : integrator and steps
-    rules : rule of each log's initial state, as ``Settings.initial_state``
-    threads : None: one per core
+    dataset : Dataset
+    signals : (n_s,) bool array, optional
+        Signals of the dataset that are compared with the measured ones; None: all.
+    resolution : Resolution, optional
+        Integrator and steps per sample.
+    rules : sequence of str or mapping of str to float, optional
+        Rule of each log's initial state in `score`, as ``Settings.initial_state``; None: the first samples.
+    threads : int, optional
+        Number of threads; None: one per core.
     """
 
     def __init__(
@@ -180,12 +221,26 @@ class Simulation:
         Raises
         ------
         LogError
-            A log lacks its initial state.
+            A log lacks a state on which a measured signal depends.
         """
         return [one.initial_state(rule) for one, rule in zip(self._dataset.segments, self._rules, strict=True)]
 
     def score(self, parameters: FloatArray, thresholds: FloatArray, min_inlier_signals: int) -> Scores:
-        """Sums of squared errors and inliers of every hypothesis ``(n_lanes, n)`` over all logs."""
+        """Sums of squared errors and inliers of every hypothesis over all logs.
+
+        Parameters
+        ----------
+        parameters : (n_lanes, n) array
+            Hypotheses, each parameter in its unit.
+        thresholds : (n_s,) array
+            Inlier thresholds of the compared signals.
+        min_inlier_signals : int
+            Number of signals of a row that must be below their thresholds.
+
+        Returns
+        -------
+        Scores
+        """
         batches = []
         for i, one in enumerate(self._dataset.segments):
             lanes = RolloutBatch(self._dataset.layout.of_log(parameters, i), self.starts[i], one.inputs, one.log.dt)
@@ -201,15 +256,25 @@ class Simulation:
     def errors(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
     ) -> FloatArray:
-        """Simulated less measured ``(K, n_rows, n_s)`` of one log, restarted from given states.
-
-        NaN from a divergence on; a missing sample counts as measured 0.
+        """Simulated less measured signals of one log in windows that start from given states.
 
         Parameters
         ----------
-        parameters : (n_p,)   of the model
-        states : (K, n_x)   initial state of each window
-        start_rows : (K,)   first row of each; rows past the end of the log repeat its last one
+        log : int
+            Index of the log.
+        parameters : (n_p,) array
+            Parameters of the model.
+        states : (K, n_x) array
+            Initial state of each window.
+        start_rows : (K,) int array
+            First row of each window; rows past the end of the log repeat its last one.
+        n_rows : int
+            Number of rows of a window.
+
+        Returns
+        -------
+        (K, n_rows, n_s) array
+            NaN from a divergence on; a missing sample counts as measured 0.
         """
         batch, measured = self._restarted(log, parameters, states, start_rows, n_rows)
         return self._simulator.errors(batch, measured)
@@ -217,7 +282,7 @@ class Simulation:
     def trajectories(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
     ) -> FloatArray:
-        """All signals of the model ``(K, n_rows, n_signals)``, restarted as in `errors`."""
+        """All signals of the model ``(K, n_rows, n_signals)``; parameters as those of `errors`."""
         return self._simulator.trajectories(self._restarted(log, parameters, states, start_rows, n_rows)[0])
 
     def _restarted(
@@ -234,13 +299,21 @@ class Simulation:
 def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: Settings) -> Evaluation:
     """Evaluation of an estimate on the logs that it was made from.
 
-    The simulation is as fine as the one that fitted; inputs act as late, and first states are, as the estimate has
-    them.  Nothing is simulated, and the fit error is NaN, where a log lacks its initial state.
+    The simulation has the resolution, input delay and initial states of the fit.
 
     Parameters
     ----------
-    scoring : weights and thresholds
-    settings : initial states and threads
+    estimate : Estimate
+    dataset : Dataset
+    scoring : Scoring
+        Weights and thresholds.
+    settings : Settings
+        Rule of the initial states, and threads.
+
+    Returns
+    -------
+    Evaluation
+        The fit error is NaN, and there are no inliers, where a log lacks its initial state.
     """
     acting, rules = as_estimated(dataset, estimate.diagnosis, settings)
     judged, weights = scoring.judged, scoring.weights[scoring.judged]
@@ -267,9 +340,22 @@ def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: S
 def as_estimated(
     dataset: Dataset, found: Diagnosis | None, settings: Settings
 ) -> tuple[Dataset, list[str | Mapping[str, float]]]:
-    """The dataset with inputs that act as late as a diagnosis has them, and the rule of each log's initial state.
+    """The dataset with the input delay of a diagnosis, and the rule of each log's initial state.
 
-    That is the first sample, as by default, but the smoothed state where the sample is missing or an outlier.
+    Parameters
+    ----------
+    dataset : Dataset
+    found : Diagnosis, optional
+        Input delay, outliers and smoothed states; None: the dataset is returned unchanged.
+    settings : Settings
+        Rule of the initial states.
+
+    Returns
+    -------
+    dataset : Dataset
+    rules : list of str or mapping of str to float
+        With a diagnosis and ``initial_state="first"``: the first sample, replaced by the smoothed state where it is
+        missing or an outlier.
     """
     rule = settings.initial_state
     if found is None:
@@ -310,13 +396,17 @@ def rms_error(sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> Floa
 
     Parameters
     ----------
-    sum_squares : (n_hypotheses, n_signals)   sum over time of squared errors, infinite where a rollout diverged
-    n_rows : N, observations in that sum
-    weights : (n_signals,)   w
+    sum_squares : (n_hypotheses, n_signals) array
+        Squared errors summed over time, each signal's unit squared; infinite where a rollout diverged.
+    n_rows : int
+        Number of observations N in the sum.
+    weights : (n_signals,) array
+        Weights w, one over each signal's unit.
 
     Returns
     -------
-    (n_hypotheses,).  Signals of zero weight are left out, so they add no 0 times infinity.
+    (n_hypotheses,) array
+        Signals of zero weight are left out, so that no 0 is multiplied by infinity.
 
     References
     ----------
@@ -326,12 +416,24 @@ def rms_error(sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> Floa
 
 
 def mean_squared_error(sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
-    """``e = sum_i w_i sum_j err_ij^2 / N``: DIRANSAC's error, eq. (2) without the root; shapes as in `rms_error`."""
+    """``e = sum_i w_i sum_j err_ij^2 / N``, DIRANSAC's error: eq. (2) without the root.
+
+    Parameters
+    ----------
+    sum_squares : (n_hypotheses, n_signals) array
+    n_rows : int
+    weights : (n_signals,) array
+        As in `rms_error`.
+
+    Returns
+    -------
+    (n_hypotheses,) array
+    """
     return _weighted_sum(sum_squares / n_rows, weights)
 
 
 def _weighted_sum(errors: FloatArray, weights: FloatArray) -> FloatArray:
-    """A sum over signals in their order: its rounding depends on no shape."""
+    """Weighted sum over signals in their order, so that rounding does not depend on shapes."""
     total = np.zeros(len(errors))
     for i in np.flatnonzero(weights > 0.0):
         total += weights[i] * errors[:, i]

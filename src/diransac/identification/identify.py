@@ -1,4 +1,4 @@
-"""The one entry: a model and logs in, a `Result` out: dataset, method, estimate, evaluation."""
+"""`identify`: a `Result` from a model and logs, by dataset, method, estimate and evaluation."""
 
 from __future__ import annotations
 
@@ -41,38 +41,49 @@ def identify(
 
     Parameters
     ----------
-    model : equations with the parameters to be estimated
-    logs : one log, or a sequence of logs.  Several share their parameters, but for those that are `Parameter.per_log`;
-        each has an initial state of its own, and nothing is continued from one to the next
-    method : name or object.  "lo-diransac" (default) needs no tuning and returns full diagnostics; "ols", "tls", "nls"
-        are least squares of all rows (ordinary, total, nonlinear); "diransac" and "i-diransac" are the paper's.  An
-        object, such as ``dr.LoDiransac(substeps=10)``, has settings of its own
-    seed : of all that is random; sample k of a search depends on (seed, k) alone
-    settings : of a method that is given by name.  A setting that the method has no use for is refused
-    estimator : inside the paper's methods: `OrdinaryLeastSquares` (default; `NonlinearLeastSquares` where the model is
-        not affine in its parameters), another of ours, or any scikit-learn linear regressor
-    differentiate : derive the velocities and accelerations that a log lacks, and filter both sides of the equations
-        alike; the identification is then repeated at half and twice the bandwidth, for
-        ``result.bandwidth_sensitivity``.  lo-diransac estimates what a log lacks, and has no such filter
-    bandwidth : of that filter, Hz; None: chosen from each log
-    compare_logs : whether each of several logs is also identified alone, so that logs that disagree with the others
-        are named; that takes about as long again
-    progress : called with a `Progress` now and then
+    model : Model
+        Equations with the parameters to be estimated.
+    logs : Log or iterable of Log
+        One log, or several.  Logs share all parameters except those with ``Parameter.per_log``; each log has an initial
+        state of its own.
+    method : str or Method, optional
+        Name or object.  "lo-diransac" (default) needs no tuning and returns full diagnostics; "ols", "tls", "nls" are
+        least squares of all rows (ordinary, total, nonlinear); "diransac" and "i-diransac" are the paper's.  An object,
+        such as ``dr.LoDiransac(substeps=10)``, carries its own settings.
+    seed : int, optional
+        Seed of all random numbers; sample k of a search depends on (seed, k) alone.
+    settings : Settings, optional
+        Settings of a method that is given by name; a setting that the method does not use is refused.
+    estimator : object, optional
+        Estimator inside "diransac" and "i-diransac": `OrdinaryLeastSquares` (default; `NonlinearLeastSquares` where the
+        model is not affine in its parameters), `TotalLeastSquares`, or any scikit-learn linear regressor.
+    differentiate : bool, optional
+        Whether to derive the velocities and accelerations that a log lacks, and to filter both sides of the equations
+        alike; the identification is then repeated at half and at twice the bandwidth, for
+        ``result.bandwidth_sensitivity``.  lo-diransac estimates missing signals without a filter.
+    bandwidth : float, optional
+        Bandwidth of the differentiating filter, Hz; None: chosen from each log.
+    compare_logs : bool, optional
+        Whether each of several logs is also identified alone, so that logs that disagree with the others are named;
+        that takes about as long again.
+    progress : callable, optional
+        Called with a `Progress` at every stage.
 
     Returns
     -------
     Result
+        Parameters, covariance, evaluation and provenance.
 
     Raises
     ------
     LogError
         A log lacks a signal, or cannot be used.
     SettingsError
-        An argument has no meaning, or a setting no use.
+        An argument is out of range, or a setting is not used by the method.
     ModelError
-        A linear method meets a model that is not affine in its parameters.
+        A linear method is given a model that is not affine in its parameters.
     IdentificationError
-        The logs do not determine the parameters, or no hypothesis was accepted.
+        A parameter is not identifiable from the logs, or no hypothesis was accepted.
 
     References
     ----------
@@ -122,7 +133,7 @@ def _check_arguments(model: object, seed: object) -> None:
 
 @dataclass(frozen=True)
 class _Task:
-    """One identification, apart from how its logs are prepared."""
+    """One identification, apart from the preparation of its logs."""
 
     model: Model
     given: tuple[Log, ...]
@@ -196,3 +207,6 @@ def _summaries(dataset: Dataset, evaluation: Evaluation, remarks: Sequence[str])
         )
         for log, one, (error, fraction), remark in parts
     )
+
+
+# ---------------------------------------------------------------------- agreement of several logs

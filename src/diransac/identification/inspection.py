@@ -1,4 +1,4 @@
-"""What a log holds, what is odd about it, and what it can tell about a model - before anything is identified."""
+"""Inspection of a log before identification: its signals, their faults, and the identifiability of a model."""
 
 from __future__ import annotations
 
@@ -37,11 +37,16 @@ class SignalFacts:
 
     Parameters
     ----------
-    unit : its unit, None where the log does not say
-    minimum, maximum, standard_deviation : of its finite samples, in that unit; NaN where there is none
-    n_missing : samples that are NaN
-    n_spikes : samples that a Hampel filter would replace
-    frozen : s, the longest stretch without any change, if it has at least 10 samples
+    unit : str
+        Unit; None where the log does not give it.
+    minimum, maximum, standard_deviation : float
+        Statistics of the finite samples, in that unit; NaN where there is none.
+    n_missing : int
+        Number of NaN samples.
+    n_spikes : int
+        Number of samples that a Hampel filter would replace.
+    frozen : float
+        Longest stretch of one value, s; 0 if it is shorter than 10 samples.
     """
 
     unit: str | None
@@ -55,13 +60,16 @@ class SignalFacts:
 
 @dataclass(frozen=True)
 class Excitation:
-    """How well ordinary least squares determines a parameter from the whole log, outliers included.
+    """Ordinary least-squares estimate of a parameter from the whole log, outliers included, and its relative error.
 
     Parameters
     ----------
-    unit : its unit
-    estimate : in that unit; NaN where the log does not determine it
-    relative_error : standard error over estimate, by a jackknife; infinite where the log does not determine it
+    unit : str
+        Unit of the parameter.
+    estimate : float
+        Estimate in that unit; NaN where the parameter is not identifiable.
+    relative_error : float
+        Standard error over estimate, by a jackknife; infinite where the parameter is not identifiable.
     """
 
     unit: str
@@ -70,22 +78,28 @@ class Excitation:
 
     @property
     def verdict(self) -> str:
-        """Whether the motion shows the parameter: well (error below 10 %), weakly (below 50 %) or not at all."""
+        """Degree of excitation: "well" (relative error below 10 %), "weakly" (below 50 %) or "not"."""
         return "well" if self.relative_error < _WELL else "weakly" if self.relative_error < _WEAKLY else "not"
 
 
 @dataclass(frozen=True)
 class Fitness:
-    """What a log offers to a model.
+    """Suitability of a log for the identification of a model.
 
     Parameters
     ----------
-    model : its name
-    missing : signals and inputs that the equations need and the log lacks
-    derivable : those of them that differentiation supplies
-    excitation : by parameter; empty where it cannot be said
-    reason : why it cannot be said
-    caveat : what makes it doubtful
+    model : str
+        Name of the model.
+    missing : tuple of str
+        Signals and inputs that the equations need and the log lacks.
+    derivable : tuple of str
+        Missing signals that differentiation supplies.
+    excitation : mapping of str to Excitation
+        Excitation of each parameter; empty where it cannot be computed.
+    reason : str, optional
+        Reason why it cannot be computed, or why parameters are not identifiable.
+    caveat : str, optional
+        Reason why the estimates are doubtful.
     """
 
     model: str
@@ -98,7 +112,23 @@ class Fitness:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What `inspect` found: the log's time, s, its signals by name, and what it offers to a model if one was given."""
+    """Statistics of a log, returned by `inspect`; printed as a table.
+
+    Parameters
+    ----------
+    source : str
+        Name of the log in messages.
+    n_rows : int
+        Number of rows.
+    start, dt : float
+        First time and sampling time, s.
+    signals : mapping of str to SignalFacts
+        Statistics of each signal.
+    notes : tuple of str
+        Findings on reading, a sentence each.
+    fitness : Fitness, optional
+        Suitability for a model; None where no model was given.
+    """
 
     source: str
     n_rows: int
@@ -146,9 +176,17 @@ class Inspection:
 
 
 def inspect(log: Log, model: Model | None = None) -> Inspection:
-    """What a log holds, and what it can tell about a model.
+    """Statistics of a log, and the identifiability of a model's parameters from it.
 
-    Where the log lacks velocities or accelerations that can be derived, the model is judged with them derived.
+    Parameters
+    ----------
+    log : Log
+    model : Model, optional
+        Velocities and accelerations that the model needs and the log lacks are derived, where they can be.
+
+    Returns
+    -------
+    Inspection
     """
     signals = {name: _signal_facts(log, name) for name in log.names}
     fitness = None if model is None else _fitness(log, model)
@@ -204,28 +242,28 @@ def _fitness(log: Log, model: Model) -> Fitness:
     if model.nonlinear_parameters:
         names = ", ".join(model.nonlinear_parameters)
         return Fitness(
-            model.name, missing, derivable, {}, f"not affine in {names}: only a search can tell what is excited"
+            model.name, missing, derivable, {}, f"not affine in {names}: excitation is known only after identification"
         )
     try:
         dataset = Dataset.of(model, derived)
         excitation, reason = _excitation(OrdinaryLeastSquares().bind(dataset), model)
         if not reason:
-            choose_scoring(dataset, Settings())  # refuses a log in which nothing moves, as identify does
+            choose_scoring(dataset, Settings())  # raises for a log in which nothing moves, as identify does
     except LogError as error:
         return Fitness(model.name, missing, derivable, {}, str(error))
     return Fitness(model.name, missing, derivable, excitation, reason)
 
 
 def _caveat(signals: Mapping[str, SignalFacts], model: Model) -> str:
-    """What spikes in the signals of the equations do to an estimate that believes every row; nothing without them."""
+    """A warning of spikes in the signals of the equations; empty without them."""
     spiked = [name for name in model.required_signals if name in signals and signals[name].n_spikes]
     if not spiked:
         return ""
-    return f"spikes in {', '.join(spiked)} bend these estimates and errors: --despike them, or trust identify alone"
+    return f"spikes in {', '.join(spiked)} bias these estimates and errors: pass --despike, or use those of identify"
 
 
 def _derived(log: Log, model: Model) -> Log:
-    """The log with what differentiation supplies; the log itself where it supplies nothing."""
+    """The log with signals derived by differentiation; the log itself where none can be."""
     try:
         return preprocessing.differentiate(log, model)
     except LogError:
@@ -233,14 +271,17 @@ def _derived(log: Log, model: Model) -> Log:
 
 
 def _excitation(bound: BoundEstimator, model: Model) -> tuple[dict[str, Excitation], str]:
-    """How well the whole log determines each parameter; where it leaves some open, those alone, and what that means."""
+    """Excitation of each parameter; where some are not identifiable, of those alone, with the reason."""
     names, units = list(model.parameters), [parameter.unit for parameter in model.parameters.values()]
     rows = np.arange(bound.n_rows)
     selected = bound.select([rows])
     if not selected.well_defined()[0]:
         loose = bound.unidentifiable() or range(len(names))
         found = {names[i]: Excitation(units[i], np.nan, np.inf) for i in loose}
-        return found, f"the motion that would show {', '.join(found)} is missing, or moves with another"
+        return (
+            found,
+            f"{', '.join(found)}: not excited by this motion, or only in combination; record another",
+        )
     estimates = selected.fit()[0]
     errors = np.sqrt(np.diag(jackknife_covariance(bound, rows)))
     relative = np.divide(errors, np.abs(estimates), out=np.full(len(names), np.inf), where=estimates != 0.0)

@@ -16,13 +16,16 @@ __all__ = ["Callback", "Method", "Progress", "report", "within"]
 
 @dataclass(frozen=True)
 class Progress:
-    """How far an identification has come.
+    """Progress of an identification.
 
     Parameters
     ----------
-    stage : what is being done
-    fraction : of the whole work that is done, 0 to 1; it never falls
-    note : what has been found so far, or empty
+    stage : str
+        Name of the current stage.
+    fraction : float
+        Completed fraction of the whole work, 0 to 1; it never falls.
+    note : str, optional
+        Intermediate finding, or empty.
     """
 
     stage: str
@@ -42,15 +45,15 @@ class Method(Protocol):
 
     @property
     def criteria(self) -> Settings:
-        """Settings of the evaluation: what judges a simulation, and where it starts."""
+        """Settings of the evaluation: weights, thresholds and initial state."""
 
     @property
     def needs_all_signals(self) -> bool:
-        """Whether the method evaluates the equations at each row, so that every signal in them must be there."""
+        """True if the method evaluates the equations at each row and needs every signal in them."""
 
     @property
     def uses(self) -> tuple[str, ...]:
-        """Names of the criteria that the method, or its evaluation, depends on."""
+        """Names of the criteria that the method or its evaluation uses."""
 
     def options(self) -> Mapping[str, Any]:
         """The method's own settings, ready for JSON."""
@@ -60,19 +63,49 @@ class Method(Protocol):
 
         Parameters
         ----------
-        seed : of all that is random
-        callback : called with the `Progress` now and then
+        dataset : Dataset
+        seed : int
+            Seed of all random numbers.
+        callback : callable, optional
+            Called with a `Progress` at every stage.
+
+        Returns
+        -------
+        Estimate
         """
 
 
 def report(callback: Callback | None, stage: str, fraction: float, note: str = "") -> None:
-    """Report progress, if somebody listens."""
+    """Call the callback, if there is one, with a `Progress`.
+
+    Parameters
+    ----------
+    callback : callable, optional
+    stage : str
+    fraction : float
+    note : str, optional
+        Fields of the `Progress`.
+    """
     if callback is not None:
         callback(Progress(stage, fraction, note))
 
 
 def within(callback: Callback | None, low: float, high: float, prefix: str = "") -> Callback | None:
-    """The callback of a part of the work, which takes it from one fraction to another."""
+    """Callback of a part of the work.
+
+    Parameters
+    ----------
+    callback : callable, optional
+        Callback of the whole work.
+    low, high : float
+        Fractions of the whole work at which the part begins and ends.
+    prefix : str, optional
+        Text before the stages of the part.
+
+    Returns
+    -------
+    callable or None
+    """
     if callback is None:
         return None
     return lambda x: callback(Progress(prefix + x.stage, low + (high - low) * x.fraction, x.note))

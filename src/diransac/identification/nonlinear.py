@@ -1,7 +1,7 @@
 """Nonlinear least squares of the accelerations, for models that are not affine in their parameters.
 
-The error is that of the predicted acceleration, not that of the equation: equations can be multiplied by any function
-of the parameters, and their error vanishes wherever that function does; an acceleration's cannot.
+The error is that of the predicted acceleration, not that of the equation: an equation can be multiplied by any function
+of the parameters, and its error vanishes with that function; the error of an acceleration does not.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from diransac.identification.estimators import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from diransac.data.dataset import Dataset, Segment
+    from diransac.data.dataset import Dataset
+    from diransac.data.segment import Segment
     from diransac.model import Model, Parameter
     from diransac.simulation.compiler import Map
 
@@ -37,7 +38,7 @@ _ROWS_FOR_WHOLE = 2000
 # Evaluated together: bounds the memory, whatever the number of sets.
 _ROWS_AT_A_TIME = 300_000
 _CONVERGED = 1e-14
-# Errors whose squares could not be summed: a lane that has one is nowhere to go.
+# Errors whose squares overflow in a sum: a lane with one has diverged.
 _HUGE = 1e140
 # Marquardt's damping at the start, and its bounds.
 _DAMPING = (1e-3, 1e-12, 1e12)
@@ -49,18 +50,24 @@ _LOG_BOUND = 27.6
 class NonlinearLeastSquares:
     """Least squares of ``(a - a_model(q, v, u, p)) / rms(a)`` within the parameters' bounds.
 
-    No starting value is asked for: ``n_starts`` points spread over six decades, or over the bounds, are evaluated on
-    the rows to be fitted, and the best few are followed by Levenberg and Marquardt's method; where the model is affine
-    in its parameters, the solution of the linear regression is followed, too.
+    No starting value is required: ``n_starts`` points spread over six decades, or over the bounds, are evaluated on
+    the rows to be fitted, and the best few are refined by Levenberg and Marquardt's method.  Where the model is affine
+    in its parameters, the solution of the linear regression is refined, too.
 
     Parameters
     ----------
-    n_starts : starting points evaluated
-    n_followed : of them, those that are followed
-    max_steps : steps of each
-    min_eigenvalue : as in `OrdinaryLeastSquares`, for the Jacobian at the fit of the whole log
+    n_starts : int, optional
+        Number of starting points that are evaluated.
+    n_followed : int, optional
+        Number of starting points that are refined.
+    max_steps : int, optional
+        Largest number of steps of each.
+    min_eigenvalue : float, optional
+        As in `OrdinaryLeastSquares`, for the Jacobian at the fit of the whole log.
 
-    References: Levenberg 1944; Marquardt 1963; Transtrum and Sethna 2012 for the damping.
+    References
+    ----------
+    Levenberg 1944; Marquardt 1963; Transtrum and Sethna 2012 for the damping.
     """
 
     n_starts: int = 200
@@ -74,7 +81,7 @@ class NonlinearLeastSquares:
 
 
 class _BoundNonlinear:
-    """Accelerations of the usable rows, and the model that predicts them."""
+    """Measured accelerations of the usable rows, and the compiled model of them."""
 
     def __init__(self, settings: NonlinearLeastSquares, dataset: Dataset) -> None:
         self._settings, self._layout = settings, dataset.layout
@@ -103,7 +110,7 @@ class _BoundNonlinear:
         return _SelectedRows(self, row_sets)
 
     def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
-        """Whether the Jacobian at the fit of all rows has full rank in each set of rows."""
+        """Mask of the sets of rows in which the Jacobian at the fit of all rows has full rank."""
         gram = np.array([self._blocks[rows].sum(axis=0) for rows in row_sets])
         return np.asarray(smallest_eigenvalue(gram) > self._settings.min_eigenvalue)
 
@@ -142,7 +149,7 @@ class _BoundNonlinear:
         return self._chart.to_parameters(free.reshape(n_sets, -1, self._n_p)[np.arange(n_sets), winner])
 
     def _descend(self, rows: IntArray, free: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Levenberg-Marquardt on every lane, each until it gains nothing more: free coordinates and sums of squares."""
+        """Levenberg-Marquardt on every lane until convergence: free coordinates and sums of squares."""
         free, damping, active = free.copy(), np.full(len(free), _DAMPING[0]), np.arange(len(free))
         errors, J = self._errors(rows, free)
         costs = np.square(errors).sum(axis=1)

@@ -30,7 +30,7 @@ _FEW_INLIERS = 0.5
 
 @dataclass(frozen=True)
 class _Provenance:
-    """The plain part of a result's JSON."""
+    """Provenance of a result in its JSON."""
 
     method: str
     seed: int
@@ -42,7 +42,7 @@ class _Provenance:
 
 @dataclass(frozen=True)
 class _Derived:
-    """Figures of a result's JSON that follow from the rest, for programs that read it."""
+    """Derived figures in a result's JSON, for programs that read it."""
 
     units: Mapping[str, str]
     standard_errors: Values
@@ -52,19 +52,33 @@ class _Derived:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Parameters of a model with everything that is needed to judge and repeat them.
+    """Parameters of a model, with their evaluation and the provenance that repeats them.
 
-    Two results are equal if all of it is.  A result serves as a plant: it has a ``model`` and its ``parameters``.
+    Two results are equal if their JSON is.  A result can be used wherever a plant is required: it has a ``model`` and
+    its ``parameters``.
 
     Parameters
     ----------
-    model : the model, equations included
-    method, seed, settings, options : how it was made; ``options`` are the method's own settings
-    estimate : parameters, covariance, and what the method found beside them
-    evaluation : agreement of a simulation of every log with the measured signals
-    logs : the logs that it was made from
-    notes : findings on the way, a sentence each
-    bandwidth_sensitivity : name -> relative change at half and at twice the differentiating filter's bandwidth
+    model : Model
+        Identified model, equations included.
+    method : str
+        Name of the method.
+    seed : int
+        Seed of all random numbers.
+    settings : Settings
+        Criteria of the method.
+    estimate : Estimate
+        Parameters, covariance, and diagnosis.
+    evaluation : Evaluation
+        Agreement of a simulation of every log with the measured signals.
+    logs : tuple of LogSummary
+        Provenance and scores of each log.
+    notes : tuple of str, optional
+        Findings, a sentence each.
+    options : mapping of str to object, optional
+        The method's own settings.
+    bandwidth_sensitivity : mapping of str to (float, float), optional
+        Relative change of each parameter at half and at twice the differentiating filter's bandwidth; None without one.
     """
 
     model: Model
@@ -115,7 +129,7 @@ class Result:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance ``(n_p, n_p)`` of `parameters`; infinite variances where the logs do not determine one."""
+        """Covariance ``(n_p, n_p)`` of `parameters`; infinite variances where one is not identifiable."""
         if self.layout.is_shared:
             return self.estimate.covariance
         known = np.isfinite(np.diag(self.estimate.covariance))
@@ -131,7 +145,17 @@ class Result:
         return dict(zip(self.model.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """``(low, high)`` of each parameter, by Student's t.
+        """Confidence interval of each parameter by Student's t.
+
+        Parameters
+        ----------
+        level : float, optional
+            Confidence level, between 0 and 1.
+
+        Returns
+        -------
+        dict of str to (float, float)
+            Lower and upper limit in the parameter's unit.
 
         Raises
         ------
@@ -165,7 +189,7 @@ class Result:
 
     @property
     def n_fitted(self) -> int:
-        """Observations that the parameters were fitted to: a sample, or a set of inliers."""
+        """Number of observations that the parameters were fitted to: of a sample, or of a set of inliers."""
         return self.estimate.n_fitted
 
     @property
@@ -175,17 +199,17 @@ class Result:
 
     @property
     def iterations(self) -> int:
-        """Samples drawn, the paper's k."""
+        """Number of samples drawn, the paper's k."""
         return self.estimate.iterations
 
     @property
     def n_hypotheses(self) -> int:
-        """Hypotheses judged, refits included."""
+        """Number of hypotheses evaluated, refits included."""
         return self.estimate.n_hypotheses
 
     @property
     def rejected(self) -> Mapping[str, int]:
-        """Hypotheses that went no further, by reason."""
+        """Number of rejected hypotheses by reason."""
         return self.estimate.rejected
 
     @property
@@ -200,17 +224,17 @@ class Result:
 
     @property
     def fit_error(self) -> float:
-        """Eq. (2) of the parameters (its square sibling for DIRANSAC); NaN if nothing could be simulated."""
+        """Fit error of the parameters, eq. (2), or its mean square for DIRANSAC; NaN if nothing could be simulated."""
         return self.evaluation.fit_error
 
     @property
     def inlier_fraction(self) -> float:
-        """Inliers over the rows that count."""
+        """Number of inliers over the number of rows that count."""
         return self.evaluation.inlier_fraction
 
     @property
     def inliers(self) -> BoolArray:
-        """Inliers ``(N,)`` over the rows of the logs that were given, log after log."""
+        """Inliers ``(N,)`` among the rows of the given logs, log after log."""
         return self.evaluation.inliers
 
     # ------------------------------------------------------------------ logs
@@ -243,7 +267,16 @@ class Result:
 
     @classmethod
     def from_dict(cls, data: object) -> Result:
-        """The result that `to_dict` wrote.
+        """Result from the mapping that `to_dict` returned.
+
+        Parameters
+        ----------
+        data : object
+            Decoded JSON.
+
+        Returns
+        -------
+        Result
 
         Raises
         ------
@@ -272,9 +305,16 @@ class Result:
         return cls(model, estimate=estimate, evaluation=evaluation, settings=settings, **vars(plain))
 
     def save(self, path: str | Path) -> None:
-        """Write JSON, whole or not at all.
+        """Write the result as JSON, atomically.
 
-        Raises ResultError: it cannot be written there.
+        Parameters
+        ----------
+        path : str or Path
+
+        Raises
+        ------
+        ResultError
+            The file cannot be written.
         """
         try:
             write_text(path, self._text())
@@ -283,9 +323,20 @@ class Result:
 
     @classmethod
     def load(cls, path: str | Path) -> Result:
-        """The result that `save` wrote.
+        """Result from a file that `save` wrote.
 
-        Raises ResultError: there is no such file, or it holds no result; it names the file.
+        Parameters
+        ----------
+        path : str or Path
+
+        Returns
+        -------
+        Result
+
+        Raises
+        ------
+        ResultError
+            There is no such file, or it does not contain a result; the message names the file.
         """
         try:
             return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
@@ -337,7 +388,7 @@ class Result:
         return "; ".join(parts)
 
     def _diagnosed(self) -> list[str]:
-        """What is wrong with the log and with the model, where it is known."""
+        """Tables of the logs, and of noise, outliers and unexplained accelerations."""
         lines = [] if len(self.logs) == 1 else ["", *aligned(self._log_lines())]
         return lines if self.diagnosis is None else [*lines, "", *aligned(self.diagnosis.lines(self.model.units)), ""]
 
@@ -370,7 +421,7 @@ class Result:
         if self.iterations and wanted is not None and self.inlier_fraction < wanted:
             lines.append(f"! the search ended short of the {100 * wanted:.3g} % inliers that it was to reach")
         if not np.isfinite(self.covariance).all():
-            lines.append(f"! intervals are unknown: {self.n_fitted} fitted rows are too few to tell")
+            lines.append(f"! intervals are unknown: {self.n_fitted} fitted rows are too few for a jackknife")
         return lines
 
     def _warnings_of_diagnosis(self, found: Diagnosis) -> list[str]:

@@ -1,12 +1,14 @@
 """Samples without replacement, in which sample ``k`` depends on ``(seed, k)`` alone.
 
-Sample ``k`` is the beginning of a pseudo-random permutation of the rows that ``(seed, k)`` keys.  No state is carried
-from one sample to the next, a sample is extended by reading on, and integers alone are involved, so every machine draws
-the same.
+Sample ``k`` is the beginning of a pseudo-random permutation of the rows whose key is ``(seed, k)``.  No state is
+carried from one sample to the next, a sample is extended by reading on, and all arithmetic is integer, so that samples
+are the same on every machine.
 
-References: Luby and Rackoff 1988 (a Feistel network of random round functions is a random permutation); Black and
-Rogaway 2002 (cycle walking to a domain of any size); Steele, Lea, Flood 2014 (the SplitMix64 mixer); Salmon et al. 2011
-(counter-based random numbers).
+References
+----------
+Luby and Rackoff 1988 (a Feistel network of random round functions is a random permutation); Black and Rogaway 2002
+(cycle walking to a domain of any size); Steele, Lea, Flood 2014 (the SplitMix64 mixer); Salmon et al. 2011 (counter-
+based random numbers).
 """
 
 from __future__ import annotations
@@ -25,22 +27,29 @@ __all__ = ["sample_rows"]
 
 _Words = npt.NDArray[np.uint64]
 
-# Six rounds leave no trace in pairs of places (chi-square) from 30 rows on; over fewer rows it takes twelve.
+# Six rounds pass a chi-square test of pairs of positions from 30 rows on; fewer rows need twelve.
 _ROUNDS, _ROUNDS_OF_FEW, _FEW_BITS = 6, 12, 3
 _GOLDEN = 0x9E3779B97F4A7C15
 
 
 def sample_rows(seed: int, iterations: npt.ArrayLike, n_rows: int, start: int, stop: int) -> IntArray:
-    """Places ``start`` to ``stop`` of the keyed permutations of ``range(n_rows)``.
+    """Positions ``start`` to ``stop`` of the keyed permutations of ``range(n_rows)``.
 
     Parameters
     ----------
-    seed : any integer
-    iterations : (n,)   k of each sample
-    n_rows : length of the permutation
-    start, stop : places read, ``0 <= start <= stop <= n_rows``
+    seed : int
+        Any integer.
+    iterations : (n,) array_like
+        Index k of each sample.
+    n_rows : int
+        Length of the permutation.
+    start, stop : int
+        Positions that are read, ``0 <= start <= stop <= n_rows``.
 
-    Returns (n, stop - start): row ``i`` holds distinct rows of the log, and no place read elsewhere repeats them.
+    Returns
+    -------
+    (n, stop - start) int array
+        Distinct rows of the log for each sample; other positions of the same permutation do not repeat them.
     """
     k = np.atleast_1d(np.asarray(iterations, dtype=np.uint64))
     half = np.uint64(max(1, -(-(n_rows - 1).bit_length() // 2)))

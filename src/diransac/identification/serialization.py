@@ -49,7 +49,7 @@ class _Form:
 
 
 def _encode_number(x: float) -> float | str:
-    """JSON has no infinity and no NaN."""
+    """A number; as text where JSON has none: infinity and NaN."""
     return float(x) if np.isfinite(x) else str(float(x))
 
 
@@ -117,20 +117,39 @@ Masks = Annotated[Mapping[str, BoolArray], _MASK.by_name()]
 
 
 def dump(value: Any) -> Any:
-    """A dataclass as a mapping that JSON can hold; `load` reads it back."""
+    """A dataclass as a mapping that JSON can hold; `load` reads it back.
+
+    Parameters
+    ----------
+    value : dataclass
+
+    Returns
+    -------
+    dict
+    """
     adapter: Any = _adapter(type(value))  # type: ignore[arg-type]  # a class is hashable
     return adapter.dump_python(value, mode="json")
 
 
 def load(kind: type[T], data: Mapping[str, Any]) -> T:
-    """The dataclass of that kind that `dump` wrote, from the keys that are its fields.
+    """Dataclass from a mapping that `dump` returned; keys that are not fields are ignored.
+
+    Parameters
+    ----------
+    kind : type
+        Class of the dataclass.
+    data : mapping of str to object
+
+    Returns
+    -------
+    dataclass of that class
 
     Raises
     ------
     KeyError
         A key is missing.
     ValueError
-        A key holds something else; one line says which.
+        The value of a key is of another type; the message names the key.
     """
     from pydantic import ValidationError
 

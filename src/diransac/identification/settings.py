@@ -1,4 +1,4 @@
-"""What can be chosen about an identification, with the paper's symbols."""
+"""`Settings` of the RANSAC methods and of the evaluation, with the paper's symbols."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ JUDGING = ("inlier_thresholds", "min_inlier_signals", "error_weights")
 """Settings of the fit error and the inliers, which every method's evaluation has."""
 
 SIMULATION = ("integrator", "substeps", "initial_state")
-"""Settings of the simulation that is judged."""
+"""Settings of the simulation that is evaluated."""
 
 EXECUTION = ("threads", "batch_size")
-"""Settings that change no answer; every method accepts them."""
+"""Settings on which results do not depend; every method accepts them."""
 
 
 @dataclass(frozen=True)
@@ -33,27 +33,47 @@ class Settings:
 
     Parameters
     ----------
-    sample_size : s, observations in a sample at least
-    max_iterations : k_m, samples drawn at most
-    stop_inlier_fraction : f_I,t, stop once the stored model has this fraction of inliers; None forces all iterations
-    inlier_thresholds : epsilon by signal, in its unit; an error is an inlier's if strictly below.  A signal that is not
-        named has 0, which switches it off.  None: a fifth of each signal's spread in the log
-    min_inlier_signals : xi, signals of an observation that must be inliers; None: half of those with a threshold
-    error_weights : w by signal in eq. (2), one over its unit; a signal that is not named has 0.  None: 1 over the
-        spread for velocities, 0.1 over it for accelerations (Table IV's ratio), coordinates only where the log has no
-        velocity of theirs
-    acceptance_weights : nu = (nu_e, nu_f) of eq. (3)
-    refit : "inliers" (Algorithm 1, lines 25-31) or "none"
-    integrator : "rk4", "euler" or "semi-implicit-euler"
-    substeps : integration steps per sample
-    initial_state : Y_0; "first" (the paper's: the first row), "robust" (the same, but a first sample far from the line
-        through the first seven gives way to it), or values by name, which replace those of the first row
-    threads : threads of the simulation; None: one a core, one in a worker process (`simulate.default_threads`).  Never
-        changes an answer
-    batch_size : hypotheses simulated at once.  Never changes an answer
+    sample_size : int, optional
+        Smallest number of observations in a sample (the paper's s).
+    max_iterations : int, optional
+        Largest number of samples, k_m.
+    stop_inlier_fraction : float, optional
+        Fraction of inliers of the stored model that ends the search, f_I,t; None forces all iterations.
+    inlier_thresholds : mapping of str to float, optional
+        Threshold epsilon of each signal in its unit; an error strictly below it is an inlier's.  A signal that is not
+        named has 0, which switches it off.  None: a fifth of each signal's spread in the log.
+    min_inlier_signals : int, optional
+        Number of signals of an observation that must be inliers, xi; None: half of those with a threshold.
+    error_weights : mapping of str to float, optional
+        Weight w of each signal in eq. (2), one over its unit; a signal that is not named has 0.  None: 1 over the
+        spread for velocities, 0.1 over it for accelerations (Table IV's ratio), coordinates only where their velocity
+        is not measured.
+    acceptance_weights : (float, float), optional
+        Weights nu = (nu_e, nu_f) of eq. (3).
+    refit : str, optional
+        Refit of improving hypotheses: to their "inliers" (Algorithm 1, lines 25-31) or "none".
+    integrator : str, optional
+        "rk4", "euler" or "semi-implicit-euler".
+    substeps : int, optional
+        Integration steps per sample.
+    initial_state : str or mapping of str to float, optional
+        Rule of the initial state Y_0: "first" (the paper's: the first row), "robust" (the first row, in which a sample
+        far from the line through the first seven is replaced by the line's value), or values by name, which replace
+        those of the first row.
+    threads : int, optional
+        Number of threads of the simulation; None: one per core, one in a worker process
+        (`simulation.default_threads`).  Results do not depend on it.
+    batch_size : int, optional
+        Number of hypotheses simulated at once.  Results do not depend on it.
 
-    Raises SettingsError: a value has no meaning.
-    References: Dimmig et al. 2023, Algorithm 1 and Table IV.
+    Raises
+    ------
+    SettingsError
+        A value is out of range, or of another type.
+
+    References
+    ----------
+    Dimmig et al. 2023, Algorithm 1 and Table IV.
     """
 
     sample_size: int = 75
@@ -124,7 +144,19 @@ class Settings:
     def from_dict(cls, data: Mapping[str, Any]) -> Settings:
         """Settings from a mapping, such as a TOML table or `to_dict`'s.
 
-        Raises SettingsError: an unknown name; it lists those there are.
+        Parameters
+        ----------
+        data : mapping of str to object
+            Settings by name.
+
+        Returns
+        -------
+        Settings
+
+        Raises
+        ------
+        SettingsError
+            A name is unknown; the message lists all.  A value is out of range.
         """
         known = [f.name for f in dataclasses.fields(cls)]
         unknown = [name for name in data if name not in known]
@@ -138,12 +170,20 @@ class Settings:
 
 
 def check_used(settings: Settings, used: Collection[str], method: str) -> None:
-    """Refuse settings that a method has no use for.
+    """Raise for settings that a method does not use.
+
+    Parameters
+    ----------
+    settings : Settings
+    used : collection of str
+        Names of the settings that the method uses.
+    method : str
+        Name of the method in the message.
 
     Raises
     ------
     SettingsError
-        A setting that is not in ``used`` differs from its default; it is named.
+        A setting that is not in ``used`` differs from its default; the message names it.
     """
     unused = [name for name in settings.changed() if name not in (*used, *EXECUTION)]
     if unused:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["N_BLOCKS", "jackknife_covariance"]
 
 
-# Few and long: intervals cover what they promise while residuals are correlated over up to an eighth of a stretch
+# Few and long: intervals have their nominal coverage while residuals are correlated over up to an eighth of a stretch
 # (tests/test_uncertainty.py), 0.3 s of a log of 25 s; with 30 stretches it would be 0.1 s.
 N_BLOCKS = 10
 
@@ -22,17 +22,26 @@ N_BLOCKS = 10
 def jackknife_covariance(estimator: BoundEstimator, rows: IntArray) -> FloatArray:
     """Covariance ``(n_p, n_p)`` of an estimate from ``rows``, by leaving out 10 stretches of time in turn.
 
-    Residuals of a real machine are correlated over many samples, which the textbook formula takes for information; a
-    stretch of time that is left out takes its correlation with it.  What it cannot show is a bias that every stretch
-    shares, such as that of noise in the regressors.
+    Residuals of real machines are correlated over many samples, for which the textbook formula is too optimistic; a
+    stretch that is left out contains its correlations.  A bias that all stretches share, such as that of noise in the
+    regressors, is not included.
 
     Parameters
     ----------
-    rows : (n,)   usable rows that the estimate was fitted to, ascending
+    estimator : BoundEstimator
+    rows : (n,) int array
+        Usable rows that the estimate was fitted to, ascending.
 
-    Returns infinite variances where leaving out a stretch leaves a parameter unidentifiable.
-    References: Künsch 1989, "The jackknife and the bootstrap for general stationary observations"; Busing, Meijer, van
-    der Leeden 1999, "Delete-m jackknife for unequal m".
+    Returns
+    -------
+    (n_p, n_p) array
+        Infinite where a parameter is not identifiable without one of the stretches.
+
+
+    References
+    ----------
+    Künsch 1989, "The jackknife and the bootstrap for general stationary observations"; Busing, Meijer, van der Leeden
+    1999, "Delete-m jackknife for unequal m".
     """
     groups = [g for g in np.array_split(rows, min(N_BLOCKS, len(rows))) if len(g)]
     fits = estimator.fit_without(groups, rows)

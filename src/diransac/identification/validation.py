@@ -1,4 +1,4 @@
-"""How well a plant predicts a log that it was not identified from: open-loop simulation at several horizons."""
+"""Validation: open-loop prediction of logs by a plant at several horizons; leave-one-log-out cross-validation."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.data.dataset import Dataset, Segment, as_logs
+from diransac.data import preprocessing
+from diransac.data.dataset import Dataset, as_logs
 from diransac.data.log import Log
+from diransac.data.segment import Segment
 from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.identification.estimate import Resolution
 from diransac.identification.evaluation import Simulation
@@ -35,12 +37,18 @@ class HorizonScores:
 
     Parameters
     ----------
-    horizon : s after which the simulation restarts from the measured state; infinite: never
-    windows : simulations that were scored
-    diverged : of them, those that became infinite; they leave every score infinitely bad
-    rmse : root of the mean squared error, the signal's unit
-    fit_percent : ``100 (1 - |y - y_sim| / |y - mean(y)|)``
-    r_squared : ``1 - sum (y - y_sim)^2 / sum (y - mean(y))^2``
+    horizon : float
+        Time after which the simulation restarts from the measured state, s; infinite: never.
+    windows : int
+        Number of simulations that were scored.
+    diverged : int
+        Number of simulations that became infinite, which makes the scores infinite.
+    rmse : mapping of str to float
+        Root mean squared error of each signal, its unit.
+    fit_percent : mapping of str to float
+        ``100 (1 - |y - y_sim| / |y - mean(y)|)``.
+    r_squared : mapping of str to float
+        ``1 - sum (y - y_sim)^2 / sum (y - mean(y))^2``.
     """
 
     horizon: float
@@ -53,14 +61,20 @@ class HorizonScores:
 
 @dataclass(frozen=True)
 class Validation:
-    """Scores at several horizons, shortest first; ``rmse`` and the like are those of the horizon that was asked for.
+    """Scores at several horizons, shortest first; `rmse`, `fit_percent` and `r_squared` are those of the requested one.
 
     Parameters
     ----------
-    source : how messages name the log
-    units : unit of each signal
-    asked : index of the horizon that was asked for; the whole log if none was
-    notes : what was found in the log
+    source : str
+        Names of the logs in messages.
+    units : mapping of str to str
+        Unit of each signal.
+    horizons : tuple of HorizonScores
+        Scores of each horizon.
+    asked : int
+        Index of the requested horizon; of the whole log if none was requested.
+    notes : tuple of str, optional
+        Findings in the logs, a sentence each.
     """
 
     source: str
@@ -112,27 +126,33 @@ def validate(
     integrator: str | None = None,
     substeps: int | None = None,
 ) -> Validation:
-    """Open-loop prediction of logs by a plant (a `Plant`, or a `Result`), as far as its model goes.
+    """Scores of the open-loop prediction of logs by a plant.
 
     Parameters
     ----------
-    logs : one log, or several, whose errors are pooled.  A per-log parameter takes its own value in a log that the
-        result was identified from, and the mean of these in others
-    horizon : s; the simulation restarts from the measured state after each.  None: two that suit the length of the
-        logs.  The whole of each log from its first complete state on is always scored, too
-    integrator, substeps : as in `Settings`; None: those of the method that identified a result, else "rk4" and 1
+    plant : Plant or Result
+        Model with its parameters.
+    logs : Log or iterable of Log
+        One log, or several, whose errors are pooled.  A per-log parameter takes its own value in a log that the result
+        was identified from, and the mean of these in others.
+    horizon : float, optional
+        Time after which the simulation restarts from the measured state, s.  None: two that suit the length of the
+        logs.  The whole of each log from its first complete state on is always scored, too.
+    integrator : str, optional
+    substeps : int, optional
+        As in `Settings`; None: those of the identification of a result, else "rk4" and 1.
 
     Returns
     -------
     Validation
-        Scores by signal.  The first row of a window, whose state is the measured one, is not scored.
+        Scores by signal.  The first row of a window, whose state is measured, is not scored.
 
     Raises
     ------
     LogError
         A log lacks an input or an initial state.
     SettingsError
-        An argument is of another kind, or a horizon shorter than a sample.
+        An argument is of another type, or a horizon is shorter than a sample.
     """
     several = as_logs(logs)
     if horizon is not None and not isinstance(horizon, (int, float, np.number)):
@@ -262,9 +282,12 @@ class CrossValidation:
 
     Parameters
     ----------
-    sources : how messages name each log
-    results : of all logs but that one; or why there is none
-    validations : prediction of that log; or why there is none
+    sources : tuple of str
+        Name of each log in messages.
+    results : tuple of Result or str
+        Result of all logs but that one; or the reason why there is none.
+    validations : tuple of Validation or str
+        Validation with that log; or the reason why there is none.
     """
 
     sources: tuple[str, ...]
@@ -302,7 +325,7 @@ class CrossValidation:
             estimates = ["" if isinstance(result, str) else f"{result.parameters[n]:.5g}" for n in parameters]
             errors = ["" if isinstance(found, str) else f"{found.rmse.get(n, np.nan):.4g}" for n in signals]
             rows.append([source, *estimates, *errors])
-            remarks += [f"{source}: {x}" for x in (result, found) if isinstance(x, str)]
+            remarks += [x if x.startswith(source) else f"{source}: {x}" for x in (result, found) if isinstance(x, str)]
         return "\n".join([*aligned(rows), *remarks])
 
 
@@ -315,20 +338,32 @@ def cross_validate(
     progress: Callback | None = None,
     **arguments: Any,
 ) -> CrossValidation:
-    """Leave-one-log-out cross-validation: identify from all logs but one, and predict that one, for each in turn.
+    """Leave-one-log-out cross-validation: prediction of each log by the model identified from the others.
 
-    A per-log parameter of the log that is left out takes the mean over the others.
+    A per-log parameter of the log that is left out is the mean over the others.
 
     Parameters
     ----------
-    logs : two or more
-    method, progress, arguments : as `identify` has them
-    horizon : s, as `validate` has it
+    model : Model
+    logs : iterable of Log
+        Two or more.
+    method : str or Method, optional
+        As in `identify`.
+    horizon : float, optional
+        As in `validate`, s.
+    progress : callable, optional
+        Called with a `Progress` at every stage.
+    arguments : object
+        Other arguments of `identify`.
+
+    Returns
+    -------
+    CrossValidation
 
     Raises
     ------
     SettingsError
-        There are fewer than two logs, or an argument has no meaning.
+        There are fewer than two logs, or an argument is out of range.
     """
     several = as_logs(logs)
     if len(several) < 2:
@@ -346,6 +381,8 @@ def cross_validate(
             validations.append("no model of the other logs")
             continue
         try:
+            if arguments.get("differentiate"):
+                left_out = preprocessing.differentiate(left_out, model, arguments.get("bandwidth"))
             validations.append(validate(results[-1], left_out, horizon))
         except DiransacError as error:
             validations.append(str(error))

@@ -11,8 +11,9 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
-from diransac.data.dataset import Dataset, Segment
+from diransac.data.dataset import Dataset
 from diransac.data.log import Log
+from diransac.data.segment import Segment
 from diransac.errors import LogError, ResultError, SettingsError
 from diransac.identification.estimate import Diagnosis, LogSummary
 from diransac.identification.evaluation import Scoring, Simulation, as_estimated, choose_scoring, judged_signals

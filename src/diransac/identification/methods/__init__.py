@@ -1,6 +1,6 @@
 """Identification methods, each a frozen object with its own settings; `METHODS` names them.
 
-A new method is a file here and a line in the registry: its name, and the function that makes it from `Settings`.
+A new method is a file here and a line in the registry: its name, and the function that returns it from `Settings`.
 """
 
 from __future__ import annotations
@@ -30,16 +30,25 @@ METHODS = tuple(_REGISTRY)
 
 DEFAULT = "lo-diransac"
 WITH_ESTIMATOR = ("diransac", "i-diransac")
-"""Methods that take an estimator inside."""
+"""Names of the methods with an estimator inside."""
 
 
 def factory(name: str) -> Callable[..., Method]:
-    """The function that makes a method from `Settings`.
+    """Function that returns a method from `Settings`.
+
+    Parameters
+    ----------
+    name : str
+        Name of the method, one of `METHODS`.
+
+    Returns
+    -------
+    callable
 
     Raises
     ------
     SettingsError
-        There is no method of that name; it lists those there are.
+        There is no method of that name; the message lists all.
     """
     if name not in _REGISTRY:
         raise SettingsError(f'there is no method "{name}"; there are {", ".join(METHODS)}')
@@ -49,12 +58,32 @@ def factory(name: str) -> Callable[..., Method]:
 
 
 def default_options(name: str) -> Mapping[str, Any]:
-    """The default values of a method's own settings; none of a method that is not in the registry."""
+    """Default values of a method's own settings; empty for a method that is not in the registry.
+
+    Parameters
+    ----------
+    name : str
+        Name of the method.
+
+    Returns
+    -------
+    mapping of str to object
+    """
     return factory(name)(Settings()).options() if name in _REGISTRY else {}
 
 
 def setting_names(name: str) -> tuple[str, ...]:
-    """Names of all settings of a method: its own, and those of `Settings` that it uses."""
+    """Names of all settings of a method: its own, and those of `Settings` that it uses.
+
+    Parameters
+    ----------
+    name : str
+        Name of the method, one of `METHODS`.
+
+    Returns
+    -------
+    tuple of str
+    """
     method = factory(name)(Settings())
     return tuple(dict.fromkeys((*method.options(), *method.uses, *EXECUTION)))
 
@@ -62,10 +91,23 @@ def setting_names(name: str) -> tuple[str, ...]:
 def configured(name: str, values: Mapping[str, Any], **of_search: Any) -> Method:
     """A method with settings by name, its own or those of `Settings`.
 
+    Parameters
+    ----------
+    name : str
+        Name of the method, one of `METHODS`.
+    values : mapping of str to object
+        Settings by name.
+    of_search : object
+        Other arguments of the method, such as ``estimator``.
+
+    Returns
+    -------
+    Method
+
     Raises
     ------
     SettingsError
-        There is no such method or setting, or a value has no meaning.
+        There is no such method or setting, or a value is out of range.
     """
     own = default_options(name)
     options = {key: value for key, value in values.items() if key in own}

@@ -39,14 +39,16 @@ class LeastSquares:
 
     Parameters
     ----------
-    estimator : `OrdinaryLeastSquares` (default), `TotalLeastSquares`, `NonlinearLeastSquares`, or any scikit-learn
-        linear regressor
-    criteria : settings of the evaluation: `Settings` of which those of a search are refused
+    estimator : object, optional
+        `OrdinaryLeastSquares` (default), `TotalLeastSquares`, `NonlinearLeastSquares`, or any scikit-learn linear
+        regressor.
+    criteria : Settings, optional
+        Settings of the evaluation; settings of a search are refused.
 
     Raises
     ------
     SettingsError
-        A setting has no use here, or the estimator is none.
+        A setting is not used by least squares, or the estimator is not an estimator.
     """
 
     estimator: object = field(default_factory=OrdinaryLeastSquares)
@@ -69,16 +71,28 @@ class LeastSquares:
         return self.estimator  # type: ignore[return-value]  # as_estimator made it one
 
     def options(self) -> Mapping[str, Any]:
-        """None beside the estimator."""
+        """An empty mapping: the estimator has the settings."""
         return {}
 
     def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
         """Parameters by least squares of all rows.
 
+        Parameters
+        ----------
+        dataset : Dataset
+        seed : int
+            Not used.
+        callback : callable, optional
+            Called with a `Progress` at every stage.
+
+        Returns
+        -------
+        Estimate
+
         Raises
         ------
         IdentificationError
-            The dataset does not determine the parameters, or no finite ones are found.
+            A parameter is not identifiable from the dataset, or the solution is not finite.
         """
         report(callback, "fitting", 0.0)
         bound = bound_to(self._estimator, dataset)
@@ -107,26 +121,52 @@ def nonlinear(settings: Settings) -> LeastSquares:
 
 
 def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
-    """The estimator over the dataset.
+    """The estimator over a dataset.
+
+    Parameters
+    ----------
+    estimator : Estimator
+    dataset : Dataset
+
+    Returns
+    -------
+    BoundEstimator
 
     Raises
     ------
     IdentificationError
-        The dataset as a whole does not determine the parameters; they are named.
+        A parameter is not identifiable from the whole dataset; the message names it.
     """
     bound = estimator.bind(dataset)
     if bound.select([np.arange(bound.n_rows)]).well_defined()[0]:
         return bound
     names = [dataset.layout.names[i] for i in bound.unidentifiable()] or list(dataset.layout.names)
+    one, logs = len(names) == 1, "this log" if len(dataset.segments) == 1 else "these logs"
     raise IdentificationError(
-        f"{dataset.source}: the log does not determine {', '.join(names)}: the motion that would show "
-        f"{'it' if len(names) == 1 else 'them'} is missing or moves with another; record a livelier motion, or fix "
-        "parameters in the model"
+        f"{dataset.source}: {', '.join(names)} {'is' if one else 'are'} not identifiable from {logs}: the motion does "
+        f"not excite {'it' if one else 'them, or only in combination'}; record a motion that does, or fix "
+        f"{'it' if one else 'one of them'} in the model"
     )
 
 
 def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows: np.ndarray, **about: Any) -> Estimate:
-    """The estimate of parameters ``(n,)`` that were fitted to rows, with its jackknife covariance."""
+    """Estimate of fitted parameters, with its jackknife covariance.
+
+    Parameters
+    ----------
+    bound : BoundEstimator
+    dataset : Dataset
+    parameters : (n,) array
+        Each in its unit.
+    rows : (n_fitted,) int array
+        Usable rows that the parameters were fitted to, ascending.
+    about : object
+        Other fields of the estimate.
+
+    Returns
+    -------
+    Estimate
+    """
     return Estimate(
         parameters=dict(zip(dataset.layout.names, parameters.tolist(), strict=True)),
         covariance=jackknife_covariance(bound, rows),

@@ -1,16 +1,17 @@
-"""Algorithm 1: random minimal samples, simulated over all logs, judged by consensus, refitted to their inliers.
+"""Algorithm 1: random minimal samples, scored by simulation of all logs, refitted to their inliers.
 
 Samples do not depend on earlier results, so hypotheses are fitted and simulated a batch at a time ("speculate"); their
-scores are then walked in order exactly as the algorithm says ("replay"), and only a chain of refits runs on its own.
+scores are then walked in order exactly as in the algorithm ("replay"), and only a chain of refits runs on its own.
 The answer is that of the sequential algorithm, whatever the batch size.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -43,10 +44,10 @@ __all__ = [
     "Evaluator",
     "Hypothesis",
     "IDiransac",
+    "RansacMethod",
     "Score",
     "ScoredBatch",
     "SearchState",
-    "Variant",
     "search",
 ]
 
@@ -61,98 +62,123 @@ _SEARCH = ("sample_size", "max_iterations", "refit")
 
 @dataclass(frozen=True)
 class Score:
-    """A hypothesis' ``error`` (eq. (2) or its square sibling; infinite where it diverged) and ``inlier_fraction``."""
+    """Score of a hypothesis.
+
+    Parameters
+    ----------
+    error : float, optional
+        Eq. (2), or its mean square; infinite where the simulation diverged.
+    inlier_fraction : float, optional
+        Number of inliers over the number of rows that count.
+    """
 
     error: float = np.inf
     inlier_fraction: float = 0.0
 
 
-class Variant(Protocol):
-    """The parts in which DIRANSAC and I-DIRANSAC differ."""
-
-    @property
-    def name(self) -> str:
-        """Name of the method."""
-
-    @property
-    def criteria(self) -> Settings:
-        """Settings of the search."""
-
-    def errors(self, sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
-        """Model-fit error of every hypothesis."""
-
-    def improves(self, new: Score, best: Score) -> bool:
-        """Whether a hypothesis is worth more than a look (Algorithm 1, line 19)."""
-
-    def accepts(self, new: Score, best: Score) -> bool:
-        """Whether an improving hypothesis is stored (line 20)."""
-
-    def refits(self, *, stored: bool) -> bool:
-        """Whether an improving hypothesis hands its inliers to the next one (lines 25-31)."""
-
-    def is_finished(self, best: Score, stop_inlier_fraction: float | None) -> bool:
-        """Whether the stored model ends the search early (line 3)."""
-
-
 @dataclass(frozen=True)
-class _Ransac:
-    """The parts that both variants share: settings, the estimator inside, and the search.
+class RansacMethod(ABC):
+    """Algorithm 1; variants differ in which hypotheses improve, are stored, are refitted, and end the search.
 
     Parameters
     ----------
-    criteria : settings of the search and of the evaluation
-    estimator : inside the search; None: `OrdinaryLeastSquares`, or `NonlinearLeastSquares` where the model is not
-        affine in its parameters
+    criteria : Settings, optional
+        Settings of the search and of the evaluation.
+    estimator : object, optional
+        Estimator of a sample; None: `OrdinaryLeastSquares`, or `NonlinearLeastSquares` where the model is not affine in
+        its parameters.
 
     Raises
     ------
     SettingsError
-        A setting has no use here, or the estimator is none.
+        A setting is not used by the method, or the estimator is not an estimator.
     """
 
     criteria: Settings = field(default_factory=Settings)
     estimator: object = None
+
+    name: ClassVar[str]
+    uses: ClassVar[tuple[str, ...]]
+    squared_error: ClassVar[bool]
     needs_all_signals = True
 
+    def __post_init__(self) -> None:
+        check_used(self.criteria, self.uses, self.name)
+
     def options(self) -> Mapping[str, Any]:
-        """None beside the criteria and the estimator."""
+        """An empty mapping: the criteria and the estimator have the settings."""
         return {}
 
-    def _estimator(self, model: Model) -> Estimator:
-        if self.estimator is not None:
-            return as_estimator(self.estimator)
-        return NonlinearLeastSquares() if model.nonlinear_parameters else OrdinaryLeastSquares()
+    def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
+        """The best hypothesis of the search, with its jackknife covariance.
 
-    def _fit(self, variant: Variant, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
+        Parameters
+        ----------
+        dataset : Dataset
+        seed : int
+            Sample k depends on (seed, k) alone.
+        callback : callable, optional
+            Called with a `Progress` after every batch of hypotheses.
+
+        Returns
+        -------
+        Estimate
+
+        Raises
+        ------
+        IdentificationError
+            A parameter is not identifiable from the dataset, or no hypothesis was accepted.
+        LogError
+            There are fewer rows than in a sample, or an initial state is missing.
+        """
         settings, estimator = self.criteria, self._estimator(dataset.model)
         bound = bound_to(estimator, dataset)
-        evaluator = Evaluator(dataset, choose_scoring(dataset, settings), variant)
+        evaluator = Evaluator(dataset, choose_scoring(dataset, settings), self)
         if bound.n_rows < settings.sample_size:
             raise LogError(
                 f"{dataset.source}: {bound.n_rows} usable rows are fewer than sample_size = "
                 f"{settings.sample_size}; give a longer log or a smaller sample_size"
             )
-        found = search(variant, bound, evaluator, sample_rows, int(seed), callback)
+        found = search(self, bound, evaluator, sample_rows, int(seed), callback)
         assert found.best is not None
-        estimate = fitted(
+        return fitted(
             bound,
             dataset,
             found.best.parameters,
             np.sort(found.best.rows),
             estimator=name_of(estimator),
             resolution=Resolution(settings.integrator, settings.substeps),
-        )
-        return replace(
-            estimate,
+            squared_error=self.squared_error,
             iterations=found.iterations,
             n_hypotheses=found.n_hypotheses,
             stop_reason=found.stop_reason,
             rejected=dict(found.rejected),
         )
 
+    def _estimator(self, model: Model) -> Estimator:
+        if self.estimator is not None:
+            return as_estimator(self.estimator)
+        return NonlinearLeastSquares() if model.nonlinear_parameters else OrdinaryLeastSquares()
+
+    @abstractmethod
+    def improves(self, new: Score, best: Score) -> bool:
+        """Condition under which a hypothesis is considered further (Algorithm 1, line 19)."""
+
+    @abstractmethod
+    def accepts(self, new: Score, best: Score) -> bool:
+        """Condition under which an improving hypothesis is stored (line 20)."""
+
+    @abstractmethod
+    def refits(self, *, stored: bool) -> bool:
+        """Condition under which an improving hypothesis is refitted to its inliers (lines 25-31)."""
+
+    @abstractmethod
+    def is_finished(self, best: Score, stop_inlier_fraction: float | None) -> bool:
+        """Condition under which the stored hypothesis ends the search early (line 3)."""
+
 
 @dataclass(frozen=True)
-class IDiransac(_Ransac):
+class IDiransac(RansacMethod):
     """I-DIRANSAC: RMS error, eq. (3), a refit of the inliers of every improving hypothesis, a stop by inlier fraction.
 
     References
@@ -162,25 +188,7 @@ class IDiransac(_Ransac):
 
     name = "i-diransac"
     uses = (*_SEARCH, "stop_inlier_fraction", "acceptance_weights", *JUDGING, *SIMULATION)
-
-    def __post_init__(self) -> None:
-        check_used(self.criteria, self.uses, self.name)
-
-    def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
-        """The best hypothesis of the search.
-
-        Raises
-        ------
-        IdentificationError
-            The dataset does not determine the parameters, or no hypothesis was accepted.
-        LogError
-            There are fewer rows than a sample has, or an initial state is missing.
-        """
-        return self._fit(self, dataset, seed, callback)
-
-    def errors(self, sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
-        """Eq. (2)."""
-        return rms_error(sum_squares, n_rows, weights)
+    squared_error = False
 
     def improves(self, new: Score, best: Score) -> bool:
         """More inliers or less error."""
@@ -201,7 +209,7 @@ class IDiransac(_Ransac):
         return cost
 
     def refits(self, *, stored: bool) -> bool:
-        """Near misses, too."""
+        """Always: improving hypotheses that were not stored, too."""
         return True
 
     def is_finished(self, best: Score, stop_inlier_fraction: float | None) -> bool:
@@ -210,8 +218,8 @@ class IDiransac(_Ransac):
 
 
 @dataclass(frozen=True)
-class Diransac(_Ransac):
-    """DIRANSAC, the predecessor: mean squared error, the smallest is stored and refitted, the cap alone ends it.
+class Diransac(RansacMethod):
+    """DIRANSAC, the predecessor: the smallest mean squared error is stored and refitted, up to the iteration limit.
 
     References
     ----------
@@ -220,30 +228,23 @@ class Diransac(_Ransac):
 
     name = "diransac"
     uses = (*_SEARCH, *JUDGING, *SIMULATION)
+    squared_error = True
 
     def __post_init__(self) -> None:
         # It never ends early, which is what stop_inlier_fraction = None says.
         early = () if self.criteria.stop_inlier_fraction else ("stop_inlier_fraction",)
         check_used(self.criteria, (*self.uses, *early), self.name)
 
-    def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
-        """The best hypothesis of the search; raises as `IDiransac.fit`."""
-        return replace(self._fit(self, dataset, seed, callback), squared_error=True)
-
-    def errors(self, sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
-        """Eq. (2) without the root."""
-        return mean_squared_error(sum_squares, n_rows, weights)
-
     def improves(self, new: Score, best: Score) -> bool:
         """Less error; inliers play no part."""
         return new.error < best.error
 
     def accepts(self, new: Score, best: Score) -> bool:
-        """Whatever improves is stored."""
+        """Always: whatever improves is stored."""
         return True
 
     def refits(self, *, stored: bool) -> bool:
-        """Only what was stored."""
+        """Only of what was stored."""
         return stored
 
     def is_finished(self, best: Score, stop_inlier_fraction: float | None) -> bool:
@@ -255,7 +256,18 @@ class Diransac(_Ransac):
 
 
 class ScoredBatch:
-    """Scores of a batch of hypotheses, and the rows that are their inliers."""
+    """Scores of a batch of hypotheses, and the rows that are their inliers.
+
+    Parameters
+    ----------
+    scores : Scores
+    errors : (n_lanes,) array
+        Model-fit error of each hypothesis.
+    n_rows : int
+        Number of rows that count.
+    valid : sequence of (N,) bool array
+        Rows of each log that count.
+    """
 
     def __init__(self, scores: Scores, errors: FloatArray, n_rows: int, valid: Sequence[BoolArray]) -> None:
         self._scores, self._valid = scores, valid
@@ -269,7 +281,15 @@ class ScoredBatch:
 
 
 class Evaluator:
-    """Bounds, simulation, error and inliers of hypotheses over a dataset.
+    """Preliminary test, simulation, error and inliers of hypotheses over a dataset.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    scoring : Scoring
+        Weights and thresholds.
+    variant : RansacMethod
+        Method whose error and criteria are used.
 
     Raises
     ------
@@ -277,16 +297,15 @@ class Evaluator:
         A log lacks its initial state.
     """
 
-    def __init__(self, dataset: Dataset, scoring: Scoring, variant: Variant) -> None:
+    def __init__(self, dataset: Dataset, scoring: Scoring, variant: RansacMethod) -> None:
         settings, judged = variant.criteria, scoring.judged
-        self._dataset, self._variant = dataset, variant
+        self._dataset = dataset
+        self._error_of = mean_squared_error if variant.squared_error else rms_error
         self._weights, self._thresholds = scoring.weights[judged], scoring.thresholds[judged]
         self._min_inlier_signals = scoring.min_inlier_signals
         self._valid = [one.valid for one in dataset.segments]
-        resolution, rules = (
-            Resolution(settings.integrator, settings.substeps),
-            [settings.initial_state] * len(self._valid),
-        )
+        resolution = Resolution(settings.integrator, settings.substeps)
+        rules = [settings.initial_state] * len(self._valid)
         self._simulation = Simulation(dataset, judged, resolution, rules, settings.threads)
         self._simulation.starts  # noqa: B018  refuses a log without an initial state
 
@@ -298,12 +317,24 @@ class Evaluator:
         """Error, inlier fraction and inliers of every hypothesis ``(n_vectors, n)``."""
         scores = self._simulation.score(parameters, self._thresholds, self._min_inlier_signals)
         n_rows = self._dataset.n_rows
-        return ScoredBatch(scores, self._variant.errors(scores.sum_squares, n_rows, self._weights), n_rows, self._valid)
+        return ScoredBatch(scores, self._error_of(scores.sum_squares, n_rows, self._weights), n_rows, self._valid)
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Parameters ``(n,)``, the usable rows that they were fitted to, ascending, and their place in a scored batch."""
+    """A hypothesis and its place in a scored batch.
+
+    Parameters
+    ----------
+    parameters : (n,) array
+        Each in its unit.
+    rows : (n_fitted,) int array
+        Usable rows that the parameters were fitted to, ascending.
+    batch : ScoredBatch
+        Scores of the batch that the hypothesis belongs to.
+    lane : int
+        Index of the hypothesis in the batch.
+    """
 
     parameters: FloatArray
     rows: IntArray
@@ -325,11 +356,16 @@ class SearchState:
 
     Parameters
     ----------
-    best : the stored hypothesis; None while nothing was accepted
-    iterations : k, samples drawn
-    n_hypotheses : hypotheses looked at, refits included
-    rejected : hypotheses that went no further, by reason
-    stop_reason : why it ended
+    best : Hypothesis, optional
+        Stored hypothesis; None while nothing was accepted.
+    iterations : int, optional
+        Number of samples drawn, the paper's k.
+    n_hypotheses : int, optional
+        Number of hypotheses evaluated, refits included.
+    rejected : Counter of str, optional
+        Number of rejected hypotheses by reason.
+    stop_reason : str, optional
+        Reason why the search ended.
     """
 
     best: Hypothesis | None = None
@@ -345,22 +381,40 @@ class SearchState:
 
 
 def search(
-    variant: Variant,
+    variant: RansacMethod,
     estimator: BoundEstimator,
     evaluator: Evaluator,
     sampler: Sampler,
     seed: int,
     callback: Callback | None = None,
 ) -> SearchState:
-    """Algorithm 1 in the given variant.
+    """State at the end of Algorithm 1 in the given variant.
 
     Parameters
     ----------
-    sampler : ``(seed, iterations, n_rows, start, stop) -> rows``, as `sampling.sample_rows`
-    callback : called after every batch
+    variant : RansacMethod
+    estimator : BoundEstimator
+        Fit of samples and inlier sets.
+    evaluator : Evaluator
+        Preliminary test and scores of hypotheses.
+    sampler : callable
+        ``(seed, iterations, n_rows, start, stop) -> rows``, as `sampling.sample_rows`.
+    seed : int
+    callback : callable, optional
+        Called with a `Progress` after every batch.
 
-    Raises IdentificationError: the whole log is not well-defined, or nothing was ever accepted.
-    References: Dimmig et al. 2023, Algorithm 1.
+    Returns
+    -------
+    SearchState
+
+    Raises
+    ------
+    IdentificationError
+        The whole log is not well-defined, or no hypothesis was accepted.
+
+    References
+    ----------
+    Dimmig et al. 2023, Algorithm 1.
     """
     settings, state = variant.criteria, SearchState()
     for batch in _batches(settings):
@@ -382,7 +436,7 @@ def search(
 
 
 def _batches(settings: Settings) -> Iterator[IntArray]:
-    """Iterations in batches that grow from a few to ``batch_size`` where the search may stop early, as many do."""
+    """Iterations in batches, which grow from 16 to ``batch_size`` where the search may stop early."""
     may_stop = settings.stop_inlier_fraction is not None
     start, size = 0, min(_FIRST_BATCH, settings.batch_size) if may_stop else settings.batch_size
     while start < settings.max_iterations:
@@ -425,7 +479,7 @@ def _grow(sample: IntArray, k: IntArray, estimator: BoundEstimator, sampler: Sam
     while not estimator.select([whole]).well_defined()[0]:
         low = len(whole)
         if low == estimator.n_rows:
-            raise IdentificationError("the whole log is not well-defined: it does not determine the parameters")
+            raise IdentificationError("the whole log is not well-defined: parameters are not identifiable; excite them")
         more = sampler(seed, k, estimator.n_rows, low, min(2 * low, estimator.n_rows))[0]
         whole = np.concatenate([whole, more])
     high = len(whole)
@@ -438,7 +492,7 @@ def _grow(sample: IntArray, k: IntArray, estimator: BoundEstimator, sampler: Sam
 def _replay(
     hypothesis: Hypothesis | None,
     state: SearchState,
-    variant: Variant,
+    variant: RansacMethod,
     estimator: BoundEstimator,
     evaluator: Evaluator,
 ) -> None:
@@ -466,14 +520,14 @@ def _replay(
 
 
 def _fingerprint(rows: IntArray, n_rows: int) -> bytes:
-    """A bit a row: a chain may be thousands of refits long, and knows every set of inliers that it has met."""
+    """One bit per row: a chain of thousands of refits keeps all its inlier sets."""
     chosen = np.zeros(n_rows, bool)
     chosen[rows] = True
     return np.packbits(chosen).tobytes()
 
 
-def _judge(hypothesis: Hypothesis, state: SearchState, variant: Variant) -> bool | None:
-    """Whether a hypothesis was stored; None where it does not even improve (lines 19-23)."""
+def _judge(hypothesis: Hypothesis, state: SearchState, variant: RansacMethod) -> bool | None:
+    """True if a hypothesis was stored, False if it improves only, None otherwise (lines 19-23)."""
     score = hypothesis.score
     if not variant.improves(score, state.score):
         state.rejected["diverged" if np.isinf(score.error) else "no improvement"] += 1

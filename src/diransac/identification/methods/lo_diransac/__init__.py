@@ -2,8 +2,8 @@
 
 | file | content |
 |---|---|
-| `settings.py` | `LoDiransac`: settings, and `fit` |
-| `method.py` | the steps in their order |
+| `settings.py` | settings, checked |
+| `method.py` | `LoDiransac`: the steps in their order |
 | `smoothing.py` | screening of samples, and the motion without a model |
 | `hypotheses.py` | samples in weak form, consensus |
 | `augmented_model.py` | the model with discrepancies |
@@ -14,6 +14,6 @@
 | `instrumental_variables.py` | parameters and covariance |
 """
 
-from diransac.identification.methods.lo_diransac.settings import LoDiransac, configured
+from diransac.identification.methods.lo_diransac.method import LoDiransac, configured
 
 __all__ = ["LoDiransac", "configured"]

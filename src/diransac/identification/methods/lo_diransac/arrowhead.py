@@ -5,11 +5,13 @@
     |      E_1  D_2  ...  B_2 |
     | B_0' B_1' B_2' ...   C  |
 
-Every window meets its neighbours and the parameters, nothing else, so a solution and the blocks of the inverse that
-matter cost O(W).  Blocks are eliminated by cyclic reduction: all odd ones at once, then every other one of what is
+Each window is coupled to its neighbours and to the parameters only, so that a solution and the required blocks of the
+inverse cost O(W).  Blocks are eliminated by cyclic reduction: all odd ones at once, then every other one of what is
 left, so that each of the log2(W) levels is a handful of operations on stacks of small matrices.
 
-References: Hockney 1965 and Heller 1976 (cyclic reduction); Takahashi, Fagan, Chen 1973 (selected inverse).
+References
+----------
+Hockney 1965 and Heller 1976 (cyclic reduction); Takahashi, Fagan, Chen 1973 (selected inverse).
 """
 
 from __future__ import annotations
@@ -25,14 +27,20 @@ __all__ = ["Arrowhead", "Factored"]
 
 @dataclass(frozen=True)
 class Factored:
-    """What is needed of an inverse.
+    """Solution of an arrowhead system, and blocks of its inverse.
 
     Parameters
     ----------
-    step_z, step_p : (W, k), (m,)   the solution
-    var_z : (W, k, k)   diagonal blocks of the inverse
-    var_p : (m, m)   its corner
-    gain : (W, k, m)   ``A^-1 B``, so that a shift of p moves z by ``-gain`` times it
+    step_z : (W, k) array
+        Solution of each window.
+    step_p : (m,) array
+        Solution of the shared unknowns.
+    var_z : (W, k, k) array
+        Diagonal blocks of the inverse.
+    var_p : (m, m) array
+        Corner of the inverse.
+    gain : (W, k, m) array
+        ``A^-1 B``: a shift of p moves z by ``-gain`` times the shift.
     """
 
     step_z: FloatArray
@@ -44,7 +52,19 @@ class Factored:
 
 @dataclass(frozen=True)
 class Arrowhead:
-    """The blocks: ``D (W, k, k)``, ``E (W-1, k, k)`` below it, ``B (W, k, m)``, ``C (m, m)``."""
+    """Blocks of a symmetric positive definite system.
+
+    Parameters
+    ----------
+    diagonal : (W, k, k) array
+        D.
+    below : (W - 1, k, k) array
+        E, below the diagonal.
+    border : (W, k, m) array
+        B.
+    corner : (m, m) array
+        C.
+    """
 
     diagonal: FloatArray
     below: FloatArray
@@ -52,12 +72,34 @@ class Arrowhead:
     corner: FloatArray
 
     def solve(self, right_z: FloatArray, right_p: FloatArray, damping: float = 0.0) -> Factored:
-        """Solution for the right-hand side ``(W, k)`` and ``(m,)``, the diagonal grown by a factor ``1 + damping``."""
+        """Solution for one right-hand side.
+
+        Parameters
+        ----------
+        right_z : (W, k) array
+        right_p : (m,) array
+        damping : float, optional
+            The diagonal is multiplied by ``1 + damping``.
+
+        Returns
+        -------
+        Factored
+        """
         found = self._solved(right_z[:, :, None], right_p[:, None], damping)
         return replace(found, step_z=found.step_z[:, :, 0], step_p=found.step_p[:, 0])
 
     def functional(self, of_z: FloatArray, of_p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Inverse times columns ``(W, k, c)`` over ``(m, c)``: what each unknown contributes to linear functionals."""
+        """Inverse times columns: the gradient of c linear functionals of the solution.
+
+        Parameters
+        ----------
+        of_z : (W, k, c) array
+        of_p : (m, c) array
+
+        Returns
+        -------
+        (W, k, c) array, (m, c) array
+        """
         found = self._solved(of_z, of_p, 0.0)
         return found.step_z, found.step_p
 
@@ -93,7 +135,7 @@ _RIDGE, _TINY = 1e-13, 1e-300
 
 
 def _inverse(A: FloatArray) -> FloatArray:
-    """Of a symmetric matrix whose flat directions get a large variance, not an error."""
+    """Inverse of a symmetric matrix; singular directions have a large variance instead of an error."""
     values, vectors = np.linalg.eigh(0.5 * (A + A.T))
     return np.asarray((vectors / np.maximum(values, 1e-15)) @ vectors.T)
 

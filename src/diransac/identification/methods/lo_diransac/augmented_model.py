@@ -1,10 +1,10 @@
 """A model augmented by discrepancies.
 
-All of them are parameters of an ordinary model, so that compiled rollouts and their derivatives serve unchanged:
+All discrepancies are parameters of an ordinary model, so that compiled rollouts and their derivatives need no change:
 
 - Unmodelled accelerations, one for each of the model's: ``a = f(q, v, u, p) + d``.
 - Input gain and bias discrepancies: in every equation a constant force, and one in proportion to each input.  An
-  actuator that is stronger or points elsewhere than the model has it deviates alike for as long as the motion lasts;
+  actuator with another gain or direction than in the model deviates by the same amount throughout the motion;
   unmodelled accelerations, free in every interval, would attribute that to the parameters.
 - A delay of the inputs, ``u(t - tau) = u - tau du/dt``.
 
@@ -37,10 +37,12 @@ class AugmentedModel:
 
     Parameters
     ----------
-    model : its parameters are the model's ``p``; the discrepancies, equation by equation the bias and one gain per
+    model : Model
+        Model whose parameters are the original ones; the discrepancies, equation by equation the bias and one gain per
         input; the delay in samples; the unmodelled accelerations.  Its inputs are u, and the change of u per sample of
-        delay
-    n_p, n_v, n_u : of the model
+        delay.
+    n_p, n_v, n_u : int
+        Number of parameters, velocities and inputs of the original model.
     """
 
     model: Model
@@ -50,13 +52,22 @@ class AugmentedModel:
 
     @property
     def n_discrepancies(self) -> int:
-        """Input gain and bias discrepancies."""
+        """Number of input gain and bias discrepancies."""
         return self.n_v * (self.n_u + 1)
 
 
 @lru_cache(maxsize=16)
 def augmented_model(model: Model) -> AugmentedModel:
-    """The model with unmodelled accelerations, input gain and bias discrepancies, and an input delay."""
+    """The model with unmodelled accelerations, input gain and bias discrepancies, and an input delay.
+
+    Parameters
+    ----------
+    model : Model
+
+    Returns
+    -------
+    AugmentedModel
+    """
     derived = model.kinematics is None
     own = list(model.coordinates if derived else model.velocities)
     later, latent = [f"{n}_later" for n in model.inputs], [f"unmodelled_{n}" for n in own]

@@ -1,12 +1,14 @@
 """Hypotheses from random minimal samples of the equations in weak form, and their consensus by simulation.
 
-An equation that holds at every moment holds under any average, too.  Rows ``W p = b`` of the smoothed motion are
-averaged under a bump of a window's length: vibration and noise average out, and since the bump ends in zero, as if by
-parts, little depends on the accelerations.  A sample of few averages of each equation gives a first guess, and every
-guess is scored by simulation.
+An equation that holds at every moment also holds for any weighted average.  Rows ``W p = b`` of the smoothed motion are
+averaged under a bump of a window's length: vibration and noise average out, and since the bump vanishes at its ends,
+little depends on the accelerations (integration by parts).  A sample of few averages of each equation gives a
+hypothesis, and every hypothesis is scored by simulation.
 
-References: Fischler, Bolles 1981 (RANSAC); Messenger, Bortz 2021 (weak form); Nister 2005 (judging many on little, few
-on all); Torr, Zisserman 2000.
+References
+----------
+Fischler, Bolles 1981 (RANSAC); Messenger, Bortz 2021 (weak form); Nister 2005 (preemptive scoring);
+Torr, Zisserman 2000.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.identification.methods.lo_diransac.settings import LoDiransac
+    from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
@@ -35,11 +37,25 @@ _OVERLAP = 5
 
 
 def find_hypotheses(
-    settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
+    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
 ) -> FloatArray:
-    """Hypotheses ``(n_hypotheses, n)`` within their bounds, best first.
+    """Hypotheses within the parameter bounds, best first.
 
-    Samples are scored on a few intervals, the best on all.
+    Samples are scored on a few intervals, the best of them on all.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+    seed : int
+    dataset : Dataset
+
+    Returns
+    -------
+    (n_hypotheses, n) array
+        Each parameter in its unit; empty where no sample is within the bounds.
     """
     if intervals.model.nonlinear_parameters:
         finalists = _nonlinear(settings, intervals, motion, seed, dataset)
@@ -51,7 +67,7 @@ def find_hypotheses(
     return finalists[np.argsort(scores, kind="stable")[: np.isfinite(scores).sum()]]
 
 
-def _linear(settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, seed: int) -> FloatArray:
+def _linear(settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int) -> FloatArray:
     """Finalists of a model that is affine in its parameters: the best of least squares of random averages."""
     weak = weak_form(intervals, motion)
     n = len(intervals)
@@ -64,7 +80,7 @@ def _linear(settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, 
 
 
 def _nonlinear(
-    settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
+    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
 ) -> FloatArray:
     """Finalists of any model: nonlinear least squares of all and of random rows of the smoothed motion."""
     segments = tuple(
@@ -86,13 +102,19 @@ def _nonlinear(
 
 @dataclass(frozen=True)
 class WeakForm:
-    """Averaged rows ``W (n, r, n_p)``, ``b (n, r)``, each equation scaled by its own size."""
+    """Averaged rows of ``W p = b``, each equation scaled to the same size.
+
+    Parameters
+    ----------
+    W : (n, r, n_p) array
+    b : (n, r) array
+    """
 
     W: FloatArray
     b: FloatArray
 
     def solve(self, chosen: BoolArray) -> FloatArray:
-        """Least squares of each set of rows ``(n_sets, n, r)``: parameters ``(n_sets, n_p)``."""
+        """Parameters ``(n_sets, n_p)`` by least squares of each set of rows ``(n_sets, n, r)``."""
         n, r, n_p = self.W.shape
         masks = chosen.reshape(len(chosen), -1).astype(np.float64)
         G = (masks @ np.einsum("nri,nrj->nrij", self.W, self.W).reshape(n * r, -1)).reshape(-1, n_p, n_p)
@@ -102,7 +124,7 @@ class WeakForm:
         return np.asarray(np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d)
 
 
-def _samples(settings: LoDiransac, weak: WeakForm, seed: int) -> BoolArray:
+def _samples(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArray:
     """All rows, and random sets of n to ``largest_sample`` n rows of each equation, with n parameters."""
     rng = _generator(seed)
     n, r, n_p = weak.W.shape
@@ -116,7 +138,18 @@ def _generator(seed: int) -> np.random.Generator:
 
 
 def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
-    """Rows of the smoothed motion, averaged under overlapping bumps that lie within one log each."""
+    """Rows of the smoothed motion, averaged under overlapping bumps that lie within one log each.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+
+    Returns
+    -------
+    WeakForm
+    """
     model, H, layout = intervals.model, intervals.length, intervals.layout
     n_p, n_v = model.n_p, model.n_v
     bump = np.sin(np.pi * (np.arange(H) + 0.5) / H) ** 2
@@ -139,7 +172,7 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
 
 
 def _admitted(intervals: ShootingIntervals, p: FloatArray) -> FloatArray:
-    """Moved to a bound that may be touched; without those outside one that may not."""
+    """Hypotheses clipped to inclusive bounds, without those that violate a strict one."""
     bounds = intervals.layout.bounds
     lower = np.array([-np.inf if x.positive else x.lower for x in bounds])
     p = np.clip(p, lower, np.array([x.upper for x in bounds]))
@@ -147,10 +180,23 @@ def _admitted(intervals: ShootingIntervals, p: FloatArray) -> FloatArray:
 
 
 def robust_scores(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray, chosen: IntArray) -> FloatArray:
-    """Score ``(n_hypotheses,)`` of each hypothesis, simulated over chosen intervals from the smoothed states.
+    """Sum over signals of the log of the 35 % quantile of ``|residual|``, by simulation from the smoothed states.
 
-    The score is the sum over signals of the log of the 35 % quantile of the residuals' size: it needs no threshold,
-    and units do not matter.
+    The score needs no threshold, and its order does not depend on units.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+    parameters : (n_hypotheses, n) array
+    chosen : (n_chosen,) int array
+        Indices of the intervals that are simulated.
+
+    Returns
+    -------
+    (n_hypotheses,) array
+        Lower is better; infinite where the simulation diverges on most samples.
     """
     n, n_x = len(parameters), intervals.model.n_q + intervals.model.n_v
     starts, logs = intervals.starts[chosen], np.tile(intervals.log_of[chosen], n)

@@ -1,13 +1,13 @@
 """Parameters from the most probable motion by instrumental variables, and their covariance.
 
-Where the model is right, the parameters of the fit are the parameters.  Where it is not, the log is explained by
-parameters and discrepancies together, in proportions that depend on the noise.  Wanted are the parameters of least
-squares on noise-free data, for which the equations hold best.  ``W p = b`` is solved again, on the fitted motion, with
-instruments that leave the unmodelled accelerations out: accelerations with noise would pull inertias towards zero.
+Where the model is exact, the parameters of the fit are the estimate.  Where it is not, the log is explained by
+parameters and discrepancies together, in proportions that depend on the noise.  The estimate is then that of least
+squares on noise-free data: ``W p = b`` is solved again on the fitted motion, with instruments without the unmodelled
+accelerations, because noise in the accelerations would bias inertias towards zero.
 
-The covariance has three parts: the fit's, carried through that solution; that of the unmodelled forces that no
-parameters make, as a sample of the forces on the machine, for another log would hold others; and the change under a
-tenfold wider prior on model error, because a deviation from the model that is the same all along is more than chance.
+The covariance has three parts: that of the fit, propagated through the solution; that of the unmodelled forces outside
+the regressor's column space, as a sample of forces that differ from log to log; and the change under a tenfold wider
+prior on model error, because a constant deviation from the model is not averaged out.
 
 References
 ----------
@@ -54,9 +54,13 @@ class InstrumentalEstimate:
 
     Parameters
     ----------
-    parameters, covariance : (n,), (n, n)   per-log parameters of every log included
-    unexplained : (W, n_v)   mean of each interval's accelerations that the model with these parameters does not make
-    delay_error : standard error of the delay, samples
+    parameters : (n,) array
+        Each in its unit, per-log parameters of every log included.
+    covariance : (n, n) array
+    unexplained : (W, n_v) array
+        Mean over each interval of the accelerations that the model with these parameters does not explain.
+    delay_error : float
+        Standard error of the delay, samples.
     """
 
     parameters: FloatArray
@@ -66,14 +70,27 @@ class InstrumentalEstimate:
 
 
 def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation: float) -> InstrumentalEstimate:
-    """The parameters for which the equations hold best on the fitted motion, and their covariance."""
+    """Parameters that solve the equations on the fitted motion by instrumental variables, and their covariance.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        Most probable motion.
+    prior_inflation : float
+        Factor of the prior on model error whose effect on the parameters is added to their covariance.
+
+    Returns
+    -------
+    InstrumentalEstimate
+    """
     found = _solution(intervals, fit)
     change = _solution(intervals, _inflated_prior(intervals, fit, prior_inflation)).parameters - found.parameters
     return replace(found, covariance=found.covariance + np.outer(change, change))
 
 
 def _inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fit:
-    """The fit, by one step, with unmodelled accelerations so many times as large as the evidence has them."""
+    """The fit after one step with ``tau`` larger by a factor."""
     inflated, n_x = replace(fit, tau=factor * fit.tau), fit.x.shape[1]
     at = linearize(intervals, inflated, weights_of(intervals, fit))
     step = at.system.solve(at.right_z, at.right_s)
@@ -140,7 +157,18 @@ def _sampled(
 
 
 def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:
-    """Mean accelerations (W, n_v) of the fitted motion that the model does not make: ``M^-1 r`` of the residuals."""
+    """``M^-1 r``: mean over each interval of the fitted accelerations that the model does not explain.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    parameters : (n,) array
+
+    Returns
+    -------
+    (W, n_v) array
+    """
     p = _row_parameters(intervals, parameters)
     residuals, _, M = _residual_map(intervals.model)(*_motion(intervals, fit), p)
     left = np.linalg.solve(_matrices(M, intervals.model.n_v), residuals[:, :, None])[:, :, 0]
@@ -149,14 +177,42 @@ def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) 
 
 
 def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
-    """The discrepancy that would make all of its equation's inertial force; infinite for parameters."""
+    """Discrepancies that equal the inertial force of their equation.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+    p : (n,) array
+        Parameters of a hypothesis.
+
+    Returns
+    -------
+    (n_shared,) array
+        Infinite for parameters; 1 sample for the delay.
+    """
     force = inertial_forces(intervals, motion, p)
     level = np.append(1.0, np.sqrt(np.square(intervals.inputs).mean(axis=0)) + _TINY)
     return np.concatenate([np.full(intervals.n_p, np.inf), (force[:, None] / level).ravel(), [1.0]])
 
 
 def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
-    """The change of each parameter ``(n,)`` that would make all of some equation's inertial force."""
+    """Change of each parameter that equals the inertial force of an equation.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+    p : (n,) array
+        Parameters of a hypothesis.
+
+    Returns
+    -------
+    (n,) array
+        The smallest over the equations, each in its parameter's unit.
+    """
     W = _residual_map(intervals.model)(*_smoothed(intervals, motion), _row_parameters(intervals, p, logged=True))[1]
     logs = intervals.log_of_row[intervals.is_logged]
     sizes = np.sqrt(np.square(_by_log(intervals, _matrices(W, intervals.model.n_p), logs)).mean(axis=0)).T
@@ -164,7 +220,20 @@ def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
 
 
 def inertial_forces(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
-    """RMS of ``M a`` of each equation, (n_v,)."""
+    """RMS of ``M a`` of each equation.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+    p : (n,) array
+        Parameters of a hypothesis.
+
+    Returns
+    -------
+    (n_v,) array
+    """
     q, v, a, u = _smoothed(intervals, motion)
     n_v = intervals.model.n_v
     own = _row_parameters(intervals, p, logged=True)

@@ -1,20 +1,21 @@
 """The steps of lo-diransac in their order.
 
 1. `smoothing`: screening of samples; the motion without a model.
-2. `hypotheses`: parameters from random samples of the equations in weak form, judged by simulation.
+2. `hypotheses`: parameters from random samples of the equations in weak form, scored by simulation.
 3. `refinement`: the most probable motion and parameters, noise and discrepancies, from the best of them.
-4. `instrumental_variables`: parameters that hold for the whole motion, and their covariance.
+4. `instrumental_variables`: parameters of the whole motion, and their covariance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
+from diransac.blas import single_threaded
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Resolution
 from diransac.identification.method import report, within
@@ -29,6 +30,7 @@ from diransac.identification.methods.lo_diransac.instrumental_variables import (
 from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.refinement import make_prior, refine, start
+from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
     Motion,
@@ -42,13 +44,14 @@ from diransac.identification.methods.lo_diransac.smoothing import (
 )
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset, Segment
+    from diransac.data.dataset import Dataset
+    from diransac.data.segment import Segment
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
-    from diransac.identification.methods.lo_diransac.settings import LoDiransac
+    from diransac.identification.settings import Settings
 
-__all__ = ["estimate"]
+__all__ = ["LoDiransac", "configured"]
 
 _FEWEST_INTERVALS = 4
 # Half a sample of delay or more is taken up by shifting the inputs.
@@ -68,8 +71,118 @@ _GAUSSIAN = 10_000
 """Degrees of freedom of an interval whose covariance is not itself an estimate from few numbers."""
 
 
-def estimate(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
-    """Parameters of the dataset's model; raises as `LoDiransac.fit`."""
+@dataclass(frozen=True)
+class LoDiransac(LoDiransacSettings):
+    """Locally optimised DIRANSAC: random samples, consensus by simulation, one weak-constraint fit of all logs.
+
+    Every default works for any model and any subset of signals.  Windows have at least 5 samples.
+
+    Parameters
+    ----------
+    criteria : Settings, optional
+        Settings of the evaluation: weights, thresholds and initial state, threads.
+    stuck_rows : bool, optional
+        Whether rows that repeat the row before in every signal are taken as missing.
+    input_window : float, optional
+        Window of the Hampel filter that replaces momentary leaps of inputs, s; at most 15 samples.
+    input_threshold : float, optional
+        Threshold of the Hampel filter, in local standard deviations.
+    median_window : float, optional
+        Window of the running median from which smoothing starts, s; at most 31 samples.
+    smoothing_half_width : float, optional
+        Smallest half width of the smoothing polynomials and length of the shooting intervals, s; at most 25 samples.
+        Cross-validation chooses between it and three, nine, ... times its value.
+    n_samples, n_nonlinear_samples : int, optional
+        Number of random samples of a model that is affine in its parameters, and of others.
+    largest_sample : int, optional
+        Largest number of rows of each equation in a sample, over the number of parameters.
+    n_screening_intervals, n_finalists : int, optional
+        Number of intervals on which all hypotheses are scored; number of hypotheses that are scored on all intervals.
+    delay_range : (float, float), optional
+        Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation.
+    max_delay_shifts : int, optional
+        Largest number of shifts of the inputs by whole samples after local optimisation.
+    substeps : int, optional
+        Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
+        samples or links are light.
+    max_starts, max_fits : int, optional
+        Largest number of hypotheses that are optimised, and of local optimisations.
+    max_steps : int, optional
+        Largest number of Gauss-Newton steps of a local optimisation; 0: the best hypothesis is the estimate.
+    outliers : bool, optional
+        Whether the noise of each signal has outliers; otherwise it is Gaussian.
+    neighbouring_starts : bool, optional
+        Whether initial states are propagated from neighbouring intervals where that has a higher likelihood.
+    gradual_continuity : bool, optional
+        Whether the motion is made continuous gradually rather than from the start.
+    robust_model_error : bool, optional
+        Whether the size of unmodelled accelerations follows the median interval until the first convergence.
+    model_error : bool, optional
+        Whether the size of unmodelled accelerations is estimated; otherwise they vanish.
+    prior_model_error : float, optional
+        Prior size of the unmodelled accelerations, over the spread of the accelerations.
+    prior_discrepancy, initial_discrepancy : float, optional
+        Prior size of input gain and bias discrepancies, over that which equals an equation's inertial force: after, and
+        until the first convergence.
+    prior_delay : float, optional
+        Prior standard deviation of the input delay, s.
+    instrumental_variables : bool, optional
+        Whether parameters are estimated from the fitted motion by instrumental variables; otherwise they are those of
+        the fit.
+    prior_inflation : float, optional
+        Factor of the prior on model error whose effect on the parameters is added to their covariance.
+
+    Raises
+    ------
+    SettingsError
+        A value is out of range, or of another type.
+    """
+
+    def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
+        """Parameters of the model from the logs, without starting values or thresholds.
+
+        Parameters
+        ----------
+        dataset : Dataset
+        seed : int
+            Seed of all random samples.
+        callback : callable, optional
+            Called with a `Progress` at every stage.
+
+        Returns
+        -------
+        Estimate
+
+        Raises
+        ------
+        LogError
+            The logs are too short, or sampled at different rates.
+        IdentificationError
+            No sample gives parameters within their bounds.
+        """
+        with single_threaded():  # matrices are small: more threads would only add waiting
+            return _fitted(self, dataset, int(seed), callback)
+
+
+def configured(settings: Settings, **options: Any) -> LoDiransac:
+    """The method with its own options, and criteria of the evaluation.
+
+    Parameters
+    ----------
+    settings : Settings
+        Criteria.
+    options : object
+        Other fields of `LoDiransac`.
+
+    Returns
+    -------
+    LoDiransac
+    """
+    return LoDiransac(settings, **options)
+
+
+def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
+    """Parameters of the dataset's model, step by step."""
     report(callback, "smoothing", 0.0)
     intervals, motion, notes = _prepared(settings, dataset)
     report(callback, "drawing hypotheses", 0.1)
@@ -89,7 +202,7 @@ def estimate(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callba
     if not settings.instrumental_variables:
         result = replace(result, parameters=kept, unexplained=unexplained(intervals, refined.fit, kept))
     elif not intervals.layout.admits(result.parameters[None])[0]:
-        # The fit keeps to the bounds, least squares on its motion need not.
+        # The fit satisfies the bounds; least squares on its motion may violate them.
         result = replace(result, parameters=kept, unexplained=unexplained(intervals, refined.fit, kept))
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
     if _explains_nothing(intervals, motion, refined):
@@ -101,7 +214,7 @@ def estimate(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callba
 
 
 def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
-    """Whether the noise of every signal is as large as the signal."""
+    """True if the noise of every signal is as large as the signal."""
     seen = intervals.known.any(axis=0)
     return bool((refined.fit.noise.sigma > _ALL_OF_IT * motion.spread)[seen].all())
 
@@ -109,7 +222,7 @@ def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Ref
 # ---------------------------------------------------------------------- preparation
 
 
-def _prepared(settings: LoDiransac, dataset: Dataset) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
+def _prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
     """The logs in intervals of the motion's own time scale, and the motion, row by row of the intervals."""
     model, dt = dataset.model, dataset.dt
     screened = [_screened(settings, one, dt) for one in dataset.segments]
@@ -139,8 +252,8 @@ def _to_length(values: FloatArray, n_rows: int) -> FloatArray:
     return np.pad(values, ((0, n_rows - len(values)), (0, 0)), mode="edge")
 
 
-def _screened(settings: LoDiransac, one: Segment, dt: float) -> tuple[Samples, FloatArray, list[str]]:
-    """Samples and inputs of one log, and what was found."""
+def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Samples, FloatArray, list[str]]:
+    """Samples and inputs of one log, and findings, a sentence each."""
     model, notes = one.model, []
     measured = np.full((len(one), len(model.signals)), np.nan)
     measured[:, [model.signals.index(n) for n in one.signals]] = one.measured
@@ -166,7 +279,7 @@ def _screened(settings: LoDiransac, one: Segment, dt: float) -> tuple[Samples, F
 class _LocalSearch:
     """Local optimisations from the best hypotheses, and delays of the inputs."""
 
-    settings: LoDiransac
+    settings: LoDiransacSettings
     motion: Motion
     hypotheses: FloatArray
     prior: Prior
@@ -175,9 +288,9 @@ class _LocalSearch:
     def best(self, intervals: ShootingIntervals, callback: Callback | None = None) -> Refinement:
         """Local optimisation from the best hypothesis; where it is doubtful, from others; the likeliest of these.
 
-        Doubtful is a fit that takes most of an interval for outliers: sensors may have failed there, or the fit.  It
-        becomes a hypothesis itself if it is the likeliest so far, or else the next one has its turn; doubt ends with a
-        second fit that is as likely.
+        A fit is doubtful if most samples of an interval are outliers: either sensors failed there, or the fit did.  The
+        likeliest fit so far becomes a hypothesis itself; otherwise the next hypothesis is optimised.  The search ends
+        with a second fit that is as likely.
         """
         waiting = list(self.hypotheses[: self.settings.max_starts])
         found: list[Refinement] = []
@@ -196,8 +309,8 @@ class _LocalSearch:
     def best_delayed(self, intervals: ShootingIntervals) -> tuple[int, Refinement]:
         """Delay of the inputs in samples, and the best fit then.
 
-        Where the hypotheses favour a delay at all, the neighbouring samples are tried, too, and theirs, as long as the
-        fit becomes likelier: hypotheses come from inputs without a delay.
+        Where the best hypothesis favours a delay, neighbouring delays are tried as long as the fit becomes likelier,
+        because hypotheses were drawn from inputs without a delay.
         """
         report(self.callback, "searching for a delay", 0.25)
         delay = self._likeliest_delay(intervals)
@@ -218,8 +331,8 @@ class _LocalSearch:
     def _likeliest_delay(self, intervals: ShootingIntervals) -> int:
         """Delay in samples with which simulations by the best hypothesis agree best with the log.
 
-        Inputs that are held for many samples and then step make few outliers under a wrong delay, and local
-        optimisation would rest there; so whole samples are settled before it begins.
+        Inputs that are held for many samples and then step cause few outliers under a wrong delay, which is a local
+        optimum; so the number of whole samples is chosen before local optimisation.
         """
         every, scores = np.arange(len(intervals)), dict[int, float]()
         low, high = (round(x / intervals.dt) for x in self.settings.delay_range)
@@ -257,7 +370,7 @@ class _LocalSearch:
 
 
 def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:
-    """Whether some interval has too few inlying samples for a robust scale to stand on."""
+    """True if an interval has too few inlying samples for a robust scale."""
     fit, n = refined.fit, len(intervals)
     inlying = (fit.noise.inlying(fit.residuals, intervals.known) > _OUTLIER).reshape(n, -1).sum(axis=1)
     return bool((inlying < BREAKDOWN * intervals.known.reshape(n, -1).sum(axis=1)).any())
@@ -268,7 +381,7 @@ def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:
 
 @dataclass(frozen=True)
 class _Found:
-    """Everything that an estimate is made of; the delay is in samples."""
+    """Parts of an estimate; the delay is in samples."""
 
     dataset: Dataset
     intervals: ShootingIntervals
@@ -279,7 +392,7 @@ class _Found:
 
 
 def _estimate(
-    settings: LoDiransac, found: _Found, n_hypotheses: int, converged: bool, notes: tuple[str, ...]
+    settings: LoDiransacSettings, found: _Found, n_hypotheses: int, converged: bool, notes: tuple[str, ...]
 ) -> Estimate:
     dataset, intervals, result = found.dataset, found.intervals, found.result
     names = dataset.layout.names
@@ -304,7 +417,7 @@ def _estimate(
 
 
 def _diagnosis(found: _Found, unidentifiable: tuple[str, ...]) -> Diagnosis:
-    """Noise, faults and unmodelled forces, by name and over the rows of the logs as they were given."""
+    """Noise, faults and unmodelled forces, by name and over the rows of the given logs."""
     dataset, intervals, fit, result = found.dataset, found.intervals, found.fit, found.result
     model, dt = dataset.model, intervals.dt
     columns = {name: model.signals.index(name) for name in dataset.signals}
@@ -342,7 +455,7 @@ def _on_given_logs(dataset: Dataset, intervals: ShootingIntervals, mask: BoolArr
 
 
 def _unmodelled_forces(intervals: ShootingIntervals, fit: Fit, result: InstrumentalEstimate) -> FloatArray | None:
-    """Generalised forces (W, n_v) that make the unmodelled accelerations, at the intervals' starts; or None."""
+    """Generalised forces (W, n_v) of the unmodelled accelerations at the intervals' starts, or None."""
     model = intervals.model
     try:
         response = model.force_response

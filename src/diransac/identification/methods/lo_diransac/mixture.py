@@ -1,6 +1,8 @@
 """Noise of each signal: a Gaussian, and a uniform of outliers over the signal's range.
 
-References: Torr and Zisserman 2000, "MLESAC"; Dempster, Laird, Rubin 1977 (EM).
+References
+----------
+Torr and Zisserman 2000, "MLESAC"; Dempster, Laird, Rubin 1977 (EM).
 """
 
 from __future__ import annotations
@@ -26,7 +28,19 @@ _FAR = 40.0
 
 @dataclass(frozen=True)
 class Mixture:
-    """Scale ``sigma``, outlier fraction ``pi``, range ``span`` and smallest scale ``floor`` of each signal, (n_s,)."""
+    """``(1 - pi) N(0, sigma^2) + pi U(span)``: density of the residuals of each signal.
+
+    Parameters
+    ----------
+    sigma : (n_s,) array
+        Standard deviation of the Gaussian, each signal's unit.
+    pi : (n_s,) array
+        Fraction of outliers.
+    span : (n_s,) array
+        Half width of the uniform density, each signal's unit.
+    floor : (n_s,) array
+        Smallest admissible sigma.
+    """
 
     sigma: FloatArray
     pi: FloatArray
@@ -34,13 +48,13 @@ class Mixture:
     floor: FloatArray
 
     def inlying(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
-        """Probability ``(N, n_s)`` that each sample is no outlier; 0 where there is none (the E step)."""
+        """Probability ``(N, n_s)`` that each sample is not an outlier; 0 where it is missing (the E step)."""
         core = self._core(residuals)
         total = core + self.pi / (2.0 * self.span)
         return np.where(known, np.divide(core, total, out=np.ones_like(core), where=total > 0.0), 0.0)
 
     def negative_log_likelihood(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
-        """Of each sample, ``(N, n_s)``; 0 where there is none."""
+        """Negative log-likelihood ``(N, n_s)`` of each sample; 0 where it is missing."""
         total = self._core(residuals) + self.pi / (2.0 * self.span)
         with np.errstate(over="ignore"):
             gaussian = 0.5 * np.square(residuals / self.sigma) + np.log(self.sigma * np.sqrt(2.0 * np.pi))
@@ -58,7 +72,17 @@ class Mixture:
 
         Parameters
         ----------
-        outliers : whether the fraction of outliers is estimated; it stays as it is without
+        residuals : (N, n_s) array
+        known : (N, n_s) bool array
+            Samples that are measured.
+        inlying : (N, n_s) array
+            Result of `inlying`.
+        outliers : bool, optional
+            Whether the fraction of outliers is estimated; otherwise it remains unchanged.
+
+        Returns
+        -------
+        Mixture
         """
         weight = inlying.sum(axis=0)
         squares = (inlying * np.square(residuals)).sum(axis=0)
@@ -72,7 +96,19 @@ class Mixture:
 
 
 def lower_scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
-    """Robust scale of each column ``(..., n_s)`` of residuals ``(..., N, n_s)``; NaN where there are too few."""
+    """Robust standard deviation of each column: the 35 % quantile of ``|residual|`` over that of a standard normal.
+
+    Parameters
+    ----------
+    residuals : (..., N, n_s) array
+    known : (..., N, n_s) bool array
+        Samples that are measured.
+
+    Returns
+    -------
+    (..., n_s) array
+        NaN where fewer than 5 samples are known.
+    """
     size = np.where(known, np.abs(residuals), np.inf)
     count = known.sum(axis=-2)
     place = np.maximum((BREAKDOWN * count).astype(int), 0)

@@ -8,7 +8,9 @@ state x_w and an unmodelled acceleration d_w that acts over the interval.  With 
 
 The second sum is over neighbours within one log.
 
-References: Bock 1987 (multiple shooting); Tremolet 2006 (weak-constraint 4D-Var).
+References
+----------
+Bock 1987 (multiple shooting); Tremolet 2006 (weak-constraint 4D-Var).
 """
 
 from __future__ import annotations
@@ -34,13 +36,22 @@ class Fit:
 
     Parameters
     ----------
-    shared : (n_s,)   parameters, discrepancies, input delay in samples
-    x, d : (W, n_x), (W, n_v)   states at the intervals' starts, unmodelled accelerations
-    residuals : (N, n_signals)   simulated less measured
-    noise : of each signal
-    tau : (n_v,)   size of the unmodelled accelerations
-    continuity_std : (n_x,)   size of the jumps from interval to interval
-    prior : (n_s,)   size of the discrepancies and of the delay; infinite for the parameters
+    shared : (n_s,) array
+        Parameters, discrepancies, input delay in samples.
+    x : (W, n_x) array
+        States at the intervals' starts.
+    d : (W, n_v) array
+        Unmodelled accelerations.
+    residuals : (N, n_signals) array
+        Simulated less measured signals.
+    noise : Mixture
+        Noise of each signal.
+    tau : (n_v,) array
+        Size of the unmodelled accelerations.
+    continuity_std : (n_x,) array
+        Size of the jumps from interval to interval.
+    prior : (n_s,) array
+        Size of the discrepancies and of the delay; infinite for the parameters.
     """
 
     shared: FloatArray
@@ -55,7 +66,15 @@ class Fit:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Blocks of the system at a fit, and its right-hand side: minus the gradient."""
+    """Gauss-Newton system at a fit.
+
+    Parameters
+    ----------
+    system : Arrowhead
+    right_z : (W, n_x + n_v) array
+    right_s : (n_s,) array
+        Right-hand side, minus the gradient: of states and unmodelled accelerations, and of the shared unknowns.
+    """
 
     system: Arrowhead
     right_z: FloatArray
@@ -63,12 +82,34 @@ class NormalEquations:
 
 
 def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
-    """The fit with its residuals over these intervals."""
+    """The fit with its residuals over the given intervals.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    Fit
+    """
     return replace(fit, residuals=intervals.residuals(fit.shared, fit.x, fit.d))
 
 
 def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> NormalEquations:
-    """Gauss-Newton normal equations; ``weights (N, n_signals)`` are those of the measurements."""
+    """Gauss-Newton normal equations of the cost at a fit.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    weights : (N, n_signals) array
+        Weights of the measurements, one over each signal's unit squared.
+
+    Returns
+    -------
+    NormalEquations
+    """
     n_x, k = fit.x.shape[1], fit.x.shape[1] + fit.d.shape[1]
     sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights)
     order = _order(sums.gradient.shape[1] - k, n_x, k)
@@ -121,7 +162,20 @@ def _order(n_s: int, n_x: int, k: int) -> IntArray:
 
 
 def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
-    """Twice the cost with the weights held; infinite where a rollout diverges."""
+    """Twice the cost of a fit with fixed weights.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    weights : (N, n_signals) array
+        Weights of the measurements, one over each signal's unit squared.
+
+    Returns
+    -------
+    float
+        Infinite where a rollout diverges.
+    """
     ends = intervals.ends(fit.shared, fit.x, fit.d)
     terms = (
         (weights * np.square(fit.residuals)).sum(),

@@ -1,16 +1,16 @@
 """Local optimisation: the most probable motion, parameters and discrepancies, given the logs.
 
-Gauss-Newton steps on `normal_equations`, each followed by an update of every scale from what the logs show:
+Gauss-Newton steps on `normal_equations`, each followed by an update of every scale:
 
 - the noise of each signal, by EM (`mixture`);
 - tau, the size of the unmodelled accelerations, by the evidence: with tau large, intervals stand alone; with tau = 0,
-  a log is one rollout.  A model of a real machine is right to a thousandth of its accelerations at best, which counts
-  like one interval's evidence: where noise hides the discrepancies, tau does not vanish;
+  a log is one rollout.  Models of real machines are accurate to a thousandth of the accelerations at best; this prior
+  has the weight of one interval, so that tau does not vanish where noise hides the discrepancies;
 - the size of the input gain and bias discrepancies, and of the delay, likewise.
 
-All come down gradually from large values, and so does the standard deviation of continuity: far from the solution the
-problem is many easy ones, near it a single one that uses every bit of information (graduated non-convexity).  On the
-way down tau follows the median interval, so that intervals with large residuals give way to their neighbours.
+All scales decrease gradually from large values, and so does the standard deviation of continuity: far from the solution
+intervals are independent problems, near it they are one (graduated non-convexity).  Until convergence tau follows the
+median interval, so that intervals with large residuals give way to their neighbours.
 
 References
 ----------
@@ -31,7 +31,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import Fit, co
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.arrowhead import Factored
-    from diransac.identification.methods.lo_diransac.settings import LoDiransac
+    from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
@@ -43,7 +43,7 @@ _TAU_START, _SHRINK = 0.3, 0.4
 # Continuity is exact for practical purposes: jumps are as small a part of the effect of tau in an interval.
 _CONTINUITY = 0.03
 _SIGMA_FLOOR = 1e-4
-# Tau on the way down, over its prior: noise must not explain what the model does not.
+# Tau until convergence, over its prior: noise must not absorb model error.
 _GUARDED = 10.0
 _MAX_TRIALS, _MAX_SWEEPS = 8, 12
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
@@ -51,15 +51,20 @@ _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
 
 @dataclass(frozen=True)
 class Prior:
-    """Sizes of the discrepancies before the logs are seen; each counts like one interval's evidence.
+    """Prior sizes of the discrepancies; each has the weight of one interval.
 
     Parameters
     ----------
-    tau : (n_v,)   unmodelled accelerations
-    unit : (n_s,)   a discrepancy that makes all of an equation's inertial force; a sample of delay; infinite for
-        parameters
-    discrepancy : in those units, once the fit has converged; ``guarded`` until then
-    delay : samples
+    tau : (n_v,) array
+        Unmodelled accelerations.
+    unit : (n_s,) array
+        Discrepancy that equals an equation's inertial force; a sample of delay; infinite for parameters.
+    discrepancy : float
+        Prior size of the discrepancies in those units, after the first convergence.
+    guarded : float
+        The same until then.
+    delay : float
+        Prior size of the input delay, samples.
     """
 
     tau: FloatArray
@@ -71,14 +76,18 @@ class Prior:
 
 @dataclass(frozen=True)
 class Refinement:
-    """What local optimisation found.
+    """Result of local optimisation.
 
     Parameters
     ----------
-    fit : the most probable motion and parameters
-    loss : minus the log of the likelihood of all samples
-    steps : Gauss-Newton steps
-    converged : whether they ended before the limit
+    fit : Fit
+        Most probable motion and parameters.
+    loss : float
+        Negative log-likelihood of all samples.
+    steps : int
+        Number of Gauss-Newton steps.
+    converged : bool
+        Whether the steps ended before the limit.
     """
 
     fit: Fit
@@ -87,8 +96,21 @@ class Refinement:
     converged: bool
 
 
-def make_prior(settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, unit: FloatArray) -> Prior:
-    """The prior in the units of these logs."""
+def make_prior(settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, unit: FloatArray) -> Prior:
+    """Prior in the units of the logs.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    intervals : ShootingIntervals
+    motion : Motion
+    unit : (n_s,) array
+        Result of `discrepancy_units`.
+
+    Returns
+    -------
+    Prior
+    """
     return Prior(
         tau=settings.prior_model_error * motion.spread[-intervals.model.n_v :],
         unit=unit,
@@ -98,8 +120,25 @@ def make_prior(settings: LoDiransac, intervals: ShootingIntervals, motion: Motio
     )
 
 
-def start(settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, p: FloatArray, prior: Prior) -> Fit:
-    """From a hypothesis, and the smoothed motion at the intervals' starts, or where the intervals before end."""
+def start(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, p: FloatArray, prior: Prior
+) -> Fit:
+    """Initial fit from a hypothesis and the smoothed motion at the intervals' starts, or their neighbours' ends.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+    p : (n,) array
+        Hypothesis.
+    prior : Prior
+
+    Returns
+    -------
+    Fit
+    """
     n_x, n_v = intervals.model.n_q + intervals.model.n_v, intervals.model.n_v
     x, d = motion.signals[intervals.starts, :n_x].copy(), np.zeros((len(intervals), n_v))
     shared = np.concatenate([p, np.zeros(intervals.n_shared - len(p))])
@@ -118,9 +157,9 @@ def start(settings: LoDiransac, intervals: ShootingIntervals, motion: Motion, p:
 
 
 def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
-    """Intervals that begin where their neighbours have them begin, where that explains them better.
+    """The fit with initial states propagated from neighbouring intervals, where they have a higher likelihood.
 
-    Where outliers are in the majority for longer than an interval, nothing there shows the state; its neighbours do.
+    Where outliers are in the majority for longer than an interval, its state follows from its neighbours alone.
     """
     for _ in range(_MAX_SWEEPS):
         before, after = fit.x.copy(), fit.x.copy()
@@ -134,7 +173,7 @@ def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
 
 
 def _better(intervals: ShootingIntervals, fit: Fit, x: FloatArray) -> tuple[Fit, bool]:
-    """The fit with those of other initial states that explain their intervals better, and whether there are any."""
+    """The fit with those of other initial states that have a higher likelihood; True if there are any."""
     residuals = intervals.residuals(fit.shared, x, fit.d)
     found = _loss_by_interval(intervals, replace(fit, residuals=residuals)) < _loss_by_interval(intervals, fit)
     rows = np.repeat(found, intervals.length)[:, None]
@@ -143,13 +182,26 @@ def _better(intervals: ShootingIntervals, fit: Fit, x: FloatArray) -> tuple[Fit,
 
 
 def _loss_by_interval(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
-    """Minus the log of the likelihood of each interval's samples, (W,)."""
+    """Negative log-likelihood of each interval's samples, (W,)."""
     losses = fit.noise.negative_log_likelihood(fit.residuals, intervals.known)
     return np.asarray(losses.reshape(len(intervals), -1).sum(axis=1))
 
 
-def refine(settings: LoDiransac, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
-    """Steps and updates until nothing changes, first with a robust tau, then with the evidence's."""
+def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
+    """Fit after steps and updates until convergence, first with a robust tau, then with that of the evidence.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    intervals : ShootingIntervals
+    fit : Fit
+        Initial fit, as from `start`.
+    prior : Prior
+
+    Returns
+    -------
+    Refinement
+    """
     damping, robust, converged, steps = 0.0, settings.robust_model_error, False, 0
     while steps < settings.max_steps and (robust or not converged):
         steps += 1
@@ -164,12 +216,22 @@ def refine(settings: LoDiransac, intervals: ShootingIntervals, fit: Fit, prior: 
 
 
 def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
-    """Of each measurement: the probability that it is no outlier, over its variance."""
+    """Weight of each measurement: the probability that it is not an outlier, over its variance.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    (N, n_signals) array
+    """
     return fit.noise.inlying(fit.residuals, intervals.known) / np.square(fit.noise.sigma)
 
 
 def _step(intervals: ShootingIntervals, fit: Fit, damping: float) -> tuple[Fit, Factored, float]:
-    """One Gauss-Newton step within the bounds, damped until the cost falls; with what damping came next."""
+    """One Gauss-Newton step within the bounds, damped until the cost falls, and the damping of the next step."""
     weights = weights_of(intervals, fit)
     at, before = linearize(intervals, fit, weights), cost(intervals, fit, weights)
     n_x = fit.x.shape[1]
@@ -196,9 +258,15 @@ def _bounded(intervals: ShootingIntervals, now: FloatArray, then: FloatArray) ->
 
 
 def _update(
-    settings: LoDiransac, intervals: ShootingIntervals, fit: Fit, solved: Factored, prior: Prior, *, robust: bool
+    settings: LoDiransacSettings,
+    intervals: ShootingIntervals,
+    fit: Fit,
+    solved: Factored,
+    prior: Prior,
+    *,
+    robust: bool,
 ) -> Fit:
-    """Every scale from the residuals, unmodelled accelerations and discrepancies as they are now."""
+    """The fit with every scale updated from residuals, unmodelled accelerations and discrepancies."""
     n_x, n_p = fit.x.shape[1], intervals.n_p
     inlying = fit.noise.inlying(fit.residuals, intervals.known)
     noise = fit.noise.updated(fit.residuals, intervals.known, inlying, outliers=settings.outliers)
@@ -234,7 +302,7 @@ def _discrepancies(fit: Fit, prior: Prior, variance: FloatArray, n_p: int) -> Fl
 
 
 def _continuity(intervals: ShootingIntervals, tau: FloatArray) -> FloatArray:
-    """Jumps ``(n_x,)`` that are negligible beside what unmodelled accelerations do to velocities and coordinates."""
+    """Jumps ``(n_x,)`` that are negligible beside the effect of unmodelled accelerations on the state."""
     T = intervals.duration
     velocity = _CONTINUITY * tau * T
     derived = intervals.model.kinematics is None
@@ -243,7 +311,7 @@ def _continuity(intervals: ShootingIntervals, tau: FloatArray) -> FloatArray:
 
 
 def _unchanged(old: Fit, new: Fit, errors: FloatArray) -> bool:
-    """Whether parameters move by less than a hundredth of their standard errors, and scales by a few hundredths."""
+    """True if parameters move by less than a hundredth of their standard errors, and scales by a few hundredths."""
     n_p = len(errors)
     moved = np.abs(new.shared - old.shared)[:n_p] / (errors + 1e-9 * np.abs(old.shared[:n_p]) + 1e-300)
     changes = (

@@ -1,71 +1,23 @@
-"""`LoDiransac`: the settings of the default method."""
+"""Settings of lo-diransac, checked."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from diransac.blas import single_threaded
 from diransac.errors import SettingsError
 from diransac.identification.settings import JUDGING, Settings, check_used
 
-if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset
-    from diransac.identification.estimate import Estimate
-    from diransac.identification.method import Callback
-
-__all__ = ["LoDiransac", "configured"]
+__all__ = ["LoDiransacSettings"]
 
 
 @dataclass(frozen=True)
-class LoDiransac:
-    """Locally optimised DIRANSAC: random samples, consensus by simulation, one weak-constraint fit of all logs.
-
-    Every default works for any model and any subset of signals.  Times are in seconds; a window of less than 5 samples
-    is widened to them.
-
-    Parameters
-    ----------
-    criteria : settings of the evaluation: weights, thresholds and initial state, threads
-    stuck_rows : whether rows that repeat the row before in every signal are taken as missing
-    input_window : s, window of the Hampel filter that replaces momentary leaps of inputs; the shorter of it and 15
-        samples
-    input_threshold : of that filter, in local standard deviations
-    median_window : s, window of the running median that residuals of the smoothing start from; the shorter of it and 31
-        samples
-    smoothing_half_width : s, narrowest half width of the smoothing polynomials, and of the shooting intervals; the
-        shorter of it and 25 samples.  Three times, nine times, ... as wide ones are chosen by cross-validation
-    n_samples, n_nonlinear_samples : random samples of a model that is affine in its parameters, and of others
-    largest_sample : rows of each equation in a sample at most, over the number of parameters
-    n_screening_intervals, n_finalists : intervals on which all hypotheses are scored; hypotheses that are scored on all
-    delay_range : s, delays of the inputs that are tried before local optimisation, in whole samples
-    max_delay_shifts : how often inputs are shifted by whole samples after it
-    substeps : integration steps per sample: one is off by a percent where dry friction changes sign between samples or
-        links are light
-    max_starts, max_fits : hypotheses that may be optimised, and local optimisations at most
-    max_steps : Gauss-Newton steps of each at most; 0: the best hypothesis is the estimate
-    outliers : whether the noise of each signal has outliers; it is Gaussian without
-    neighbouring_starts : whether intervals may begin where their neighbours end, where that explains them better
-    gradual_continuity : whether the motion is made continuous gradually rather than from the start
-    robust_model_error : whether the size of unmodelled accelerations follows the median interval at first
-    model_error : whether unmodelled accelerations follow the evidence; they vanish without
-    prior_model_error : their size before the log is seen, over the spread of the accelerations
-    prior_discrepancy, initial_discrepancy : size of input gain and bias discrepancies, over that which makes all of an
-        equation's inertial force, before the log is seen and on the way down
-    prior_delay : s, standard deviation of the input delay before the log is seen
-    instrumental_variables : whether parameters are read from the fitted motion by instrumental variables, rather than
-        from the fit
-    prior_inflation : factor of the prior on model error whose effect on the parameters is added to their covariance
-
-    Raises
-    ------
-    SettingsError
-        A value has no meaning.
-    """
+class LoDiransacSettings:
+    """Fields of `LoDiransac`, which documents them."""
 
     criteria: Settings = field(default_factory=Settings)
     stuck_rows: bool = True
@@ -113,26 +65,6 @@ class LoDiransac:
         """All settings but the criteria."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "criteria"}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
-
-    def fit(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
-        """Parameters of the model from the logs, without starting values or thresholds.
-
-        Raises
-        ------
-        LogError
-            The logs are too short, or sampled at different rates.
-        IdentificationError
-            No sample gives parameters within their bounds.
-        """
-        from diransac.identification.methods.lo_diransac.method import estimate
-
-        with single_threaded():  # matrices are small: other cores would only wait
-            return estimate(self, dataset, int(seed), callback)
-
-
-def configured(settings: Settings, **options: Any) -> LoDiransac:
-    """The method with these options, evaluated by the given settings."""
-    return LoDiransac(settings, **options)
 
 
 _MAY_BE_ZERO = ("n_samples", "max_delay_shifts", "max_steps", "prior_model_error", "prior_discrepancy")

@@ -27,19 +27,30 @@ _WELL_CONDITIONED = 1e8
 
 @dataclass(frozen=True)
 class ShootingIntervals:
-    """Rows of all logs as intervals of ``length`` rows; made by `of`, which fills up the last interval of each log.
+    """Rows of all logs as intervals of ``length`` rows; made by `of`, which pads the last interval of each log.
 
     Parameters
     ----------
-    model : what is identified
-    layout : places of each log's parameters
-    measured, known : (N, n_s)   every signal of the model, in its order; nothing is known of rows that fill up
-    inputs : (N, n_u)
-    is_logged : (N,)   rows of the logs, as opposed to those that fill up
-    log_of : (W,)   log of each interval
-    dt : s
-    length : rows of an interval
-    substeps : integration steps from row to row
+    model : Model
+        Equations with the parameters to be estimated.
+    layout : ParameterLayout
+        Positions of each log's parameters.
+    measured : (N, n_s) array
+        Every signal of the model, in its order and its unit.
+    known : (N, n_s) bool array
+        Samples that are measured; False in padded rows.
+    inputs : (N, n_u) array
+        Each in its unit.
+    is_logged : (N,) bool array
+        Rows of the logs, as opposed to padded ones.
+    log_of : (W,) int array
+        Log of each interval.
+    dt : float
+        Sampling time, s.
+    length : int
+        Number of rows of an interval.
+    substeps : int
+        Integration steps from row to row.
     """
 
     model: Model
@@ -63,7 +74,25 @@ class ShootingIntervals:
         length: int,
         substeps: int,
     ) -> ShootingIntervals:
-        """Intervals of logs, each given as measured, known (N, n_s) and inputs (N, n_u)."""
+        """Intervals of logs of any length.
+
+        Parameters
+        ----------
+        model : Model
+        layout : ParameterLayout
+        logs : sequence of ((N, n_s) array, (N, n_s) bool array, (N, n_u) array)
+            Measured signals, known samples, and inputs of each log.
+        dt : float
+            Sampling time, s.
+        length : int
+            Number of rows of an interval.
+        substeps : int
+            Integration steps from row to row.
+
+        Returns
+        -------
+        ShootingIntervals
+        """
         missing = [-len(inputs) % length for _, _, inputs in logs]
         measured = np.concatenate([_filled_up(log[0], more) for log, more in zip(logs, missing, strict=True)])
         inputs = np.concatenate([_filled_up(log[2], more) for log, more in zip(logs, missing, strict=True)])
@@ -83,7 +112,7 @@ class ShootingIntervals:
 
     @cached_property
     def linked(self) -> BoolArray:
-        """Whether each interval but the last goes on in the next one ``(W - 1,)``: both are of one log."""
+        """Mask ``(W - 1,)`` of the intervals that continue in the next one, which is of the same log."""
         return np.asarray(self.log_of[1:] == self.log_of[:-1])
 
     @cached_property
@@ -98,7 +127,7 @@ class ShootingIntervals:
 
     @property
     def duration(self) -> float:
-        """Of an interval, s."""
+        """Duration of an interval, s."""
         return self.length * self.dt
 
     @cached_property
@@ -118,7 +147,7 @@ class ShootingIntervals:
 
     @cached_property
     def rollouts(self) -> Simulator:
-        """Of the augmented model."""
+        """Simulator of the augmented model."""
         return rollouts(self.augmented.model, substeps=self.substeps)
 
     @cached_property
@@ -132,23 +161,41 @@ class ShootingIntervals:
 
     @cached_property
     def rows_of_logs(self) -> list[slice]:
-        """Rows of each log, with those that fill up."""
+        """Rows of each log, padded ones included."""
         edges = [*self.first_of_log.tolist(), len(self.inputs)]
         return [slice(a, b) for a, b in pairwise(edges)]
 
     def delayed(self, rows: int) -> ShootingIntervals:
-        """The same logs with their inputs acting some rows later."""
+        """The intervals with inputs delayed by a number of rows."""
         at = [np.clip(np.arange(r.start, r.stop) - rows, r.start, r.stop - 1) for r in self.rows_of_logs]
         return replace(self, inputs=self.inputs[np.concatenate(at)])
 
     def parameters_of(self, values: FloatArray, logs: IntArray) -> FloatArray:
-        """Parameters ``(n, n_p of the model)`` of each of the logs ``(n,)`` from a vector, or one that serves all."""
+        """Model parameters ``(n, n_p)`` of the logs ``(n,)`` from a vector; the vector itself if all are shared."""
         return values if self.layout.is_shared else values[self.layout.index[logs]]
 
     def batch(
         self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray | None = None, more_rows: int = 0
     ) -> RolloutBatch:
-        """Lanes of all intervals, or of the chosen ones, with so many rows more."""
+        """Lanes of all or chosen intervals.
+
+        Parameters
+        ----------
+        shared : (n_shared,) array
+            Parameters, discrepancies, input delay in samples.
+        x : (W, n_x) array
+            States at the intervals' starts.
+        d : (W, n_v) array
+            Unmodelled accelerations.
+        chosen : (n,) int array, optional
+            Indices of intervals; None: all.
+        more_rows : int, optional
+            Number of rows that are simulated beyond each interval.
+
+        Returns
+        -------
+        RolloutBatch
+        """
         chosen = np.arange(len(self)) if chosen is None else chosen
         own = np.broadcast_to(
             self.parameters_of(shared[: self.n_p], self.log_of[chosen]), (len(chosen), self.model.n_p)
@@ -161,20 +208,20 @@ class ShootingIntervals:
 
     @cached_property
     def measurements(self) -> Measurements:
-        """All rows count; what isn't known in them has no weight."""
+        """Measured signals; all rows count, and unknown samples have no weight."""
         return Measurements(self.measured, np.ones(len(self.measured), bool))
 
     def residuals(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
-        """Simulated less measured, (N, n_s); huge from a divergence on."""
+        """Simulated less measured signals ``(N, n_s)``, huge from a divergence on; arguments as `batch`."""
         errors = self.rollouts.errors(self.batch(shared, x, d), self.measurements).reshape(self.measured.shape)
         return np.nan_to_num(errors, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
 
     def gauss_newton(self, shared: FloatArray, x: FloatArray, d: FloatArray, weights: FloatArray) -> GaussNewtonBatch:
-        """Least-squares sums of every interval; ``weights (N, n_s)``."""
+        """Least-squares sums of every interval with ``weights (N, n_s)``; other arguments as `batch`."""
         return self.rollouts.gauss_newton(self.batch(shared, x, d), self.measurements, weights)
 
     def ends(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
-        """States (W - 1, n_x) in which intervals end, where their successors begin; the successor's where unlinked."""
+        """Final states (W - 1, n_x) of all intervals but the last; the successor's initial state where unlinked."""
         chosen = np.flatnonzero(self.linked)
         found = x[1:].copy()
         if len(chosen):
@@ -183,9 +230,9 @@ class ShootingIntervals:
         return found
 
     def origins(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
-        """States (W - 1, n_x) from which intervals, but for the last, would end where their successors begin.
+        """Initial states (W - 1, n_x) for which all intervals but the last end in their successor's initial state.
 
-        By one Newton step; states as they are where that has no answer.
+        One Newton step; states are unchanged where it has no solution.
         """
         sums = self.gauss_newton(shared, x, d, np.zeros(self.measured.shape))
         jumps, slopes = x[1:] - sums.final_states[:-1], sums.final_slopes[:-1, :, -x.shape[1] :]
@@ -198,5 +245,5 @@ class ShootingIntervals:
 
 
 def _filled_up(values: FloatArray, more: int) -> FloatArray:
-    """The rows with the last one repeated."""
+    """The rows, padded by repetitions of the last one."""
     return np.pad(values, ((0, more), (0, 0)), mode="edge") if more else values

@@ -1,10 +1,10 @@
 """Screening of samples, and the motion without a model.
 
 The motion is local polynomials that a coordinate shares with its velocity and acceleration.  In a window about each
-knot a polynomial of degree 4 is fitted to whatever is measured of a coordinate and its derivatives.  Weights are Geman
+knot a polynomial of degree 4 is fitted to the measured ones of a coordinate and its derivatives.  Weights are Geman
 and McClure's, the scale of each signal a low quantile of its residuals, so that more than half of the samples may be
-wrong; residuals start from a running median, and scales come down gradually, so that the fit does not settle on the
-first majority that it meets (graduated non-convexity).
+outliers; residuals start from a running median, and scales decrease gradually, to avoid local optima (graduated
+non-convexity).
 
 References
 ----------
@@ -52,7 +52,17 @@ _ENOUGH = 4000
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples of one log: measured, known and running median ``(N, n_signals)``, in the model's order of signals."""
+    """Samples of one log, in the model's order of signals.
+
+    Parameters
+    ----------
+    measured : (N, n_signals) array
+        Each signal in its unit; 0 where missing.
+    known : (N, n_signals) bool array
+        Samples that are measured.
+    centre : (N, n_signals) array
+        Running median.
+    """
 
     measured: FloatArray
     known: BoolArray
@@ -61,7 +71,15 @@ class Samples:
 
 @dataclass(frozen=True)
 class Motion:
-    """Smoothed signals ``(N, n_signals)``, and the spread of each signal ``(n_signals,)``."""
+    """Smoothed motion.
+
+    Parameters
+    ----------
+    signals : (N, n_signals) array
+        Each in its unit.
+    spread : (n_signals,) array
+        Robust standard deviation of each signal over all logs.
+    """
 
     signals: FloatArray
     spread: FloatArray
@@ -71,21 +89,56 @@ class Motion:
 
 
 def odd_window(seconds: float, dt: float, most: int) -> int:
-    """Samples of a window, an odd number from 5 to ``most``."""
+    """Number of samples of a window, odd and from 5 to ``most``.
+
+    Parameters
+    ----------
+    seconds : float
+    dt : float
+        Sampling time, s.
+    most : int
+
+    Returns
+    -------
+    int
+    """
     return max(_FEWEST, min(most, 2 * round(0.5 * (seconds / dt - 1.0)) + 1))
 
 
 def stuck_rows(measured: FloatArray) -> BoolArray:
-    """Rows ``(N,)`` that repeat the row before exactly in every signal: nothing new was measured."""
+    """Rows that repeat the previous row exactly in every signal: nothing new was measured.
+
+    Parameters
+    ----------
+    measured : (N, n) array
+
+    Returns
+    -------
+    (N,) bool array
+    """
     stuck = np.zeros(len(measured), bool)
     stuck[1:] = np.all(measured[1:] == measured[:-1], axis=1)
     return stuck
 
 
 def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[FloatArray, int]:
-    """Inputs whose momentary leaps are replaced by the running median, and the number of rows with one (Hampel filter).
+    """Inputs whose momentary leaps are replaced by the running median (Hampel filter).
 
-    A simulation goes on from a wrong input with a wrong state, so inputs cannot be left to the noise model.
+    An error of an input persists in the simulated state, so that the noise model cannot absorb it.
+
+    Parameters
+    ----------
+    inputs : (N, n_u) array
+    window : int
+        Odd number of samples.
+    threshold : float
+        Local standard deviations beyond which an input is replaced.
+
+    Returns
+    -------
+    inputs : (N, n_u) array
+    n_leaps : int
+        Number of rows with a replaced input.
     """
     if len(inputs) < window or not inputs.shape[1]:
         return inputs, 0
@@ -105,11 +158,21 @@ def _chains(model: Model) -> list[list[int]]:
 
 
 def smooth(model: Model, logs: Sequence[Samples], dt: float, half: int) -> list[Motion]:
-    """Motion of every log; the spread of each signal is that over all logs.
+    """Smoothed motion of every log.
 
     Parameters
     ----------
-    half : samples that a polynomial covers to either side of its knot
+    model : Model
+    logs : sequence of Samples
+    dt : float
+        Sampling time, s.
+    half : int
+        Samples that a polynomial covers to either side of its knot.
+
+    Returns
+    -------
+    list of Motion
+        The spread of each signal is that over all logs.
     """
     signals = [_smoothed(model, log, dt, half) for log in logs]
     middle = np.concatenate(
@@ -140,14 +203,23 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
 
 
 def choose_half_width(model: Model, logs: Sequence[Samples], dt: float, narrowest: float) -> int:
-    """The half width, in samples, whose polynomials best predict samples that they were not fitted to.
+    """Half width whose polynomials best predict samples that they were not fitted to (cross-validation).
 
-    A narrow window is noisy, a wide one is stiff; every other sample is left out and predicted (cross-validation), and
-    the error is a low quantile, so that outliers have no influence.
+    Every other sample is left out and predicted; the error is a low quantile, so that outliers have no influence.
 
     Parameters
     ----------
-    narrowest : s; the first candidate is the shorter of it and 25 samples, others are three times as wide each
+    model : Model
+    logs : sequence of Samples
+    dt : float
+        Sampling time, s.
+    narrowest : float
+        Smallest candidate, s, at most 25 samples; each other candidate is three times as wide as the one before.
+
+    Returns
+    -------
+    int
+        Number of samples.
     """
     longest = max(len(log.measured) for log in logs)
     first = max(_FEWEST, min(round(narrowest / dt), _ENOUGH_SAMPLES))
@@ -196,14 +268,28 @@ def _neighbourhoods(knots: IntArray, half: int, n_rows: int) -> tuple[IntArray, 
 
 
 def _spread(values: FloatArray) -> FloatArray:
-    """Standard deviation of each column by the MAD; where half the samples rest at one value, by the central 80 %."""
+    """Standard deviation of each column by the MAD; by the central 80 % where half the samples have one value."""
     low, median, high = np.quantile(values, [0.1, 0.5, 0.9], axis=0)
     mad, wide = 1.4826 * np.median(np.abs(values - median), axis=0), (high - low) / 2.563
     return np.asarray(np.where(mad > _AT_REST * wide, mad, wide))
 
 
 def running_median(measured: FloatArray, known: BoolArray, window: int) -> FloatArray:
-    """Median over a window of rows, gaps bridged by straight lines; 0 for what is not measured."""
+    """Median over a window of rows; gaps are interpolated linearly.
+
+    Parameters
+    ----------
+    measured : (N, n) array
+    known : (N, n) bool array
+        Samples that are measured.
+    window : int
+        Odd number of rows.
+
+    Returns
+    -------
+    (N, n) array
+        0 in signals without a measured sample.
+    """
     rows, bridged = np.arange(len(measured)), np.zeros(measured.shape)
     for i in np.flatnonzero(known.any(axis=0)):
         bridged[:, i] = np.interp(rows, rows[known[:, i]], measured[known[:, i], i])
@@ -211,7 +297,7 @@ def running_median(measured: FloatArray, known: BoolArray, window: int) -> Float
 
 
 def _medians(columns: FloatArray, window: int) -> FloatArray:
-    """Running median of each column; one dimension at a time, for which SciPy has the faster algorithm."""
+    """Running median of each column; SciPy has a faster algorithm for one dimension."""
     return np.asarray(np.column_stack([median_filter(x, size=window, mode="mirror") for x in columns.T]))
 
 
@@ -249,7 +335,7 @@ def _fit(
 
 
 def _scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
-    """One for what is not measured."""
+    """Robust standard deviation of each column; one where nothing is measured."""
     c = residuals.shape[-1]
     flat, seen = residuals.reshape(-1, c), known.reshape(-1, c)
     every = max(1, len(flat) // _ENOUGH) | 1

@@ -1,0 +1,264 @@
+"""`Segment`: one log bound to a model, as arrays that every method reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray
+from diransac.data import preprocessing
+from diransac.data.log import Log
+from diransac.data.units import conversion, same_unit
+from diransac.errors import LogError, SettingsError
+
+if TYPE_CHECKING:
+    from diransac.model import Model
+
+__all__ = ["Segment", "bind_log"]
+
+
+# A line through seven samples bears two outliers, and is short against any motion that is sampled well; the slope that
+# stands for a missing velocity needs a longer one.
+_ROWS_FOR_VALUE, _ROWS_FOR_SLOPE = 7, 25
+_FAR = 5.0
+# Rows that an input is held for, beyond which the motion is no longer the one that it made.
+_LONG_HOLD = 3
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Arrays of one model over one log.
+
+    Parameters
+    ----------
+    model : Model
+    log : Log
+        The log, with its angles unwrapped.
+    offset : int
+        Row of the log that is row 0 of the arrays: the first that counts.
+    signals : tuple of str
+        Names of the n_s signals of the model that the dataset has, in the model's order.
+    measured : (N, n_s) array
+        Measured signals, each in its unit; NaN where missing.
+    inputs : (N, n_u) array
+        Inputs, each in its unit; NaN is replaced by the last good sample.
+    valid : (N,) bool array
+        Rows in which every signal in use is finite.
+    notes : tuple of str
+        Findings and changes, a sentence each.
+    """
+
+    model: Model
+    log: Log
+    offset: int
+    signals: tuple[str, ...]
+    measured: FloatArray
+    inputs: FloatArray
+    valid: BoolArray
+    notes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.valid)
+
+    @property
+    def n_rows(self) -> int:
+        """Rows that count."""
+        return int(self.valid.sum())
+
+    def column(self, name: str) -> FloatArray:
+        """A measured signal (N,)."""
+        return self.measured[:, self.signals.index(name)]
+
+    @cached_property
+    def present(self) -> tuple[str, ...]:
+        """Signals of which this log has at least one sample."""
+        some: BoolArray = np.asarray(np.isfinite(self.measured).any(axis=0))
+        return tuple(n for n, x in zip(self.signals, some, strict=True) if x)
+
+    def state_arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Coordinates ``(N, n_q)``, velocities and accelerations ``(N, n_v)``; 0 in what the log lacks."""
+        full = np.zeros((len(self), len(self.model.signals)))
+        for name in self.present:
+            full[:, self.model.signals.index(name)] = self.column(name)
+        n_q, n_v = self.model.n_q, self.model.n_v
+        return full[:, :n_q], full[:, n_q : n_q + n_v], full[:, n_q + n_v :]
+
+    def acting_inputs(self) -> FloatArray:
+        """Inputs ``(N, n_u)`` that belong to each row's accelerations; see `preprocessing.acting_inputs`."""
+        return preprocessing.acting_inputs(self.log.filter, self.inputs)
+
+    def initial_state(self, rule: str | Mapping[str, float]) -> FloatArray:
+        """State ``(n_x,)`` at row 0 by a rule of ``Settings.initial_state``.
+
+        A state that the log lacks and on which no measured signal depends starts at 0, a quaternion at (1, 0, 0, 0).
+
+        Raises
+        ------
+        LogError
+            A state is missing on which a measured signal depends.
+        SettingsError
+            The rule names an unknown state.
+        """
+        given = rule if isinstance(rule, Mapping) else {}
+        unknown = [n for n in given if n not in self.model.state]
+        if unknown:
+            raise SettingsError(f'initial_state names "{unknown[0]}"; the state is {", ".join(self.model.state)}')
+        matter = self.model.states_behind(self.present)
+        start = np.zeros(len(self.model.state))
+        start[[four[0] for four in self.model.quaternions]] = 1.0
+        for i, name in enumerate(self.model.state):
+            if name in given:
+                start[i] = given[name]
+            elif name in self.present:
+                start[i] = self._first(name) if rule != "robust" else self._robust(name)
+            elif name in matter:
+                start[i] = self._start_of_missing(name, rule)
+        return start
+
+    def _start_of_missing(self, name: str, rule: str | Mapping[str, float]) -> float:
+        coordinate = name.removesuffix("_dot")
+        if rule == "robust" and self.model.kinematics is None and coordinate in self.present:
+            return self._line(coordinate, _ROWS_FOR_SLOPE)[1]
+        raise LogError(
+            f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; pass '
+            f"--differentiate, or give initial_state = {{{name} = ...}}"
+        )
+
+    def _first(self, name: str) -> float:
+        column = self.column(name)
+        return float(column[np.flatnonzero(np.isfinite(column))[0]])
+
+    def _robust(self, name: str) -> float:
+        """The first sample, unless it is far from the line through the first few: then the line's value at row 0."""
+        column = self.column(name)
+        rows = np.flatnonzero(np.isfinite(column))[:_ROWS_FOR_VALUE]
+        value, slope = self._line(name, _ROWS_FOR_VALUE)
+        distances = np.abs(column[rows] - value - slope * rows * self.log.dt)
+        return float(column[rows[0]]) if distances[0] <= _FAR * np.median(distances) else value
+
+    def _line(self, name: str, n_rows: int) -> tuple[float, float]:
+        """Value and slope at row 0 of the line through a signal's first samples, by Theil and Sen."""
+        from scipy.stats import theilslopes
+
+        column = self.column(name)
+        rows = np.flatnonzero(np.isfinite(column))[:n_rows]
+        slope, intercept, *_ = theilslopes(column[rows], rows * self.log.dt)
+        return float(intercept), float(slope)
+
+    def with_signals(self, signals: tuple[str, ...]) -> Segment:
+        """The segment with exactly these signals, NaN where its log has none."""
+        if self.signals == signals:
+            return self
+        measured = np.full((len(self), len(signals)), np.nan)
+        for i, name in enumerate(signals):
+            if name in self.signals:
+                measured[:, i] = self.column(name)
+        return replace(self, signals=signals, measured=measured)
+
+
+def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: bool = True) -> Segment:
+    """Segment of ``log`` under ``model``.
+
+    Parameters
+    ----------
+    model : Model
+    log : Log
+    also : sequence of str, optional
+        Signals in use besides those that the equations name.
+    pointwise : bool, optional
+        Whether the equations are evaluated at each row, which needs every signal that they name.
+
+    Returns
+    -------
+    Segment
+
+    Raises
+    ------
+    LogError
+        A signal is missing, all NaN, infinite, too large to square, or in another unit; too few rows.
+    """
+    needed = model.required_signals if pointwise else tuple(model.inputs)
+    for name in needed:
+        if name not in log:
+            _raise_missing(model, log, name)
+    signals = tuple(n for n in model.signals if n in log)
+    if not signals:
+        _raise_missing(model, log, model.signals[0])
+    used = [n for n in (*signals, *model.inputs) if n in log]
+    log.check(used)
+    _check_units(model, log, used)
+    log = preprocessing.unwrap(log, [n for n in model.coordinates if n in log and model.coordinates[n] == "rad"])
+    inputs, held = _held_inputs(model, log)
+    measured = np.column_stack([log[n] for n in signals])
+    critical = [i for i, n in enumerate(signals) if n in needed or n in also]
+    valid = np.all(np.isfinite(np.hstack([measured[:, critical], inputs])), axis=1)
+    if not valid.any():
+        raise LogError(
+            f"{log.source}: no row has a value in every signal in use ({', '.join(used)}); found NaN in each"
+        )
+    offset = int(np.argmax(valid))
+    notes = [*log.notes, *_row_notes(log, valid, held)]
+    return Segment(model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], tuple(notes))
+
+
+def _raise_missing(model: Model, log: Log, name: str) -> None:
+    derivable = name in model.velocities or name in model.accelerations
+    hint = (
+        "pass --differentiate to estimate velocities and accelerations" if derivable else "name its column with --map"
+    )
+    if name in log.unusable:
+        raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; correct the column, or {hint}')
+    found = ", ".join(("t", *log.names))
+    raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}.')
+
+
+def _check_units(model: Model, log: Log, names: Sequence[str]) -> None:
+    for name in names:
+        found, wanted = log.units.get(name), model.units[name]
+        if found is None or same_unit(found, wanted):
+            continue
+        factor = conversion(found, wanted)
+        hint = f"pass --scale {name}={factor:.6g}" if factor is not None else "check the column"
+        raise LogError(f'{log.source}: signal "{name}" is in {found}, the model needs {wanted}; {hint}')
+
+
+def _held_inputs(model: Model, log: Log) -> tuple[FloatArray, BoolArray]:
+    """Inputs ``(N, n_u)`` with NaN held from the last good sample, and in which rows (N,) one was."""
+    held = np.zeros(len(log), dtype=bool)
+    columns = []
+    for name in model.inputs:
+        column = log[name] if name in log else np.zeros(len(log))
+        good = np.isfinite(column)
+        last = np.maximum.accumulate(np.where(good, np.arange(len(column)), -1))
+        held |= ~good & (last >= 0)
+        columns.append(np.where(last >= 0, column[last], np.nan))
+    return np.column_stack(columns) if columns else np.zeros((len(log), 0)), held
+
+
+def _row_notes(log: Log, valid: BoolArray, held: BoolArray) -> list[str]:
+    notes = []
+    skipped = int((~valid).sum())
+    if skipped:
+        notes.append(f"{skipped} of {len(valid)} rows were skipped: a signal in use is NaN there")
+    if held.any():
+        notes.append(f"inputs were held from the last good sample in {held.sum()} rows, where they are NaN")
+    return [*notes, *_gap_notes(log, held)]
+
+
+def _gap_notes(log: Log, held: BoolArray) -> list[str]:
+    """A note on the gaps over which inputs were held for 3 rows or more; none without gaps."""
+    edges = np.flatnonzero(np.diff(np.r_[False, held, False]))
+    first, length = edges[::2], edges[1::2] - edges[::2]
+    n_gaps = int((length >= _LONG_HOLD).sum())
+    if not n_gaps:
+        return []
+    longest = int(length.argmax())
+    return [
+        f"inputs are unknown in {n_gaps} gap{'s' * (n_gaps > 1)}, the longest {(length[longest] + 1) * log.dt:.4g} s "
+        f"after t = {log.time[first[longest] - 1]:.6g} s: a simulation through it drifts, which affects fit error "
+        "and inliers; split the log there to avoid it"
+    ]
