@@ -43,8 +43,8 @@ def identify(log: dr.Log) -> dict[str, dr.Result]:
     print(f"{'method':14}{'mass':>10}{'inertia':>10}{'drag':>10}{'inliers':>11}{'time':>10}")
     print(_row("true", PLANT.parameters))
     print(
-        _row("effective", effective(PLANT.parameters))
-        + "   identifiable from a log: 9 % of the lift is not in the model"
+        _row("pseudo-true", effective(PLANT.parameters))
+        + "   the best fit of any log: 9 % of the lift is not in the model"
     )
     results = {}
     for method in dr.METHODS:
@@ -58,7 +58,7 @@ def identify(log: dr.Log) -> dict[str, dr.Result]:
 
 
 def effective(parameters: Mapping[str, float]) -> dict[str, float]:
-    """Identifiable parameters: 9 % of lift that is not in the model appear as 8 % less mass."""
+    """Pseudo-true parameters, which fit any log best: 9 % of lift that is not in the model appear as 8 % less mass."""
     lift = 1.0 + IMBALANCE / (C_T * DIAMETER**4)
     return {**parameters, "mass": parameters["mass"] / lift}
 
