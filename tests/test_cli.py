@@ -253,9 +253,7 @@ def test_without_a_terminal_long_work_prints_a_line_every_ten_seconds(
     assert err.splitlines() == ["ols: fitting, 0% after 6 s", "ols: fitting, 50% after 20 s, about 20 s left"]
 
 
-def test_a_process_without_stderr_works_in_silence(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_a_process_without_stderr_works_in_silence(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     with monkeypatch.context() as patched:
         patched.setattr("sys.stderr", None)
         lines_of_progress(patched, (0.0, 0.0), (60.0, 0.5))
