@@ -4,13 +4,16 @@ PYTHON ?= $(firstword $(foreach p,python3 python python3.14 python3.13 python3.1
 BIN := .venv/bin
 ENVIRONMENT := .venv/.installed
 
-.PHONY: demo test lint bench docs coverage lock clean
+.PHONY: demo test quick lint bench docs coverage lock clean
 
 demo: $(ENVIRONMENT)  ## fly, identify, fly what was identified; writes out/demo/report.html and flight.png
 	$(BIN)/python examples/demo.py
 
 test: lint docs  ## everything that must hold
-	$(BIN)/pytest -q
+	$(BIN)/pytest -q -n auto --dist worksteal
+
+quick: $(ENVIRONMENT)  ## tests without the slow ones
+	$(BIN)/pytest -q -n auto --dist worksteal -m "not slow"
 
 lint: $(ENVIRONMENT)
 	$(BIN)/ruff check .

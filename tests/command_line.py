@@ -1,18 +1,25 @@
-"""What the tests of the command line share: a command that runs, a log, model files."""
+"""Support for tests of the command line: running a command, a log, model files."""
 
+import io
+import json
+from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
 import diransac as dr
+from diransac.cli import screen
 from diransac.cli.commands import app
 
 TRUE = {"mass": 50.0, "linear_drag": 12.0, "quadratic_drag": 30.0, "bias": 2.0}
 MODEL = ["--model", "underwater-vehicle"]
-# A search that takes a few milliseconds.
-QUICK = ["--set", "max_iterations=20", "--set", "sample_size=20"]
+FEW = ["--set", "max_iterations=20", "--set", "sample_size=20"]
+"""Settings of a search that takes a few milliseconds, for the methods that draw samples."""
+
+QUICK = ["--method", "i-diransac", *FEW]
 NONLINEAR = """
 from casadi import exp
 from diransac import Model, Parameter
@@ -35,10 +42,28 @@ model = Model(
 
 
 def run(*words: object) -> Result:
-    """Run a command line; an error that nobody foresaw fails the test."""
+    """Run a command line in this process; an unexpected exception, or a message of more than three lines, fails."""
     done = CliRunner().invoke(app, [str(word) for word in words], prog_name="diransac", catch_exceptions=False)
     assert done.exit_code == 0 or len(done.stderr.splitlines()) <= 3, done.stderr
     return done
+
+
+def run_both(monkeypatch: pytest.MonkeyPatch, *words: object) -> tuple[str, dict[str, Any]]:
+    """Text that a command prints, and what it prints with ``--json``, from one run."""
+    shown = []
+    with monkeypatch.context() as patched:
+        patched.setattr("diransac.cli.screen.show", lambda item, as_json: shown.append((item, as_json)))
+        done = run(*words)
+    assert (done.exit_code, done.stdout, [as_json for _, as_json in shown]) == (0, "", [False]), done.stderr
+    text, as_json = (_printed(shown[0][0], as_json) for as_json in (False, True))
+    return text, json.loads(as_json)
+
+
+def _printed(item: screen.Showable, as_json: bool) -> str:
+    """What `screen.show` prints."""
+    with redirect_stdout(io.StringIO()) as out:
+        screen.show(item, as_json)
+    return out.getvalue()
 
 
 def swim(t: np.ndarray, frequency: float = 1.3) -> dict[str, np.ndarray]:

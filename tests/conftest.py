@@ -1,8 +1,14 @@
-"""Fixtures that every test may use."""
+"""Fixtures that every test may use, and one thread per worker of pytest-xdist."""
 
+import os
+from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # there is a worker per core; BLAS reads its variable when NumPy is imported
+    os.environ.setdefault("DIRANSAC_THREADS", "1")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
@@ -14,3 +20,14 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"REAL LOGS NOT CHECKED: {SHARED_DATA} is missing")
     return SHARED_DATA
+
+
+@pytest.fixture
+def trials_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run trials of studies in a thread of this process where they would run in processes of this machine."""
+    from diransac.study.run import Given, Workers, workers_of
+
+    def workers(executor: Executor | None, jobs: int | None, tasks: int | None) -> Workers:
+        return Given(ThreadPoolExecutor(1), 1) if executor is None else workers_of(executor, jobs, tasks)
+
+    monkeypatch.setattr("diransac.study.run.workers_of", workers)

@@ -1,4 +1,4 @@
-"""What the tests of studies share: a study that takes a second, and how rows are compared."""
+"""Support for tests of studies: a study that takes a second, and the comparison of rows."""
 
 import copy
 import os
@@ -87,17 +87,22 @@ def rows(store: Path) -> dict[tuple, dict]:
     return by_key
 
 
-def command(store: Path, jobs: int) -> dict:
-    """What `subprocess.Popen` needs for a process that runs the study, and says, line by line, how many rows it has."""
+def command(store: Path, jobs: int | None) -> dict:
+    """Arguments of `subprocess.Popen` for a process that runs the study and prints its number of rows, line by line.
+
+    The trials run in that many processes of its own; None: in a thread of it.
+    """
+    where = "executor=ThreadPoolExecutor(1)" if jobs is None else f"jobs={jobs}"
     script = store.parent / "runner.py"
     script.write_text(f"""
+from concurrent.futures import ThreadPoolExecutor
 import diransac as dr
 
 def progress(done, asked):
     print(done, asked, flush=True)
 
 if __name__ == "__main__":
-    dr.run_study({TINY!r}, store={str(store)!r}, jobs={jobs}, batch_size=1, progress=progress)
+    dr.run_study({TINY!r}, store={str(store)!r}, {where}, batch_size=1, progress=progress)
 """)
     return {"args": [sys.executable, str(script)]}
 

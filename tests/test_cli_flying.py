@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from command_line import contents, run
+from command_line import contents, run, run_both
 from diransac.cli.flight_options import NoiseOptions
 
 IMBALANCE = ["--plant", "extended-rotorcraft", "--aerodynamic-imbalance", 1.4e-6, "--mass-imbalance", 0]
@@ -87,9 +87,10 @@ def test_simulate_flies_what_the_library_flies(folder: Path):
     assert all(np.array_equal(found[name], expected[name]) for name in expected.names)
 
 
-def test_simulate_shows_tracking_errors_and_faults_by_signal(folder: Path):
+def test_simulate_shows_tracking_errors_and_faults_by_signal(folder: Path, monkeypatch: pytest.MonkeyPatch):
     words = ("simulate", "square", *IMBALANCE, "--dropouts", 0.01, "-o", "flight.csv")
-    shown, said = run(*words).stdout.splitlines(), json.loads(run(*words, "--json").stdout)
+    text, said = run_both(monkeypatch, *words)
+    shown = text.splitlines()
     rows = {line.split()[0]: line.split()[1:] for line in shown[2:]}
     assert "100 Hz" in shown[0]
     assert "seed 0" in shown[0]
@@ -187,10 +188,11 @@ def test_fly_flies_what_the_library_flies(result: dr.Result):
         assert said["at_limit"][name] == np.mean((log[name] <= low) | (log[name] >= high))
 
 
-def test_fly_shows_errors_with_units_beside_those_of_the_true_parameters(result: dr.Result):
+def test_fly_shows_errors_with_units_beside_those_of_the_true_parameters(
+    result: dr.Result, monkeypatch: pytest.MonkeyPatch
+):
     words = ["fly", "model.json", "--trajectory", "square", *IMBALANCE, "--parameter", "mass=0.22"]
-    shown = run(*words).stdout
-    said = json.loads(run(*words, "--json").stdout)
+    shown, said = run_both(monkeypatch, *words)
     rows = {line.split()[0]: line.split()[1:] for line in shown.splitlines()[1:] if line}
     error, ideal = said["tracking_error"]["z"], said["true"]["tracking_error"]["z"]
     assert rows["z"] == ["m", f"{error:.4g}", f"{ideal:.4g}"]
@@ -201,18 +203,17 @@ def test_fly_shows_errors_with_units_beside_those_of_the_true_parameters(result:
     assert rows["thrust"][:4] == ["N", "0", "..", "5"]
 
 
+@pytest.mark.slow
 def test_fly_says_how_often_inputs_are_at_their_limits(result: dr.Result):
     heavy = ["--parameter", "mass=0.45"]
     said = json.loads(run("fly", "model.json", "--trajectory", "square", *heavy, "--json").stdout)
     assert said["at_limit"]["thrust"] > 0.01
 
 
-def test_fly_says_when_the_true_parameters_cannot_fly_themselves(result: dr.Result):
-    too_heavy = ["--parameter", "mass=0.5"]
-    done = run("fly", "model.json", "--trajectory", "square", *too_heavy)
-    said = json.loads(run("fly", "model.json", "--trajectory", "square", *too_heavy, "--json").stdout)
-    assert done.exit_code == 0
-    assert "! the flight with the true parameters failed" in done.stdout
+@pytest.mark.slow
+def test_fly_says_when_the_true_parameters_cannot_fly_themselves(result: dr.Result, monkeypatch: pytest.MonkeyPatch):
+    shown, said = run_both(monkeypatch, "fly", "model.json", "--trajectory", "square", "--parameter", "mass=0.5")
+    assert "! the flight with the true parameters failed" in shown
     assert "thrust" in said["true"]["refused"]
 
 
@@ -226,14 +227,16 @@ def test_fly_draws_and_repeats_itself(result: dr.Result):
     assert Path("a.png").read_bytes() == Path("b.png").read_bytes()
 
 
-def test_fly_knows_table_i_for_the_paper_s_equations_under_any_name(folder: Path, clean_log: dr.Log):
+def test_fly_knows_table_i_for_the_paper_s_equations_under_any_name(
+    folder: Path, clean_log: dr.Log, monkeypatch: pytest.MonkeyPatch
+):
     twin("twin.py")
     clean_log.write("log.csv")
     assert run("identify", "log.csv", "--model", "twin.py", "--method", "ols", "-o", "model.json").exit_code == 0
-    said = json.loads(run("fly", "model.json", "--trajectory", "square", *IMBALANCE, "--json").stdout)
+    shown, said = run_both(monkeypatch, "fly", "model.json", "--trajectory", "square", *IMBALANCE)
     assert said["model"] == "twin"
     assert said["true"]["parameters"] == dict(dr.models.TABLE_I)
-    assert "other equations" not in run("fly", "model.json", "--trajectory", "square", *IMBALANCE).stdout
+    assert "other equations" not in shown
 
 
 def test_fly_takes_a_model_with_other_equations_for_the_same_machine_and_says_so(folder: Path, clean_log: dr.Log):

@@ -1,14 +1,14 @@
-r"""What README.md, docs/ and examples/ show is run, so that they cannot lie.
+r"""README.md, docs/ and examples/, run as they are shown.
 
 A page runs from top to bottom in a folder of its own, with ``examples/`` inside and the real logs in
 ``../shared/data``:
 
-- every ``python`` block, in one namespace a page;
+- every ``python`` block, in one namespace per page;
 - a ``python`` or ``toml`` block whose first line is a comment that names a file (``# rover.py``) is written to that
   file;
-- in every ``console`` block, each ``$ diransac ...`` and ``$ python ...`` line, continued over ``\``
-  at a line's end. Lines of `NOT_RUN` are shown only. Any other command belongs into a
-  ``text`` block, as does what cannot run.
+- in every ``console`` block, each ``$ diransac ...`` line in this process, trials of its studies included, and each
+  ``$ python ...`` line in its own; both may be continued over ``\`` at a line's end. Lines of `NOT_RUN` are shown only.
+  Any other command belongs into a ``text`` block, as does what cannot run.
 """
 
 import re
@@ -20,6 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
+
+from diransac.cli.commands import app
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED = REPOSITORY.parent / "shared"
@@ -53,14 +56,20 @@ def commands(body: str) -> list[list[str]]:
 
 
 def run_command(command: list[str], folder: Path) -> None:
-    """Run one command line of a page in a process of its own; its message is the failure's."""
+    """Run one command line of a page in its folder, the working directory; its output is the failure's message."""
     program, *arguments = command
     if program in NOT_RUN:
         return
     assert program in {"diransac", "python"}, f"{shlex.join(command)}: this cannot be run; show it in a text block"
-    prefix = [sys.executable] if program == "python" else [sys.executable, "-m", "diransac"]
-    done = subprocess.run([*prefix, *arguments], cwd=folder, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, f"{shlex.join(command)}: exit code {done.returncode}\n{done.stdout}{done.stderr}"
+    if program == "diransac":
+        assert folder == Path.cwd()
+        done = CliRunner().invoke(app, arguments, prog_name=program, catch_exceptions=False)
+        code = done.exit_code
+    else:
+        words = [sys.executable, *arguments]
+        done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=600, check=False)
+        code = done.returncode
+    assert code == 0, f"{shlex.join(command)}: exit code {code}\n{done.stdout}{done.stderr}"
 
 
 def write_named(block: Block, folder: Path) -> None:
@@ -76,7 +85,7 @@ def run_python(block: Block, page: Path, namespace: dict[str, object]) -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trials_in_this_process: None) -> Path:
     """Build a page's working directory: it looks like a checkout that has the real logs beside it."""
     checkout = tmp_path / "main"
     checkout.mkdir()
@@ -87,6 +96,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return checkout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_page_runs_as_it_is_shown(page: Path, folder: Path):
     namespace: dict[str, object] = {"__name__": "__page__"}
@@ -109,6 +119,7 @@ def test_page_marks_every_block_with_a_plain_language(page: Path):
     assert not odd, f"{page.name}: mark blocks with one of {sorted(LANGUAGES)}; text is for what cannot run"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
 def test_example_runs(example: Path, folder: Path):
     run_command(["python", str(example)], folder)

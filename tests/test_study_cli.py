@@ -3,7 +3,6 @@
 import json
 import re
 import tomllib
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -14,17 +13,15 @@ from rich.console import Console
 from command_line import contents, run
 from diransac.cli.study import _bar
 from diransac.study import builtin_names, load, template
-from diransac.study.run import Given
 from studies import TINY_TOML, rows
 
 QUICK = ["--store", "a.db", "--jobs", 1, "--trials", 1]
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Working directory with a study in it; trials run in a thread of this process."""
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trials_in_this_process: None) -> Path:
+    """Working directory with a study in it."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("diransac.study.run.workers_of", lambda *_: Given(ThreadPoolExecutor(1), 1))
     (tmp_path / "tiny.toml").write_text(TINY_TOML)
     return tmp_path
 

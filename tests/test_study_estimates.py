@@ -220,6 +220,7 @@ def of_a_users_plant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "a.db"
 
 
+@pytest.mark.slow
 def test_a_store_is_reported_without_the_file_of_its_plant(of_a_users_plant: Path):
     store = of_a_users_plant
     store.with_name("own.py").unlink()

@@ -76,6 +76,7 @@ def test_every_trial_of_the_gauntlet_flies_another_flight_and_is_judged_by_its_p
     assert {"diransac", "lo-diransac"} <= {method.method for method in study.methods.values()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GAUNTLET)
 def test_runs_of_faults_strike_about_a_fifth_of_the_gauntlets_samples(name: str):
     study = load(name)

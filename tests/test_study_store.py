@@ -67,6 +67,7 @@ def test_a_store_whose_maker_was_killed_at_once_is_new(tmp_path: Path):
         assert kept.finished("0", [0, 1]) == set()
 
 
+@pytest.mark.slow
 def test_processes_that_write_at_once_lose_nothing_and_repeat_nothing(tmp_path: Path):
     store = tmp_path / "a.db"
     workers = [multiprocessing.get_context("spawn").Process(target=write_rows, args=(store, 30 * k)) for k in range(2)]
