@@ -348,7 +348,7 @@ def test_fewer_rows_than_a_sample_are_refused():
 @pytest.mark.parametrize("method", dr.METHODS)
 def test_log_in_which_nothing_moves_is_refused(method):
     columns = dict.fromkeys((*PLANE.signals, *PLANE.inputs), np.zeros(200))
-    with pytest.raises(IdentificationError, match="does not determine|within their bounds"):
+    with pytest.raises(IdentificationError, match=r"does not determine|within their bounds"):
         dr.identify(MODEL, dr.Log.from_arrays(np.arange(200) * 0.01, columns), method)
 
 
