@@ -175,6 +175,7 @@ class _Task:
         for k, factor in enumerate((0.5, 2.0)):
             part = within(progress, 0.4 + 0.3 * k, 0.7 + 0.3 * k, f"{factor:g} x bandwidth: ")
             changes.append(self._change(result, [factor * x for x in chosen], part))
+        report(progress, "done", 1.0)
         pairs = {n: (changes[0][n], changes[1][n]) for n in result.parameters}
         return dataclasses.replace(result, bandwidth_sensitivity=pairs)
 
