@@ -280,7 +280,7 @@ def _excitation(bound: BoundEstimator, model: Model) -> tuple[dict[str, Excitati
         found = {names[i]: Excitation(units[i], np.nan, np.inf) for i in loose}
         return (
             found,
-            f"{', '.join(found)}: not excited by this motion, or only in combination; record another",
+            f"excitation of {', '.join(found)} is missing, or in combination only; record a richer motion",
         )
     estimates = selected.fit()[0]
     errors = np.sqrt(np.diag(jackknife_covariance(bound, rows)))
