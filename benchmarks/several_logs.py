@@ -111,7 +111,7 @@ def double_pendulum(methods: Sequence[str]) -> None:
         return
     model = dr.models.double_pendulum()
     columns = {"t": "time", "q1": "pos_meas1", "q2": "pos_meas2", "torque1": "tau_meas1", "torque2": "tau_meas2"}
-    logs = [dr.read_log(file, rename=columns, resample=500.0) for file in sorted(REAL.glob("A0_*.parquet"))]
+    logs = [dr.read_log(file, rename=columns, resample=125.0) for file in sorted(REAL.glob("A0_*.parquet"))]
     for method in methods:
         begin = time.perf_counter()
         result = dr.identify(model, logs, method, differentiate=True)
