@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from command_line import contents, run
+from command_line import contents, run, run_both
 from diransac.cli.study import _bar
 from diransac.study import builtin_names, load, template
 from studies import TINY_TOML, rows
@@ -26,19 +26,24 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trials_in_this_proce
     return tmp_path
 
 
-def test_list_shows_every_study_and_every_method():
-    done = run("study", "list")
-    assert done.exit_code == 0
-    assert all(name in done.stdout for name in (*builtin_names(), "true, ols", "i-diransac"))
-    listed = json.loads(run("study", "list", "--json").stdout)
-    assert load(listed["studies"]["fig4"]) == load("fig4")
+@pytest.fixture(scope="module")
+def listed() -> tuple[str, dict]:
+    """What ``diransac study list`` prints, as text and as JSON."""
+    with pytest.MonkeyPatch.context() as patched:
+        return run_both(patched, "study", "list")
 
 
-def test_list_names_the_methods_of_every_study():
-    lines = run("study", "list").stdout.splitlines()
+def test_list_shows_every_study_and_every_method(listed: tuple[str, dict]):
+    text, as_json = listed
+    assert all(name in text for name in (*builtin_names(), "true, ols", "i-diransac"))
+    assert load(as_json["studies"]["fig4"]) == load("fig4")
+
+
+def test_list_names_the_methods_of_every_study(listed: tuple[str, dict]):
+    lines = listed[0].splitlines()
     named = [line.removeprefix("methods of ").split(": ") for line in lines if line.startswith("methods of ")]
-    listed = {name: methods for names, methods in named for name in names.split(", ")}
-    assert listed == {name: ", ".join(load(name).methods) for name in builtin_names()}
+    methods_of = {name: methods for names, methods in named for name in names.split(", ")}
+    assert methods_of == {name: ", ".join(load(name).methods) for name in builtin_names()}
 
 
 def test_new_writes_a_study_and_never_over_another(folder: Path):

@@ -420,11 +420,15 @@ def test_ctrl_c_ends_a_run_at_once_and_says_how_to_go_on(tmp_path: Path):
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # which a shell's background jobs ignore
     )  # fmt: skip
-    while not has_rows(tmp_path / "a.db") and process.poll() is None:
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(MOMENT)
-    os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=10)
+    try:
+        while not has_rows(tmp_path / "a.db") and process.poll() is None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(MOMENT)
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=10)
+    finally:
+        with suppress(ProcessLookupError):  # it ended, as it should
+            os.killpg(process.pid, signal.SIGKILL)
     kept = len(rows(tmp_path / "a.db"))
     assert status(tmp_path / "a.db").failed == 0
     assert (process.returncode, out) == (130, "")
