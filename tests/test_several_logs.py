@@ -11,6 +11,7 @@ import diransac as dr
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.errors import LogError, SettingsError
 from diransac.model.library import builtin
+from diransac.simulation import RolloutBatch, rollouts
 from simulated import MACHINES, flight, rollout
 
 VEHICLE, PLANE = MACHINES["underwater-vehicle"], MACHINES["planar-rotorcraft"]
@@ -556,3 +557,78 @@ def test_progress_never_falls_and_ends_at_one(method):
     assert fractions == sorted(fractions)
     assert fractions[0] >= 0.0
     assert fractions[-1] == 1.0
+
+
+# ---------------------------------------------------------------------- logs of very different length
+
+
+def sliding(seed, n_rows, bias, delay=0):
+    """A log of a mass with drag, whose force sensor has a bias of its own."""
+    t = 0.01 * np.arange(n_rows)
+    rng = np.random.default_rng(seed)
+    force = 3.0 * np.sin(2.1 * t + rng.uniform(0, 6)) + 2.0 * np.sin(5.3 * t + rng.uniform(0, 6))
+    batch = RolloutBatch([[2.0, 0.5, bias]], np.zeros(2), force[:, None], 0.01)
+    x, v, a = rollouts(SLIDER, substeps=5).trajectories(batch)[0].T
+    noise = rng.normal(size=(3, n_rows)) * np.array([[1e-3], [1e-2], [3e-2]])
+    signals = dict(zip(("s", "s_dot", "s_ddot"), np.array([x, v, a]) + noise, strict=True))
+    return dr.Log.from_arrays(t, {**signals, "force": np.roll(force, -delay)}, source=f"slide {seed}")
+
+
+SLIDER = dr.Model(
+    "slider",
+    {"s": "m"},
+    {"force": "N"},
+    {"mass": dr.Parameter("kg", positive=True), "drag": dr.Parameter("N s/m"), "bias": dr.Parameter("N", per_log=True)},
+    lambda q, v, a, u, p: [p.mass * a.s + p.drag * v.s - u.force - p.bias],
+)
+
+
+@pytest.mark.parametrize("method", ["ols", "i-diransac"])
+def test_short_logs_beside_a_long_one_leave_intervals_finite(method):
+    logs = [sliding(0, 4000, 0.3), *(sliding(k, 300, 0.1 * k) for k in (1, 2, 3))]
+    settings = dr.Settings(sample_size=400, max_iterations=20) if method == "i-diransac" else None
+    result = dr.identify(SLIDER, logs, method, settings=settings)
+    assert np.isfinite(list(result.standard_errors.values())).all()
+    assert np.isfinite(result.per_log_standard_errors["bias"]).all()
+    assert result.per_log["bias"] == pytest.approx([0.3, 0.1, 0.2, 0.3], abs=0.05)
+
+
+def test_where_a_log_begins_is_no_noise():
+    """A coordinate that begins 1 km further away has the same noise, and the same answer."""
+    near = [sliding(k, 800, 0.0) for k in range(2)]
+    far = dr.Log.from_arrays(near[1].time, {**near[1].signals, "s": near[1]["s"] + 1000.0}, source="far")
+    found, moved = (dr.identify(SLIDER, logs) for logs in (near, [near[0], far]))
+    assert moved.parameters["mass"] == pytest.approx(found.parameters["mass"], rel=1e-3)
+    assert moved.diagnosis.noise_std["s"] == pytest.approx(found.diagnosis.noise_std["s"], rel=0.1)
+
+
+def test_a_log_whose_inputs_act_at_another_time_is_named():
+    logs = [sliding(k, 800, 0.0) for k in range(2)] + [sliding(3, 800, 0.0, delay=6)]
+    result = dr.identify(SLIDER, logs)
+    assert "input delay" in result.logs[2].remark
+    assert [bool(x.remark) for x in result.logs] == [False, False, True]
+
+
+def test_a_log_that_is_too_short_to_be_compared_is_named():
+    logs = [sliding(0, 800, 0.0), sliding(1, 800, 0.0), sliding(2, 40, 0.0)]
+    result = dr.identify(SLIDER, logs)
+    assert any(note.startswith("slide 2 could not be compared with the other logs") for note in result.notes)
+
+
+def test_json_has_parameters_by_their_names_and_those_of_every_log():
+    result = dr.identify(SLIDER, [sliding(0, 600, 0.3), sliding(1, 600, 0.1)], "ols")
+    data = result.to_dict()
+    assert list(data["parameters"]) == list(data["standard_errors"]) == ["mass", "drag", "bias"]
+    assert data["per_log"]["bias"] == list(result.per_log["bias"])
+    assert dr.Result.from_dict(data) == result
+
+
+def test_a_derived_log_has_the_per_log_values_of_the_log_that_it_comes_from():
+    bare = [
+        dr.Log.from_arrays(log.time, {n: log[n] for n in ("s", "force")}, source=log.source)
+        for log in (sliding(0, 1500, 0.3), sliding(1, 1500, 0.1))
+    ]
+    result = dr.identify(SLIDER, bare, "ols", differentiate=True)
+    derived = dr.differentiate(bare[0], SLIDER)
+    assert result.parameters_in(derived) == result.parameters_in(bare[0])
+    assert result.parameters_in(bare[0])["bias"] == result.per_log["bias"][0]

@@ -77,12 +77,14 @@ class Comparison:
             if found.unidentifiable:
                 yield f"{name}: not identifiable from this log: {', '.join(found.unidentifiable)}"
             if found.input_delay_significant:
-                yield f"{name}: inputs act {1e3 * found.input_delay:.3g} ms late; the other methods assume no delay"
+                sense = "later" if found.input_delay > 0.0 else "earlier"
+                delay = f"{1e3 * abs(found.input_delay):.3g} ms {sense} than recorded"
+                yield f"{name}: inputs act {delay}; the other methods assume no delay"
 
     def _row(self, name: str, result: Result) -> list[str]:
         errors = result.standard_errors
         outside = {n: "!" if n in result.violations else "" for n in result.parameters}
-        unknown = () if result.diagnosis is None else result.diagnosis.unidentifiable
+        unknown = result.unidentifiable
         estimates = [
             "?" if n in unknown else f"{x:.5g} ± {errors[n]:.2g}{outside[n]}" for n, x in result.parameters.items()
         ]

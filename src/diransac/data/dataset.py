@@ -231,8 +231,15 @@ class Dataset:
 
     @cached_property
     def scales(self) -> dict[str, float]:
-        """Spread of each measured signal over the rows that count, in its unit; 0 where it is constant."""
-        values = np.concatenate([one.measured[one.valid] for one in self.segments])
+        """Spread of each measured signal over the rows that count, in its unit; 0 where it is constant.
+
+        Coordinates of several logs are taken about the median of their log: where a log begins is no motion.
+        """
+        parts = [one.measured[one.valid] for one in self.segments]
+        if len(parts) > 1:
+            centred = np.array([n in self.model.coordinates for n in self.signals])
+            parts = [x - np.where(centred, _medians(x), 0.0) for x in parts]
+        values = np.concatenate(parts)
         return {n: _spread(values[:, i]) for i, n in enumerate(self.signals)}
 
     def by_signal(self, values: Mapping[str, float]) -> FloatArray:
@@ -295,3 +302,9 @@ def _spread(values: FloatArray) -> float:
         return mad
     spread = wide if wide > 0.0 else float(values.std())
     return spread if spread > 1e-12 * float(np.abs(values).max(initial=0.0)) else 0.0
+
+
+def _medians(values: FloatArray) -> FloatArray:
+    """Median of each column's finite values, 0 where there is none."""
+    found = [x[np.isfinite(x)] for x in values.T]
+    return np.array([np.median(x) if len(x) else 0.0 for x in found])

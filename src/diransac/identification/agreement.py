@@ -24,33 +24,43 @@ _LEVEL = 1e-3
 _NEGLIGIBLE = 1e-3
 """Relative difference that is none, however narrow the intervals are."""
 
+_DELAY, _SMALL_DELAY = "input delay [s]", 0.25
+"""Name of the delay of the inputs in a sentence, and the difference that is none, samples."""
+
 _ROUNDING = 1e-12
 """Relative standard deviation that any estimate has."""
 
 
-def disagreements(method: Method, dataset: Dataset, seed: int, callback: Callback | None = None) -> list[str]:
+def disagreements(
+    method: Method, dataset: Dataset, seed: int, callback: Callback | None = None
+) -> tuple[list[str], list[str]]:
     """A sentence for each log whose own estimate disagrees with those of the others; empty where it agrees.
+
+    The second list has a sentence on every log that cannot be compared, because alone it gives no estimate.
 
     Each log is identified alone.  A shared parameter of log ``i`` is compared with the precision-weighted mean of the
     other logs: ``|p_i - p| > t sqrt(B (C_i + C))``, with Student's ``t`` at the level shared among all comparisons and
     the Birge ratio ``B >= 1`` of the others' scatter to their intervals.  The worst log is set aside and the others are
-    compared again, so that one deviating log does not make the rest disagree.
+    compared again, so that one deviating log does not make the rest disagree.  Input delays are compared likewise.
 
     References
     ----------
     Birge 1932, "The calculation of errors by the method of least squares"; Cochran 1954, "The combination of estimates
     from different experiments"; Hadi and Simonoff 1993 (backward removal).
     """
-    n, remarks = len(dataset.segments), [""] * len(dataset.segments)
+    n, remarks, notes = len(dataset.segments), [""] * len(dataset.segments), list[str]()
+    shared = [name for name, x in dataset.model.parameters.items() if not x.per_log]
     found = {}
     for i in range(n):
         estimate = _alone(method, dataset, i, seed, within(callback, i / n, (i + 1) / n, f"log {i + 1} alone: "))
-        if estimate is not None:
+        if not isinstance(estimate, str) and any(np.isfinite(_marginal(estimate, name)[1]) for name in shared):
             found[i] = estimate
-    shared = [name for name, x in dataset.model.parameters.items() if not x.per_log]
+        else:
+            reason = estimate if isinstance(estimate, str) else "its parameters are not identifiable from it alone"
+            notes.append(f"{dataset.given[i].source} could not be compared with the other logs: {reason}")
     level = _LEVEL / max(1, 2 * len(shared) * n)
     while len(found) > 1:
-        tests = {i: _worst(found, i, shared, level) for i in found}
+        tests = {i: _worst(found, i, shared, level, dataset.segments[i].log.dt) for i in found}
         worst = max(found, key=lambda i: tests[i][0])
         if tests[worst][0] <= 1.0:
             break
@@ -58,31 +68,38 @@ def disagreements(method: Method, dataset: Dataset, seed: int, callback: Callbac
         for i in named:
             remarks[i] = f"{dataset.given[i].source} disagrees with the other logs: {tests[i][1]}"
             del found[i]
-    return remarks
+    return remarks, notes
 
 
-def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callback | None) -> Estimate | None:
-    """The estimate of one log, or None where that log alone gives none."""
+def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callback | None) -> Estimate | str:
+    """The estimate of one log, or the reason why that log alone gives none."""
     try:
         return method.fit(dataset.subset([i]), seed, callback)
-    except (DiransacError, np.linalg.LinAlgError):
-        return None
+    except (DiransacError, np.linalg.LinAlgError) as error:
+        return str(error)
 
 
-def _worst(found: Mapping[int, Estimate], i: int, names: Sequence[str], level: float) -> tuple[float, str]:
+def _worst(
+    found: Mapping[int, Estimate], i: int, parameters: Sequence[str], level: float, dt: float
+) -> tuple[float, str]:
     """Largest difference of log ``i`` from the others over what is allowed, and a sentence on it."""
     from scipy.special import stdtrit
 
     worst, sentence = 0.0, ""
     t = float(stdtrit(min(x.degrees_of_freedom for x in found.values()), 1.0 - level))
-    for name in names:
+    delays = [_DELAY] if all(x.diagnosis is not None for x in found.values()) else []
+    for name in (*parameters, *delays):
         own, variance = _marginal(found[i], name)
         others = [_marginal(x, name) for j, x in found.items() if j != i]
         others = [(p, v) for p, v in others if np.isfinite(v)]
         if not np.isfinite(variance) or not others:
             continue
         mean, spread, ratio = _combined(others)
-        allowed = max(t * np.sqrt(ratio * (variance + spread)), _NEGLIGIBLE * abs(mean))
+        allowed = max(
+            t * np.sqrt(ratio * (variance + spread)),
+            _NEGLIGIBLE * abs(mean),
+            _SMALL_DELAY * dt if name == _DELAY else 0.0,
+        )
         surprise = abs(own - mean) / allowed if allowed > 0.0 else 0.0
         if surprise > worst:
             worst = float(surprise)
@@ -93,7 +110,10 @@ def _worst(found: Mapping[int, Estimate], i: int, names: Sequence[str], level: f
 
 
 def _marginal(estimate: Estimate, name: str) -> tuple[float, float]:
-    """A parameter and its variance."""
+    """A parameter, or the delay of the inputs, and its variance."""
+    if name == _DELAY:
+        assert estimate.diagnosis is not None
+        return estimate.diagnosis.input_delay, estimate.diagnosis.input_delay_error**2
     k = list(estimate.parameters).index(name)
     return estimate.parameters[name], float(estimate.covariance[k, k])
 

@@ -209,6 +209,8 @@ class Evaluation:
         Inliers among the rows of the given logs, log after log.
     fit_errors, inlier_fractions : (n_logs,) array
         Fit error and inlier fraction of each log alone.
+    thresholds : mapping of str to float
+        Inlier threshold of each signal that has one, in its unit.
     """
 
     fit_error: Number
@@ -216,6 +218,7 @@ class Evaluation:
     inliers: Mask
     fit_errors: Numbers
     inlier_fractions: Numbers
+    thresholds: Values = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         inliers: BoolArray = np.array(self.inliers, bool)
@@ -243,6 +246,8 @@ class LogSummary:
         Scores of the simulation of this log.
     remark : str, optional
         Disagreement of this log's own estimate with those of the other logs; empty where they agree.
+    prepared_fingerprint : str, optional
+        Digest of the log after its preparation.
     """
 
     source: str
@@ -254,3 +259,4 @@ class LogSummary:
     fit_error: Number = np.nan
     inlier_fraction: Number = np.nan
     remark: str = ""
+    prepared_fingerprint: str = ""

@@ -122,6 +122,11 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
         Every signal is constant.
     """
     by_default = _judged_by_default(dataset.model, dataset.common_signals)
+    if not by_default and (settings.error_weights is None or settings.inlier_thresholds is None):
+        raise LogError(
+            f"{dataset.source}: no signal that could be scored is in every log; give one that all logs "
+            "have, or name signals in error_weights and inlier_thresholds"
+        )
     scales = {n: dataset.scales[n] for n in by_default}
     constant = [n for n, scale in scales.items() if scale == 0.0]
     weights, thresholds = settings.error_weights, settings.inlier_thresholds
@@ -317,13 +322,14 @@ def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: S
     """
     acting, rules = as_estimated(dataset, estimate.diagnosis, settings)
     judged, weights = scoring.judged, scoring.weights[scoring.judged]
+    thresholds = {n: float(x) for n, x in zip(dataset.signals, scoring.thresholds, strict=True) if x > 0.0}
     simulation = Simulation(acting, judged, estimate.resolution, rules, settings.threads)
     try:
         simulation.starts  # noqa: B018  refuses a log without an initial state
     except LogError:
         nothing = acting.on_given_logs([np.zeros(len(one), dtype=bool) for one in acting.segments])
         unknown = np.full(len(acting.segments), np.nan)
-        return Evaluation(np.nan, np.nan, nothing, unknown, unknown)
+        return Evaluation(np.nan, np.nan, nothing, unknown, unknown, thresholds)
     scores = simulation.score(estimate.values[None], scoring.thresholds[judged], scoring.min_inlier_signals)
     error_of = mean_squared_error if estimate.squared_error else rms_error
     counts = [one.n_rows for one in acting.segments]
@@ -334,6 +340,7 @@ def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: S
         inliers=acting.on_given_logs(scores.inlier_masks(0)),
         fit_errors=np.array([error_of(batch.sum_squares, n, weights)[0] for batch, n in parts]),
         inlier_fractions=np.array([batch.inlier_count[0] / n for batch, n in parts]),
+        thresholds=thresholds,
     )
 
 
@@ -362,11 +369,12 @@ def as_estimated(
         return dataset, [rule] * len(dataset.segments)
     delay = found.input_delay if found.input_delay_significant else 0.0
     segments = tuple(_delayed(one, delay) for one in dataset.segments)
-    if rule != "first":
+    if rule == "robust":
         return replace(dataset, segments=segments), [rule] * len(segments)
     begins = np.cumsum([0, *(len(log) for log in dataset.given)])
     rules = [_first_state(one, i, int(begins[i]) + one.offset, found) for i, one in enumerate(segments)]
-    return replace(dataset, segments=segments), [*rules]
+    given = rule if isinstance(rule, Mapping) else {}
+    return replace(dataset, segments=segments), [{**start, **given} for start in rules]
 
 
 def _delayed(one: Segment, delay: float) -> Segment:

@@ -111,7 +111,7 @@ def _method(method: object, settings: object, estimator: object) -> Method:
     if settings is not None and not isinstance(settings, Settings):
         raise SettingsError(f"settings is {settings!r}; give a dr.Settings, such as dr.Settings(sample_size=75)")
     if not isinstance(method, str):
-        if not hasattr(method, "fit") or isinstance(method, type):
+        if isinstance(method, type) or not all(hasattr(method, x) for x in ("fit", "criteria", "options")):
             raise SettingsError(f"method is {method!r}; give a name ({', '.join(METHODS)}) or an object")
         if settings is not None or estimator is not None:
             raise SettingsError("settings and estimator belong to a method's name; a method object has its own")
@@ -152,9 +152,9 @@ class _Task:
         report(progress, "evaluating", fitted)
         scoring = choose_scoring(dataset, criteria)
         evaluation = evaluate(estimate, dataset, scoring, criteria)
-        remarks = [""] * len(logs)
+        remarks, incomparable = [""] * len(logs), list[str]()
         if self.compares:
-            remarks = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
+            remarks, incomparable = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
         report(progress, "done", 1.0)
         return Result(
             model=self.model,
@@ -165,7 +165,7 @@ class _Task:
             estimate=estimate,
             evaluation=evaluation,
             logs=_summaries(dataset, evaluation, remarks),
-            notes=(*dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x)),
+            notes=(*dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x), *incomparable),
         )
 
     def with_sensitivity(self, result: Result, derived: Sequence[Log], progress: Callback | None) -> Result:
@@ -205,9 +205,7 @@ def _summaries(dataset: Dataset, evaluation: Evaluation, remarks: Sequence[str])
             error,
             fraction,
             remark,
+            one.log.fingerprint,
         )
         for log, one, (error, fraction), remark in parts
     )
-
-
-# ---------------------------------------------------------------------- agreement of several logs

@@ -17,7 +17,7 @@ from diransac.data.dataset import ParameterLayout
 from diransac.data.log import Log
 from diransac.errors import DiransacError, ResultError, SettingsError
 from diransac.identification.estimate import Diagnosis, Estimate, Evaluation, LogSummary
-from diransac.identification.serialization import NumberPairs, Values, dump, load
+from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
 from diransac.model import Model
 from diransac.text_table import aligned, telling_digits
@@ -26,6 +26,8 @@ __all__ = ["Result"]
 
 _FORMAT = 4
 _FEW_INLIERS = 0.5
+_BY_LOG = ("parameters", "covariance")
+"""Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,15 @@ class _Provenance:
     notes: tuple[str, ...]
     options: Mapping[str, Any]
     bandwidth_sensitivity: NumberPairs | None
+
+
+@dataclass(frozen=True)
+class _Public:
+    """Parameters of a result's JSON where some are per log: one value each, and the values of every log."""
+
+    parameters: Values
+    covariance: Numbers
+    per_log: Series
 
 
 @dataclass(frozen=True)
@@ -115,7 +126,8 @@ class Result:
 
     def parameters_in(self, log: Log) -> dict[str, float]:
         """Parameters that hold in a log: per-log ones of that log if it was identified from, else their mean."""
-        index = next((i for i, one in enumerate(self.logs) if one.fingerprint == log.fingerprint), None)
+        known = [(one.fingerprint, one.prepared_fingerprint) for one in self.logs]
+        index = next((i for i, own in enumerate(known) if log.fingerprint in own), None)
         if index is None:
             return self.parameters
         return {**self.parameters, **{name: values[index] for name, values in self.per_log.items()}}
@@ -181,6 +193,12 @@ class Result:
         return {n: x.unit for n, x in self.model.parameters.items()}
 
     # ------------------------------------------------------------------ estimate and evaluation by their names
+
+    @property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """Parameters that the logs do not determine, as lo-diransac finds; a per-log one if it is so in any log."""
+        found = () if self.diagnosis is None else self.diagnosis.unidentifiable
+        return tuple(dict.fromkeys(name.partition("[")[0] for name in found))
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -254,9 +272,15 @@ class Result:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON; `from_dict` reads it back."""
+        estimate = dump(self.estimate)
+        if not self.layout.is_shared:
+            full = {f"{key}_of_logs": estimate[key] for key in _BY_LOG}
+            estimate |= full | dump(
+                _Public(self.parameters, self.covariance, {n: np.array(x) for n, x in self.per_log.items()})
+            )
         return {
             "format": _FORMAT,
-            **dump(self.estimate),
+            **estimate,
             **dump(self.evaluation),
             # Its notes hold the estimate's, too.
             **dump(_Provenance(**{n: getattr(self, n) for n in _Provenance.__dataclass_fields__})),
@@ -292,6 +316,7 @@ class Result:
 
     @classmethod
     def _from_checked(cls, data: Mapping[str, Any]) -> Result:
+        data = {**data, **{key: data[f"{key}_of_logs"] for key in _BY_LOG if f"{key}_of_logs" in data}}
         model, plain = Model.from_dict(data["model"]), load(_Provenance, data)
         estimate, evaluation = load(Estimate, data), load(Evaluation, data)
         layout = ParameterLayout(model.parameters, len(plain.logs))
@@ -363,19 +388,18 @@ class Result:
         many = len(self.logs) > 1
         seconds = sum(log.dt * (log.n_rows - 1) for log in self.logs)
         source = f"{len(self.logs)} logs" if many else self.logs[0].source
-        return f"{self.model.name} by {self.method} from {source} ({seconds:.4g} s at {1.0 / self.logs[0].dt:.4g} Hz)"
+        rates = sorted({f"{1.0 / log.dt:.4g}" for log in self.logs}, key=float)
+        rate = rates[0] if len(rates) == 1 else f"{rates[0]} to {rates[-1]}"
+        return f"{self.model.name} by {self.method} from {source} ({seconds:.4g} s at {rate} Hz)"
 
     def _table(self) -> list[str]:
         rows = [("parameter", "estimate", "95 % interval", "unit")]
         for name, (low, high) in self.intervals().items():
             digits = telling_digits(low, high)
             interval = f"{low:.{digits}g} .. {high:.{digits}g}" if np.isfinite(high - low) else "unknown"
-            estimate = "?" if self._is_undetermined(name) else f"{self.parameters[name]:.6g}"
+            estimate = "?" if name in self.unidentifiable else f"{self.parameters[name]:.6g}"
             rows.append((name, estimate, interval, self.units[name]))
         return aligned(rows)
-
-    def _is_undetermined(self, name: str) -> bool:
-        return self.diagnosis is not None and name in self.diagnosis.unidentifiable
 
     def _summary(self) -> str:
         whole = "" if self.diagnosis is None else "in one simulation of the whole log: "
@@ -427,5 +451,6 @@ class Result:
     def _warnings_of_diagnosis(self, found: Diagnosis) -> list[str]:
         lines = [f"! {name} is not identifiable from this log; excite it" for name in found.unidentifiable]
         if found.input_delay_significant:
-            lines.append(f"! inputs act {1e3 * found.input_delay:.3g} ms later than recorded")
+            sense = "later" if found.input_delay > 0.0 else "earlier"
+            lines.append(f"! inputs act {1e3 * abs(found.input_delay):.3g} ms {sense} than recorded")
         return lines

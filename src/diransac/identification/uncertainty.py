@@ -9,6 +9,8 @@ import numpy as np
 from diransac.arrays import FloatArray, IntArray
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from diransac.identification.estimators import BoundEstimator
 
 __all__ = ["N_BLOCKS", "jackknife_covariance"]
@@ -19,7 +21,9 @@ __all__ = ["N_BLOCKS", "jackknife_covariance"]
 N_BLOCKS = 10
 
 
-def jackknife_covariance(estimator: BoundEstimator, rows: IntArray) -> FloatArray:
+def jackknife_covariance(
+    estimator: BoundEstimator, rows: IntArray, log_sizes: Sequence[int] | None = None
+) -> FloatArray:
     """Covariance ``(n_p, n_p)`` of an estimate from ``rows``, by leaving out 10 stretches of time in turn.
 
     Residuals of real machines are correlated over many samples, for which the textbook formula is too optimistic; a
@@ -31,19 +35,23 @@ def jackknife_covariance(estimator: BoundEstimator, rows: IntArray) -> FloatArra
     estimator : BoundEstimator
     rows : (n,) int array
         Usable rows that the estimate was fitted to, ascending.
+    log_sizes : sequence of int, optional
+        Usable rows of each log, where logs have parameters of their own: a stretch is then a tenth of every log, so
+        that no log is left out.  None: rows are taken as one log.
 
     Returns
     -------
     (n_p, n_p) array
         Infinite where a parameter is not identifiable without one of the stretches.
 
-
     References
     ----------
     Künsch 1989, "The jackknife and the bootstrap for general stationary observations"; Busing, Meijer, van der Leeden
     1999, "Delete-m jackknife for unequal m".
     """
-    groups = [g for g in np.array_split(rows, min(N_BLOCKS, len(rows))) if len(g)]
+    logs = np.split(rows, np.searchsorted(rows, np.cumsum(log_sizes or [estimator.n_rows])[:-1]))
+    stretches = [np.array_split(log, min(N_BLOCKS, len(rows))) for log in logs]
+    groups = [g for parts in zip(*stretches, strict=True) if len(g := np.concatenate(parts))]
     fits = estimator.fit_without(groups, rows)
     n = len(fits)
     determined = estimator.select([np.setdiff1d(rows, group) for group in groups]).well_defined()

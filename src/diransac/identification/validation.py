@@ -373,7 +373,7 @@ def cross_validate(
         try:
             others = [*several[:i], *several[i + 1 :]]
             part = within(progress, i / len(several), (i + 1) / len(several), f"without log {i + 1}: ")
-            results.append(identify(model, others, method, compare_logs=False, progress=part, **arguments))
+            results.append(identify(model, others, method, progress=part, **{"compare_logs": False, **arguments}))
         except SettingsError:
             raise
         except DiransacError as error:

@@ -240,8 +240,7 @@ class Entry:
 
     def identifies(self, name: str) -> bool:
         """True if the result has the parameter and the parameter is identifiable."""
-        diagnosis = self.result.diagnosis
-        return name in self.result.parameters and (diagnosis is None or name not in diagnosis.unidentifiable)
+        return name in self.result.parameters and name not in self.result.unidentifiable
 
 
 def bulk_range(values: FloatArray) -> tuple[float, float]:
@@ -348,10 +347,16 @@ def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | 
         errors=errors,
         open_loop=open_loop[:, columns],
         accelerations=dict(zip(model.accelerations, simulated[:, len(model.state) :].T, strict=True)),
-        thresholds=scoring.thresholds,
+        thresholds=_thresholds(result, view, dataset, scoring),
         inliers=inliers,
         validation=_validation(result, view, log),
     )
+
+
+def _thresholds(result: Result, view: LogView, dataset: Dataset, scoring: Scoring) -> FloatArray:
+    """Inlier thresholds (n_s,): the result's own in a log that it was identified from."""
+    own = result.evaluation.thresholds
+    return scoring.thresholds if view.held_out else np.array([own.get(name, 0.0) for name in dataset.signals])
 
 
 def _close_rows(errors: FloatArray, observations: Segment, scoring: Scoring) -> BoolArray:

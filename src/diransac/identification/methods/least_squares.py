@@ -167,9 +167,10 @@ def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows
     -------
     Estimate
     """
+    log_sizes = None if dataset.layout.is_shared else [one.n_rows for one in dataset.segments]
     return Estimate(
         parameters=dict(zip(dataset.layout.names, parameters.tolist(), strict=True)),
-        covariance=jackknife_covariance(bound, rows),
+        covariance=jackknife_covariance(bound, rows, log_sizes),
         degrees_of_freedom=max(1, min(N_BLOCKS, len(rows)) - 1),
         n_fitted=len(rows),
         **about,

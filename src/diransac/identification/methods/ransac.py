@@ -104,6 +104,8 @@ class RansacMethod(ABC):
 
     def __post_init__(self) -> None:
         check_used(self.criteria, self.uses, self.name)
+        if self.estimator is not None:
+            as_estimator(self.estimator)
 
     def options(self) -> Mapping[str, Any]:
         """An empty mapping: the criteria and the estimator have the settings."""

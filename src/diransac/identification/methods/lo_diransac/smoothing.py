@@ -175,8 +175,8 @@ def smooth(model: Model, logs: Sequence[Samples], dt: float, half: int) -> list[
         The spread of each signal is that over all logs.
     """
     signals = [_smoothed(model, log, dt, half) for log in logs]
-    middle = np.concatenate(
-        [np.where(log.known.any(axis=0), log.centre, x) for log, x in zip(logs, signals, strict=True)]
+    middle = _joined(
+        model, [np.where(log.known.any(axis=0), log.centre, x) for log, x in zip(logs, signals, strict=True)]
     )
     spread = _spread(middle) + 1e-9
     return [Motion(x, spread) for x in signals]
@@ -236,18 +236,27 @@ def _prediction_error(model: Model, logs: Sequence[Samples], dt: float, half: in
         np.concatenate([getattr(log, name) for log in logs]) if len(logs) > 1 else getattr(logs[0], name)
         for name in ("measured", "known", "centre")
     )
+    about = _joined(model, [log.centre for log in logs])
     even, near = np.arange(len(offsets)) % 2 == 0, np.abs(offsets) <= half // 2
     basis = _basis(offsets / half, half * dt)
     loss = 0.0
     for columns in _chains(model):
         values, oks = measured[:, columns][rows], known[:, columns][rows]
         first = values - centre[:, columns][rows]
-        spread = _spread(centre[:, columns])
+        spread = _spread(about[:, columns])
         fitted = _fit(values, oks & even[:, None], first, basis[: len(columns)], spread)
         scale = _scale(values - fitted, oks & (near & ~even)[:, None])
         seen = oks.any(axis=(0, 1))
         loss += float(np.log(np.maximum(scale, _FLOOR * spread + 1e-12))[seen].sum())
     return loss
+
+
+def _joined(model: Model, logs: Sequence[FloatArray]) -> FloatArray:
+    """Signals of all logs, of which spreads are taken: coordinates of several logs about the median of their log."""
+    if len(logs) == 1:
+        return logs[0]
+    centred = np.arange(len(model.signals)) < model.n_q
+    return np.concatenate([x - np.where(centred, np.median(x, axis=0), 0.0) for x in logs])
 
 
 def _trial_rows(sizes: Sequence[int], half: int, offsets: IntArray) -> IntArray:
