@@ -75,7 +75,7 @@ def bench_of(loops: CLoops | None) -> Bench:
 
 def row(name: str, ratio: float | None, bound: str = "", note: str = "") -> None:
     """Print one row: a ratio, at most and aim, and what was measured."""
-    shown = "" if ratio is None else f"{ratio:.2f}" if ratio >= 0.01 else f"1/{1 / ratio:,.0f}"
+    shown = "" if not ratio else f"{ratio:.2f}" if ratio >= 0.01 else f"1/{1 / ratio:,.0f}"
     print(f"{name:<66}{shown:>10}  {bound:<16}{note}", flush=True)
 
 

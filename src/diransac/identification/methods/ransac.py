@@ -332,6 +332,8 @@ class Hypothesis:
         Each in its unit.
     rows : (n_fitted,) int array
         Usable rows that the parameters were fitted to, ascending.
+    score : Score
+        Error and inlier fraction.
     batch : ScoredBatch
         Scores of the batch that the hypothesis belongs to.
     lane : int
@@ -340,13 +342,9 @@ class Hypothesis:
 
     parameters: FloatArray
     rows: IntArray
+    score: Score
     batch: ScoredBatch
     lane: int
-
-    @property
-    def score(self) -> Score:
-        """Error and inlier fraction."""
-        return self.batch.scores[self.lane]
 
 
 # ---------------------------------------------------------------------- the search
@@ -467,7 +465,7 @@ def _speculate(
         return [None] * len(samples)
     scored, lanes = evaluator.score(parameters[admitted]), {int(i): lane for lane, i in enumerate(admitted)}
     return [
-        Hypothesis(parameters[i], np.sort(rows), scored, lanes[i]) if i in lanes else None
+        Hypothesis(parameters[i], np.sort(rows), scored.scores[lanes[i]], scored, lanes[i]) if i in lanes else None
         for i, rows in enumerate(samples)
     ]
 
@@ -499,7 +497,8 @@ def _replay(
     evaluator: Evaluator,
 ) -> None:
     """One sample and the chain of refits that it starts (lines 13-34)."""
-    settings, used = variant.criteria, set[bytes]()
+    settings = variant.criteria
+    used: set[bytes] = set()
     while True:
         state.n_hypotheses += 1
         if hypothesis is None:
@@ -545,7 +544,8 @@ def _refit(inliers: IntArray, parameters: FloatArray, evaluator: Evaluator) -> H
     """The hypothesis of an inlier set with its parameters ``(1, n)``, None where it fails the preliminary test."""
     if not evaluator.admits(parameters)[0]:
         return None
-    return Hypothesis(parameters[0], inliers, evaluator.score(parameters), 0)
+    scored = evaluator.score(parameters)
+    return Hypothesis(parameters[0], inliers, scored.scores[0], scored, 0)
 
 
 def _nothing_accepted(state: SearchState) -> str:
