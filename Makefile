@@ -10,10 +10,10 @@ demo: $(ENVIRONMENT)  ## fly, identify, fly what was identified; writes out/demo
 	$(BIN)/python examples/demo.py
 
 test: lint docs  ## everything that must hold
-	$(BIN)/pytest -q -n auto --dist worksteal
+	$(BIN)/pytest -q -n auto --dist loadfile
 
 quick: $(ENVIRONMENT)  ## tests without the slow ones
-	$(BIN)/pytest -q -n auto --dist worksteal -m "not slow"
+	$(BIN)/pytest -q -n auto --dist loadfile -m "not slow"
 
 lint: $(ENVIRONMENT)
 	$(BIN)/ruff check .

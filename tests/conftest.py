@@ -5,6 +5,11 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# How quickly a busy machine draws examples is no promise of the package; examples and their number stay as they are.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # there is a worker per core; BLAS reads its variable when NumPy is imported
     os.environ.setdefault("DIRANSAC_THREADS", "1")
