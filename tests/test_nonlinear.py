@@ -161,3 +161,22 @@ def test_leaving_rows_out_is_fitting_the_others():
     groups = np.array_split(rows, 5)
     others = bound.select([np.setdiff1d(rows, group) for group in groups]).fit()
     assert bound.fit_without(groups, rows) == pytest.approx(others, rel=1e-6)
+
+
+def test_estimate_on_its_bound_is_named_and_has_no_interval(tmp_path):
+    """A block against which the fit stops says nothing of how well the value is known."""
+    bounded = hanging_mass(parameters=hanging_mass().parameters | {"c": Parameter("N m s", lower=0.2)})
+    result = dr.identify(bounded, swing(noise=0.02), "nls")
+    assert result.parameters["c"] == 0.2
+    assert result.on_bounds == ("c",)
+    assert not np.isfinite(result.intervals()["c"]).any()
+    assert np.isfinite([result.intervals()[name] for name in ("l", "m")]).all()
+    assert "! c = 0.2 is on its bound" in str(result)
+    assert "too few" not in str(result)
+    result.save(tmp_path / "result.json")
+    assert dr.Result.load(tmp_path / "result.json") == result
+
+
+def test_value_fixed_by_equal_bounds_is_not_on_a_bound():
+    fixed = hanging_mass(parameters=hanging_mass().parameters | {"c": Parameter("N m s", lower=0.06, upper=0.06)})
+    assert dr.identify(fixed, swing(), "nls").on_bounds == ()

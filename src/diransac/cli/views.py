@@ -71,6 +71,11 @@ class Comparison:
             yield f"{', '.join(diagnosed)} is evaluated on measured signals, the others on derived ones, too"
         elif diagnosed and len(self.results) > 1:
             yield "fit error and inliers are those of one simulation of the whole log, outliers and drift included"
+        for name, result in self.results.items():
+            for parameter in (*result.violations, *result.on_bounds):
+                where = "outside its bounds" if parameter in result.violations else "on its bound, its interval unknown"
+                yield f"! {name}: {parameter} is {where}"
+            yield from (f"! {name}: {log.remark}" for log in result.logs if log.remark)
         for name, result in diagnosed.items():
             found = result.diagnosis
             assert found is not None

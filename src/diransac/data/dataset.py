@@ -92,6 +92,11 @@ class ParameterLayout:
         """Names of the parameters of a vector ``(n,)`` that are outside their bounds."""
         return tuple(n for n, x, value in zip(self.names, self.bounds, values, strict=True) if not x.admits(value))
 
+    def on_bounds(self, values: FloatArray) -> BoolArray:
+        """Mask ``(n,)`` of the parameters of a vector ``(n,)`` that lie on a bound, where an estimator stops."""
+        pairs = zip(self.bounds, values.tolist(), strict=True)
+        return np.array([x.lower < x.upper and value in (x.lower, x.upper) for x, value in pairs], bool)
+
 
 def as_logs(logs: Log | Iterable[Log]) -> tuple[Log, ...]:
     """One log, or a sequence of logs, as a tuple.

@@ -188,6 +188,12 @@ class Result:
         return self.layout.violations(self.estimate.values)
 
     @property
+    def on_bounds(self) -> tuple[str, ...]:
+        """Names of the parameters on one of their bounds, where the estimator stopped: their intervals are unknown."""
+        stuck = self.layout.on_bounds(self.estimate.values)
+        return tuple(n for n, on_bound in zip(self.layout.names, stuck, strict=True) if on_bound)
+
+    @property
     def units(self) -> dict[str, str]:
         """Unit of each parameter."""
         return {n: x.unit for n, x in self.model.parameters.items()}
@@ -428,6 +434,11 @@ class Result:
 
     def _warnings(self) -> list[str]:
         lines = [f"! {n} = {self.estimate.parameters[n]:.6g} is outside its bounds" for n in self.violations]
+        lines += [
+            f"! {n} = {self.estimate.parameters[n]:.6g} is on its bound, where the fit was stopped: its interval is "
+            "unknown"
+            for n in self.on_bounds
+        ]
         lines += self._warnings_of_search() if self.diagnosis is None else self._warnings_of_diagnosis(self.diagnosis)
         remarks = [log.remark for log in self.logs if log.remark]
         lines += [f"! {remark}" for remark in remarks]
@@ -444,7 +455,7 @@ class Result:
         wanted = self.settings.stop_inlier_fraction
         if self.iterations and wanted is not None and self.inlier_fraction < wanted:
             lines.append(f"! the search ended short of the {100 * wanted:.3g} % inliers that it was to reach")
-        if not np.isfinite(self.covariance).all():
+        if not np.isfinite(self.covariance).all() and not self.on_bounds:
             lines.append(f"! intervals are unknown: {self.n_fitted} fitted rows are too few for a jackknife")
         return lines
 

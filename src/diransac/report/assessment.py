@@ -88,7 +88,10 @@ def _bounds(run: Run) -> Iterator[Finding]:
         value, unit = number(result.parameters[name]), result.units[name]
         allowed = bounds_text(result.model.parameters[name])
         yield Finding("bad", f"{name} = {value} {unit} is outside its bounds ({allowed}): physically impossible.")
-    if not result.violations and any(bounds_text(x) for x in result.model.parameters.values()):
+    for name in result.on_bounds:
+        value = number(result.estimate.parameters[name])
+        yield Finding("bad", f"{name} = {value} is on its bound, where the fit was stopped: its interval is unknown.")
+    if not (result.violations or result.on_bounds) and any(bounds_text(x) for x in result.model.parameters.values()):
         yield Finding("good", "Every parameter is within its bounds.")
 
 
@@ -210,9 +213,11 @@ def _uncertainty(run: Run) -> Iterator[Finding]:
     result, widths = run.result, {}
     intervals = result.intervals()
     unknown = [name for name, (low, high) in intervals.items() if not np.isfinite(high - low)]
-    if unknown and result.diagnosis is None:
+    stuck = {name.partition("[")[0] for name in result.on_bounds}
+    unexplained = [name for name in unknown if name not in stuck]
+    if unexplained and result.diagnosis is None:
         rows = plural(result.n_fitted, "fitted row")
-        text = f"The uncertainty of {', '.join(unknown)} is unknown: {rows} are too few, or do not excite it."
+        text = f"The uncertainty of {', '.join(unexplained)} is unknown: {rows} are too few, or do not excite it."
         yield Finding("care", text)
     for name, (low, high) in intervals.items():
         if name in unknown:

@@ -152,6 +152,9 @@ def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
 def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows: np.ndarray, **about: Any) -> Estimate:
     """Estimate of fitted parameters, with its jackknife covariance.
 
+    A parameter on one of its bounds stays there whichever rows are left out: its variance is unknown, and infinite
+    here, not zero.
+
     Parameters
     ----------
     bound : BoundEstimator
@@ -168,9 +171,12 @@ def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows
     Estimate
     """
     log_sizes = None if dataset.layout.is_shared else [one.n_rows for one in dataset.segments]
+    covariance = jackknife_covariance(bound, rows, log_sizes)
+    stuck = dataset.layout.on_bounds(parameters)
+    covariance[stuck] = covariance[:, stuck] = np.inf
     return Estimate(
         parameters=dict(zip(dataset.layout.names, parameters.tolist(), strict=True)),
-        covariance=jackknife_covariance(bound, rows, log_sizes),
+        covariance=covariance,
         degrees_of_freedom=max(1, min(N_BLOCKS, len(rows)) - 1),
         n_fitted=len(rows),
         **about,
