@@ -284,7 +284,8 @@ def test_result_of_several_logs_is_loaded_as_it_was_saved(method, tmp_path):
 def test_result_prints_a_row_per_log_with_its_own_parameters():
     result = dr.identify(vehicle(), biased_logs(), "ols")
     lines = str(result).splitlines()
-    assert any("bias [N]" in line for line in lines)
+    assert any("bias ± standard error [N]" in line for line in lines)
+    assert any(line.startswith("bias (mean of logs)") for line in lines)
     for i, bias in enumerate(BIASES):
         (line,) = [x for x in lines if x.startswith(f"dive {i} ")]
         assert f" {bias:.5g}" in line

@@ -63,6 +63,7 @@ class Comparison:
 
     def _remarks(self) -> Iterator[str]:
         """Sentences on figures that do not compare, and on findings of a diagnosis."""
+        yield "±: one standard error"
         if "diransac" in self.results:
             yield "diransac's fit error is a mean square, the others' a root mean square, eq. (2)"
         diagnosed = {name: result for name, result in self.results.items() if result.diagnosis is not None}

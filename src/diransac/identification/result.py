@@ -404,7 +404,8 @@ class Result:
             digits = telling_digits(low, high)
             interval = f"{low:.{digits}g} .. {high:.{digits}g}" if np.isfinite(high - low) else "unknown"
             estimate = "?" if name in self.unidentifiable else f"{self.parameters[name]:.6g}"
-            rows.append((name, estimate, interval, self.units[name]))
+            averaged = not self.layout.is_shared and self.model.parameters[name].per_log
+            rows.append((f"{name} (mean of logs)" if averaged else name, estimate, interval, self.units[name]))
         return aligned(rows)
 
     def _summary(self) -> str:
@@ -425,7 +426,9 @@ class Result:
     def _log_lines(self) -> list[list[str]]:
         """Rows of a table: log, duration, fit error, inliers, per-log parameters."""
         own, errors = self.per_log, self.per_log_standard_errors
-        rows = [["log", "s", "fit error", "inliers", *(f"{name} [{self.units[name]}]" for name in own)]]
+        rows = [
+            ["log", "s", "fit error", "inliers", *(f"{name} ± standard error [{self.units[name]}]" for name in own)]
+        ]
         for i, log in enumerate(self.logs):
             inliers = f"{100.0 * log.inlier_fraction:.1f} %"
             values = [f"{x[i]:.5g} ± {errors[name][i]:.2g}" for name, x in own.items()]

@@ -220,7 +220,8 @@ def _uncertainty(run: Run) -> Iterator[Finding]:
         text = f"The uncertainty of {', '.join(unexplained)} is unknown: {rows} are too few, or do not excite it."
         yield Finding("care", text)
     for name, (low, high) in intervals.items():
-        if name in unknown:
+        # The mean of a per-log parameter is of no machine: the table of the logs has its values.
+        if name in unknown or (result.model.parameters[name].per_log and not result.layout.is_shared):
             continue
         if low <= 0.0 <= high:
             possible = result.model.parameters[name].admits(0.0)
