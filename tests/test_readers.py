@@ -81,6 +81,8 @@ HOSTILE = {
     "hole.csv": (b"t,x\n0,1\n\n2,3\n", "line 3 is blank; remove blank lines$"),
     "holes.csv": (b't,"x"\n0,1\n\n2,3\n \n3,4', "line 3 is blank, the first of 2; remove blank lines$"),
     "open_quote.csv": (b't,x\n0,"1\n1,2\n2,3\n', "line .* cannot be read"),
+    "broken_field.csv": (b't,x\n0,"1\n"\n1,2\n2,3\n', "line 2 has a line break in quotation marks"),
+    "broken_header.csv": (b't,"x\n"\n0,1\n1,2\n', "line 1 has a line break in quotation marks"),
     "cut.csv": (b"t,x,y\n0,1,2\n1,2,3\n2,", "line 4 has 2 fields"),
     "garbage.csv": (GARBAGE, "not UTF-8 text"),
     "nul.csv": (b"t,x\n0,\x001\n1,2\n", "binary data"),
@@ -334,6 +336,12 @@ def test_headers_carry_units_and_indices(tmp_path):
     log = read(tmp_path, "t [s],theta [deg],q[0],q[1]\n0,1,2,3\n1,2,3,4\n")
     assert log.names == ("theta", "q[0]", "q[1]")
     assert log.units == {"theta": "deg"}
+
+
+def test_a_name_is_never_taken_as_a_pattern(tmp_path):
+    log = read(tmp_path, "t,^$,.*\n0,1.5,2\n0.1,2.5,3\n")
+    assert log.names == ("^$", ".*")
+    assert np.array_equal(log[".*"], [2.0, 3.0])
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.mat"])

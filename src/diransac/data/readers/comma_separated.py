@@ -50,7 +50,7 @@ def read_csv(data: bytes, source: str) -> Table:
         raise LogError(f"{source}: there is a header ({', '.join(headers)[:200]}) but no row")
     named = [split_unit(header) for header in headers]
     check_unique([name for name, _ in named if name], source)
-    frame = _frame(lines, separator, source)
+    frame = _frame(lines[1:], len(headers), separator, source)
     fields = zip(named, frame.get_columns(), strict=True)
     columns = {name: _numbers(column, line + 1, separator) for (name, _), column in fields if name}
     units = {name: unit for name, unit in named if unit is not None}
@@ -122,17 +122,23 @@ def _check_ragged(lines: list[str], first: int, separator: str, source: str) -> 
 def _quoted_counts(lines: list[str], first: int, separator: str, source: str) -> list[tuple[int, int]]:
     """Line number and number of fields of every record; separators in quotation marks do not count."""
     reader = csv.reader((line + "\n" for line in lines), delimiter=separator, strict=True)
+    counts = []
     try:
-        return [(reader.line_num + first - 1, len(record)) for record in reader]
+        for number, record in enumerate(reader, first):
+            if reader.line_num + first - 1 != number:
+                raise LogError(f"{source}: line {number} has a line break in quotation marks; remove it")
+            counts.append((number, len(record)))
     except csv.Error as error:
         raise LogError(f"{source}: line {reader.line_num + first - 1} cannot be read ({error})") from error
+    return counts
 
 
-def _frame(lines: list[str], separator: str, source: str) -> pl.DataFrame:
-    """Data frame with every field as text."""
+def _frame(lines: list[str], n_columns: int, separator: str, source: str) -> pl.DataFrame:
+    """Data frame with every field as text; columns are numbered, because Polars takes some names as patterns."""
     import polars as pl
 
-    data = io.BytesIO("\n".join(lines).encode())
+    header = separator.join(map(str, range(n_columns)))
+    data = io.BytesIO("\n".join([header, *lines]).encode())
     try:
         return pl.read_csv(data, separator=separator, infer_schema=False)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
