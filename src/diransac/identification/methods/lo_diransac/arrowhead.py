@@ -41,6 +41,8 @@ class Factored:
         Corner of the inverse.
     gain : (W, k, m) array
         ``A^-1 B``: a shift of p moves z by ``-gain`` times the shift.
+    log_det : float
+        Logarithm of the determinant of the whole system.
     """
 
     step_z: FloatArray
@@ -48,6 +50,7 @@ class Factored:
     var_z: FloatArray
     var_p: FloatArray
     gain: FloatArray
+    log_det: float
 
 
 @dataclass(frozen=True)
@@ -115,9 +118,10 @@ class Arrowhead:
         E = self.below * sz[1:, :, None] * sz[:-1, None, :]
         B = self.border * sz[:, :, None] * sp
         C = self.corner * sp[:, None] * sp + (damping + _RIDGE) * np.eye(m)
-        solved, var, _ = _reduce(D, E, np.concatenate([B, right_z * sz[:, :, None]], axis=2))
+        solved, var, _, log_det = _reduce(D, E, np.concatenate([B, right_z * sz[:, :, None]], axis=2))
         gain, alone = solved[:, :, :m], solved[:, :, m:]
-        var_p = _inverse(C - np.einsum("wki,wkj->ij", B, gain))
+        left = C - np.einsum("wki,wkj->ij", B, gain)
+        var_p = _inverse(left)
         p = var_p @ (right_p * sp[:, None] - np.einsum("wki,wkc->ic", B, alone))
         z = alone - gain @ p
         var = var + gain @ var_p @ gain.swapaxes(1, 2)
@@ -127,6 +131,7 @@ class Arrowhead:
             var * sz[:, :, None] * sz[:, None, :],
             var_p * sp[:, None] * sp,
             gain * sz[:, :, None] / sp,
+            float(log_det + _log_det(left) - 2.0 * (np.log(sz).sum() + np.log(sp).sum())),
         )
 
 
@@ -140,12 +145,17 @@ def _inverse(A: FloatArray) -> FloatArray:
     return np.asarray((vectors / np.maximum(values, 1e-15)) @ vectors.T)
 
 
-def _reduce(D: FloatArray, E: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """``A^-1 R (W, k, c)``, and of ``A^-1`` the diagonal blocks (W, k, k) and those below them (W-1, k, k)."""
+def _log_det(A: FloatArray) -> float:
+    """Logarithm of the determinants of positive definite matrices, all together."""
+    return float(np.linalg.slogdet(A)[1].sum())
+
+
+def _reduce(D: FloatArray, E: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """``A^-1 R (W, k, c)``, and of ``A^-1`` the diagonal blocks (W, k, k) and those below them (W-1, k, k); log det A."""
     n, k, c = R.shape
     if n == 1:
         inverse = np.asarray(np.linalg.inv(D))
-        return inverse @ R, np.asarray(inverse, np.float64), E
+        return inverse @ R, np.asarray(inverse, np.float64), E, _log_det(D)
     n_odd, n_even = n // 2, n - n // 2
     has_right = n_even > n_odd  # whether the last odd block has a neighbour on its right, too
     left = E[0::2]
@@ -161,7 +171,7 @@ def _reduce(D: FloatArray, E: FloatArray, R: FloatArray) -> tuple[FloatArray, Fl
     m = n_even - 1
     De[1:] -= (rt @ Fr)[:m]
     Re[1:] -= (rt @ Ro)[:m]
-    Xe, Se, Te = _reduce(De, -(rt @ Fl)[:m], Re)
+    Xe, Se, Te, log_det = _reduce(De, -(rt @ Fl)[:m], Re)
     if not has_right:  # a neighbour that isn't there: couples to nothing
         Xe_r = np.concatenate([Xe[1:], np.zeros_like(Xe[:1])])
         Se_r = np.concatenate([Se[1:], np.zeros_like(Se[:1])])
@@ -177,4 +187,4 @@ def _reduce(D: FloatArray, E: FloatArray, R: FloatArray) -> tuple[FloatArray, Fl
     S[1::2] = Io - to_left @ Fl.swapaxes(1, 2) - to_right @ Fr.swapaxes(1, 2)
     off[0::2] = to_left
     off[1::2] = to_right.swapaxes(1, 2)[: len(off[1::2])]
-    return X, S, off
+    return X, S, off, log_det + _log_det(D[1::2])

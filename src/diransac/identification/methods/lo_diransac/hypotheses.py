@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["WeakForm", "find_hypotheses", "robust_scores", "weak_form"]
 
 _OVERLAP = 5
+# Least residual of an equation over its terms: smoothing is not exact.
+_SMALL_RESIDUAL = 0.01
 
 
 def find_hypotheses(
@@ -166,9 +168,32 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
         means = np.lib.stride_tricks.sliding_window_view(both, H, axis=0)[firsts] @ bump
         Ws.append(layout.scattered(means[:, : n_p * n_v].reshape(-1, n_p, n_v).swapaxes(1, 2), i))
         bs.append(means[:, n_p * n_v :])
-    W, b = np.concatenate(Ws), np.concatenate(bs)
-    scale = np.maximum(np.median(np.abs(b - np.median(b, axis=0)), axis=0), 1e-9)
-    return WeakForm(np.ascontiguousarray(W / scale[:, None]), b / scale)
+    return _scaled(WeakForm(np.ascontiguousarray(np.concatenate(Ws)), np.concatenate(bs)))
+
+
+def _scaled(weak: WeakForm) -> WeakForm:
+    """Rows over the scale of their equation: of its residuals, and a hundredth of its terms at least.
+
+    An equation without a known term (``b = 0``) is also solved by parameters of zero.  Its scale is that of its terms
+    with the parameters that the other equations determine, so that it cannot dominate them.
+    """
+    known = np.abs(weak.b).max(axis=0) > 0.0
+    scale = np.where(known, _median_size(weak.b - np.median(weak.b, axis=0)), np.inf)
+    scale = np.where(scale > 0.0, scale, np.abs(weak.b).max(axis=0))
+    for residuals in (False, False, False, True, True):
+        scale = np.where(scale > 0.0, scale, np.inf)
+        rows = WeakForm(weak.W / scale[:, None], weak.b / scale)
+        p = rows.solve(np.ones((1, *weak.b.shape), bool))[0]
+        terms = weak.W * p
+        scale = _median_size(np.sqrt(np.square(terms).sum(axis=2) + np.square(weak.b)))
+        if residuals:
+            scale = np.maximum(_median_size(terms.sum(axis=2) - weak.b), _SMALL_RESIDUAL * scale)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    return WeakForm(weak.W / scale[:, None], weak.b / scale)
+
+
+def _median_size(values: FloatArray) -> FloatArray:
+    return np.asarray(np.median(np.abs(values), axis=0))
 
 
 def _admitted(intervals: ShootingIntervals, p: FloatArray) -> FloatArray:

@@ -29,7 +29,7 @@ from diransac.identification.methods.lo_diransac.instrumental_variables import (
 )
 from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
-from diransac.identification.methods.lo_diransac.refinement import make_prior, refine, start
+from diransac.identification.methods.lo_diransac.refinement import make_prior, refine, refine_exact, start
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
@@ -56,7 +56,7 @@ __all__ = ["LoDiransac", "configured"]
 _FEWEST_INTERVALS = 4
 # Half a sample of delay or more is taken up by shifting the inputs.
 _WHOLE_SAMPLE = 0.5
-# Difference of two fits' losses, nats, below which both are as likely.
+# Difference of two fits' evidence, nats, below which both are as likely.
 _AS_LIKELY = 5.0
 _OUTLIER = 0.5
 # Delays that are tried at a time, before they are refined to a sample.
@@ -196,6 +196,13 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     search = _LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
     delay, refined = search.best_delayed(intervals)
     intervals, refined, later = search.shifted(intervals.delayed(delay), refined)
+    first = estimate_parameters(intervals, refined.fit, settings.prior_inflation).parameters
+    begin = refined.fit
+    if intervals.layout.admits(first[None])[0]:
+        begin = replace(begin, shared=np.concatenate([first, begin.shared[intervals.n_p :]]))
+    exact = refine_exact(settings, intervals, begin, search.prior)
+    if exact.cost < refined.cost:
+        refined = exact
     report(callback, "estimating parameters", 0.9)
     result = estimate_parameters(intervals, refined.fit, settings.prior_inflation)
     kept = refined.fit.shared[: intervals.n_p]
@@ -299,12 +306,12 @@ class _LocalSearch:
             report(callback, "local optimisation", share, f"fit {len(found) + 1}")
             begin = start(self.settings, intervals, self.motion, waiting.pop(0), self.prior)
             found.append(refine(self.settings, intervals, begin, self.prior))
-            again = any(abs(found[-1].loss - x.loss) < _AS_LIKELY for x in found[:-1])
+            again = any(abs(found[-1].cost - x.cost) < _AS_LIKELY for x in found[:-1])
             if again or not _is_doubtful(intervals, found[-1]):
                 break
-            if all(found[-1].loss < x.loss for x in found[:-1]):
+            if all(found[-1].cost < x.cost for x in found[:-1]):
                 waiting.insert(0, found[-1].fit.shared[: intervals.n_p])
-        return min(found, key=lambda x: x.loss)
+        return min(found, key=lambda x: x.cost)
 
     def best_delayed(self, intervals: ShootingIntervals) -> tuple[int, Refinement]:
         """Delay of the inputs in samples, and the best fit then.
@@ -319,7 +326,7 @@ class _LocalSearch:
             while abs(delay + step) < intervals.length:
                 other = self.best(intervals.delayed(delay + step), self._progress(len(fits)))
                 fits[delay + step] = other
-                if other.loss >= fits[delay].loss:
+                if other.cost >= fits[delay].cost:
                     break
                 delay += step
         return delay, fits[delay]
@@ -397,7 +404,8 @@ def _estimate(
     dataset, intervals, result = found.dataset, found.intervals, found.result
     names = dataset.layout.names
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
-    lost = ~(spans < parameter_units(intervals, found.motion, result.parameters))
+    units = parameter_units(intervals, found.motion, result.parameters)
+    lost = ~((spans < units) | (spans < np.abs(result.parameters)))
     covariance = result.covariance.copy()
     covariance[lost] = covariance[:, lost] = np.inf
     nonlinear = bool(dataset.model.nonlinear_parameters)

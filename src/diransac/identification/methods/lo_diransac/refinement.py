@@ -27,7 +27,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
-from diransac.identification.methods.lo_diransac.normal_equations import Fit, cost, linearize
+from diransac.identification.methods.lo_diransac.normal_equations import Fit, cost, linearize, with_residuals
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.arrowhead import Factored
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["Prior", "Refinement", "make_prior", "refine", "start", "weights_of"]
+__all__ = ["Prior", "Refinement", "make_prior", "refine", "refine_exact", "start", "weights_of"]
 
 
 # Where tau starts, in spreads of the accelerations; the largest change of any scale in a step.
@@ -43,6 +43,8 @@ _TAU_START, _SHRINK = 0.3, 0.4
 # Continuity is exact for practical purposes: jumps are as small a part of the effect of tau in an interval.
 _CONTINUITY = 0.03
 _SIGMA_FLOOR = 1e-4
+# Discrepancies of a model that is taken to be exact, over their prior sizes.
+_EXACT = 1e-3
 # Tau until convergence, over its prior: noise must not absorb model error.
 _GUARDED = 10.0
 _MAX_TRIALS, _MAX_SWEEPS = 8, 12
@@ -82,8 +84,8 @@ class Refinement:
     ----------
     fit : Fit
         Most probable motion and parameters.
-    loss : float
-        Negative log-likelihood of all samples.
+    cost : float
+        Negative log evidence: of the likelihood, integrated over all unknowns about the fit (Laplace), up to a constant.
     steps : int
         Number of Gauss-Newton steps.
     converged : bool
@@ -91,7 +93,7 @@ class Refinement:
     """
 
     fit: Fit
-    loss: float
+    cost: float
     steps: int
     converged: bool
 
@@ -211,8 +213,68 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
         errors = np.sqrt(np.diag(solved.var_p)[: intervals.n_p])
         converged = _unchanged(fit, updated, errors)
         fit = updated
-    loss = float(fit.noise.negative_log_likelihood(fit.residuals, intervals.known).sum())
-    return Refinement(fit, loss, steps, converged and not robust)
+    return Refinement(fit, negative_log_evidence(intervals, fit), steps, converged and not robust)
+
+
+def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
+    """Fit of the model as it is, without unmodelled accelerations and input gain and bias discrepancies.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    intervals : ShootingIntervals
+    fit : Fit
+        Initial fit, as from `refine`.
+    prior : Prior
+
+    Returns
+    -------
+    Refinement
+    """
+    n_p, tau = intervals.n_p, _EXACT * prior.tau
+    shared, sizes = fit.shared.copy(), fit.prior.copy()
+    shared[n_p:-1], sizes[n_p:-1] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:-1]
+    begin = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, prior=sizes)
+    begin = with_residuals(intervals, replace(begin, continuity_std=_continuity(intervals, tau)))
+    damping, converged, steps, fit = 0.0, False, 0, begin
+    while steps < settings.max_steps and not converged:
+        steps += 1
+        moved, solved, damping = _step(intervals, fit, damping)
+        inlying = moved.noise.inlying(moved.residuals, intervals.known)
+        noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
+        sizes = fit.prior.copy()
+        sizes[-1] = _discrepancies(moved, prior, np.diag(solved.var_p), n_p)[-1]
+        updated = replace(moved, noise=noise, prior=sizes)
+        converged = _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
+        fit = updated
+    return Refinement(fit, negative_log_evidence(intervals, fit), steps, converged)
+
+
+def negative_log_evidence(intervals: ShootingIntervals, fit: Fit) -> float:
+    """Negative logarithm of the probability of the measurements, given the scales of a fit, by Laplace's method.
+
+    Freedom costs: a discrepancy whose prior is wide counts against a fit unless it explains the log better.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        At its optimum.
+
+    Returns
+    -------
+    float
+        Up to a constant that fits of the same log have in common; infinite where a rollout diverges.
+    """
+    loss = fit.noise.negative_log_likelihood(fit.residuals, intervals.known).sum()
+    beforehand = cost(intervals, fit, np.zeros_like(fit.residuals))
+    if not np.isfinite(loss + beforehand):
+        return np.inf
+    at = linearize(intervals, fit, weights_of(intervals, fit))
+    log_det = at.system.solve(at.right_z, at.right_s).log_det
+    scales = intervals.linked.sum() * np.log(fit.continuity_std).sum() + len(fit.d) * np.log(fit.tau).sum()
+    scales += np.log(fit.prior[np.isfinite(fit.prior)]).sum()
+    return float(loss + 0.5 * beforehand + 0.5 * log_det + scales)
 
 
 def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:

@@ -18,12 +18,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import casadi as ca
 import numpy as np
 from scipy.ndimage import median_filter
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
+from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
     from diransac.model import Model
@@ -183,23 +185,98 @@ def smooth(model: Model, logs: Sequence[Samples], dt: float, half: int) -> list[
 
 
 def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
-    """Smoothed signals ``(N, n_signals)`` of all rows of one log."""
-    measured, known, centre = log.measured, log.known, log.centre
-    N, n = measured.shape
-    step = max(1, half // 2)
-    rows, inside = _neighbourhoods(np.arange(0, N, step), half, N)
-    offsets = np.arange(-half, half + 1)
-    basis = _basis(offsets / half, half * dt)
-    signals = np.zeros((N, n))
-    blend = np.maximum(0.0, 1.0 - np.abs(offsets) / (step + 1.0))
-    total = np.bincount(rows[inside], np.broadcast_to(blend, rows.shape)[inside], N)
-    for columns in _chains(model):
-        values, oks = measured[:, columns][rows], known[:, columns][rows] & inside[:, :, None]
-        first = values - centre[:, columns][rows]
-        fitted = _fit(values, oks, first, basis[: len(columns)], _spread(centre[:, columns]))
-        for j, column in enumerate(columns):
-            signals[:, column] = np.bincount(rows[inside], (fitted[:, :, j] * blend)[inside], N) / total
+    """Smoothed signals ``(N, n_signals)`` of all rows of one log; those that it lacks follow from those that it has."""
+    smoother = _Smoother.of(len(log.measured), dt, half)
+    measured, known, centre = log.measured.copy(), log.known.copy(), log.centre.copy()
+    signals = np.zeros(measured.shape)
+    chains = _chains(model)
+    if model.kinematics is not None:
+        rates = np.zeros((len(measured), model.n_q))
+        for d in range(model.n_q):
+            signals[:, [d]], rates[:, d] = smoother.smoothed(measured[:, [d]], known[:, [d]], centre[:, [d]])
+        lacking = model.n_q + np.flatnonzero(~known[:, model.n_q : model.n_q + model.n_v].any(axis=0))
+        if len(lacking):
+            inferred = _velocities_of_rates(model, signals, rates, measured, known, lacking)
+            measured[:, lacking], known[:, lacking], centre[:, lacking] = inferred, True, inferred
+        chains = chains[model.n_q :]
+    for columns in chains:
+        signals[:, columns], _ = smoother.smoothed(measured[:, columns], known[:, columns], centre[:, columns])
+        _integrate(signals, known, columns, dt)
     return signals
+
+
+def _velocities_of_rates(
+    model: Model, signals: FloatArray, rates: FloatArray, measured: FloatArray, known: BoolArray, lacking: IntArray
+) -> FloatArray:
+    """Velocities ``(N, n)`` that a log lacks, from the rates of its coordinates by least squares of the kinematics."""
+    n_q, n_v = model.n_q, model.n_v
+    q, v = (ca.SX.sym(name, n) for name, n in (("q", n_q), ("v", n_v)))
+    assert model.kinematics is not None
+    rate = model.kinematics(q, v)
+    evaluate = compile_map(ca.Function("rates", [q, v], [ca.densify(rate), ca.densify(ca.jacobian(rate, v))]))
+    rows = np.arange(len(signals))
+    v_known = np.zeros((len(signals), n_v))
+    for d in range(n_v):
+        ok = known[:, n_q + d]
+        if ok.any():
+            v_known[:, d] = np.interp(rows, rows[ok], measured[ok, n_q + d])
+    at_known, slopes = evaluate(signals[:, :n_q], v_known)
+    J = slopes.reshape(len(signals), n_v, n_q).swapaxes(1, 2)[:, :, lacking - n_q]
+    seen = known[:, :n_q].any(axis=0)
+    return np.einsum("nvq,nq->nv", np.linalg.pinv(J[:, seen], rcond=1e-6), (rates - at_known)[:, seen])
+
+
+def _integrate(signals: FloatArray, known: BoolArray, columns: Sequence[int], dt: float) -> None:
+    """Fill signals below the first of a chain that the log has with its integral, in place: the constant is unknown."""
+    has = [bool(known[:, c].any()) for c in columns]
+    if not any(has):
+        return
+    for j in range(has.index(True), 0, -1):
+        rate = signals[:, columns[j]]
+        integral = np.concatenate([[0.0], np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))])
+        signals[:, columns[j - 1]] = integral - integral.mean()
+
+
+@dataclass(frozen=True)
+class _Smoother:
+    """Overlapping windows of one log, whose polynomials are blended.
+
+    Parameters
+    ----------
+    rows : (K, 2 half + 1) int array
+        Rows about each knot.
+    inside : (K, 2 half + 1) bool array
+        Those that are in the log.
+    basis : (4, 2 half + 1, 5) array
+        Polynomials and their derivatives.
+    blend : (2 half + 1,) array
+        Weight of a polynomial by its distance from the knot.
+    """
+
+    rows: IntArray
+    inside: BoolArray
+    basis: FloatArray
+    blend: FloatArray
+
+    @classmethod
+    def of(cls, n_rows: int, dt: float, half: int) -> _Smoother:
+        step = max(1, half // 2)
+        rows, inside = _neighbourhoods(np.arange(0, n_rows, step), half, n_rows)
+        offsets = np.arange(-half, half + 1)
+        blend = np.maximum(0.0, 1.0 - np.abs(offsets) / (step + 1.0))
+        return cls(rows, inside, _basis(offsets / half, half * dt), blend)
+
+    def smoothed(self, values: FloatArray, known: BoolArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """A chain's signals ``(N, c)``, and the derivative ``(N,)`` of its last."""
+        rows, inside, c = self.rows, self.inside, values.shape[1]
+        oks = known[rows] & inside[:, :, None]
+        first = (values - centre)[rows]
+        coefficients = _coefficients(values[rows], oks, first, self.basis[:c], _spread(centre))
+        fitted = np.einsum("ka,jta->ktj", coefficients, self.basis[: c + 1])
+        weight = np.broadcast_to(self.blend, rows.shape)[inside]
+        total = np.bincount(rows[inside], weight, len(values))
+        blended = [np.bincount(rows[inside], fitted[inside, j] * weight, len(values)) / total for j in range(c + 1)]
+        return np.column_stack(blended[:c]), blended[c]
 
 
 def choose_half_width(model: Model, logs: Sequence[Samples], dt: float, narrowest: float) -> int:
@@ -311,18 +388,26 @@ def _medians(columns: FloatArray, window: int) -> FloatArray:
 
 
 def _basis(t: FloatArray, unit: float) -> FloatArray:
-    """Powers of scaled time and their derivatives, (3, n_t, 5)."""
-    powers = np.arange(_DEGREE + 1)
-    value = t[:, None] ** powers
-    first = powers * t[:, None] ** np.maximum(powers - 1, 0) / unit
-    second = powers * (powers - 1) * t[:, None] ** np.maximum(powers - 2, 0) / unit**2
-    return np.stack([value, first, second])
+    """Powers of scaled time and their first three derivatives, (4, n_t, 5)."""
+    powers, factor, orders = np.arange(_DEGREE + 1), np.ones(_DEGREE + 1), []
+    for order in range(4):
+        orders.append(factor * t[:, None] ** np.maximum(powers - order, 0) / unit**order)
+        factor = factor * (powers - order)
+    return np.stack(orders)
 
 
 def _fit(
     values: FloatArray, known: BoolArray, residuals: FloatArray, basis: FloatArray, spread: FloatArray
 ) -> FloatArray:
     """Fitted values ``(K, n_t, c)`` of the c signals of one chain."""
+    coefficients = _coefficients(values, known, residuals, basis, spread)
+    return np.asarray(np.einsum("ka,jta->ktj", coefficients, basis))
+
+
+def _coefficients(
+    values: FloatArray, known: BoolArray, residuals: FloatArray, basis: FloatArray, spread: FloatArray
+) -> FloatArray:
+    """Coefficients ``(K, 5)`` of the polynomials of the c signals of one chain, ``(K, n_t, c)``."""
     K, n_t, c = values.shape
     floor = _FLOOR * spread + 1e-12
     scale = np.maximum(_scale(residuals, known), floor)
@@ -340,7 +425,7 @@ def _fit(
         residuals = values - fitted
         scale = np.maximum(np.maximum(_scale(residuals, known), floor), _SHRINK * scale)
         width = 3.0 * scale
-    return np.asarray(fitted)
+    return np.asarray(coefficients)
 
 
 def _scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
