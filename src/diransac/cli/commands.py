@@ -87,7 +87,7 @@ def _identify(
     with staged([output, report], [*files, model_file(model), search.settings]) as (saved, page):
         plant, logs = load_model(model), preparation.read_all(files)
         with screen.bar(method) as progress:
-            result = identify(plant, logs, chosen, seed=search.seed, progress=progress, **derived)
+            result = identify(plant, logs, chosen, progress=progress, **search.arguments(), **derived)
         if output:
             result.save(saved)
         if report:
@@ -111,7 +111,7 @@ def _compare(
 ) -> None:
     """Identify by every method from the same logs, side by side."""
     wanted = search.methods(known_methods(methods))
-    arguments = {"seed": search.seed, **derivation.arguments()}
+    arguments = {**search.arguments(), **derivation.arguments()}
     with staged([report], [*files, model_file(model), search.settings]) as (page,):
         plant, logs = load_model(model), preparation.read_all(files)
         comparison = compare_methods(plant, logs, wanted, arguments)
@@ -154,7 +154,7 @@ def _cross_validate(
     (chosen,), derived = search.methods([method]), derivation.arguments()
     plant, logs = load_model(model), preparation.read_all(files)
     with screen.bar(f"{method}, leaving one log out") as progress:
-        found = cross_validate(plant, logs, chosen, horizon=horizon, seed=search.seed, progress=progress, **derived)
+        found = cross_validate(plant, logs, chosen, horizon=horizon, progress=progress, **search.arguments(), **derived)
     screen.show(found, as_json)
 
 

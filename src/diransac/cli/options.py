@@ -18,6 +18,7 @@ from diransac.errors import LogError, SettingsError
 from diransac.identification.method import Method
 from diransac.identification.methods import METHODS
 from diransac.model import Model
+from diransac.simulation import HOLDS
 
 __all__ = [
     "Derivation",
@@ -41,6 +42,13 @@ def known_method(name: str) -> str:
     """The name itself.  Raises typer.BadParameter: there is no method of that name."""
     if name not in METHODS:
         raise typer.BadParameter(f"there is no method {name!r}; there are {', '.join(METHODS)}")
+    return name
+
+
+def _known_hold(name: str | None) -> str | None:
+    """The name itself.  Raises typer.BadParameter: there is no hold of that name."""
+    if name is not None and name not in HOLDS:
+        raise typer.BadParameter(f"there is no hold {name!r}; there are {', '.join(HOLDS)}")
     return name
 
 
@@ -103,7 +111,7 @@ def _option(*names: str, **about: Any) -> Any:
 
 @dataclass(frozen=True)
 class Search:
-    """Options of the method: seed and settings."""
+    """Options of the method: seed, settings and hold of the inputs."""
 
     seed: Annotated[int, typer.Option(help="The same seed gives the same answer.")] = 0
     settings: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Settings by name.")] = None
@@ -111,6 +119,20 @@ class Search:
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="One setting, such as sample_size=50; repeatable."),
     ] = None
+
+    input_hold: Annotated[
+        str | None,
+        typer.Option(
+            "--input-hold",
+            callback=_known_hold,
+            metavar="|".join(HOLDS),
+            help="Inputs between samples: held, or interpolated linearly.",
+        ),
+    ] = None
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `diransac.identify`, without the method."""
+        return {"seed": self.seed, "input_hold": self.input_hold}
 
     def methods(self, names: Sequence[str]) -> list[Method]:
         """The methods with these settings.  Raises SettingsError: a setting has no meaning."""

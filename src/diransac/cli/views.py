@@ -72,6 +72,9 @@ class Comparison:
             yield f"{', '.join(diagnosed)} is evaluated on measured signals, the others on derived ones, too"
         elif diagnosed and len(self.results) > 1:
             yield "fit error and inliers are those of one simulation of the whole log, outliers and drift included"
+        interpolated = [name for name, x in self.results.items() if x.estimate.resolution.hold == "linear"]
+        if interpolated:
+            yield f"{', '.join(interpolated)}: inputs interpolated linearly"
         for name, result in self.results.items():
             for parameter in (*result.violations, *result.on_bounds):
                 where = "outside its bounds" if parameter in result.violations else "on its bound, its interval unknown"

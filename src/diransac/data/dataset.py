@@ -137,12 +137,15 @@ class Dataset:
         One per log, in the same order; all have the same ``signals``.
     layout : ParameterLayout
         Positions of each log's parameters in the vector of all parameters.
+    input_hold : str, optional
+        Requested hold of the inputs between samples, "zero-order" or "linear"; None: the method's choice.
     """
 
     model: Model
     given: tuple[Log, ...]
     segments: tuple[Segment, ...]
     layout: ParameterLayout
+    input_hold: str | None = None
 
     @classmethod
     def of(
@@ -153,6 +156,7 @@ class Dataset:
         *,
         pointwise: bool = True,
         given: Sequence[Log] | None = None,
+        input_hold: str | None = None,
     ) -> Dataset:
         """The dataset of one log or several.
 
@@ -166,6 +170,8 @@ class Dataset:
             Whether the equations are evaluated at each row, which needs every signal that they name.
         given : sequence of Log, optional
             Logs as the user gave them, where ``logs`` were derived from them.
+        input_hold : str, optional
+            Requested hold of the inputs.
 
         Returns
         -------
@@ -181,9 +187,8 @@ class Dataset:
         found = {name for one in segments for name in one.signals}
         signals = tuple(name for name in model.signals if name in found)
         layout = ParameterLayout(model.parameters, len(several))
-        return cls(
-            model, several if given is None else tuple(given), tuple(x.with_signals(signals) for x in segments), layout
-        )
+        own = several if given is None else tuple(given)
+        return cls(model, own, tuple(x.with_signals(signals) for x in segments), layout, input_hold)
 
     def __len__(self) -> int:
         """Rows of all segments."""
@@ -198,6 +203,11 @@ class Dataset:
     def signals(self) -> tuple[str, ...]:
         """Signals of the model that at least one log has, in the model's order."""
         return self.segments[0].signals
+
+    @property
+    def hold(self) -> str:
+        """Hold of the inputs in the simulations of a method that makes no choice: as requested, else "zero-order"."""
+        return self.input_hold or "zero-order"
 
     @property
     def source(self) -> str:

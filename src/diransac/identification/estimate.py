@@ -32,10 +32,13 @@ class Resolution:
         "rk4", "euler" or "semi-implicit-euler".
     substeps : int, optional
         Integration steps per sample.
+    hold : str, optional
+        Inputs between samples: "zero-order", held, or "linear", interpolated.
     """
 
     integrator: str = "rk4"
     substeps: int = 1
+    hold: str = "zero-order"
 
 
 @dataclass(frozen=True, eq=False)

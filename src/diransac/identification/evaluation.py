@@ -192,7 +192,7 @@ class Simulation:
     signals : (n_s,) bool array, optional
         Signals of the dataset that are compared with the measured ones; None: all.
     resolution : Resolution, optional
-        Integrator and steps per sample.
+        Integrator, steps per sample, and hold of the inputs.
     rules : sequence of str or mapping of str to float, optional
         Rule of each log's initial state in `score`, as ``Settings.initial_state``; None: the first samples.
     threads : int, optional
@@ -213,7 +213,11 @@ class Simulation:
         self._rules = ["first"] * len(dataset.segments) if rules is None else list(rules)
         self._threads = threads or default_threads()
         self._simulator: Simulator = rollouts(
-            dataset.model, names, integrator=resolution.integrator, substeps=resolution.substeps
+            dataset.model,
+            names,
+            integrator=resolution.integrator,
+            substeps=resolution.substeps,
+            hold=resolution.hold,
         )
         self._measured = [
             Measurements(np.ascontiguousarray(one.measured[:, compared]), one.valid) for one in dataset.segments

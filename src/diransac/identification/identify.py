@@ -20,8 +20,9 @@ from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, fa
 from diransac.identification.result import Result
 from diransac.identification.settings import Settings
 from diransac.model import Model
+from diransac.simulation import HOLDS
 
-__all__ = ["METHODS", "identify"]
+__all__ = ["METHODS", "checked_hold", "identify"]
 
 
 def identify(
@@ -34,6 +35,7 @@ def identify(
     estimator: object = None,
     differentiate: bool = False,
     bandwidth: float | None = None,
+    input_hold: str | None = None,
     compare_logs: bool = True,
     progress: Callback | None = None,
 ) -> Result:
@@ -63,6 +65,9 @@ def identify(
         ``result.bandwidth_sensitivity``.  lo-diransac estimates missing signals without a filter.
     bandwidth : float, optional
         Bandwidth of the differentiating filter, Hz; None: chosen from each log.
+    input_hold : str, optional
+        Inputs between samples in every simulation: "zero-order", held, as those of a digital controller are; "linear",
+        interpolated, for continuous inputs such as those of a sensor.  None: "zero-order".
     compare_logs : bool, optional
         Whether each of several logs is also identified alone, so that logs that disagree with the others are named;
         that takes about as long again.
@@ -92,13 +97,14 @@ def identify(
     chosen = _method(method, settings, estimator)
     given = as_logs(logs)
     _check_arguments(model, seed)
+    hold = checked_hold(input_hold)
     filtered = differentiate and chosen.needs_all_signals
     if bandwidth is not None and not filtered:
         raise SettingsError(
             "bandwidth is given without differentiate=True, which alone uses it (and lo-diransac does not)"
         )
     pointwise = chosen.needs_all_signals or not differentiate
-    task = _Task(model, given, chosen, int(seed), pointwise, compares=compare_logs and len(given) > 1)
+    task = _Task(model, given, chosen, int(seed), pointwise, hold, compares=compare_logs and len(given) > 1)
     if not filtered:
         return task.run(given, progress)
     derived = tuple(preprocessing.differentiate(log, model, bandwidth) for log in given)
@@ -124,6 +130,19 @@ def _method(method: object, settings: object, estimator: object) -> Method:
     return make(settings or Settings(), **of_search)
 
 
+def checked_hold(name: object) -> str | None:
+    """The hold of the inputs itself, None included.
+
+    Raises
+    ------
+    SettingsError
+        There is no hold of that name.
+    """
+    if name is None or (isinstance(name, str) and name in HOLDS):
+        return name
+    raise SettingsError(f"input_hold is {name!r}; choose {', '.join(HOLDS)}, or None")
+
+
 def _check_arguments(model: object, seed: object) -> None:
     if not isinstance(model, Model):
         raise SettingsError(f"model is {model!r}; give a dr.Model, such as dr.models.planar_rotorcraft()")
@@ -140,13 +159,16 @@ class _Task:
     method: Method
     seed: int
     pointwise: bool
+    input_hold: str | None
     compares: bool
 
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
         """Identify from prepared logs."""
         criteria = self.method.criteria
         judged = judged_signals(self.model, logs, criteria)
-        dataset = Dataset.of(self.model, logs, judged, pointwise=self.pointwise, given=self.given)
+        dataset = Dataset.of(
+            self.model, logs, judged, pointwise=self.pointwise, given=self.given, input_hold=self.input_hold
+        )
         fitted = 0.5 if self.compares else 0.95
         estimate = self.method.fit(dataset, self.seed, within(progress, 0.0, fitted))
         report(progress, "evaluating", fitted)

@@ -16,7 +16,7 @@ from diransac.data.segment import Segment
 from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.identification.estimate import Resolution
 from diransac.identification.evaluation import Simulation
-from diransac.identification.identify import identify
+from diransac.identification.identify import checked_hold, identify
 from diransac.identification.method import Callback, Method, within
 from diransac.identification.methods import DEFAULT
 from diransac.identification.result import Result
@@ -125,6 +125,7 @@ def validate(
     *,
     integrator: str | None = None,
     substeps: int | None = None,
+    input_hold: str | None = None,
 ) -> Validation:
     """Scores of the open-loop prediction of logs by a plant.
 
@@ -140,7 +141,8 @@ def validate(
         logs.  The whole of each log from its first complete state on is always scored, too.
     integrator : str, optional
     substeps : int, optional
-        As in `Settings`; None: those of the identification of a result, else "rk4" and 1.
+    input_hold : str, optional
+        As in `Settings` and `identify`; None: those of the identification of a result, else "rk4", 1 and "zero-order".
 
     Returns
     -------
@@ -152,14 +154,16 @@ def validate(
     LogError
         A log lacks an input or an initial state.
     SettingsError
-        An argument is of another type, or a horizon is shorter than a sample.
+        An argument is of another type, or unknown, or a horizon is shorter than a sample.
     """
     several = as_logs(logs)
     if horizon is not None and not isinstance(horizon, (int, float, np.number)):
         raise SettingsError(f"horizon is {horizon!r:.60}; give seconds")
     known = as_plant(plant)
     fitted = plant.estimate.resolution if isinstance(plant, Result) else Resolution()
-    resolution = Resolution(integrator or fitted.integrator, substeps or fitted.substeps)
+    resolution = Resolution(
+        integrator or fitted.integrator, substeps or fitted.substeps, checked_hold(input_hold) or fitted.hold
+    )
     dataset = Dataset.of(known.model, several, pointwise=False)
     own = [plant.parameters_in(log) if isinstance(plant, Result) else known.parameters for log in several]
     predictions = [_OpenLoop(dataset, i, parameters, resolution) for i, parameters in enumerate(own)]

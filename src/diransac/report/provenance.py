@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from diransac.data.log import Log
+from diransac.identification.estimate import Resolution
 from diransac.identification.methods import default_options
 from diransac.identification.settings import Settings
 from diransac.model import Model
@@ -18,6 +19,7 @@ __all__ = ["log_facts", "model_text", "notes", "preparation", "settings", "snipp
 
 _PACKAGES = ("diransac", "numpy", "scipy", "casadi", "llvmlite")
 _DEFAULT_ESTIMATORS = ("OrdinaryLeastSquares", "NonlinearLeastSquares")
+_HOLD = Resolution().hold
 
 
 def unique_models(entries: Sequence[Entry]) -> list[Model]:
@@ -41,6 +43,7 @@ def settings(entries: Sequence[Entry]) -> list[tuple[str, list[tuple[str, bool]]
 
 def _facts(entry: Entry) -> dict[str, tuple[str, bool]]:
     result, default, defaults = entry.result, Settings().to_dict(), default_options(entry.result.method)
+    hold = result.estimate.resolution.hold
     squares = " (sum of squares)" if result.method == "diransac" else ""
     facts = {
         "method": result.method,
@@ -55,7 +58,7 @@ def _facts(entry: Entry) -> dict[str, tuple[str, bool]]:
     }
     chosen = {key: (_value(x), x != default[key]) for key, x in result.settings.to_dict().items()}
     own = {key: (_value(x), x != defaults.get(key)) for key, x in result.options.items()}
-    return {key: (text, False) for key, text in facts.items()} | chosen | own
+    return {key: (text, False) for key, text in facts.items()} | chosen | {"input hold": (hold, hold != _HOLD)} | own
 
 
 def _value(x: Any) -> str:
@@ -139,6 +142,8 @@ def _call(entry: Entry) -> str:
         arguments.append("differentiate=True")
     elif steps and steps[-1].get("step") == "differentiate":
         arguments.append(f"differentiate=True, bandwidth={steps[-1]['bandwidth']!r}")
+    if result.estimate.resolution.hold != _HOLD:
+        arguments.append(f"input_hold={result.estimate.resolution.hold!r}")
     return f"result = dr.identify(model, log, {', '.join(arguments)})"
 
 

@@ -411,6 +411,6 @@ def _validation(result: Result, view: LogView, log: Log) -> Validation | str:
     fitted = result.estimate.resolution
     try:
         plant = Plant(result.model, view.parameters)
-        return validate(plant, log, integrator=fitted.integrator, substeps=fitted.substeps)
+        return validate(plant, log, integrator=fitted.integrator, substeps=fitted.substeps, input_hold=fitted.hold)
     except (LogError, SettingsError) as error:
         return str(error)

@@ -1,7 +1,7 @@
 """Batches of rollouts of a model: scored against a log, differentiated, or under feedback.
 
-Observation `j` is the state at `t_j`; then the input `u_j` is held to `t_{j+1}`; the acceleration at `t_j` is the one
-under `u_j`.
+Observation `j` is the state at `t_j`; then the input `u_j` is held to `t_{j+1}`, or interpolated linearly to `u_{j+1}`;
+the acceleration at `t_j` is the one under `u_j`.
 
 | file | contents |
 |---|---|
@@ -23,10 +23,11 @@ from diransac.simulation.batch import (
     inlier_mask,
 )
 from diransac.simulation.compiler.machine_code import default_threads
-from diransac.simulation.integrators import INTEGRATORS, linearized_step
+from diransac.simulation.integrators import HOLDS, INTEGRATORS, linearized_step
 from diransac.simulation.rollouts import Rollouts, rollouts
 
 __all__ = [
+    "HOLDS",
     "INTEGRATORS",
     "ClosedLoopBatch",
     "GaussNewtonBatch",

@@ -39,7 +39,8 @@ class RolloutBatch:
     initial_states : (n_x,) or (n_lanes, n_x)
         Coordinates, then velocities; one state for all lanes, or one per lane.
     inputs : (n_log, n_u)
-        Held from each row to the next. `Simulator.fly` uses their number of rows only.
+        Held from each row to the next, or interpolated, as the simulator is made. `Simulator.fly` uses their number of
+        rows only.
     dt : float
         Time from row to row, s.
     start_rows : (n_lanes,), optional

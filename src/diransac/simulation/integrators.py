@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -25,10 +25,61 @@ if TYPE_CHECKING:
 
     SimulatedModel: TypeAlias = Model | DisturbedModel
 
-__all__ = ["INTEGRATORS", "Sensitivities", "linearized_step", "loop_specification", "sensitivities_of"]
+__all__ = ["HOLDS", "INTEGRATORS", "Hold", "Sensitivities", "linearized_step", "loop_specification", "sensitivities_of"]
 
-Dynamics = Callable[[ca.SX], ca.SX]
-"""State and its derivatives, in columns -> their rates, with inputs and parameters held."""
+Dynamics = Callable[[ca.SX, float], ca.SX]
+"""(state and its derivatives, in columns; fraction of the step that has elapsed) -> their rates."""
+
+
+# Inputs between rows -------------------------------------------------------------------------------------------------
+class Hold(Protocol):
+    """Inputs from one row to the next, as the time loop reads and the integration steps evaluate them."""
+
+    def columns(self, inputs: FloatArray, substeps: int) -> FloatArray:
+        """Columns of each row (n_log, n_columns) from its inputs (n_log, n_u)."""
+
+    def n_changes(self, n_u: int) -> int:
+        """Number of trailing columns that the leading ones change by with each sub-step."""
+
+    def at(self, columns: ca.SX, fraction: float) -> ca.SX:
+        """Inputs (n_u,) after a fraction of a sub-step, from the columns at its beginning."""
+
+
+class _ZeroOrderHold:
+    """Inputs of a row until the next."""
+
+    def columns(self, inputs: FloatArray, _substeps: int) -> FloatArray:
+        """The inputs."""
+        return inputs
+
+    def n_changes(self, _n_u: int) -> int:
+        """No column changes."""
+        return 0
+
+    def at(self, columns: ca.SX, _fraction: float) -> ca.SX:
+        """The inputs."""
+        return columns
+
+
+class _LinearHold:
+    """Linear interpolation between the inputs of a row and of the next; those of the last row are held."""
+
+    def columns(self, inputs: FloatArray, substeps: int) -> FloatArray:
+        """The inputs, then their changes in a sub-step."""
+        return np.hstack([inputs, np.diff(inputs, axis=0, append=inputs[-1:]) / substeps])
+
+    def n_changes(self, n_u: int) -> int:
+        """Every input changes."""
+        return n_u
+
+    def at(self, columns: ca.SX, fraction: float) -> ca.SX:
+        """Inputs at the beginning, and the fraction of their change."""
+        n_u = columns.numel() // 2
+        return columns[:n_u] + fraction * columns[n_u:]
+
+
+HOLDS: dict[str, Hold] = {"zero-order": _ZeroOrderHold(), "linear": _LinearHold()}
+"""Inputs between rows: held, or interpolated linearly (first-order hold)."""
 
 
 # Integrators ---------------------------------------------------------------------------------------------------------
@@ -40,14 +91,14 @@ def _euler(_dynamics: Dynamics, x: ca.SX, h: ca.SX, slope: ca.SX, _n_q: int) -> 
 def _semi_implicit_euler(dynamics: Dynamics, x: ca.SX, h: ca.SX, slope: ca.SX, n_q: int) -> ca.SX:
     """v+ = v + h a(q, v), q+ = q + h dq/dt(q, v+), order 1."""
     v = x[n_q:, :] + h * slope[n_q:, :]
-    return ca.vertcat(x[:n_q, :] + h * dynamics(ca.vertcat(x[:n_q, :], v))[:n_q, :], v)
+    return ca.vertcat(x[:n_q, :] + h * dynamics(ca.vertcat(x[:n_q, :], v), 1.0)[:n_q, :], v)
 
 
 def _rk4(dynamics: Dynamics, x: ca.SX, h: ca.SX, slope: ca.SX, _n_q: int) -> ca.SX:
     """The classical Runge-Kutta step, order 4."""
-    second = dynamics(x + h / 2 * slope)
-    third = dynamics(x + h / 2 * second)
-    fourth = dynamics(x + h * third)
+    second = dynamics(x + h / 2 * slope, 0.5)
+    third = dynamics(x + h / 2 * second, 0.5)
+    fourth = dynamics(x + h * third, 1.0)
     return x + h / 6 * (slope + fourth + 2 * (second + third))
 
 
@@ -130,7 +181,12 @@ def _driving(model: SimulatedModel, unknowns: Sequence[str], P: ca.SX) -> ca.SX:
 
 # A row ---------------------------------------------------------------------------------------------------------------
 def loop_specification(
-    model: SimulatedModel, signals: Sequence[str], sensitivities: Sensitivities, integrator: str, substeps: int
+    model: SimulatedModel,
+    signals: Sequence[str],
+    sensitivities: Sensitivities,
+    integrator: str,
+    substeps: int,
+    hold: str,
 ) -> LoopSpecification:
     """Expressions of one row, as graphs.
 
@@ -146,14 +202,16 @@ def loop_specification(
         One of `INTEGRATORS`.
     substeps : int
         Integration steps from one row to the next.
+    hold : str
+        One of `HOLDS`.
     """
     from diransac.simulation.compiler.time_loop import PARAMETER, STEP, LoopSpecification
 
-    n_states = len(model.state) + len(sensitivities.entries)
-    sizes = {"x": n_states, "u": model.n_u, "p": model.n_p, "h": 1}
+    n_states, n_changes = len(model.state) + len(sensitivities.entries), HOLDS[hold].n_changes(model.n_u)
+    sizes = {"x": n_states, "u": model.n_u + n_changes, "p": model.n_p, "h": 1}
     arguments = [ca.SX.sym(name, n) for name, n in sizes.items()]
     scored = tuple(model.signals.index(name) for name in signals)
-    after, simulated, slopes = _expressions(model, sensitivities, integrator, arguments)
+    after, simulated, slopes = _expressions(model, sensitivities, integrator, HOLDS[hold], arguments)
     step, further_step = (
         read_graph(ca.Function("step", arguments, results), (PARAMETER, STEP), reciprocals=True)
         for results in ([after, simulated, slopes[list(scored), :]], [after])
@@ -163,7 +221,8 @@ def loop_specification(
         further_step=further_step,
         substeps=substeps,
         n_states=n_states,
-        n_inputs=model.n_u,
+        n_inputs=model.n_u + n_changes,
+        n_changes=n_changes,
         n_signals=len(model.signals),
         n_unknowns=slopes.size2(),
         scored=scored,
@@ -173,15 +232,15 @@ def loop_specification(
 
 
 def _expressions(
-    model: SimulatedModel, sensitivities: Sensitivities, integrator: str, arguments: Sequence[ca.SX]
+    model: SimulatedModel, sensitivities: Sensitivities, integrator: str, hold: Hold, arguments: Sequence[ca.SX]
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
     """State after a step with the varying derivatives, all signals before it, and the derivatives of these."""
     n_x, n_q = len(model.state), model.n_q
-    states, u, p, h = arguments
+    states, inputs, p, h = arguments
     S = _variables(sensitivities, states[n_x:])
 
-    def rates(columns: ca.SX) -> ca.SX:
-        x = columns[:, 0]
+    def rates(columns: ca.SX, fraction: float) -> ca.SX:
+        x, u = columns[:, 0], hold.at(inputs, fraction)
         rate = model.dynamics(x, u, p)[0]
         if not sensitivities.unknowns:
             return rate
@@ -189,11 +248,11 @@ def _expressions(
         return ca.horzcat(rate, A @ columns[:, 1:] + _driving(model, sensitivities.unknowns, P))
 
     columns = ca.horzcat(states[:n_x], S)
-    slope = rates(columns)
+    slope = rates(columns, 0.0)
     after = INTEGRATORS[integrator](rates, columns, h, slope, n_q)
     after = _normalised(after, model.quaternions)
     moved = [after[i, 1 + j] for i, j in sensitivities.entries]
-    acceleration = model.dynamics(states[:n_x], u, p)[1]
+    acceleration = model.dynamics(states[:n_x], hold.at(inputs, 0.0), p)[1]
     return (
         ca.vertcat(after[:, 0], *moved),
         ca.vertcat(states[:n_x], acceleration),
@@ -229,12 +288,12 @@ def linearized_step(model: Model, integrator: str = "rk4") -> ca.Function:
     n_x, n_u = len(model.state), model.n_u
     x, u, p, h = (ca.SX.sym(name, n) for name, n in (("x", n_x), ("u", n_u), ("p", model.n_p), ("h", 1)))
 
-    def rates(columns: ca.SX) -> ca.SX:
+    def rates(columns: ca.SX, _fraction: float) -> ca.SX:
         A, B, _ = model.rate_jacobians(columns[:, 0], u, p)
         driving = ca.horzcat(ca.SX(n_x, n_x), B)
         return ca.horzcat(model.dynamics(columns[:, 0], u, p)[0], A @ columns[:, 1:] + driving)
 
     columns = ca.horzcat(x, ca.SX.eye(n_x), ca.SX(n_x, n_u))
-    after = INTEGRATORS[integrator](rates, columns, h, rates(columns), model.n_q)
+    after = INTEGRATORS[integrator](rates, columns, h, rates(columns, 0.0), model.n_q)
     results = ca.cse(ca.horzsplit(_normalised(after, model.quaternions), [0, 1, 1 + n_x, 1 + n_x + n_u]))
     return ca.Function("linearized_step", [x, u, p, h], results, ["x", "u", "p", "h"], ["after", "A", "B"])

@@ -29,11 +29,12 @@ from diransac.simulation.compiler.lanes import (
     arranged_lanes,
     arranged_measurements,
     arranged_weights,
+    checked_array,
     run_time_loop,
     squared_thresholds,
 )
 from diransac.simulation.compiler.machine_code import LANES, MachineCode, Target, compile_function
-from diransac.simulation.integrators import INTEGRATORS, Sensitivities, loop_specification, sensitivities_of
+from diransac.simulation.integrators import HOLDS, INTEGRATORS, Sensitivities, loop_specification, sensitivities_of
 
 if TYPE_CHECKING:
     from diransac.simulation.compiler.time_loop import InputSource, LoopSpecification, Output
@@ -48,6 +49,7 @@ def rollouts(
     *,
     integrator: str = "rk4",
     substeps: int = 1,
+    hold: str = "zero-order",
     target: Target | None = None,
 ) -> Rollouts:
     """Compiled rollouts of a model; the same object again for an equal model and equal options.
@@ -63,13 +65,16 @@ def rollouts(
         The last one steps velocities first, then coordinates with the new velocities.
     substeps : int
         Integration steps from one row to the next.
+    hold : {"zero-order", "linear"}
+        Inputs from one row to the next: those of the row, or interpolated linearly to those of the next at the time of
+        every stage of every step; after the last row of the log, its own.  A closed loop has a zero-order hold.
     target : Target, optional
         Processor to compile for; this one by default.
 
     Raises
     ------
     SettingsError
-        A signal or the integrator is unknown, or there is no integration step.
+        A signal, the integrator or the hold is unknown, or there is no integration step.
     ModelError
         The dynamics hold an operation that cannot be compiled.
     """
@@ -83,32 +88,41 @@ def rollouts(
         )
     if integrator not in INTEGRATORS:
         raise SettingsError(f"integrator {integrator!r} is unknown; choose one of {', '.join(INTEGRATORS)}.")
+    if hold not in HOLDS:
+        raise SettingsError(f"hold {hold!r} is unknown; choose one of {', '.join(HOLDS)}.")
     if substeps < 1:
         raise SettingsError(f"substeps is {substeps}, but a row takes at least 1 integration step.")
     if not model.dynamics.is_a("SXFunction"):
         raise ModelError(f"the dynamics of model {model.name!r} are not made of SX symbols; expand them: .expand().")
-    return _rollouts(model, scored, integrator, int(substeps), target)
+    return _rollouts(model, scored, integrator, int(substeps), hold, target)
 
 
 @lru_cache(maxsize=64)
 def _rollouts(
-    model: SimulatedModel, signals: tuple[str, ...], integrator: str, substeps: int, target: Target | None
+    model: SimulatedModel, signals: tuple[str, ...], integrator: str, substeps: int, hold: str, target: Target | None
 ) -> Rollouts:
     """Rollouts by value of what defines them."""
-    return Rollouts(model, signals, integrator, substeps, target)
+    return Rollouts(model, signals, integrator, substeps, hold, target)
 
 
 class Rollouts(Simulator):
-    """Compiled rollouts of one model, integrator and choice of scored signals; made by `rollouts`.
+    """Compiled rollouts of one model, integrator, hold and choice of scored signals; made by `rollouts`.
 
     Each method compiles a variant of the time loop when it is first called.
     """
 
     def __init__(
-        self, model: SimulatedModel, signals: tuple[str, ...], integrator: str, substeps: int, target: Target | None
+        self,
+        model: SimulatedModel,
+        signals: tuple[str, ...],
+        integrator: str,
+        substeps: int,
+        hold: str,
+        target: Target | None,
     ) -> None:
         self.signals = signals
         self._model, self._integrator, self._substeps, self._target = model, integrator, substeps, target
+        self._hold = hold
         self._specifications: dict[tuple[str, ...], tuple[LoopSpecification, Sensitivities]] = {}
         self._code: dict[tuple[Any, ...], MachineCode] = {}
         self._lock = RLock()
@@ -225,6 +239,8 @@ class Rollouts(Simulator):
         from diransac.simulation.compiler.time_loop import inputs_by_feedback, inputs_by_shared_feedback
 
         model, n_signals = self._model, len(self._model.signals)
+        if self._hold != "zero-order":
+            raise SettingsError(f"a closed loop holds its inputs from row to row; these rollouts are {self._hold}.")
         if (feedback.n_x, feedback.n_u) != (len(model.state), model.n_u):
             raise SettingsError(
                 f"the feedback is for {feedback.n_x} states and {feedback.n_u} inputs, but the model has "
@@ -242,10 +258,15 @@ class Rollouts(Simulator):
 
     def _lanes(self, batch: RolloutBatch, inputs: FloatArray | None = None) -> Lanes:
         """Lanes of a batch as the time loop reads them, with other inputs where given."""
-        sizes = (self._model.n_p, len(self._model.state), self._model.n_u)
-        inputs = batch.inputs if inputs is None else inputs
+        n_u, hold = self._model.n_u, HOLDS[self._hold]
+        u = checked_array("inputs", batch.inputs if inputs is None else inputs, (None, n_u))
         return arranged_lanes(
-            sizes, batch.parameters, batch.initial_states, inputs, batch.start_rows, batch.rows_per_lane
+            (self._model.n_p, len(self._model.state), n_u + hold.n_changes(n_u)),
+            batch.parameters,
+            batch.initial_states,
+            hold.columns(u, self._substeps),
+            batch.start_rows,
+            batch.rows_per_lane,
         )
 
     def _unknowns(self, unknowns: Sequence[str] | None) -> tuple[tuple[str, ...], Sensitivities]:
@@ -283,7 +304,7 @@ class Rollouts(Simulator):
             if unknowns not in self._specifications:
                 sensitivities = sensitivities_of(self._model, unknowns)
                 specification = loop_specification(
-                    self._model, self.signals, sensitivities, self._integrator, self._substeps
+                    self._model, self.signals, sensitivities, self._integrator, self._substeps, self._hold
                 )
                 self._specifications[unknowns] = specification, sensitivities
             return self._specifications[unknowns]

@@ -172,10 +172,10 @@ def _stepped(model: Model, s: ca.SX, u: ca.SX, p: ca.SX, c: ca.SX, free_time: bo
     n_x = len(model.state)
     x, h = s[:n_x], c * s[n_x] if free_time else c
 
-    def rates(x: ca.SX) -> ca.SX:
+    def rates(x: ca.SX, _fraction: float) -> ca.SX:
         return model.dynamics(x, u, p)[0]
 
-    after = INTEGRATORS["rk4"](rates, x, h, rates(x), model.n_q)
+    after = INTEGRATORS["rk4"](rates, x, h, rates(x, 0.0), model.n_q)
     for four in model.quaternions:
         rows = list(four)
         after[rows] = after[rows] / ca.norm_2(after[rows])

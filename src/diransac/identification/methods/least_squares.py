@@ -101,7 +101,7 @@ class LeastSquares:
         if not np.isfinite(parameters).all():
             raise IdentificationError(f"{dataset.source}: {self.name} finds no finite parameters; try another method")
         report(callback, "uncertainty", 0.5)
-        resolution = Resolution(self.criteria.integrator, self.criteria.substeps)
+        resolution = Resolution(self.criteria.integrator, self.criteria.substeps, dataset.hold)
         return fitted(bound, dataset, parameters, rows, estimator=name_of(self._estimator), resolution=resolution)
 
 

@@ -149,7 +149,7 @@ class RansacMethod(ABC):
             found.best.parameters,
             np.sort(found.best.rows),
             estimator=name_of(estimator),
-            resolution=Resolution(settings.integrator, settings.substeps),
+            resolution=Resolution(settings.integrator, settings.substeps, dataset.hold),
             squared_error=self.squared_error,
             iterations=found.iterations,
             n_hypotheses=found.n_hypotheses,
@@ -306,7 +306,7 @@ class Evaluator:
         self._weights, self._thresholds = scoring.weights[judged], scoring.thresholds[judged]
         self._min_inlier_signals = scoring.min_inlier_signals
         self._valid = [one.valid for one in dataset.segments]
-        resolution = Resolution(settings.integrator, settings.substeps)
+        resolution = Resolution(settings.integrator, settings.substeps, dataset.hold)
         rules = [settings.initial_state] * len(self._valid)
         self._simulation = Simulation(dataset, judged, resolution, rules, settings.threads)
         self._simulation.starts  # noqa: B018  refuses a log without an initial state

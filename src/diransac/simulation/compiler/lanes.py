@@ -43,7 +43,7 @@ class Lanes:
     window : rows of the log that any lane uses
     n_rows : rows that each lane simulates
     arrays : by their names in the time loop: parameters (n_p, n_padded), initial_states (n_x, n_padded), inputs
-        (n_window, n_u), and start_rows (n_padded,) unless all lanes start at the window's first row
+        (n_window, n_inputs), and start_rows (n_padded,) unless all lanes start at the window's first row
     """
 
     n_lanes: int
@@ -75,20 +75,20 @@ def arranged_lanes(
 
     Parameters
     ----------
-    sizes : n_p, n_x, n_u
+    sizes : n_p, n_x, n_inputs
     parameters : (n_lanes, n_p)
     initial_states : (n_x,) or (n_lanes, n_x)
-    inputs : (n_log, n_u)
+    inputs : (n_log, n_inputs)
     start_rows : (n_lanes,), optional   row of the log at which each lane starts
     n_rows : rows that each lane simulates, which lie within the log
 
     Raises SettingsError: an array does not fit the sizes.
     """
-    n_p, n_x, n_u = sizes
+    n_p, n_x, n_inputs = sizes
     p = checked_array("parameters", parameters, (None, n_p))
     x = initial_states
     x = np.broadcast_to(x, (len(p), n_x)) if x.shape == (n_x,) else checked_array("initial_states", x, (len(p), n_x))
-    u = checked_array("inputs", inputs, (None, n_u))
+    u = checked_array("inputs", inputs, (None, n_inputs))
     starts = np.zeros(len(p), np.int64) if start_rows is None else start_rows.astype(np.int64)
     shared = not len(starts) or bool(np.all(starts == starts[0]))
     first = int(starts.min()) if len(starts) else 0

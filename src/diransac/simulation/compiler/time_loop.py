@@ -49,7 +49,7 @@ __all__ = [
 ARGUMENTS = {
     "parameters": "pointer",  # (n_p, n_padded) float64
     "initial_states": "pointer",  # (n_states, n_padded) float64
-    "inputs": "pointer",  # (n_log, n_u) float64, read where the log gives the inputs
+    "inputs": "pointer",  # (n_log, n_inputs) float64, read where the log gives the inputs
     "feedback": "pointer",  # (n_laws, n_log, width) float64, read where feedback gives the inputs
     "feedback_starts": "pointer",  # (n_padded,) int64, row of all laws' rows at which each lane's law starts
     "limits": "pointer",  # (2, n_u) float64, smallest and largest inputs of the feedback
@@ -87,6 +87,7 @@ class LoopSpecification:
     substeps : sub-steps per row
     n_states, n_inputs, n_signals, n_unknowns : sizes of x, u, all signals, and the unknowns of the Jacobian; x is the
         model's state, followed by its varying sensitivities
+    n_changes : number of trailing elements of u that the leading ones change by with each sub-step
     scored : positions of the scored signals among all signals
     quaternions : positions of whole quaternions among the scored signals; their sign is arbitrary
     state_quaternions : positions of all quaternions in x
@@ -102,6 +103,7 @@ class LoopSpecification:
     scored: tuple[int, ...]
     quaternions: tuple[tuple[int, ...], ...]
     state_quaternions: tuple[tuple[int, ...], ...]
+    n_changes: int = 0
 
 
 @dataclass(frozen=True)
@@ -260,9 +262,19 @@ class TimeLoop:
         """Take the sub-steps after the first."""
         specification = self.specification
         (after,) = specification.further_step.outputs
-        with self.v.repeat(integer(1), integer(specification.substeps)):
-            results = self._evaluate(specification.further_step, after, u, block.further_step)
+        with self.v.repeat(integer(1), integer(specification.substeps)) as steps:
+            moved = self._changed(u, steps.index)
+            results = self._evaluate(specification.further_step, after, moved, block.further_step)
             self._set_state(numbers(self.v, results, after))
+
+    def _changed(self, u: list[Value], steps: Value) -> list[Value]:
+        """Inputs a number of sub-steps after their row."""
+        v, n_changes = self.v, self.specification.n_changes
+        if not n_changes:
+            return u
+        elapsed = v.splat(self.builder.sitofp(steps, DOUBLE))
+        moving, changes = u[:n_changes], u[-n_changes:]
+        return [*(v.fma(elapsed, change, value) for value, change in zip(moving, changes, strict=True)), *changes]
 
     def _set_state(self, after: list[Value]) -> None:
         """Set the state."""

@@ -235,7 +235,7 @@ def robust_scores(intervals: ShootingIntervals, motion: Motion, parameters: Floa
         intervals.length,
     )  # fmt: skip
     compared = Measurements(intervals.measured[:, seen], intervals.measurements.valid)
-    errors = rollouts(intervals.model, names).errors(batch, compared).reshape(n, -1, len(names))
+    errors = rollouts(intervals.model, names, hold=intervals.hold).errors(batch, compared).reshape(n, -1, len(names))
     rows = (starts[:, None] + np.arange(intervals.length)).ravel()
     known = np.broadcast_to(intervals.known[rows][:, seen], errors.shape)
     scale = lower_scale(np.nan_to_num(errors, nan=np.inf), known)

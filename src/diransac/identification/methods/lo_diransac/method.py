@@ -249,7 +249,7 @@ def _prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingI
         )
     motions = smooth(model, samples, dt, half)
     logs = [(x.measured, x.known, u) for x, u in zip(samples, inputs, strict=True)]
-    intervals = ShootingIntervals.of(model, dataset.layout, logs, dt, half, settings.substeps)
+    intervals = ShootingIntervals.of(model, dataset.layout, logs, dt, half, settings.substeps, dataset.hold)
     rows = zip(motions, intervals.rows_of_logs, strict=True)
     signals = np.concatenate([_to_length(x.signals, r.stop - r.start) for x, r in rows])
     return intervals, Motion(signals, motions[0].spread), tuple(notes)
@@ -418,7 +418,7 @@ def _estimate(
         iterations=settings.n_nonlinear_samples if nonlinear else settings.n_samples,
         n_hypotheses=n_hypotheses,
         stop_reason="converged" if converged else "limit of steps",
-        resolution=Resolution("rk4", settings.substeps),
+        resolution=Resolution("rk4", settings.substeps, intervals.hold),
         notes=notes,
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x)),
     )

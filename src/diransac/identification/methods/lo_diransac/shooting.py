@@ -51,6 +51,9 @@ class ShootingIntervals:
         Number of rows of an interval.
     substeps : int
         Integration steps from row to row.
+    hold : str, optional
+        Inputs from row to row, "zero-order" or "linear".  Only the state after the last row of a log, which nothing
+        uses, depends on the inputs of the next log.
     """
 
     model: Model
@@ -63,6 +66,7 @@ class ShootingIntervals:
     dt: float
     length: int
     substeps: int
+    hold: str = "zero-order"
 
     @classmethod
     def of(
@@ -73,6 +77,7 @@ class ShootingIntervals:
         dt: float,
         length: int,
         substeps: int,
+        hold: str = "zero-order",
     ) -> ShootingIntervals:
         """Intervals of logs of any length.
 
@@ -88,6 +93,8 @@ class ShootingIntervals:
             Number of rows of an interval.
         substeps : int
             Integration steps from row to row.
+        hold : str, optional
+            Inputs from row to row, "zero-order" or "linear".
 
         Returns
         -------
@@ -100,7 +107,7 @@ class ShootingIntervals:
         sizes = [len(inputs) for _, _, inputs in logs]
         is_logged = np.concatenate([np.arange(n + more) < n for n, more in zip(sizes, missing, strict=True)])
         log_of = np.repeat(np.arange(len(logs)), [-(-n // length) for n in sizes])
-        return cls(model, layout, measured, known, inputs, is_logged, log_of, dt, length, substeps)
+        return cls(model, layout, measured, known, inputs, is_logged, log_of, dt, length, substeps, hold)
 
     def __len__(self) -> int:
         return len(self.log_of)
@@ -148,7 +155,7 @@ class ShootingIntervals:
     @cached_property
     def rollouts(self) -> Simulator:
         """Simulator of the augmented model."""
-        return rollouts(self.augmented.model, substeps=self.substeps)
+        return rollouts(self.augmented.model, substeps=self.substeps, hold=self.hold)
 
     @cached_property
     def moving_inputs(self) -> FloatArray:
