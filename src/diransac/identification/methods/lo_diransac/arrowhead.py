@@ -37,6 +37,8 @@ class Factored:
         Solution of the shared unknowns.
     var_z : (W, k, k) array
         Diagonal blocks of the inverse.
+    var_below : (W - 1, k, k) array
+        Blocks of the inverse below the diagonal.
     var_p : (m, m) array
         Corner of the inverse.
     gain : (W, k, m) array
@@ -48,6 +50,7 @@ class Factored:
     step_z: FloatArray
     step_p: FloatArray
     var_z: FloatArray
+    var_below: FloatArray
     var_p: FloatArray
     gain: FloatArray
     log_det: float
@@ -118,17 +121,19 @@ class Arrowhead:
         E = self.below * sz[1:, :, None] * sz[:-1, None, :]
         B = self.border * sz[:, :, None] * sp
         C = self.corner * sp[:, None] * sp + (damping + _RIDGE) * np.eye(m)
-        solved, var, _, log_det = _reduce(D, E, np.concatenate([B, right_z * sz[:, :, None]], axis=2))
+        solved, var, below, log_det = _reduce(D, E, np.concatenate([B, right_z * sz[:, :, None]], axis=2))
         gain, alone = solved[:, :, :m], solved[:, :, m:]
         left = C - np.einsum("wki,wkj->ij", B, gain)
         var_p = _inverse(left)
         p = var_p @ (right_p * sp[:, None] - np.einsum("wki,wkc->ic", B, alone))
         z = alone - gain @ p
         var = var + gain @ var_p @ gain.swapaxes(1, 2)
+        below = below + gain[1:] @ var_p @ gain[:-1].swapaxes(1, 2)
         return Factored(
             z * sz[:, :, None],
             p * sp[:, None],
             var * sz[:, :, None] * sz[:, None, :],
+            below * sz[1:, :, None] * sz[:-1, None, :],
             var_p * sp[:, None] * sp,
             gain * sz[:, :, None] / sp,
             float(log_det + _log_det(left) - 2.0 * (np.log(sz).sum() + np.log(sp).sum())),
@@ -151,7 +156,7 @@ def _log_det(A: FloatArray) -> float:
 
 
 def _reduce(D: FloatArray, E: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """``A^-1 R (W, k, c)``, and of ``A^-1`` the diagonal blocks (W, k, k) and those below them (W-1, k, k); log det A."""
+    """``A^-1 R (W, k, c)``; of ``A^-1`` the diagonal blocks (W, k, k) and those below (W-1, k, k); ``log det A``."""
     n, k, c = R.shape
     if n == 1:
         inverse = np.asarray(np.linalg.inv(D))

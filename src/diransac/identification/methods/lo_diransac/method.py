@@ -18,8 +18,8 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Resolution
-from diransac.identification.method import report, within
-from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, robust_scores
+from diransac.identification.method import report
+from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.instrumental_variables import (
     InstrumentalEstimate,
     discrepancy_units,
@@ -27,9 +27,8 @@ from diransac.identification.methods.lo_diransac.instrumental_variables import (
     parameter_units,
     unexplained,
 )
-from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
-from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
-from diransac.identification.methods.lo_diransac.refinement import make_prior, refine, refine_exact, start
+from diransac.identification.methods.lo_diransac.local_search import LocalSearch
+from diransac.identification.methods.lo_diransac.refinement import make_prior
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
@@ -48,19 +47,13 @@ if TYPE_CHECKING:
     from diransac.data.segment import Segment
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
+    from diransac.identification.methods.lo_diransac.refinement import Refinement
     from diransac.identification.settings import Settings
 
 __all__ = ["LoDiransac", "configured"]
 
 _FEWEST_INTERVALS = 4
-# Half a sample of delay or more is taken up by shifting the inputs.
-_WHOLE_SAMPLE = 0.5
-# Difference of two fits' evidence, nats, below which both are as likely.
-_AS_LIKELY = 5.0
 _OUTLIER = 0.5
-# Delays that are tried at a time, before they are refined to a sample.
-_DELAYS_AT_A_TIME = 12
 # Fraction of a signal's spread from which on its noise leaves nothing to explain.
 _ALL_OF_IT = 0.8
 # A significant delay: so many standard errors, and so many samples.
@@ -193,16 +186,9 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
             "the signs and units of inputs, and the bounds"
         )
     unit = discrepancy_units(intervals, motion, hypotheses[0])
-    search = _LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
-    delay, refined = search.best_delayed(intervals)
-    intervals, refined, later = search.shifted(intervals.delayed(delay), refined)
-    first = estimate_parameters(intervals, refined.fit, settings.prior_inflation).parameters
-    begin = refined.fit
-    if intervals.layout.admits(first[None])[0]:
-        begin = replace(begin, shared=np.concatenate([first, begin.shared[intervals.n_p :]]))
-    exact = refine_exact(settings, intervals, begin, search.prior)
-    if exact.cost < refined.cost:
-        refined = exact
+    search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
+    likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
+    intervals, refined = likeliest.intervals, likeliest.refinement
     report(callback, "estimating parameters", 0.9)
     result = estimate_parameters(intervals, refined.fit, settings.prior_inflation)
     kept = refined.fit.shared[: intervals.n_p]
@@ -216,7 +202,9 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         notes = (*notes, "the model explains almost nothing of this log: do not rely on these parameters")
     if not refined.converged and settings.max_steps:
         notes = (*notes, "local optimisation did not converge within its limit of steps")
-    found = _Found(dataset, intervals, motion, refined.fit, result, float(delay + later + refined.fit.shared[-1]))
+    found = _Found(
+        dataset, intervals, motion, refined.fit, result, intervals.delay + intervals.lag + refined.fit.shared[-1]
+    )
     return _estimate(settings, found, len(hypotheses), refined.converged, notes)
 
 
@@ -277,110 +265,6 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
         notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median replaces them")
     centre = running_median(measured, known, odd_window(settings.median_window, dt, _MOST_SAMPLES))
     return Samples(measured, known, centre), inputs, notes
-
-
-# ---------------------------------------------------------------------- local search
-
-
-@dataclass(frozen=True)
-class _LocalSearch:
-    """Local optimisations from the best hypotheses, and delays of the inputs."""
-
-    settings: LoDiransacSettings
-    motion: Motion
-    hypotheses: FloatArray
-    prior: Prior
-    callback: Callback | None
-
-    def best(self, intervals: ShootingIntervals, callback: Callback | None = None) -> Refinement:
-        """Local optimisation from the best hypothesis; where it is doubtful, from others; the likeliest of these.
-
-        A fit is doubtful if most samples of an interval are outliers: either sensors failed there, or the fit did.  The
-        likeliest fit so far becomes a hypothesis itself; otherwise the next hypothesis is optimised.  The search ends
-        with a second fit that is as likely.
-        """
-        waiting = list(self.hypotheses[: self.settings.max_starts])
-        found: list[Refinement] = []
-        while waiting and len(found) < self.settings.max_fits:
-            share = len(found) / self.settings.max_fits
-            report(callback, "local optimisation", share, f"fit {len(found) + 1}")
-            begin = start(self.settings, intervals, self.motion, waiting.pop(0), self.prior)
-            found.append(refine(self.settings, intervals, begin, self.prior))
-            again = any(abs(found[-1].cost - x.cost) < _AS_LIKELY for x in found[:-1])
-            if again or not _is_doubtful(intervals, found[-1]):
-                break
-            if all(found[-1].cost < x.cost for x in found[:-1]):
-                waiting.insert(0, found[-1].fit.shared[: intervals.n_p])
-        return min(found, key=lambda x: x.cost)
-
-    def best_delayed(self, intervals: ShootingIntervals) -> tuple[int, Refinement]:
-        """Delay of the inputs in samples, and the best fit then.
-
-        Where the best hypothesis favours a delay, neighbouring delays are tried as long as the fit becomes likelier,
-        because hypotheses were drawn from inputs without a delay.
-        """
-        report(self.callback, "searching for a delay", 0.25)
-        delay = self._likeliest_delay(intervals)
-        fits = {delay: self.best(intervals.delayed(delay), self._progress(0))}
-        for step in (-1, 1) if delay else ():
-            while abs(delay + step) < intervals.length:
-                other = self.best(intervals.delayed(delay + step), self._progress(len(fits)))
-                fits[delay + step] = other
-                if other.cost >= fits[delay].cost:
-                    break
-                delay += step
-        return delay, fits[delay]
-
-    def _progress(self, k: int) -> Callback | None:
-        """The callback of the k-th delay, which takes half of what is left: nobody knows how many there will be."""
-        return within(self.callback, 0.8 - 0.5 ** (k + 1), 0.8 - 0.5 ** (k + 2))
-
-    def _likeliest_delay(self, intervals: ShootingIntervals) -> int:
-        """Delay in samples with which simulations by the best hypothesis agree best with the log.
-
-        Inputs that are held for many samples and then step cause few outliers under a wrong delay, which is a local
-        optimum; so the number of whole samples is chosen before local optimisation.
-        """
-        every, scores = np.arange(len(intervals)), dict[int, float]()
-        low, high = (round(x / intervals.dt) for x in self.settings.delay_range)
-
-        def score(rows: int) -> float:
-            if rows not in scores:
-                delayed = intervals.delayed(rows)
-                scores[rows] = float(robust_scores(delayed, self.motion, self.hypotheses[:1], every)[0])
-            return scores[rows]
-
-        step = max(1, (high - low) // (_DELAYS_AT_A_TIME - 1))
-        tried = range(-(-low // step) * step, high + 1, step)
-        best = min(tried, key=lambda rows: (score(rows), abs(rows)))
-        while step > 1:
-            step = max(1, step // 2)
-            near = [x for x in (best - step, best, best + step) if low <= x <= high]
-            best = min(near, key=lambda rows: (score(rows), abs(rows)))
-        return best
-
-    def shifted(self, intervals: ShootingIntervals, refined: Refinement) -> tuple[ShootingIntervals, Refinement, int]:
-        """Local optimisation again with the inputs shifted by whole samples, while it finds them delayed."""
-        shift = 0
-        for k in range(self.settings.max_delay_shifts):
-            delay = refined.fit.shared[-1]
-            if not _WHOLE_SAMPLE <= abs(delay) < intervals.length:
-                break
-            report(self.callback, "local optimisation with delayed inputs", 0.8 + 0.03 * k)
-            shift += round(delay)
-            intervals = intervals.delayed(round(delay))
-            shared = np.append(refined.fit.shared[:-1], delay - round(delay))
-            sizes = np.append(refined.fit.prior[:-1], self.prior.delay)
-            begin = with_residuals(intervals, replace(refined.fit, shared=shared, prior=sizes))
-            refined = refine(self.settings, intervals, begin, self.prior)
-        return intervals, refined, shift
-
-
-def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:
-    """True if an interval has too few inlying samples for a robust scale."""
-    fit, n = refined.fit, len(intervals)
-    inlying = (fit.noise.inlying(fit.residuals, intervals.known) > _OUTLIER).reshape(n, -1).sum(axis=1)
-    return bool((inlying < BREAKDOWN * intervals.known.reshape(n, -1).sum(axis=1)).any())
 
 
 # ---------------------------------------------------------------------- the estimate

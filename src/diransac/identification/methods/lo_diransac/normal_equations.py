@@ -4,9 +4,10 @@ Unknowns are those that all intervals share (parameters, discrepancies, delay), 
 state x_w and an unmodelled acceleration d_w that acts over the interval.  With ``F`` the rollout of an interval and
 ``kappa`` the standard deviation of continuity, twice the cost is
 
-    sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / kappa^2 + sum |d_w|^2 / tau^2 + |s|^2 / prior^2
+    sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / kappa^2 + sum |e_w|^2 / tau^2 + |s|^2 / prior^2
 
-The second sum is over neighbours within one log.
+The second sum is over neighbours within one log.  Unmodelled accelerations are a first-order Gauss-Markov process:
+``e_w`` is ``(d_w - rho d_{w-1}) / sqrt(1 - rho^2)``, and ``d_w`` where a log begins.
 
 References
 ----------
@@ -20,14 +21,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.mixture import Mixture
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["Fit", "NormalEquations", "cost", "linearize", "with_residuals"]
+__all__ = [
+    "Fit",
+    "NormalEquations",
+    "cost",
+    "following",
+    "innovation_std",
+    "innovations",
+    "linearize",
+    "with_residuals",
+]
 
 
 @dataclass(frozen=True)
@@ -48,6 +58,8 @@ class Fit:
         Noise of each signal.
     tau : (n_v,) array
         Size of the unmodelled accelerations.
+    rho : (n_v,) array
+        Their correlation from interval to interval.
     continuity_std : (n_x,) array
         Size of the jumps from interval to interval.
     prior : (n_s,) array
@@ -60,6 +72,7 @@ class Fit:
     residuals: FloatArray
     noise: Mixture
     tau: FloatArray
+    rho: FloatArray
     continuity_std: FloatArray
     prior: FloatArray
 
@@ -122,18 +135,70 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     FP = F.swapaxes(1, 2) * precision[:, None, :]
     H[:-1] += FP @ F
     g[:-1] += np.einsum("wij,wj->wi", FP, jumps)
-    state, latent, own = np.arange(n_x), np.arange(n_x, k), 1.0 / np.square(fit.tau)
+    state, latent = np.arange(n_x), np.arange(n_x, k)
     H[1:, state, state] += precision
     H[1:, :n_x, k:] -= precision[:, :, None] * F[:, :, k:]
     g[1:, :n_x] -= precision * jumps
-    H[:, latent, latent] += own
-    g[:, n_x:k] -= own * fit.d
     E = np.zeros((len(H) - 1, k, k))
     E[:, :n_x] = -precision[:, :, None] * F[:, :, :k]
+    follows, own = following(intervals)[:, None], 1.0 / innovation_std(intervals, fit)
+    rho = np.where(follows[1:], fit.rho, 0.0)
+    deviation = own * innovations(intervals, fit)
+    H[:, latent, latent] += np.square(own)
+    H[:-1, latent, latent] += np.square(rho * own[1:])
+    E[:, latent, latent] -= rho * np.square(own[1:])
+    g[:, n_x:k] -= deviation
+    g[:-1, n_x:k] += rho * deviation[1:]
     beforehand = 1.0 / np.square(fit.prior)
     border, corner, right = _shared_blocks(intervals, H[:, :k, k:], H[:, k:, k:], g[:, k:])
     system = Arrowhead(H[:, :k, :k], E, border, corner + np.diag(beforehand))
     return NormalEquations(system, g[:, :k], right - beforehand * fit.shared)
+
+
+def following(intervals: ShootingIntervals) -> BoolArray:
+    """Mask ``(W,)`` of the intervals that continue the one before.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+
+    Returns
+    -------
+    (W,) bool array
+    """
+    return np.concatenate([[False], intervals.linked])
+
+
+def innovation_std(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+    """Standard deviation ``(W, n_v)`` of the unmodelled accelerations, given those of the interval before.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    (W, n_v) array
+    """
+    return np.where(following(intervals)[:, None], fit.tau * np.sqrt(1.0 - np.square(fit.rho)), fit.tau)
+
+
+def innovations(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+    """Unmodelled accelerations less those expected from the interval before, over their standard deviation.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    (W, n_v) array
+    """
+    expected = np.zeros_like(fit.d)
+    expected[1:] = np.where(intervals.linked[:, None], fit.rho * fit.d[:-1], 0.0)
+    return np.asarray((fit.d - expected) / innovation_std(intervals, fit))
 
 
 def _shared_blocks(
@@ -180,7 +245,7 @@ def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
     terms = (
         (weights * np.square(fit.residuals)).sum(),
         np.square((fit.x[1:] - ends) / fit.continuity_std).sum(),
-        np.square(fit.d / fit.tau).sum(),
+        np.square(innovations(intervals, fit)).sum(),
         np.square(fit.shared / fit.prior).sum(),
     )
     total = float(sum(terms))

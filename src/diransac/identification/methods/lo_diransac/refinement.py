@@ -27,7 +27,14 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
-from diransac.identification.methods.lo_diransac.normal_equations import Fit, cost, linearize, with_residuals
+from diransac.identification.methods.lo_diransac.normal_equations import (
+    Fit,
+    cost,
+    innovation_std,
+    innovations,
+    linearize,
+    with_residuals,
+)
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.arrowhead import Factored
@@ -44,7 +51,9 @@ _TAU_START, _SHRINK = 0.3, 0.4
 _CONTINUITY = 0.03
 _SIGMA_FLOOR = 1e-4
 # Discrepancies of a model that is taken to be exact, over their prior sizes.
-_EXACT = 1e-3
+_EXACT, _EXACT_STEPS = 1e-3, 20
+# Correlation of unmodelled accelerations from interval to interval at most.
+_MOST_ALIKE = 0.98
 # Tau until convergence, over its prior: noise must not absorb model error.
 _GUARDED = 10.0
 _MAX_TRIALS, _MAX_SWEEPS = 8, 12
@@ -85,7 +94,7 @@ class Refinement:
     fit : Fit
         Most probable motion and parameters.
     cost : float
-        Negative log evidence: of the likelihood, integrated over all unknowns about the fit (Laplace), up to a constant.
+        Negative log evidence, the likelihood integrated over all unknowns (Laplace), up to a constant.
     steps : int
         Number of Gauss-Newton steps.
     converged : bool
@@ -154,7 +163,7 @@ def start(
     sizes = prior.unit * np.r_[np.full(len(shared) - 1, prior.guarded), prior.delay]
     tau = _TAU_START * motion.spread[n_x:]
     continuity = motion.spread[:n_x].copy() if settings.gradual_continuity else _continuity(intervals, tau)
-    fit = Fit(shared, x, d, residuals, noise, tau, continuity, sizes)
+    fit = Fit(shared, x, d, residuals, noise, tau, np.zeros(n_v), continuity, sizes)
     return _anchored(intervals, fit) if settings.neighbouring_starts else fit
 
 
@@ -189,7 +198,9 @@ def _loss_by_interval(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return np.asarray(losses.reshape(len(intervals), -1).sum(axis=1))
 
 
-def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
+def refine(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, *, settled: bool = False
+) -> Refinement:
     """Fit after steps and updates until convergence, first with a robust tau, then with that of the evidence.
 
     Parameters
@@ -199,12 +210,14 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
     fit : Fit
         Initial fit, as from `start`.
     prior : Prior
+    settled : bool, optional
+        Whether the initial fit is near the solution already.
 
     Returns
     -------
     Refinement
     """
-    damping, robust, converged, steps = 0.0, settings.robust_model_error, False, 0
+    damping, robust, converged, steps = 0.0, settings.robust_model_error and not settled, False, 0
     while steps < settings.max_steps and (robust or not converged):
         steps += 1
         robust = robust and not converged
@@ -234,10 +247,10 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     n_p, tau = intervals.n_p, _EXACT * prior.tau
     shared, sizes = fit.shared.copy(), fit.prior.copy()
     shared[n_p:-1], sizes[n_p:-1] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:-1]
-    begin = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, prior=sizes)
+    begin = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     begin = with_residuals(intervals, replace(begin, continuity_std=_continuity(intervals, tau)))
     damping, converged, steps, fit = 0.0, False, 0, begin
-    while steps < settings.max_steps and not converged:
+    while steps < min(_EXACT_STEPS, settings.max_steps) and not converged:
         steps += 1
         moved, solved, damping = _step(intervals, fit, damping)
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
@@ -272,7 +285,7 @@ def negative_log_evidence(intervals: ShootingIntervals, fit: Fit) -> float:
         return np.inf
     at = linearize(intervals, fit, weights_of(intervals, fit))
     log_det = at.system.solve(at.right_z, at.right_s).log_det
-    scales = intervals.linked.sum() * np.log(fit.continuity_std).sum() + len(fit.d) * np.log(fit.tau).sum()
+    scales = intervals.linked.sum() * np.log(fit.continuity_std).sum() + np.log(innovation_std(intervals, fit)).sum()
     scales += np.log(fit.prior[np.isfinite(fit.prior)]).sum()
     return float(loss + 0.5 * beforehand + 0.5 * log_det + scales)
 
@@ -332,16 +345,38 @@ def _update(
     n_x, n_p = fit.x.shape[1], intervals.n_p
     inlying = fit.noise.inlying(fit.residuals, intervals.known)
     noise = fit.noise.updated(fit.residuals, intervals.known, inlying, outliers=settings.outliers)
-    variance = np.einsum("wii->wi", solved.var_z)[:, n_x:]
-    squares, expected = np.square(fit.d).sum(axis=0), prior.tau
     if robust:
-        squares, expected = len(fit.d) * np.square(1.4826 * np.median(np.abs(fit.d), axis=0)), _GUARDED * prior.tau
-    tau = _evidence(expected, fit.tau, squares, (1.0 - variance / np.square(fit.tau)).clip(0.0).sum(axis=0))
+        squares = len(fit.d) * np.square(1.4826 * np.median(np.abs(fit.d), axis=0))
+        variance = np.einsum("wii->wi", solved.var_z)[:, n_x:]
+        determined = (1.0 - variance / np.square(fit.tau)).clip(0.0).sum(axis=0)
+        expected, rho = _GUARDED * prior.tau, fit.rho
+    else:
+        expected = prior.tau
+        squares, determined, rho = _process(intervals, fit, solved, expected)
+    tau = _evidence(expected, fit.tau, squares, determined)
     if not settings.model_error:
         tau = np.maximum(_SHRINK * fit.tau, 1e-3 * expected)
     continuity = np.maximum(_continuity(intervals, tau), _SHRINK * fit.continuity_std)
     sizes = fit.prior if robust else _discrepancies(fit, prior, np.diag(solved.var_p), n_p)
-    return replace(fit, noise=noise, tau=tau, continuity_std=continuity, prior=sizes)
+    return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity, prior=sizes)
+
+
+def _process(
+    intervals: ShootingIntervals, fit: Fit, solved: Factored, expected: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Squares of the innovations in the unit of tau, the number of those that the logs determine, and the new rho."""
+    n_x, linked = fit.x.shape[1], intervals.linked[:, None]
+    variance = np.einsum("wii->wi", solved.var_z)[:, n_x:]
+    common = np.einsum("wii->wi", solved.var_below)[:, n_x:]
+    spread = variance.copy()
+    spread[1:] += np.where(linked, fit.rho * (fit.rho * variance[:-1] - 2.0 * common), 0.0)
+    determined = (1.0 - spread / np.square(innovation_std(intervals, fit))).sum(axis=0).clip(0.0)
+    second = np.square(fit.d) + variance
+    product = np.where(linked, fit.d[1:] * fit.d[:-1] + common, 0.0).sum(axis=0)
+    size = np.where(linked, 0.5 * (second[1:] + second[:-1]), 0.0).sum(axis=0)
+    rho = (product / (size + np.square(expected))).clip(0.0, _MOST_ALIKE)
+    squares = np.square(fit.tau) * np.square(innovations(intervals, fit)).sum(axis=0)
+    return squares, determined, rho
 
 
 def _evidence(expected: FloatArray, now: FloatArray, squares: FloatArray, determined: FloatArray) -> FloatArray:
@@ -379,6 +414,7 @@ def _unchanged(old: Fit, new: Fit, errors: FloatArray) -> bool:
     changes = (
         (np.abs(np.log(new.noise.sigma / old.noise.sigma)), 0.01),
         (np.abs(np.log(new.tau / old.tau)), 0.05),
+        (np.abs(new.rho - old.rho), 0.02),
         (np.abs(np.log(new.continuity_std / old.continuity_std)), 0.05),
         (np.abs(np.log(new.prior[n_p:] / old.prior[n_p:])), 0.1),
     )

@@ -39,8 +39,8 @@ class ShootingIntervals:
         Every signal of the model, in its order and its unit.
     known : (N, n_s) bool array
         Samples that are measured; False in padded rows.
-    inputs : (N, n_u) array
-        Each in its unit.
+    recorded : (N, n_u) array
+        Recorded inputs, each in its unit; `inputs` are those that act.
     is_logged : (N,) bool array
         Rows of the logs, as opposed to padded ones.
     log_of : (W,) int array
@@ -54,19 +54,25 @@ class ShootingIntervals:
     hold : str, optional
         Inputs from row to row, "zero-order" or "linear".  Only the state after the last row of a log, which nothing
         uses, depends on the inputs of the next log.
+    delay : int, optional
+        Samples by which the inputs act later than they are recorded.
+    lag : float, optional
+        Time constant of a first-order lag of the actuators, samples; 0 without one.
     """
 
     model: Model
     layout: ParameterLayout
     measured: FloatArray
     known: BoolArray
-    inputs: FloatArray
+    recorded: FloatArray
     is_logged: BoolArray
     log_of: IntArray
     dt: float
     length: int
     substeps: int
     hold: str = "zero-order"
+    delay: int = 0
+    lag: float = 0.0
 
     @classmethod
     def of(
@@ -158,24 +164,43 @@ class ShootingIntervals:
         return rollouts(self.augmented.model, substeps=self.substeps, hold=self.hold)
 
     @cached_property
+    def inputs(self) -> FloatArray:
+        """Inputs as they act, (N, n_u)."""
+        return self._acting(self.lag)
+
+    @cached_property
     def moving_inputs(self) -> FloatArray:
-        """Inputs, and their change per sample of delay, (N, 2 n_u)."""
+        """Inputs, and their change per sample of delay, or of lag where there is one, (N, 2 n_u)."""
+        if self.lag:
+            step = 0.01 * self.lag
+            change = self._acting(self.lag + step) - self._acting(self.lag - step)
+            return np.hstack([self.inputs, change / (2.0 * step)])
         later = np.zeros_like(self.inputs)
         for rows in self.rows_of_logs:
             if rows.stop - rows.start > 1:
                 later[rows] = np.gradient(self.inputs[rows], axis=0)
         return np.hstack([self.inputs, -later])
 
+    def _acting(self, lag: float) -> FloatArray:
+        """Recorded inputs after the delay and a lag, in samples; an actuator is at rest when a log begins."""
+        at = [np.clip(np.arange(r.start, r.stop) - self.delay, r.start, r.stop - 1) for r in self.rows_of_logs]
+        delayed = [self.recorded[rows] for rows in at]
+        if lag:
+            from scipy.signal import lfilter
+
+            decay = np.exp(-1.0 / lag)
+            delayed = [lfilter([0.0, 1.0 - decay], [1.0, -decay], u, axis=0, zi=u[:1])[0] for u in delayed]
+        return np.concatenate(delayed)
+
     @cached_property
     def rows_of_logs(self) -> list[slice]:
         """Rows of each log, padded ones included."""
-        edges = [*self.first_of_log.tolist(), len(self.inputs)]
+        edges = [*self.first_of_log.tolist(), len(self.recorded)]
         return [slice(a, b) for a, b in pairwise(edges)]
 
-    def delayed(self, rows: int) -> ShootingIntervals:
-        """The intervals with inputs delayed by a number of rows."""
-        at = [np.clip(np.arange(r.start, r.stop) - rows, r.start, r.stop - 1) for r in self.rows_of_logs]
-        return replace(self, inputs=self.inputs[np.concatenate(at)])
+    def split(self, parts: int) -> ShootingIntervals:
+        """The same rows in intervals of a fraction of the length."""
+        return replace(self, length=self.length // parts, log_of=np.repeat(self.log_of, parts))
 
     def parameters_of(self, values: FloatArray, logs: IntArray) -> FloatArray:
         """Model parameters ``(n, n_p)`` of the logs ``(n,)`` from a vector; the vector itself if all are shared."""
