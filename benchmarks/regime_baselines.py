@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 from regime_flights import Recording, Regime
 from regime_machines import Array, Machine
+from scipy.interpolate import make_interp_spline
 from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
@@ -49,24 +50,24 @@ class Filtered:
 
 
 def _lowpass(values: Array, bandwidth: float, dt: float) -> Array:
-    """Fourth-order zero-phase Butterworth along the last axis."""
-    sections = butter(2, min(2.0 * bandwidth * dt, 0.9), output="sos")
+    """Zero-phase Butterworth of order four, there and back, along the last axis."""
+    sections = butter(4, min(2.0 * bandwidth * dt, 0.9), output="sos")
     return np.asarray(sosfiltfilt(sections, values, padlen=min(values.shape[-1] - 1, int(3.0 / (bandwidth * dt)))))
 
 
 def filtered(regime: Regime, recording: Recording) -> Filtered:
-    """Filtered signals; those that are not logged by central differences, coordinates by the rule of rectangles."""
+    """Filtered signals; those that are not logged are derived or integrated."""
     machine, model = regime.machine, regime.machine.model
-    columns, rows = _bridged(recording.columns, round(1.0 / (machine.bandwidth * machine.dt)))
+    columns, rows = bridged(recording.columns, round(1.0 / (machine.bandwidth * machine.dt)))
     inputs = np.stack([columns[name] for name in model.inputs])
     if regime.held:  # the filtered response is to the mean of what was held before and is held after the sample
         inputs[:, 1:] = 0.5 * (inputs[:, 1:] + inputs[:, :-1])
     smooth = {name: _lowpass(x, machine.bandwidth, machine.dt) for name, x in columns.items()}
-    q, v, a = _motion(machine, smooth)
+    q, v, a = motion(machine, smooth)
     return Filtered(q, v, a, inputs, rows, machine.dt, machine.bandwidth)
 
 
-def _bridged(columns: Mapping[str, Array], margin: int) -> tuple[dict[str, Array], Array]:
+def bridged(columns: Mapping[str, Array], margin: int) -> tuple[dict[str, Array], Array]:
     """Gaps filled by straight lines, and the rows more than a margin away from them and from the ends."""
     missing = ~np.all([np.isfinite(x) for x in columns.values()], axis=0)
     missing[[0, -1]] = True
@@ -79,61 +80,86 @@ def _bridged(columns: Mapping[str, Array], margin: int) -> tuple[dict[str, Array
     return filled, ~near
 
 
-def _motion(machine: Machine, smooth: Mapping[str, Array]) -> tuple[Array, Array, Array]:
+def motion(machine: Machine, smooth: Mapping[str, Array], *, rough: bool = False) -> tuple[Array, Array, Array]:
+    """Coordinates, velocities and accelerations (n, N); rough: 0 for those that cannot be derived.
+
+    Raises
+    ------
+    NoBaselineError
+        One of them can neither be found among the signals nor be derived from them.
+    """
     model, dt = machine.model, machine.dt
-    coordinate_of = dict(zip(model.velocities, model.coordinates, strict=False))  # those that are plain derivatives
-    q, v, a = dict[str, Array](), dict[str, Array](), dict[str, Array]()
-    for name in model.velocities:
-        origin = coordinate_of.get(name)
+    none = np.zeros_like(next(iter(smooth.values())))
+    q, v = list[Array](), list[Array]()
+    for i, name in enumerate(model.velocities):
+        origin = _derivative_of(model, i)
         if name in smooth:
-            v[name] = smooth[name]
-        elif origin in smooth and _is_derivative(model, name):
-            v[name] = np.gradient(smooth[origin], dt)
+            v.append(smooth[name])
+        elif origin in smooth:
+            v.append(_differentiated(smooth[origin], dt))
+        elif rough:
+            v.append(none)
         else:
             raise NoBaselineError(f"needs {name}")
-    for name in model.coordinates:
-        origin = next((w for w, x in coordinate_of.items() if x == name), None)
+    for i, name in enumerate(model.coordinates):
         if name in smooth:
-            q[name] = smooth[name]
-        elif origin and _is_derivative(model, origin):
-            q[name] = np.cumsum(v[origin]) * dt
+            q.append(smooth[name])
+        elif i < model.n_v and _derivative_of(model, i) == name:
+            q.append(np.cumsum(v[i]) * dt)
         else:
             raise NoBaselineError(f"needs {name}")
-    for name, velocity in zip(model.accelerations, v.values(), strict=True):
-        a[name] = smooth[name] if name in smooth else np.gradient(velocity, dt)
-    return tuple(np.stack(list(x.values())) for x in (q, v, a))  # type: ignore[return-value]
+    a = [smooth[x] if x in smooth else _differentiated(w, dt) for x, w in zip(model.accelerations, v, strict=True)]
+    return np.stack(q), np.stack(v), np.stack(a)
 
 
-def _is_derivative(model: dr.Model, velocity: str) -> bool:
-    """Whether a velocity is the derivative of the coordinate of its place, whatever the state."""
-    index = list(model.velocities).index(velocity)
+def _differentiated(values: Array, dt: float) -> Array:
+    """Derivative of the interpolating spline of fifth degree."""
+    time = dt * np.arange(len(values))
+    return np.asarray(make_interp_spline(time, values, k=5).derivative()(time))
+
+
+def _derivative_of(model: dr.Model, index: int) -> str | None:
+    """Name of the coordinate whose derivative a velocity is, whatever the state; None where there is none."""
     if model.kinematics is None:
-        return True
+        return list(model.coordinates)[index]
     q, v = ca.SX.sym("q", model.n_q), ca.SX.sym("v", model.n_v)
-    return bool(ca.is_equal(model.kinematics(q, v)[index], v[index]))
+    rates = model.kinematics(q, v)
+    return next((name for i, name in enumerate(model.coordinates) if ca.is_equal(rates[i], v[index])), None)
 
 
 # ---------------------------------------------------------------------- methods
 
 
 def ordinary(regime: Regime, recording: Recording) -> dict[str, float]:
-    """Least squares of the filtered equations, each weighted by its residual; Gauss-Newton where not affine."""
-    machine, data = regime.machine, filtered(regime, recording)
-    residual, jacobian = _equations(machine.model, data)
-    base = np.array([machine.base[name] for name in machine.model.parameters])
-    scale, values = np.abs(base), base
-    weight = np.maximum(np.sqrt(np.mean(residual(1.5 * base) ** 2, axis=1)), 1e-12)[:, None]
-    for _ in range(4):
+    """Least squares of the filtered equations, weighted by their terms, then once by their residuals.
+
+    More rounds would let an equation without a known term vanish, with all of its parameters 0.
+    """
+    machine = regime.machine
+    residual, jacobian = _equations(machine.model, filtered(regime, recording))
+    values = base = np.array([machine.base[name] for name in machine.model.parameters])
+    size = _rms(np.abs(jacobian(base) * base[:, None]).sum(axis=1))
+    for equal in (True, False):
+        weight = size if equal else np.maximum(_rms(residual(values)), 1e-6 * size)
         values = least_squares(
-            lambda p, w=weight: (residual(p) / w).ravel(),
+            lambda p, w=weight: (residual(p) / w[:, None]).ravel(),
             values,
-            jac=lambda p, w=weight: (jacobian(p) / w[:, None]).transpose(0, 2, 1).reshape(-1, len(p)),
-            x_scale=scale,
+            jac=lambda p, w=weight: _stacked(jacobian(p), w),
+            x_scale=np.abs(base),
             xtol=1e-12,
             ftol=1e-12,
         ).x
-        weight = np.sqrt(np.mean(residual(values) ** 2, axis=1))[:, None] + 1e-12
     return dict(zip(machine.model.parameters, values.tolist(), strict=True))
+
+
+def _rms(values: Array) -> Array:
+    return np.asarray(np.sqrt(np.mean(values**2, axis=-1)))
+
+
+def _stacked(jacobian: Array, weight: Array) -> Array:
+    """Rows of all equations (n_v N, n_p) of (n_v, n_p, N), each over its weight."""
+    rows = (jacobian / weight[:, None, None]).transpose(0, 2, 1)
+    return rows.reshape(-1, rows.shape[-1])
 
 
 def _equations(model: dr.Model, data: Filtered):  # noqa: ANN202
@@ -161,11 +187,9 @@ def total(regime: Regime, recording: Recording) -> dict[str, float]:
     if model.nonlinear_parameters:
         raise NoBaselineError("not affine in its parameters")
     residual, jacobian = _equations(model, filtered(regime, recording))
-    ordinary_values = np.array(list(ordinary(regime, recording).values()))
-    weight = np.sqrt(np.mean(residual(ordinary_values) ** 2, axis=1))[:, None] + 1e-12
-    zero = np.zeros(model.n_p)
-    W = (jacobian(zero) / weight[:, None]).transpose(0, 2, 1).reshape(-1, model.n_p)
-    b = -(residual(zero) / weight).ravel()
+    zero, found = np.zeros(model.n_p), np.array(list(ordinary(regime, recording).values()))
+    weight = _rms(residual(found))
+    W, b = _stacked(jacobian(zero), weight), -(residual(zero) / weight[:, None]).ravel()
     both = np.column_stack([W, b])
     size = np.sqrt(np.mean(both**2, axis=0))
     smallest = np.linalg.svd(both / size, full_matrices=False)[2][-1] / size

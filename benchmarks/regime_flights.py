@@ -115,7 +115,7 @@ def _simulated(regime: Regime, drawn: SimpleNamespace, seeds: Sequence[int]) -> 
         u = control(t, x)
         rows.append((x[: machine.n_q + machine.n_v], acceleration(t, x, u), u))
         for i in range(machine.substeps):
-            x = _rk4(rate, t + i * h, x, u if regime.held else None, h)
+            x = rk4(rate, t + i * h, x, u if regime.held else None, h)
     states, accelerations, inputs = (np.stack(parts) for parts in zip(*rows, strict=True))
     return machine.dt * np.arange(n_rows), _named(machine, states, accelerations, inputs)
 
@@ -157,7 +157,8 @@ def _start(regime: Regime, reference: Multisine, control: Callable[[float, Array
     return np.concatenate([x, control(0.0, x)]) if regime.fault.lag else x
 
 
-def _rk4(rate: Callable[..., Array], t: float, x: Array, u: Array | None, h: float) -> Array:
+def rk4(rate: Callable[..., Array], t: float, x: Array, u: Array | None, h: float) -> Array:
+    """One step of the classical Runge-Kutta method."""
     k1 = rate(t, x, u)
     k2 = rate(t + h / 2.0, x + h / 2.0 * k1, u)
     k3 = rate(t + h / 2.0, x + h / 2.0 * k2, u)
@@ -274,7 +275,7 @@ _ROTOR, _QUAD, _ARM, _CART = machines.ROTOR, machines.QUAD, machines.ARM, machin
 _HOVER = replace(_ROTOR, reference=lambda rngs: Multisine(rngs, (1e-6, 1e-6), 0.08, 0.5, 5))
 _STEPS = replace(_CART, control=machines.steps)
 _SLOW_CART = replace(machines.CART, dt=0.05, substeps=20)
-_SLOW_PENDULUM = replace(machines.PENDULUM, dt=0.05, substeps=25, duration=50.0, bandwidth=5.0)
+_SLOW_PENDULUM = replace(machines.PENDULUM, dt=0.05, substeps=25, duration=50.0, bandwidth=4.0)
 _CLEAN = 0.01
 """Noise of clean logs: about their last digit."""
 
@@ -285,52 +286,52 @@ def _late(signals: str, milliseconds: float) -> Fault:
 
 _POSE = "x y z phi theta psi"
 _ALL = [
-    Regime("rotor, noise .1x", _ROTOR, noise=0.1),
-    Regime("rotor, noise 1x", _ROTOR),
-    Regime("rotor, noise 10x", _ROTOR, noise=10.0),
-    Regime("quad, mocap and gyro", _QUAD),
-    Regime("car, all measured", machines.CAR),
-    Regime("car, gyro and lateral acceleration", machines.CAR, signals=("yaw_dot", "lateral_ddot")),
-    Regime("flexible joint, both angles", machines.JOINT),
-    Regime("flexible joint, motor angle", machines.JOINT, signals=("motor",)),
-    Regime("cart-pole, 20 Hz", _SLOW_CART),
-    Regime("cart-pole, 40 Hz", machines.CART),
-    Regime("viscous cart-pole, smooth", _CART),
-    Regime("viscous cart-pole, steps", _STEPS),
-    Regime("differential drive, all measured", machines.DRIVE),
-    Regime("pendulum, clean", machines.PENDULUM, noise=_CLEAN),
-    Regime("pendulum, noisy", machines.PENDULUM),
-    Regime("arm, clean", _ARM, noise=_CLEAN),
-    Regime("arm, noisy", _ARM),
-    Regime("underwater, clean", machines.UNDERWATER, noise=_CLEAN),
-    Regime("underwater, noisy", machines.UNDERWATER),
-    Regime("motor, clean", machines.MOTOR, noise=_CLEAN),
-    Regime("motor, noisy", machines.MOTOR),
-    Regime("pendulum, 20 Hz, continuous input", _SLOW_PENDULUM, held=False),
-    Regime("car, continuous input", machines.CAR, held=False),
-    Regime("servo, 1 s missing", machines.SERVO, fault=Fault(corrupted=_missing(100, inputs_too=True))),
-    Regime("servo, 1 s of sensors missing", machines.SERVO, fault=Fault(corrupted=_missing(100, inputs_too=False))),
-    Regime("quad, .5 s of sensors missing", _QUAD, fault=Fault(corrupted=_missing(50, inputs_too=False))),
-    Regime("rotor, x and z 10 ms late", _ROTOR, exact=False, fault=_late("x z", 10.0)),
-    Regime("quad, mocap 10 ms late", _QUAD, exact=False, fault=_late(_POSE, 10.0)),
-    Regime("quad, mocap 40 ms late", _QUAD, exact=False, fault=_late(_POSE, 40.0)),
-    Regime("rotor, slight gusts", _ROTOR, exact=False, fault=Fault(force=_gusts((0.1, 0.1, 0.001), 0.05, 3.0))),
-    Regime("rotor, torque gusts", _ROTOR, exact=False, fault=Fault(force=_gusts((0.0, 0.0, 0.008), 0.05, 3.0))),
-    Regime("rotor, hover with gusts", _HOVER, exact=False, fault=Fault(force=_gusts((0.3, 0.3, 0.003), 0.05, 3.0))),
-    Regime("underwater, waves", machines.UNDERWATER, exact=False, fault=Fault(force=_gusts((1.3,), 0.1, 0.3))),
-    Regime("underwater, slow current", machines.UNDERWATER, exact=False, fault=Fault(force=_slow_current(0.05))),
+    Regime("rotor noise .1x", _ROTOR, noise=0.1),
+    Regime("rotor noise 1x", _ROTOR),
+    Regime("rotor noise 10x", _ROTOR, noise=10.0),
+    Regime("quad mocap and gyro", _QUAD),
+    Regime("car all measured", machines.CAR),
+    Regime("car gyro and lateral acceleration", machines.CAR, signals=("yaw_dot", "lateral_ddot")),
+    Regime("flexible joint both angles", machines.JOINT),
+    Regime("flexible joint motor angle", machines.JOINT, signals=("motor",)),
+    Regime("cart-pole 20 Hz", _SLOW_CART),
+    Regime("cart-pole 40 Hz", machines.CART),
+    Regime("viscous cart-pole smooth", _CART),
+    Regime("viscous cart-pole steps", _STEPS),
+    Regime("differential drive all measured", machines.DRIVE),
+    Regime("pendulum clean", machines.PENDULUM, noise=_CLEAN),
+    Regime("pendulum noisy", machines.PENDULUM),
+    Regime("arm clean", _ARM, noise=_CLEAN),
+    Regime("arm noisy", _ARM),
+    Regime("underwater clean", machines.UNDERWATER, noise=_CLEAN),
+    Regime("underwater noisy", machines.UNDERWATER),
+    Regime("motor clean", machines.MOTOR, noise=_CLEAN),
+    Regime("motor noisy", machines.MOTOR),
+    Regime("pendulum 20 Hz continuous input", _SLOW_PENDULUM, held=False),
+    Regime("car continuous input", machines.CAR, held=False),
+    Regime("servo 1 s missing", machines.SERVO, fault=Fault(corrupted=_missing(100, inputs_too=True))),
+    Regime("servo 1 s of sensors missing", machines.SERVO, fault=Fault(corrupted=_missing(100, inputs_too=False))),
+    Regime("quad .5 s of sensors missing", _QUAD, fault=Fault(corrupted=_missing(50, inputs_too=False))),
+    Regime("rotor x and z 10 ms late", _ROTOR, exact=False, fault=_late("x z", 10.0)),
+    Regime("quad mocap 10 ms late", _QUAD, exact=False, fault=_late(_POSE, 10.0)),
+    Regime("quad mocap 40 ms late", _QUAD, exact=False, fault=_late(_POSE, 40.0)),
+    Regime("rotor slight gusts", _ROTOR, exact=False, fault=Fault(force=_gusts((0.1, 0.1, 0.001), 0.05, 3.0))),
+    Regime("rotor torque gusts", _ROTOR, exact=False, fault=Fault(force=_gusts((0.0, 0.0, 0.008), 0.05, 3.0))),
+    Regime("rotor hover with gusts", _HOVER, exact=False, fault=Fault(force=_gusts((0.3, 0.3, 0.003), 0.05, 3.0))),
+    Regime("underwater waves", machines.UNDERWATER, exact=False, fault=Fault(force=_gusts((1.3,), 0.1, 0.3))),
+    Regime("underwater slow current", machines.UNDERWATER, exact=False, fault=Fault(force=_slow_current(0.05))),
     *(
-        Regime(f"rotor, motor lag {1e3 * lag:.0f} ms", _ROTOR, exact=False, fault=Fault(lag=lag))
+        Regime(f"rotor motor lag {1e3 * lag:.0f} ms", _ROTOR, exact=False, fault=Fault(lag=lag))
         for lag in (0.03, 0.05, 0.08)
     ),
-    Regime("underwater, lag .5 s", machines.UNDERWATER, exact=False, fault=Fault(lag=0.5)),
-    Regime("motor, backlash", machines.GEARED_MOTOR, exact=False),
-    Regime("arm, Stribeck", _ARM, exact=False, fault=Fault(force=_stribeck)),
-    Regime("arm, ripple", _ARM, exact=False, fault=Fault(force=_ripple)),
-    Regime("pendulum, Coulomb friction", machines.PENDULUM, exact=False, fault=Fault(force=_coulomb)),
-    Regime("rotor, payload -30 %", _ROTOR, exact=False, fault=Fault(changed=_payload)),
-    Regime("rotor, battery sag 15 %", _ROTOR, exact=False, fault=Fault(supply=lambda share: 1.0 - 0.15 * share)),
-    Regime("rotor, wrong inputs", _ROTOR, exact=False, fault=Fault(corrupted=_wrong_inputs)),
+    Regime("underwater lag .5 s", machines.UNDERWATER, exact=False, fault=Fault(lag=0.5)),
+    Regime("motor backlash", machines.GEARED_MOTOR, exact=False),
+    Regime("arm Stribeck", _ARM, exact=False, fault=Fault(force=_stribeck)),
+    Regime("arm ripple", _ARM, exact=False, fault=Fault(force=_ripple)),
+    Regime("pendulum Coulomb friction", machines.PENDULUM, exact=False, fault=Fault(force=_coulomb)),
+    Regime("rotor payload -30 %", _ROTOR, exact=False, fault=Fault(changed=_payload)),
+    Regime("rotor battery sag 15 %", _ROTOR, exact=False, fault=Fault(supply=lambda share: 1.0 - 0.15 * share)),
+    Regime("rotor wrong inputs", _ROTOR, exact=False, fault=Fault(corrupted=_wrong_inputs)),
 ]
 REGIMES = {regime.name: regime for regime in _ALL}
 """Regimes by name, in the order of the table."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from regime_baselines import NoBaselineError, ordinary, total
 from regime_flights import REGIMES, Recording, Regime, recordings
+from regime_output_error import output_error
 
 import diransac as dr
 
@@ -60,10 +61,19 @@ class Record:
         return max((abs(x) for x in self.errors.values()), default=np.inf)
 
     @property
+    def off(self) -> bool:
+        """Whether a parameter is off by more than `WRONG` and outside its interval."""
+        return any(abs(x) > WRONG and not self.inside.get(name, True) for name, x in self.errors.items())
+
+    @property
+    def names_cause(self) -> bool:
+        """Whether a finding names a cause; a false alarm where the model is exact."""
+        return any(CAUSES.search(text) for text in self.findings)
+
+    @property
     def confidently_wrong(self) -> bool:
-        """Whether a parameter is off and outside its interval, and nothing was said that would explain it."""
-        off = any(not abs(x) <= WRONG and not self.inside.get(name, True) for name, x in self.errors.items())
-        return off and self.verdict != UNRELIABLE and not any(CAUSES.search(text) for text in self.findings)
+        """Whether the result is off, its verdict does not warn of it, and no cause is named."""
+        return self.off and self.verdict != UNRELIABLE and not self.names_cause
 
 
 def record_all(regime: str, seeds: Sequence[int], methods: Sequence[str]) -> list[Record]:
@@ -100,7 +110,7 @@ def _lo(regime: Regime, seed: int, recording: Recording) -> Record:
 def _said(result: dr.Result) -> tuple[str, tuple[str, ...]]:
     """Verdict and findings; from what is printed where the result has none."""
     if hasattr(result, "verdict"):
-        return str(result.verdict), tuple(str(one) for one in result.findings)
+        return str(result.verdict), tuple(map(str, result.findings))
     warned = tuple(line.strip() for line in str(result).splitlines() if line.startswith("!"))
     findings = (*warned, *result.notes)
     if any("do not rely" in text for text in findings):
@@ -127,5 +137,10 @@ def _baseline(
     return judged
 
 
-METHODS = {"lo": _lo, "ols": _baseline("ols", ordinary), "tls": _baseline("tls", total)}
+METHODS = {
+    "lo": _lo,
+    "ols": _baseline("ols", ordinary),
+    "tls": _baseline("tls", total),
+    "oe": _baseline("oe", output_error),
+}
 """``(regime, seed, recording) -> Record`` by name."""

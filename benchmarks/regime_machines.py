@@ -57,7 +57,7 @@ class Machine:
     noise : by measured signal, the noise's standard deviation, the signal's unit
     dt, duration : of the log, s
     substeps : RK4 steps a sample
-    bandwidth : of the baselines' filter, Hz
+    bandwidth : of the baselines' filter, Hz; about the best for ordinary least squares at seeds from 1000 on
     kinematics : ``(q, v) -> dq/dt``; None: v
     on_reference : ``r -> (q, v)`` at the start; None: at rest in 0
     """
@@ -238,7 +238,7 @@ QUAD = Machine(
     _quad_control,
     {**dict.fromkeys(("x", "y", "z"), 0.002), **dict.fromkeys(("phi", "theta", "psi"), 0.005)}
     | dict.fromkeys(("wx", "wy", "wz"), 0.02),
-    dt=0.01, duration=20.0, substeps=4, bandwidth=6.0,
+    dt=0.01, duration=20.0, substeps=4, bandwidth=5.0,
     kinematics=lambda q, v: np.concatenate([v[:3], np.stack(_euler_rates(np, q[3], q[4], *v[3:]))]),
     on_reference=_quad_start,
 )  # fmt: skip
@@ -282,7 +282,7 @@ CAR = Machine(
     lambda rngs: Multisine(rngs, (0.02, 1.0), 0.1, 1.2, 7),
     _car_control,
     {"yaw": 0.003, "yaw_dot": 0.005, "lateral_dot": 0.02, "lateral_ddot": 0.1},
-    dt=0.02, duration=25.0, substeps=4, bandwidth=4.0,
+    dt=0.02, duration=25.0, substeps=4, bandwidth=2.5,
 )  # fmt: skip
 
 
@@ -316,7 +316,7 @@ JOINT = Machine(
     lambda rngs: Multisine(rngs, (0.9,), 0.3, 9.0, 14),
     _joint_control,
     {"motor": 5e-4, "load": 5e-4},
-    dt=0.005, duration=10.0, substeps=4, bandwidth=30.0,
+    dt=0.005, duration=10.0, substeps=4, bandwidth=18.0,
 )  # fmt: skip
 
 
@@ -353,10 +353,10 @@ CART = Machine(
     _cart_model(),
     {"M": 1.5, "m": 0.33, "l": 0.5, "b": 1.1, "c": 0.008},
     _cart_accelerations,
-    lambda rngs: Multisine(rngs, (4.0,), 0.2, 2.0, 8),
+    lambda rngs: Multisine(rngs, (4.0,), 0.2, 2.5, 8),
     _cart_control,
     {"x": 5e-4, "theta": 0.0015},
-    dt=0.025, duration=25.0, substeps=10, bandwidth=6.0,
+    dt=0.025, duration=20.0, substeps=10, bandwidth=4.0,
 )  # fmt: skip
 
 
@@ -389,7 +389,7 @@ VISCOUS_CART = Machine(
     lambda rngs: Multisine(rngs, (4.5,), 0.15, 1.0, 5),
     lambda t, q, v, r, p: r(t),
     {"x": 1e-4, "theta": 1e-3},
-    dt=0.01, duration=20.0, substeps=4, bandwidth=8.0,
+    dt=0.01, duration=20.0, substeps=4, bandwidth=6.0,
 )  # fmt: skip
 
 
@@ -442,7 +442,7 @@ DRIVE = Machine(
     lambda rngs: Multisine(rngs, (3.5, 3.5), 0.05, 1.5, 7),
     lambda t, q, v, r, p: 4.0 + r(t),
     {"x": 0.002, "y": 0.002, "yaw": 0.004, "u": 0.02, "r": 0.02, "wl": 0.1, "wr": 0.1},
-    dt=0.02, duration=25.0, substeps=8, bandwidth=5.0,
+    dt=0.02, duration=25.0, substeps=8, bandwidth=3.0,
     kinematics=lambda q, v: np.stack([v[0] * np.cos(q[2]), v[0] * np.sin(q[2]), v[1]]),
 )  # fmt: skip
 
@@ -487,7 +487,7 @@ PENDULUM = Machine(
     lambda rngs: Multisine(rngs, (0.4,), 0.1, 2.0, 7),
     lambda t, q, v, r, p: r(t),
     {"q": 2 * np.pi / 4096 / np.sqrt(12.0)},
-    dt=0.01, duration=20.0, substeps=6, bandwidth=8.0,
+    dt=0.01, duration=20.0, substeps=6, bandwidth=6.0,
 )  # fmt: skip
 
 
@@ -562,7 +562,7 @@ SERVO = Machine(
     lambda rngs: Multisine(rngs, (0.08,), 0.1, 0.8, 5),
     _servo_control,
     {"s": 2e-5},
-    dt=0.01, duration=20.0, substeps=6, bandwidth=8.0,
+    dt=0.01, duration=20.0, substeps=6, bandwidth=6.0,
     on_reference=lambda r: (r(0.0), r(0.0, 1)),
 )  # fmt: skip
 
@@ -614,6 +614,6 @@ ARM = Machine(
     lambda rngs: Multisine(rngs, (0.6, 0.6), 0.1, 1.0, 5),
     _arm_control,
     {"q1": 1e-4, "q2": 1e-4},
-    dt=0.005, duration=12.5, substeps=10, bandwidth=12.0,
+    dt=0.005, duration=12.5, substeps=10, bandwidth=10.0,
     on_reference=lambda r: (r(0.0), r(0.0, 1)),
 )  # fmt: skip
