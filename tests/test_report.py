@@ -329,7 +329,8 @@ def test_a_single_log_in_a_list_gives_the_page_of_the_log(result, log, tmp_path)
     assert written(result, [log], tmp_path) == written(result, log, tmp_path)
 
 
-def test_findings_over_several_logs_are_on_the_worst_one_and_on_all_rows(model, log, other):
+def test_findings_over_several_logs_are_on_the_worst_one_and_on_all_rows(model, log):
+    other = spiked(dive(model, 500, source="another dive"), np.arange(100, 150), 20.0)
     result = dr.identify(
         model, [log, other], dr.IDiransac(dr.Settings(max_iterations=50, sample_size=10)), compare_logs=False
     )
