@@ -43,8 +43,8 @@ def slide(push=0.0, noise=0.0, late=0, seed=0, source="sledge"):
     return dr.Log.from_arrays(t[:N], {**columns, "force": force[late:]}, source=source)
 
 
-def unstable():
-    """A result of an inverted pendulum without feedback: its simulation leaves the log within a second."""
+def inverted(seed):
+    """A model of an unstable machine, and a log of it under feedback: open loop it leaves the log within a second."""
     model = dr.Model(
         "inverted",
         {"x": "rad"},
@@ -52,7 +52,7 @@ def unstable():
         {"stiffness": dr.Parameter("1/s^2"), "gain": dr.Parameter("1/(kg m^2)")},
         lambda q, v, a, u, p: [a.x - p.stiffness * q.x - p.gain * u.torque],
     )
-    rng, t = np.random.default_rng(3), DT * np.arange(1500)
+    rng, t = np.random.default_rng(seed), DT * np.arange(1500)
     x, torque = np.zeros((1501, 2)), np.zeros(1500)
     for k in range(1500):
         torque[k] = -12.0 * x[k, 0] - 4.0 * x[k, 1] + 2.0 * np.sin(2.0 * t[k]) + rng.normal(0.0, 0.5)
@@ -61,8 +61,7 @@ def unstable():
             x[k + 1, 1] += DT / 20 * (25.0 * x[k + 1, 0] + 5.0 * torque[k])
             x[k + 1, 0] += DT / 20 * x[k + 1, 1]
     signals = {"x": x[:-1, 0] + 2e-3 * rng.normal(size=1500), "x_dot": x[:-1, 1] + 1e-2 * rng.normal(size=1500)}
-    log = dr.Log.from_arrays(t, {**signals, "torque": torque}, source="inverted")
-    return dr.identify(model, log, differentiate=True), log
+    return model, dr.Log.from_arrays(t, {**signals, "torque": torque}, source=f"inverted {seed}")
 
 
 @pytest.fixture(scope="module")
@@ -169,12 +168,20 @@ def test_a_verdict_has_its_reason_among_the_findings(cases, name, verdict, reaso
     assert any(reason in finding for finding in result.findings), result.findings
 
 
-def test_an_unstable_machine_is_judged_by_restarted_simulations():
-    result, log = unstable()
+def test_an_unstable_machine_is_judged_by_restarted_simulations_of_held_out_logs_too(tmp_path):
+    model, log = inverted(seed=3)
+    result = dr.identify(model, log, differentiate=True)
     assert result.parameters["stiffness"] == pytest.approx(25.0, rel=0.05)
     assert result.inlier_fraction < 0.5
     assert result.verdict == "usable", result.findings
     assert result.logs[0].prediction.restart_period < 0.2 * (len(log) - 1) * DT
+    dr.write_report(result, inverted(seed=4)[1], tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "Held out: median error of simulations restarted every" in page
+    assert "</span> usable with care</h3>" in page  # noise of the states that it starts from grows 500 times in 1.25 s
+    falling = changed(result, parameters={"stiffness": -25.0, "gain": 5.0})
+    dr.write_report(falling, inverted(seed=4)[1], tmp_path / "page.html")
+    assert "</span> do not rely on this</h3>" in (tmp_path / "page.html").read_text()
 
 
 def test_a_restarted_simulation_finds_wrong_parameters(cases):

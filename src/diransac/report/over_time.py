@@ -82,12 +82,14 @@ def figures_of(log: Log, runs: Sequence[Run], n_logs: int) -> LogFigures:
 
 def _method(runs: Sequence[Run]) -> str:
     """Starting points of the simulations."""
-    periods = [run.restart_period for run in runs if np.isfinite(run.restart_period)]
-    if not periods:
+    restarted = [run for run in runs if np.isfinite(run.restart_period)]
+    if not restarted:
         return "Each simulation starts at the first row and depends on the inputs alone."
-    state = "measured" if runs[0].diagnosis is None else "smoothed"
+    state = "measured" if restarted[0].diagnosis is None else "smoothed"
+    which = "" if len(restarted) == len(runs) else f" by {', '.join(run.label for run in restarted)}"
+    period = number(restarted[0].restart_period)
     text = (
-        f"Each simulation depends on the inputs alone and restarts every {number(periods[0])} s from the {state} "
+        f"Each simulation{which} depends on the inputs alone and restarts every {period} s from the {state} "
         "state, so that the effect of unmodelled forces does not accumulate."
     )
     if len(runs) > 1:

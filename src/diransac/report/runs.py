@@ -134,6 +134,11 @@ class Run(SimulatedLog):
         return self.view.held_out
 
     @property
+    def restart_state(self) -> str:
+        """Kind of the states from which the simulation restarts."""
+        return "measured" if self.diagnosis is None else "smoothed"
+
+    @property
     def rows(self) -> IntArray:
         """Rows of the log (N,)."""
         return np.arange(self.first_row, self.first_row + len(self.observations))

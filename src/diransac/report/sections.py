@@ -309,11 +309,11 @@ def _delay(entry: Entry) -> str:
 
 def short_term_scores(runs: Sequence[Run]) -> Table | None:
     """RMS error of the restarted simulations over one log; None without a diagnosis of it."""
-    having = [run for run in runs if np.isfinite(run.restart_period)]
+    having = [run for run in runs if np.isfinite(run.restart_period) and run.diagnosis is not None]
     if not having:
         return None
     names = dict.fromkeys(name for run in having for name in run.observations.signals)
-    noise = having[0].diagnosis.noise_std if having[0].diagnosis is not None else {}
+    noise = having[0].noise
     units = having[0].result.model.units
     rows = [
         (name, units[name], number(noise.get(name, np.nan), 3), *(_regular_rms(run, name) for run in having))
