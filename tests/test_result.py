@@ -242,6 +242,9 @@ def test_every_key_is_needed(result, tmp_path):
         (["iterations"], "all"),
         (["method"], None),
         (["notes"], 5),
+        (["checks"], 5),
+        (["checks"], [{"level": "fatal", "text": "it burns"}]),
+        (["logs", 0, "prediction"], 3),
     ],
     ids=str,
 )

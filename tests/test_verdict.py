@@ -7,6 +7,7 @@ import pickle
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ import diransac as dr
 from command_line import MODEL, run, run_both, working_folder
 from diransac.identification.estimate import Finding
 from diransac.identification.findings import by_seriousness, verdict_of
+from diransac.identification.prediction import unexplained
 from diransac.report.runs import simulate_on
 from results import changed
 
@@ -192,6 +194,40 @@ def test_a_restarted_simulation_finds_wrong_parameters(cases):
     worse = replace(light, logs=(replace(light.logs[0], prediction=simulated.summary(light.diagnosis)),))
     assert worse.verdict == "do not rely on this"
     assert any("restarted every" in x and x.level == "bad" for x in worse.findings)
+
+
+def test_a_coordinate_at_rest_is_no_evidence_against_the_model():
+    """Relative to an acceleration of nothing, all of what is left of it would be unexplained."""
+    units = {"x_ddot": "m/s^2", "y_ddot": "m/s^2", "turn_ddot": "rad/s^2"}
+    left = {"x_ddot": 0.1, "y_ddot": 1e-9, "turn_ddot": 1e-3}
+    modelled = {"x_ddot": 0.9, "y_ddot": 0.0, "turn_ddot": 1e-3}
+    diagnosis = SimpleNamespace(unmodelled_accelerations={n: np.array([x, -x]) for n, x in left.items()})
+    observations = SimpleNamespace(model=SimpleNamespace(units=units))
+    accelerations = {n: np.full(5, x) for n, x in modelled.items()}
+    found = unexplained(diagnosis, SimpleNamespace(observations=observations, accelerations=accelerations))
+    assert found == pytest.approx({"x_ddot": 0.1, "turn_ddot": 0.5})
+
+
+@pytest.mark.parametrize(("outliers", "level"), [(0.3, "note"), (0.6, "care"), (0.9, "bad")])
+def test_a_signal_that_is_mostly_outliers_is_no_evidence_for_the_model(cases, outliers, level):
+    result, _ = cases["lo-diransac"]
+    fractions = {**result.diagnosis.outlier_fraction, "s_dot": outliers}
+    doubtful = changed(result, diagnosis=replace(result.diagnosis, outlier_fraction=fractions))
+    assert next(x.level for x in doubtful.findings if "(s_dot) are outliers" in x) == level
+
+
+def test_noise_that_is_larger_than_the_signal_explains_no_error(cases):
+    """A fit that takes a signal for noise has wrong parameters and small errors beside that noise."""
+    result, log = cases["lo-diransac"]
+    found = result.diagnosis
+    lost = replace(
+        found, noise_std=dict.fromkeys(found.noise_std, 1e6), outliers={n: ~x for n, x in found.outliers.items()}
+    )
+    wrong = changed(result, parameters={"mass": 1e-7, "drag": 1e-7}, diagnosis=lost)
+    prediction = simulate_on("wrong", wrong, log, lost).summary(lost)
+    assert max(prediction.relative_errors.values()) > 1.0
+    wrong = replace(wrong, logs=(replace(wrong.logs[0], prediction=prediction),))
+    assert wrong.verdict == "do not rely on this"
 
 
 @pytest.mark.parametrize(

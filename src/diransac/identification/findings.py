@@ -22,6 +22,8 @@ Verdict = Literal["usable", "usable with care", "do not rely on this"]
 _NEAR, _FAR = 0.05, 0.25
 """Median errors of simulations, over the range of the signal, that are good, and that need care."""
 _MOST, _HALF, _FEW = 0.7, 0.5, 0.01
+_BREAKDOWN = 2.0 / 3.0
+"""Fraction of outliers beyond which the estimate of lo-diransac is arbitrary."""
 _UNCERTAIN = 0.5
 _STEADY, _UNSTEADY = 0.05, 0.2
 """Relative changes of a parameter with the filter's bandwidth that are good, and that need care."""
@@ -233,10 +235,14 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
     name = max(found.outlier_fraction, key=lambda n: found.outlier_fraction[n])
     most = found.outlier_fraction[name]
     if most > _FEW:
-        yield Finding(
-            "note" if most <= _HALF else "care",
-            f"Up to {percent(most)} of the samples of a signal ({name}) are outliers; the estimate down-weights them.",
-        )
+        text = f"Up to {percent(most)} of the samples of a signal ({name}) are outliers"
+        if most <= _BREAKDOWN:
+            level: Level = "note" if most <= _HALF else "care"
+            yield Finding(level, f"{text}; the estimate down-weights them.")
+        else:
+            yield Finding(
+                "bad", f"{text}: check its sign and unit and the terms of the model, or leave the signal out."
+            )
     yield from _unexplained(result.logs)
     if found.input_delay_significant:
         sense = "later" if found.input_delay > 0.0 else "earlier"

@@ -34,6 +34,7 @@ __all__ = [
 ]
 
 _MET = 0.5
+_MOST_NOISE = 0.5
 _MEDIAN = 0.6745  # of the absolute value of Gaussian noise, in standard deviations
 _N_RESTARTS = 12
 _N_WINDOWS, _ROWS_PER_WINDOW = 40, 25
@@ -158,9 +159,13 @@ class SimulatedLog:
     @cached_property
     def regular_errors(self) -> dict[str, FloatArray]:
         """Absolute errors of each signal over the rows that count, without outliers; infinite after a divergence."""
-        error = np.where(np.isnan(self.simulated), np.inf, np.abs(self.errors))
-        columns = zip(self.observations.signals, error.T, strict=True)
-        return {n: x[self.observations.valid & ~self.outliers[n] & ~np.isnan(x)] for n, x in columns}
+        return {n: self._absolute_errors(n, ~self.outliers[n]) for n in self.observations.signals}
+
+    def _absolute_errors(self, name: str, rows: BoolArray) -> FloatArray:
+        """Absolute errors of a signal in those of some rows that count and are measured."""
+        column = self.observations.signals.index(name)
+        errors = np.where(np.isnan(self.simulated[:, column]), np.inf, np.abs(self.errors[:, column]))
+        return errors[self.observations.valid & rows & np.isfinite(self.observations.measured[:, column])]
 
     @cached_property
     def median_errors(self) -> dict[str, float]:
@@ -183,8 +188,18 @@ class SimulatedLog:
         """Median error of each signal with a threshold, less the noise's if known, over the signal's range."""
         widths = {n: high - low for n, (low, high) in self.ranges.items()}
         scored = [n for n, x in zip(self.observations.signals, self.thresholds, strict=True) if x > 0.0]
-        excess = {n: max(0.0, self.median_errors[n] - _MEDIAN * self.noise.get(n, 0.0)) for n in scored}
-        return {n: excess[n] / widths[n] for n in scored if widths[n] > 0.0}
+        return {n: self._excess(n, widths[n]) / widths[n] for n in scored if widths[n] > 0.0}
+
+    def _excess(self, name: str, width: float) -> float:
+        """Median error of a signal, less the noise's.
+
+        Noise of more than half the range is misfit, since that of any signal is less than the range of its samples.
+        Then nothing is subtracted, and no sample is taken for an outlier.
+        """
+        noise = self.noise.get(name, 0.0)
+        if noise <= _MOST_NOISE * width:
+            return max(0.0, self.median_errors[name] - _MEDIAN * noise)
+        return float(np.median(self._absolute_errors(name, np.ones_like(self.inliers))))
 
     def windows(self) -> tuple[IntArray, FloatArray]:
         """Edges ``(n + 1,)`` of windows over the rows, and the inlier fraction ``(n,)`` of those that count."""
@@ -260,7 +275,8 @@ def unexplained(diagnosis: Diagnosis, simulated: SimulatedLog) -> dict[str, floa
 
 def _rms(values: FloatArray) -> float:
     finite = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(np.square(finite)))) if len(finite) else 0.0
+    with np.errstate(over="ignore"):
+        return float(np.sqrt(np.mean(np.square(finite)))) if len(finite) else 0.0
 
 
 # ---------------------------------------------------------------------- predictions of an identification
