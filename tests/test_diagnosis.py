@@ -92,7 +92,7 @@ def test_an_input_that_acts_late_is_said_with_its_delay():
     found = dr.identify(sledge(), log_of(*slide(extra=0.0, lag=6))[0], seed=0)
     assert found.diagnosis.input_delay_significant
     assert found.diagnosis.input_delay == pytest.approx(0.06, abs=1e-3)
-    assert "! inputs act 60 ms later than recorded" in str(found)
+    assert "· Inputs act 60 ms later than recorded" in str(found)
     punctual = dr.identify(sledge(), log_of(*slide(extra=0.0))[0], seed=0)
     assert not punctual.diagnosis.input_delay_significant
 
@@ -127,7 +127,7 @@ def test_a_parameter_that_the_log_cannot_tell_is_printed_as_a_question(spoilt):
     diagnosis = replace(result.diagnosis, unidentifiable=("drag",))
     vague = replace(result, estimate=replace(result.estimate, covariance=covariance, diagnosis=diagnosis))
     assert re.search(r"^drag +\? +unknown +N s/m$", str(vague), re.MULTILINE)
-    assert "! drag is not identifiable from this log; excite it" in str(vague)
+    assert "· drag is not identifiable from this log; excite it" in str(vague)
 
 
 # ---------------------------------------------------------------------- how it is kept

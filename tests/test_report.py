@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from jinja2 import UndefinedError
 
 import diransac as dr
+from diransac.identification.prediction import bulk_range
 from diransac.report import figures, labelled, rendering
-from diransac.report.assessment import findings, verdict, worst
-from diransac.report.runs import bulk_range, simulate_on
+from diransac.report.runs import simulate_on
 from diransac.simulation import RolloutBatch, rollouts
+from diransac.text_table import number, percent, share
 from results import changed
 
 VOID = {"meta", "input", "link"}
@@ -122,7 +123,7 @@ def test_page_names_model_method_log_and_every_parameter_with_its_interval(resul
     assert 'Identified by ols from log "dive.csv" (11.98 s at 50 Hz, 600 rows)' in text
     for name, (low, high) in result.intervals().items():
         assert f"{name} {result.units[name]}" in text
-        assert f"{rendering.number(low, 5)} … {rendering.number(high, 5)}" in text
+        assert f"{number(low, 5)} … {number(high, 5)}" in text
 
 
 def test_page_holds_what_repeats_the_identification(model, log, tmp_path):
@@ -184,23 +185,33 @@ def test_what_is_no_result_is_refused(nothing, log, tmp_path):
         dr.write_report(nothing, log, tmp_path / "report.html")
 
 
-# ---------------------------------------------------------------------- assessment
+# ---------------------------------------------------------------------- verdict and findings
 
 
-def levels(result, log):
-    return {finding.text: finding.level for finding in findings([simulate_on("it", result, log)])}
+def predicted(result, log):
+    """A changed result with the prediction of its log made again."""
+    run = simulate_on("it", result, log, result.diagnosis)
+    return changed(result, logs=(dataclasses.replace(result.logs[0], prediction=run.summary(result.diagnosis)),))
 
 
 def level_of(result, log, words):
-    found = [level for text, level in levels(result, log).items() if words in text]
-    assert found, levels(result, log)
+    levels = {str(finding): finding.level for finding in predicted(result, log).findings}
+    found = [level for text, level in levels.items() if words in text]
+    assert found, levels
     return found[0]
 
 
-def test_a_noise_free_log_contradicts_nothing(result, log):
-    found = findings([simulate_on("ols", result, log)])
-    assert worst(found) == "good"
-    assert verdict("good") == "Usable: nothing in this log contradicts the model."
+def test_a_noise_free_log_contradicts_nothing(result):
+    assert {finding.level for finding in result.findings} == {"good", "note"}
+    assert result.verdict == "usable"
+
+
+def test_the_page_simulates_what_identify_has_simulated(result, diagnosed, log, hit):
+    assert predicted(result, log).logs == result.logs
+    again, before = predicted(diagnosed, hit).logs[0].prediction, diagnosed.logs[0].prediction
+    assert again.relative_errors == pytest.approx(before.relative_errors, abs=1e-12)
+    assert again.unexplained == pytest.approx(before.unexplained, rel=1e-9)
+    assert again.restart_period == before.restart_period
 
 
 def test_a_violated_bound_is_bad_and_says_which(result, log):
@@ -240,7 +251,7 @@ def test_inlier_fraction_is_graded_and_a_bad_stretch_is_named(result, log):
     assert level_of(patchy, log, "95 % of 600 rows agree") == "good"
     assert level_of(patchy, log, "Between 9 and 9.5 s only 0 % of the rows agree") == "care"
     mask[:400] = False
-    assert level_of(changed(result, inliers=mask), log, "33 % of 600 rows agree") == "bad"
+    assert level_of(changed(result, inliers=mask, inlier_fraction=1.0 / 3.0), log, "33 % of 600 rows agree") == "bad"
 
 
 def test_another_log_makes_it_a_held_out_validation_with_inliers_of_its_own(model, result, log, tmp_path):
@@ -302,7 +313,7 @@ def other(model):
 
 def test_several_logs_have_a_table_and_a_block_each_of_which_the_first_is_open(result, log, other, tmp_path):
     page = Page(written(result, [log, other], tmp_path))
-    assert f"{log.source} 11.98 50 600 100 % {rendering.number(result.fit_error)} another dive" in page.text
+    assert f"{log.source} 11.98 50 600 100 % {number(result.fit_error)} another dive" in page.text
     assert "another dive 9.98 50 500 90 % – held out" in page.text
     assert ["open" in a for a in page.all("details")] == [True, False]
     labels = [a["aria-label"] for a in page.all("svg")]
@@ -318,13 +329,29 @@ def test_a_single_log_in_a_list_gives_the_page_of_the_log(result, log, tmp_path)
     assert written(result, [log], tmp_path) == written(result, log, tmp_path)
 
 
-def test_findings_over_several_logs_are_on_the_worst_one_and_on_all_rows(result, log, other):
-    runs = [simulate_on("ols", result, one) for one in (log, other)]
-    found = {finding.text: finding.level for finding in findings(runs)}
-    assert any("95 % of 1,100 rows agree" in text for text in found)
-    assert any("s of another dive only 0 % of the rows agree" in text for text in found)
-    assert any("of its range; the other scored signals are closer (" in text for text in found)
-    assert found["Not used for identification (held-out validation): another dive."] == "note"
+def test_findings_over_several_logs_are_on_the_worst_one_and_on_all_rows(model, log):
+    other = spiked(dive(model, 500, source="another dive"), np.arange(100, 150), 20.0)
+    result = dr.identify(
+        model, [log, other], dr.IDiransac(dr.Settings(max_iterations=50, sample_size=10)), compare_logs=False
+    )
+    assert any("95 % of 1,100 rows agree" in text for text in result.findings)
+    assert any("s of another dive only 0 % of the rows agree" in text for text in result.findings)
+    assert any("of its range; the other scored signals are closer (" in text for text in result.findings)
+
+
+def test_findings_on_a_held_out_log_join_those_of_the_result(result, log, other, tmp_path):
+    page = Page(written(result, [log, other], tmp_path))
+    assert all(str(finding) in page.text for finding in result.findings)
+    assert "Held out: 90 % of 500 rows agree with the simulation." in page.text
+    assert "Not used for identification (held-out validation): another dive." in page.text
+    assert "Held out" not in Page(written(result, log, tmp_path)).text
+
+
+def test_a_model_that_fails_on_a_held_out_log_is_not_to_be_relied_on(model, result, tmp_path):
+    truth = dive(model, 500)
+    wrong = with_signals(truth, thrust=-truth["thrust"])
+    assert result.verdict == "usable"
+    assert "ols do not rely on this" in Page(written(result, wrong, tmp_path)).text
 
 
 def test_logs_of_one_name_are_numbered(result, log, tmp_path):
@@ -372,10 +399,10 @@ def figure_of(page, name):
 def test_noise_outliers_and_unmodelled_accelerations_stand_in_a_table_with_units(diagnosed, hit, tmp_path):
     page = Page(written(diagnosed, hit, tmp_path))
     found = diagnosed.diagnosis
-    share = rendering.percent(found.outlier_fraction["x_dot"])
-    assert f"x_dot m/s {rendering.number(found.noise_std['x_dot'], 2)} {share}" in page.text
+    share = percent(found.outlier_fraction["x_dot"])
+    assert f"x_dot m/s {number(found.noise_std['x_dot'], 2)} {share}" in page.text
     left = np.sqrt(np.mean(found.unmodelled_accelerations["x_ddot"] ** 2))
-    assert f" {rendering.number(left, 2)} Unmodelled generalised forces" in page.text
+    assert f" {number(left, 2)} Unmodelled generalised forces" in page.text
     assert any(a["aria-label"] == "Unmodelled force on x in N" for a in page.all("svg"))
     assert page.all("section")[2]["id"] == "diagnosis"
 
@@ -466,7 +493,7 @@ def test_an_unidentifiable_parameter_has_no_number(diagnosed, hit, tmp_path):
 def test_an_input_delay_is_reported_and_the_simulation_includes_it(model, log, tmp_path):
     late = with_signals(log, thrust=np.r_[log["thrust"][4:], np.full(4, log["thrust"][-1])])
     found = dr.identify(model, late, seed=0)
-    assert level_of(found, late, "Inputs act 80 ms after their time stamps") == "care"
+    assert level_of(found, late, "Inputs act 80 ms later than recorded: the estimate includes this delay") == "care"
     assert "The estimate and the simulations shown include it." in Page(written(found, late, tmp_path)).text
     run = simulate_on("it", found, late, found.diagnosis)
     assert run.median_errors["x_dot"] < 0.01 * np.ptp(log["x_dot"])
@@ -480,11 +507,17 @@ def test_positions_alone_are_simulated_from_the_smoothed_states(model, log, tmp_
     assert "method='lo-diransac', seed=0, differentiate=True)" in page.text
 
 
-def test_unmodelled_acceleration_is_graded(diagnosed, hit):
-    assert level_of(diagnosed, hit, "The RMS unmodelled acceleration is") == "good"
-    latent = {"x_ddot": diagnosed.diagnosis.unmodelled_accelerations["x_ddot"] + 2.0}
+@pytest.mark.parametrize(("size", "level"), [(0.0, "good"), (0.2, "care"), (2.0, "bad")])
+def test_the_unexplained_share_of_an_acceleration_is_graded(diagnosed, hit, size, level):
+    left = size * np.sqrt(np.mean(hit["x_ddot"] ** 2))
+    latent = {"x_ddot": diagnosed.diagnosis.unmodelled_accelerations["x_ddot"] + left}
     pushed = changed(diagnosed, diagnosis=dataclasses.replace(diagnosed.diagnosis, unmodelled_accelerations=latent))
-    assert level_of(pushed, hit, "The RMS unmodelled acceleration is") == "care"
+    assert (
+        level_of(
+            pushed, hit, f"The model leaves {percent(size / (1.0 + size))} of x_ddot" if size else "The model leaves"
+        )
+        == level
+    )
 
 
 # ---------------------------------------------------------------------- safe to open
@@ -656,8 +689,8 @@ def test_ticks_are_round_distinct_and_within_the_range(low, width):
 
 
 def test_numbers_are_printed_as_a_reader_expects_them():
-    assert [rendering.number(x) for x in (-1.5, 1.2e-6, np.inf, np.nan)] == ["−1.5", "1.2×10⁻⁶", "∞", "–"]
-    assert [rendering.percent(x) for x in (0.0042, 0.131, 0.996, 0.9999, 1.0, 1e-6, -1e-6)] == [
+    assert [number(x) for x in (-1.5, 1.2e-6, np.inf, np.nan)] == ["−1.5", "1.2×10⁻⁶", "∞", "–"]
+    assert [percent(x) for x in (0.0042, 0.131, 0.996, 0.9999, 1.0, 1e-6, -1e-6)] == [
         "0.42 %",
         "13 %",
         "99.6 %",
@@ -666,5 +699,5 @@ def test_numbers_are_printed_as_a_reader_expects_them():
         "< 0.01 %",
         "> −0.01 %",
     ]
-    assert rendering.share(0.02, "its range") == "2 % of its range"
-    assert rendering.share(19.3, "its range") == "19 times its range"
+    assert share(0.02, "its range") == "2 % of its range"
+    assert share(19.3, "its range") == "19 times its range"

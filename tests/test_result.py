@@ -204,8 +204,9 @@ def test_missing_file_is_refused_by_name(tmp_path):
 
 def test_every_key_is_needed(result, tmp_path):
     data = json.loads(json.dumps(result.to_dict()))
-    derived = {"units", "standard_errors", "intervals_95", "violations"}
-    for key in data.keys() - derived:
+    derived = {"units", "standard_errors", "intervals_95", "violations", "verdict", "findings"}
+    added = {"checks"}
+    for key in data.keys() - derived - added:
         path = tmp_path / "model.json"
         path.write_text(json.dumps({k: x for k, x in data.items() if k != key}))
         with pytest.raises(ResultError):
@@ -241,6 +242,9 @@ def test_every_key_is_needed(result, tmp_path):
         (["iterations"], "all"),
         (["method"], None),
         (["notes"], 5),
+        (["checks"], 5),
+        (["checks"], [{"level": "fatal", "text": "it burns"}]),
+        (["logs", 0, "prediction"], 3),
     ],
     ids=str,
 )
@@ -298,9 +302,11 @@ def test_printed_result_warns_of_a_fit_that_explains_little_of_the_log(result):
     poor = dataclasses.replace(
         result, estimate=vague, evaluation=dataclasses.replace(result.evaluation, inlier_fraction=0.2)
     )
-    warnings = [line for line in str(poor).splitlines() if line.startswith("!")]
-    for part in ("less than half of the log", "short of the 85 % inliers", "2 fitted rows are too few"):
-        assert any(part in line for line in warnings), part
+    lines = str(poor).splitlines()
+    assert "verdict: do not rely on this" in lines
+    assert any(line.startswith("! 20 % of") and "less than half of the log" in line for line in lines)
+    assert any(line.startswith("· ") and "2 fitted rows are too few" in line for line in lines)
+    assert any("short of the 85 % inliers" in finding for finding in poor.findings)
 
 
 def test_arrays_of_a_result_cannot_be_changed(result):

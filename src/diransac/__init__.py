@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from diransac.flight.planning import multisine, plan, random_waypoints, sine, square, star
     from diransac.flight.trajectory import Trajectory
     from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
+    from diransac.identification.estimate import Finding
     from diransac.identification.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
     from diransac.identification.identify import METHODS, identify
     from diransac.identification.method import Progress
@@ -54,6 +55,7 @@ __all__ = [
     "DiransacError",
     "Disturbance",
     "FilterSpecification",
+    "Finding",
     "IDiransac",
     "IdentificationError",
     "LeastSquares",
@@ -118,6 +120,7 @@ _FOUND_IN = {
     "flight.planning": ("multisine", "plan", "random_waypoints", "sine", "square", "star"),
     "flight.trajectory": ("Trajectory",),
     "flight.tvlqr": ("Controller", "tvlqr", "tvlqr_batch"),
+    "identification.estimate": ("Finding",),
     "identification.estimators": ("OrdinaryLeastSquares", "ScikitLearnEstimator", "TotalLeastSquares"),
     "identification.identify": ("METHODS", "identify"),
     "identification.method": ("Progress",),

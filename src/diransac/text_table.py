@@ -1,11 +1,15 @@
-"""Plain text in columns: the same on a terminal, in a file and in a notebook."""
+"""Plain text in columns, and numbers as text: the same on a terminal, in a file, in a notebook and on a page."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-__all__ = ["aligned", "telling_digits"]
+__all__ = ["aligned", "number", "percent", "plural", "share", "telling_digits"]
+
+_LEAST_PERCENT = 0.01
+_TIMES = 3.0
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -18,3 +22,37 @@ def telling_digits(low: float, high: float) -> int:
     """Number of significant digits in which the ends of an interval differ, at least 5."""
     size, width = max(abs(low), abs(high)), high - low
     return 5 if not 0.0 < width < size else min(12, max(5, 2 + math.ceil(math.log10(size / width))))
+
+
+def number(x: float, digits: int = 4) -> str:
+    """A number to significant digits: ``−1.5``, ``1.2×10⁻⁶``, ``∞``, ``–`` for NaN."""
+    if math.isnan(x):
+        return "–"
+    if math.isinf(x):
+        return "∞" if x > 0 else "−∞"
+    mantissa, _, exponent = f"{x:.{digits}g}".partition("e")
+    power = f"×10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if exponent else ""
+    return mantissa.replace("-", "−") + power
+
+
+def percent(fraction: float) -> str:
+    """A fraction in percent to about two digits: ``0.42 %``, ``13 %``, ``< 0.01 %``."""
+    x = 100.0 * fraction
+    if 0.0 < abs(x) < _LEAST_PERCENT:
+        return f"{'< ' if x > 0.0 else '> −'}{_LEAST_PERCENT} %"
+    if 99.0 < x < 100.0:
+        return f"{min(x, 99.9):.1f} %"
+    rounded = f"{x:.0f}" if math.isfinite(x) and 10.0 <= abs(x) < 1e5 else number(x, 2)
+    return f"{rounded.replace('-', '−')} %"
+
+
+def share(x: float, whole: str) -> str:
+    """A ratio to a whole: ``2 % of its range``, ``19 times its range``."""
+    if math.isfinite(x) and x >= _TIMES:
+        return f"{number(x, 2)} times {whole}"
+    return f"{percent(x)} of {whole}"
+
+
+def plural(count: int, noun: str) -> str:
+    """A count with its noun: ``1 row``, ``2,501 rows``."""
+    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"

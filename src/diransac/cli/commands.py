@@ -32,6 +32,7 @@ from diransac.cli.options import (
     Report,
     ResultFile,
     Search,
+    StrictFlag,
     known_methods,
 )
 from diransac.cli.outputs import staged
@@ -81,6 +82,7 @@ def _identify(
     output: Output = None,
     report: Report = None,
     as_json: JsonFlag = False,
+    strict: StrictFlag = False,
 ) -> None:
     """Identify the parameters of a model from one log, or from several logs of one machine."""
     (chosen,), derived = search.methods([method]), derivation.arguments()
@@ -95,6 +97,7 @@ def _identify(
 
             write_report(result, logs, page)
         screen.show(result, as_json)
+    screen.end(result.verdict, strict)
 
 
 @app.command("compare")

@@ -27,7 +27,10 @@ _LATER = {"study": "diransac.cli.study"}
 
 
 class Group(TyperGroup):
-    """Commands with exit code 0, 1 (failure), 2 (wrong usage) or 130 (Ctrl-C), and a message of at most three lines."""
+    """Commands with exit code 0, 1 (failure), 2 (wrong usage), 3 (``--strict``) or 130 (Ctrl-C).
+
+    The message of a failure has at most three lines.
+    """
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Names of all commands."""

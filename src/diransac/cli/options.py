@@ -33,6 +33,7 @@ __all__ = [
     "Report",
     "ResultFile",
     "Search",
+    "StrictFlag",
     "known_methods",
     "output_file",
 ]
@@ -102,6 +103,9 @@ Report = Annotated[
     typer.Option("--report", parser=output_file, metavar="FILE.html", help="Where to write a page to look at."),
 ]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")]
+StrictFlag = Annotated[
+    bool, typer.Option("--strict", help='End with exit code 3 where the verdict is "do not rely on this".')
+]
 
 
 def _option(*names: str, **about: Any) -> Any:

@@ -15,7 +15,10 @@ import typer
 
 from diransac.identification.method import Callback, Progress
 
-__all__ = ["bar", "show"]
+__all__ = ["bar", "end", "show"]
+
+UNRELIABLE = 3
+"""Exit code of `end`."""
 
 _FIRST_LINE, _LINE_EVERY = 5.0, 10.0
 """Seconds until the first line of progress without a terminal, and between lines."""
@@ -43,6 +46,20 @@ def show(shown: Showable, as_json: bool) -> None:
         typer.echo(json.dumps(_finite(shown.to_dict()), indent=1, ensure_ascii=False, allow_nan=False))
     else:
         typer.echo(str(shown))
+
+
+def end(verdict: str, strict: bool) -> None:
+    """End a command, after all of its output, with exit code 3 if it is strict and the verdict is the worst.
+
+    Parameters
+    ----------
+    verdict : str
+        As `Result.verdict`.
+    strict : bool
+        Whether a verdict has an exit code of its own.
+    """
+    if strict and verdict == "do not rely on this":
+        raise typer.Exit(UNRELIABLE)
 
 
 def _finite(data: object) -> object:

@@ -13,7 +13,7 @@ from diransac.data.log import Log
 from diransac.errors import DiransacError
 from diransac.identification.identify import identify
 from diransac.identification.method import Method
-from diransac.identification.result import Result
+from diransac.identification.result import MARKS, Result
 from diransac.model import Model, Parameter
 from diransac.model.library import BUILTIN
 from diransac.text_table import aligned
@@ -55,14 +55,14 @@ class Comparison:
 
     def __str__(self) -> str:
         units = [f"{name} [{parameter.unit}]" for name, parameter in self.model.parameters.items()]
-        rows = [["method", *units, "fit error", "inliers", "samples", "seconds"]]
+        rows = [["method", *units, "fit error", "inliers", "samples", "seconds", "verdict"]]
         rows += [self._row(name, result) for name, result in self.results.items()]
         lines = [f"{self.model.name} from {self._source}", *aligned(rows)]
         lines += [f"{name}: {reason}" for name, reason in self.refusals.items()]
         return "\n".join([*lines, *self._remarks()])
 
     def _remarks(self) -> Iterator[str]:
-        """Sentences on figures that do not compare, and on findings of a diagnosis."""
+        """Sentences on figures that do not compare, and the findings against each result."""
         yield "±: one standard error"
         if "diransac" in self.results:
             yield "diransac's fit error is a mean square, the others' a root mean square, eq. (2)"
@@ -76,19 +76,7 @@ class Comparison:
         if interpolated:
             yield f"{', '.join(interpolated)}: inputs interpolated linearly"
         for name, result in self.results.items():
-            for parameter in (*result.violations, *result.on_bounds):
-                where = "outside its bounds" if parameter in result.violations else "on its bound, its interval unknown"
-                yield f"! {name}: {parameter} is {where}"
-            yield from (f"! {name}: {log.remark}" for log in result.logs if log.remark)
-        for name, result in diagnosed.items():
-            found = result.diagnosis
-            assert found is not None
-            if found.unidentifiable:
-                yield f"{name}: not identifiable from this log: {', '.join(found.unidentifiable)}"
-            if found.input_delay_significant:
-                sense = "later" if found.input_delay > 0.0 else "earlier"
-                delay = f"{1e3 * abs(found.input_delay):.3g} ms {sense} than recorded"
-                yield f"{name}: inputs act {delay}; the other methods assume no delay"
+            yield from (f"{MARKS[x.level]} {name}: {x}" for x in result.findings if x.level in MARKS)
 
     def _row(self, name: str, result: Result) -> list[str]:
         errors = result.standard_errors
@@ -105,6 +93,7 @@ class Comparison:
             inliers,
             str(result.iterations),
             f"{self.seconds[name]:.2f}",
+            result.verdict,
         ]
 
 

@@ -297,9 +297,7 @@ class Dataset:
         """Mask over the rows of all given logs, log after log, from one mask per segment."""
         whole = []
         for one, log, mask in zip(self.segments, self.given, masks, strict=True):
-            begin = one.log.time[one.offset]
-            first = round(float(begin - log.time[0]) / log.dt)
-            rows = np.zeros(len(log), dtype=bool)
+            rows, first = np.zeros(len(log), dtype=bool), one.first_row_in(log)
             rows[first : first + len(mask)] = mask
             whole.append(rows)
         return np.concatenate(whole)

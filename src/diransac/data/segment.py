@@ -69,6 +69,10 @@ class Segment:
         """Rows that count."""
         return int(self.valid.sum())
 
+    def first_row_in(self, given: Log) -> int:
+        """Row of the log as it was given that is row 0 here."""
+        return round(float(self.log.time[self.offset] - given.time[0]) / given.dt)
+
     def column(self, name: str) -> FloatArray:
         """A measured signal (N,)."""
         return self.measured[:, self.signals.index(name)]

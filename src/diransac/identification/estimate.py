@@ -1,10 +1,14 @@
-"""`Estimate`: parameters, covariance and diagnosis that a method returns; `Evaluation`: its simulation's agreement."""
+"""`Estimate`: parameters, covariance and diagnosis that a method returns; `Evaluation`: its simulation's agreement.
+
+`Finding` is a sentence for or against a result, with its level.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -19,7 +23,63 @@ from diransac.identification.serialization import (
     WholeNumbers,
 )
 
-__all__ = ["Diagnosis", "Estimate", "Evaluation", "LogSummary", "Resolution"]
+__all__ = ["Diagnosis", "Estimate", "Evaluation", "Finding", "Level", "LogSummary", "Prediction", "Resolution"]
+
+Level = Literal["note", "good", "care", "bad"]
+"""Levels of findings, the least serious first."""
+
+
+class Finding(str):
+    """A sentence for or against a result: a string with a level.
+
+    Parameters
+    ----------
+    level : {"note", "good", "care", "bad"}
+        ``good`` supports the result, ``care`` and ``bad`` oppose it, a ``note`` is neutral.
+    text : str
+        The sentence; a bad one ends with what to do.
+
+    Raises
+    ------
+    ValueError
+        There is no such level.
+    """
+
+    level: Level
+
+    def __new__(cls, level: Level, text: str) -> Finding:
+        """A finding of a level."""
+        if level not in get_args(Level):
+            raise ValueError(f"level {level!r} of a finding; there are {', '.join(get_args(Level))}")
+        made = super().__new__(cls, text)
+        made.level = level
+        return made
+
+    def __getnewargs__(self) -> tuple[Level, str]:  # type: ignore[override]  # a string's are its text alone
+        return self.level, str(self)
+
+    def __repr__(self) -> str:
+        return f"Finding({self.level!r}, {str(self)!r})"
+
+    @property
+    def seriousness(self) -> int:
+        """Place of the level among the levels: 0 for a note, 3 for bad."""
+        return get_args(Level).index(self.level)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _source: object, _handler: object) -> Any:
+        """Form in JSON: level and text."""
+        from pydantic_core import core_schema
+
+        text = core_schema.typed_dict_field(core_schema.str_schema(strict=True))
+        level = core_schema.typed_dict_field(core_schema.literal_schema(list(get_args(Level))))
+        return core_schema.no_info_after_validator_function(
+            lambda found: cls(**found),
+            core_schema.typed_dict_schema({"level": level, "text": text}),
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                lambda found: {"level": found.level, "text": str(found)}
+            ),
+        )
 
 
 @dataclass(frozen=True)
@@ -111,6 +171,20 @@ class Diagnosis:
         """Indices of the windows of one log."""
         return np.flatnonzero(self.window_log == log)
 
+    def of_log(self, log: int, rows: slice) -> Diagnosis:
+        """The diagnosis of one log alone, whose rows among those of all logs are given."""
+        windows = self.windows_of(log)
+        return replace(
+            self,
+            outliers={name: mask[rows] for name, mask in self.outliers.items()},
+            window_log=np.zeros_like(windows),
+            unmodelled_time=self.unmodelled_time[windows],
+            unmodelled_accelerations={n: x[windows] for n, x in self.unmodelled_accelerations.items()},
+            unmodelled_forces={n: x[windows] for n, x in self.unmodelled_forces.items()},
+            smoothed_time=self.smoothed_time[windows],
+            smoothed_states={n: x[windows] for n, x in self.smoothed_states.items()},
+        )
+
     def first_states(self, log: int) -> dict[str, float]:
         """Most probable state at the first row of one log, by name."""
         first = self.windows_of(log)[0]
@@ -170,6 +244,8 @@ class Estimate:
         Findings and changes, a sentence each.
     diagnosis : Diagnosis, optional
         Noise, outliers and unmodelled forces; of lo-diransac alone.
+    checks : tuple of Finding, optional
+        Findings of the method's own tests.
     """
 
     parameters: Values
@@ -185,6 +261,7 @@ class Estimate:
     squared_error: bool = False
     notes: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
+    checks: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, np.float64).reshape(len(self.parameters), len(self.parameters))
@@ -230,6 +307,36 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
+class Prediction:
+    """Agreement of the simulation of one log, which restarts periodically where the smoothed states are known.
+
+    Parameters
+    ----------
+    restart_period : float
+        Time after which the simulation restarts, s; infinite: one simulation of the whole log.
+    divergence : float
+        Time of the log at which the simulation becomes infinite, s; infinite if it does not.
+    relative_errors : mapping of str to float
+        Median absolute error of each signal with an inlier threshold, less that of its noise where that is known, over
+        the range of the signal.
+    unexplained : mapping of str to float
+        Share of each acceleration that the model leaves unexplained; empty where that is unknown.
+    n_rows, n_excluded : int
+        Number of rows that count, and of those in which a required signal is missing.
+    weakest_window : tuple of float
+        Beginning and end of the window of the log with the lowest inlier fraction, s, and that fraction.
+    """
+
+    restart_period: Number
+    divergence: Number
+    relative_errors: Values
+    unexplained: Values
+    n_rows: int
+    n_excluded: int
+    weakest_window: tuple[Number, Number, Number]
+
+
+@dataclass(frozen=True)
 class LogSummary:
     """Provenance and scores of one log of an identification.
 
@@ -251,6 +358,8 @@ class LogSummary:
         Disagreement of this log's own estimate with those of the other logs; empty where they agree.
     prepared_fingerprint : str, optional
         Digest of the log after its preparation.
+    prediction : Prediction, optional
+        Agreement of the simulation of this log; None where it lacks its initial state.
     """
 
     source: str
@@ -263,3 +372,4 @@ class LogSummary:
     inlier_fraction: Number = np.nan
     remark: str = ""
     prepared_fingerprint: str = ""
+    prediction: Prediction | None = None

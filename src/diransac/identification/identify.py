@@ -13,10 +13,11 @@ from diransac.data.dataset import Dataset, as_logs
 from diransac.data.log import Log
 from diransac.errors import DiransacError, SettingsError
 from diransac.identification.agreement import disagreements
-from diransac.identification.estimate import Evaluation, LogSummary
+from diransac.identification.estimate import Evaluation, LogSummary, Prediction
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
 from diransac.identification.method import Callback, Method, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, factory
+from diransac.identification.prediction import predictions
 from diransac.identification.result import Result
 from diransac.identification.settings import Settings
 from diransac.model import Model
@@ -186,7 +187,9 @@ class _Task:
             options=dict(self.method.options()),
             estimate=estimate,
             evaluation=evaluation,
-            logs=_summaries(dataset, evaluation, remarks),
+            logs=_summaries(
+                dataset, evaluation, remarks, predictions(estimate, evaluation, dataset, scoring, criteria)
+            ),
             notes=(*dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x), *incomparable),
         )
 
@@ -213,9 +216,11 @@ class _Task:
         return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}
 
 
-def _summaries(dataset: Dataset, evaluation: Evaluation, remarks: Sequence[str]) -> tuple[LogSummary, ...]:
+def _summaries(
+    dataset: Dataset, evaluation: Evaluation, remarks: Sequence[str], predicted: Sequence[Prediction | None]
+) -> tuple[LogSummary, ...]:
     scores = zip(evaluation.fit_errors.tolist(), evaluation.inlier_fractions.tolist(), strict=True)
-    parts = zip(dataset.given, dataset.segments, scores, remarks, strict=True)
+    parts = zip(dataset.given, dataset.segments, scores, remarks, predicted, strict=True)
     return tuple(
         LogSummary(
             log.source,
@@ -228,6 +233,7 @@ def _summaries(dataset: Dataset, evaluation: Evaluation, remarks: Sequence[str])
             fraction,
             remark,
             one.log.fingerprint,
+            prediction,
         )
-        for log, one, (error, fraction), remark in parts
+        for log, one, (error, fraction), remark, prediction in parts
     )

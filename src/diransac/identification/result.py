@@ -16,18 +16,22 @@ from diransac.atomic import write_text
 from diransac.data.dataset import ParameterLayout
 from diransac.data.log import Log
 from diransac.errors import DiransacError, ResultError, SettingsError
-from diransac.identification.estimate import Diagnosis, Estimate, Evaluation, LogSummary
+from diransac.identification.estimate import Diagnosis, Estimate, Evaluation, Finding, LogSummary
+from diransac.identification.findings import Verdict, findings_of, verdict_of
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
 from diransac.model import Model
 from diransac.text_table import aligned, telling_digits
 
-__all__ = ["Result"]
+__all__ = ["MARKS", "Result"]
 
 _FORMAT = 4
-_FEW_INLIERS = 0.5
 _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
+_ADDED: Mapping[str, Any] = {"checks": []}
+"""Keys that the first files of this format lack, with their values."""
+MARKS = {"bad": "!", "care": "·"}
+"""Marks of the findings that are printed."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,8 @@ class _Derived:
     standard_errors: Values
     intervals_95: NumberPairs
     violations: tuple[str, ...]
+    verdict: Verdict
+    findings: tuple[Finding, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +199,16 @@ class Result:
         stuck = self.layout.on_bounds(self.estimate.values)
         return tuple(n for n, on_bound in zip(self.layout.names, stuck, strict=True) if on_bound)
 
+    @cached_property
+    def findings(self) -> tuple[Finding, ...]:
+        """Sentences for and against the result, the most serious first, each with its ``level``."""
+        return findings_of(self)
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict: "usable", "usable with care" or "do not rely on this", by the most serious finding."""
+        return verdict_of(self.findings)
+
     @property
     def units(self) -> dict[str, str]:
         """Unit of each parameter."""
@@ -290,10 +306,15 @@ class Result:
             **dump(self.evaluation),
             # Its notes hold the estimate's, too.
             **dump(_Provenance(**{n: getattr(self, n) for n in _Provenance.__dataclass_fields__})),
-            **dump(_Derived(self.units, self.standard_errors, self.intervals(), self.violations)),
+            **dump(self._derived()),
             "settings": self.settings.to_dict(),
             "model": self.model.to_dict(),
         }
+
+    def _derived(self) -> _Derived:
+        return _Derived(
+            self.units, self.standard_errors, self.intervals(), self.violations, self.verdict, self.findings
+        )
 
     @classmethod
     def from_dict(cls, data: object) -> Result:
@@ -322,7 +343,7 @@ class Result:
 
     @classmethod
     def _from_checked(cls, data: Mapping[str, Any]) -> Result:
-        data = {**data, **{key: data[f"{key}_of_logs"] for key in _BY_LOG if f"{key}_of_logs" in data}}
+        data = {**_ADDED, **data, **{key: data[f"{key}_of_logs"] for key in _BY_LOG if f"{key}_of_logs" in data}}
         model, plain = Model.from_dict(data["model"]), load(_Provenance, data)
         estimate, evaluation = load(Estimate, data), load(Evaluation, data)
         layout = ParameterLayout(model.parameters, len(plain.logs))
@@ -388,7 +409,7 @@ class Result:
         return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
 
     def __str__(self) -> str:
-        return "\n".join([self._headline(), *self._table(), self._summary(), *self._diagnosed(), *self._warnings()])
+        return "\n".join([self._headline(), *self._table(), self._summary(), *self._diagnosed(), *self._assessed()])
 
     def _headline(self) -> str:
         many = len(self.logs) > 1
@@ -437,36 +458,13 @@ class Result:
             rows.append([log.source, f"{log.dt * (log.n_rows - 1):.4g}", f"{log.fit_error:.4g}", inliers, *values])
         return rows
 
-    def _warnings(self) -> list[str]:
-        lines = [f"! {n} = {self.estimate.parameters[n]:.6g} is outside its bounds" for n in self.violations]
-        lines += [
-            f"! {n} = {self.estimate.parameters[n]:.6g} is on its bound, where the fit was stopped: its interval is "
-            "unknown"
-            for n in self.on_bounds
-        ]
-        lines += self._warnings_of_search() if self.diagnosis is None else self._warnings_of_diagnosis(self.diagnosis)
-        remarks = [log.remark for log in self.logs if log.remark]
-        lines += [f"! {remark}" for remark in remarks]
+    def _assessed(self) -> list[str]:
+        """The verdict, the findings against the result, sensitivities and notes."""
+        lines = [f"verdict: {self.verdict}"]
+        lines += [f"{MARKS[finding.level]} {finding}" for finding in self.findings if finding.level in MARKS]
         for name, (half, double) in (self.bandwidth_sensitivity or {}).items():
             lines.append(
                 f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice"
             )
+        remarks = [log.remark for log in self.logs]
         return lines + [f"  {note}" for note in self.notes if note not in remarks]
-
-    def _warnings_of_search(self) -> list[str]:
-        lines = []
-        if self.inlier_fraction < _FEW_INLIERS:
-            lines.append("! the simulation agrees with less than half of the log: do not rely on these parameters")
-        wanted = self.settings.stop_inlier_fraction
-        if self.iterations and wanted is not None and self.inlier_fraction < wanted:
-            lines.append(f"! the search ended short of the {100 * wanted:.3g} % inliers that it was to reach")
-        if not np.isfinite(self.covariance).all() and not self.on_bounds:
-            lines.append(f"! intervals are unknown: {self.n_fitted} fitted rows are too few for a jackknife")
-        return lines
-
-    def _warnings_of_diagnosis(self, found: Diagnosis) -> list[str]:
-        lines = [f"! {name} is not identifiable from this log; excite it" for name in found.unidentifiable]
-        if found.input_delay_significant:
-            sense = "later" if found.input_delay > 0.0 else "earlier"
-            lines.append(f"! inputs act {1e3 * abs(found.input_delay):.3g} ms {sense} than recorded")
-        return lines

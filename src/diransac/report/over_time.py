@@ -10,10 +10,10 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.log import Log
 from diransac.identification.estimate import Diagnosis
-from diransac.report.assessment import windows
+from diransac.identification.prediction import bulk_range
 from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, strip, time_axis, time_plot
-from diransac.report.rendering import number, percent, plural, share
-from diransac.report.runs import Run, bulk_range
+from diransac.report.runs import Run
+from diransac.text_table import number, percent, plural, share
 
 __all__ = ["LogFigures", "figures_of"]
 
@@ -82,11 +82,14 @@ def figures_of(log: Log, runs: Sequence[Run], n_logs: int) -> LogFigures:
 
 def _method(runs: Sequence[Run]) -> str:
     """Starting points of the simulations."""
-    periods = [run.restart_period for run in runs if np.isfinite(run.restart_period)]
-    if not periods:
+    restarted = [run for run in runs if np.isfinite(run.restart_period)]
+    if not restarted:
         return "Each simulation starts at the first row and depends on the inputs alone."
+    state = "measured" if restarted[0].diagnosis is None else "smoothed"
+    which = "" if len(restarted) == len(runs) else f" by {', '.join(run.label for run in restarted)}"
+    period = number(restarted[0].restart_period)
     text = (
-        f"Each simulation depends on the inputs alone and restarts every {number(periods[0])} s from the smoothed "
+        f"Each simulation{which} depends on the inputs alone and restarts every {period} s from the {state} "
         "state, so that the effect of unmodelled forces does not accumulate."
     )
     if len(runs) > 1:
@@ -254,8 +257,8 @@ def _unmodelled_figure(run: Run, name: str, values: FloatArray, found: Diagnosis
     unit = _FORCES.get(model.units[name], "") if found.unmodelled_forces else model.units[name]
     coordinate = model.rate_names[list(model.accelerations).index(name)]
     what = f"force on {coordinate}" if found.unmodelled_forces else name
-    rms, fraction = float(np.sqrt(np.mean(np.square(values)))), run.unmodelled_fraction.get(name)
-    relative = "no modelled motion" if fraction is None else f"{percent(fraction)} of the modelled"
+    rms, fraction = float(np.sqrt(np.mean(np.square(values)))), run.unexplained.get(name)
+    relative = "no motion" if fraction is None else f"{percent(fraction)} of the acceleration"
     least = _VISIBLE * rms / fraction if fraction else 0.0
     scale = padded(min(-least, float(values.min())), max(least, float(values.max())))
     trace = Trace(what, f"m{i}", "line", *_steps(found, values, timeline))
@@ -292,7 +295,7 @@ def _inliers(runs: Sequence[Run], timeline: Timeline) -> Figure:
 
 def _fraction_trace(run: Run, i: int) -> Trace:
     """The inlier fraction as steps over the log's rows."""
-    edges, fractions = windows(run)
+    edges, fractions = run.windows()
     rows = run.first_row + np.column_stack([edges[:-1], edges[1:] - 1]).ravel()
     return Trace(run.label, f"m{i}", "line", rows, np.repeat(100.0 * fractions, 2))
 

@@ -12,8 +12,9 @@ from diransac.identification.estimate import Resolution
 from diransac.identification.methods import default_options
 from diransac.identification.settings import Settings
 from diransac.model import Model
-from diransac.report.rendering import number, numbered, percent, plural
+from diransac.report.rendering import numbered
 from diransac.report.runs import Entry, summaries
+from diransac.text_table import number, percent, plural
 
 __all__ = ["log_facts", "model_text", "notes", "preparation", "settings", "snippet", "unique_models", "versions"]
 

@@ -1,10 +1,9 @@
-"""Jinja templates of the pages, and numbers as text."""
+"""Jinja templates of the pages."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -13,15 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 from diransac.atomic import write_text
 from diransac.errors import ResultError
+from diransac.text_table import number, percent, plural
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["Table", "encodable", "environment", "number", "numbered", "percent", "plural", "share", "write_page"]
-
-_LEAST_PERCENT = 0.01
-_TIMES = 3.0
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+__all__ = ["Table", "encodable", "environment", "numbered", "write_page"]
 
 
 @dataclass(frozen=True)
@@ -96,41 +92,7 @@ def _policy(script: str) -> str:
     return f"{allowed}; script-src 'sha256-{digest}'"
 
 
-# ---------------------------------------------------------------------- numbers and names
-
-
-def number(x: float, digits: int = 4) -> str:
-    """A number to significant digits: ``−1.5``, ``1.2×10⁻⁶``, ``∞``, ``–`` for NaN."""
-    if math.isnan(x):
-        return "–"
-    if math.isinf(x):
-        return "∞" if x > 0 else "−∞"
-    mantissa, _, exponent = f"{x:.{digits}g}".partition("e")
-    power = f"×10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if exponent else ""
-    return mantissa.replace("-", "−") + power
-
-
-def percent(fraction: float) -> str:
-    """A fraction in percent to about two digits: ``0.42 %``, ``13 %``, ``< 0.01 %``."""
-    x = 100.0 * fraction
-    if 0.0 < abs(x) < _LEAST_PERCENT:
-        return f"{'< ' if x > 0.0 else '> −'}{_LEAST_PERCENT} %"
-    if 99.0 < x < 100.0:
-        return f"{min(x, 99.9):.1f} %"
-    rounded = f"{x:.0f}" if math.isfinite(x) and 10.0 <= abs(x) < 1e5 else number(x, 2)
-    return f"{rounded.replace('-', '−')} %"
-
-
-def share(x: float, whole: str) -> str:
-    """A ratio to a whole: ``2 % of its range``, ``19 times its range``."""
-    if math.isfinite(x) and x >= _TIMES:
-        return f"{number(x, 2)} times {whole}"
-    return f"{percent(x)} of {whole}"
-
-
-def plural(count: int, noun: str) -> str:
-    """A count with its noun: ``1 row``, ``2,501 rows``."""
-    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+# ---------------------------------------------------------------------- names
 
 
 def numbered(names: Iterable[str]) -> list[str]:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from diransac.data.log import Log
+from diransac.identification.estimate import Finding, Level, LogSummary
+from diransac.identification.findings import Verdict, bounds_text, by_seriousness, findings_on_held_out, verdict_of
 from diransac.identification.validation import Validation
-from diransac.report.assessment import Finding, Level, bounds_text, findings, verdict, worst
 from diransac.report.figures import Scale, Tick, padded, ticks
-from diransac.report.rendering import Table, number, percent, plural
+from diransac.report.rendering import Table
 from diransac.report.runs import Entry, Run, summaries
-from diransac.text_table import telling_digits
+from diransac.text_table import number, percent, plural, telling_digits
 
 __all__ = [
     "card",
@@ -27,6 +28,8 @@ __all__ = [
     "short_term_scores",
 ]
 
+_LEVELS: Mapping[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}
+"""Look of each verdict."""
 _WIDEST = 2.0
 _LONG = 6
 
@@ -68,15 +71,32 @@ class Card:
 
     label: str
     level: Level
-    verdict: str
+    verdict: Verdict
     findings: tuple[Finding, ...]
 
 
 def card(entry: Entry) -> Card:
-    """The verdict on one result."""
-    found = findings(entry.runs)
-    level = worst(found)
-    return Card(entry.label, level, verdict(level), tuple(found))
+    """The verdict on one result: its own findings, and those on held-out logs of the page."""
+    held_out = [_summary(run) for run in entry.runs if run.held_out]
+    found = entry.result.findings
+    if held_out:
+        found = by_seriousness((*found, *findings_on_held_out(entry.result, held_out)))
+    verdict = verdict_of(found)
+    return Card(entry.label, _LEVELS[verdict], verdict, found)
+
+
+def _summary(run: Run) -> LogSummary:
+    """Summary of a held-out log."""
+    log = run.observations.log
+    return LogSummary(
+        run.log_name,
+        log.fingerprint,
+        float(log.time[0]),
+        log.dt,
+        len(run.observations) + run.observations.offset,
+        inlier_fraction=run.inlier_fraction,
+        prediction=run.summary(None),
+    )
 
 
 def differences(entries: Sequence[Entry]) -> str:
@@ -289,11 +309,11 @@ def _delay(entry: Entry) -> str:
 
 def short_term_scores(runs: Sequence[Run]) -> Table | None:
     """RMS error of the restarted simulations over one log; None without a diagnosis of it."""
-    having = [run for run in runs if np.isfinite(run.restart_period)]
+    having = [run for run in runs if np.isfinite(run.restart_period) and run.diagnosis is not None]
     if not having:
         return None
     names = dict.fromkeys(name for run in having for name in run.observations.signals)
-    noise = having[0].diagnosis.noise_std if having[0].diagnosis is not None else {}
+    noise = having[0].noise
     units = having[0].result.model.units
     rows = [
         (name, units[name], number(noise.get(name, np.nan), 3), *(_regular_rms(run, name) for run in having))

@@ -15,8 +15,9 @@ from diransac.plots.estimates import LEAST, methods_and_errors, plot_estimates
 from diransac.plots.figure import svg
 from diransac.plots.paths import levels_with_paths, plot_paths
 from diransac.plots.study import axis_label, level_labels, plot_study, title_of
-from diransac.report.rendering import Table, number, percent, plural, write_page
+from diransac.report.rendering import Table, write_page
 from diransac.study.summary import ParameterErrors, Summary, TrackingErrors, summarise
+from diransac.text_table import number, percent, plural
 
 __all__ = ["write_study_report"]
 

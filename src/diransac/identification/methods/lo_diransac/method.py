@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
 from diransac.errors import IdentificationError, LogError, ModelError
-from diransac.identification.estimate import Diagnosis, Estimate, Resolution
+from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.instrumental_variables import (
@@ -198,14 +198,21 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         # The fit satisfies the bounds; least squares on its motion may violate them.
         result = replace(result, parameters=kept, unexplained=unexplained(intervals, refined.fit, kept))
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
+    checks = tuple(_checks(settings, intervals, motion, refined))
+    late = float(intervals.delay + intervals.lag + refined.fit.shared[-1])
+    found = _Found(dataset, intervals, motion, refined.fit, result, late)
+    return _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
+
+
+def _checks(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, refined: Refinement
+) -> Iterator[Finding]:
+    """Findings on the fit itself."""
     if _explains_nothing(intervals, motion, refined):
-        notes = (*notes, "the model explains almost nothing of this log: do not rely on these parameters")
+        advice = "check its terms, and the signs and units of the log"
+        yield Finding("bad", f"The model explains almost nothing of this log: {advice}.")
     if not refined.converged and settings.max_steps:
-        notes = (*notes, "local optimisation did not converge within its limit of steps")
-    found = _Found(
-        dataset, intervals, motion, refined.fit, result, intervals.delay + intervals.lag + refined.fit.shared[-1]
-    )
-    return _estimate(settings, found, len(hypotheses), refined.converged, notes)
+        yield Finding("care", f"Local optimisation did not converge within its limit of {settings.max_steps} steps.")
 
 
 def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
@@ -283,7 +290,12 @@ class _Found:
 
 
 def _estimate(
-    settings: LoDiransacSettings, found: _Found, n_hypotheses: int, converged: bool, notes: tuple[str, ...]
+    settings: LoDiransacSettings,
+    found: _Found,
+    n_hypotheses: int,
+    converged: bool,
+    notes: tuple[str, ...],
+    checks: tuple[Finding, ...],
 ) -> Estimate:
     dataset, intervals, result = found.dataset, found.intervals, found.result
     names = dataset.layout.names
@@ -305,6 +317,7 @@ def _estimate(
         resolution=Resolution("rk4", settings.substeps, intervals.hold),
         notes=notes,
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x)),
+        checks=checks,
     )
 
 

@@ -1,0 +1,356 @@
+"""Findings for and against a result, in sentences, and the verdict that follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from diransac.identification.estimate import Finding, Level
+from diransac.text_table import number, percent, plural, share
+
+if TYPE_CHECKING:
+    from diransac.identification.estimate import LogSummary, Prediction
+    from diransac.identification.result import Result
+    from diransac.model import Parameter
+
+__all__ = ["Verdict", "bounds_text", "by_seriousness", "findings_of", "findings_on_held_out", "verdict_of"]
+
+Verdict = Literal["usable", "usable with care", "do not rely on this"]
+
+_NEAR, _FAR = 0.05, 0.25
+"""Median errors of simulations, over the range of the signal, that are good, and that need care."""
+_MOST, _HALF, _FEW = 0.7, 0.5, 0.01
+_BREAKDOWN = 2.0 / 3.0
+"""Fraction of outliers beyond which the estimate of lo-diransac is arbitrary."""
+_UNCERTAIN = 0.5
+_STEADY, _UNSTEADY = 0.05, 0.2
+"""Relative changes of a parameter with the filter's bandwidth that are good, and that need care."""
+
+
+def findings_of(result: Result) -> tuple[Finding, ...]:
+    """Findings on a result, the most serious first.
+
+    They depend on what the result contains alone: parameters and intervals, the predictions of its logs, its diagnosis
+    and the checks of its method.
+
+    Parameters
+    ----------
+    result : Result
+    """
+    return by_seriousness(
+        (
+            *_bounds(result),
+            *_simulation(result.logs, restarts=result.diagnosis is not None),
+            *_inliers(result.logs, result.inlier_fraction, restarted=result.diagnosis is not None),
+            *_diagnosis(result),
+            *_uncertainty(result),
+            *_bandwidth(result),
+            *_search(result),
+            *_logs(result),
+            *result.estimate.checks,
+        )
+    )
+
+
+def findings_on_held_out(result: Result, logs: Sequence[LogSummary]) -> tuple[Finding, ...]:
+    """Findings on the simulations of logs that a result was not identified from, the most serious first.
+
+    Parameters
+    ----------
+    result : Result
+    logs : sequence of LogSummary
+        The held-out logs, with their predictions and inlier fractions.
+    """
+    restarted = result.diagnosis is not None
+    counts = [one.prediction.n_rows for one in logs if one.prediction is not None]
+    fraction = float(np.average([one.inlier_fraction for one in logs if one.prediction is not None], weights=counts))
+    found = (
+        *_simulation(logs, restarts=restarted),
+        *_inliers(logs, fraction, restarted=restarted),
+        *_excluded(logs),
+    )
+    names = ", ".join(one.source for one in logs)
+    note = Finding("note", f"Not used for identification (held-out validation): {names}.")
+    return by_seriousness((*(Finding(x.level, f"Held out: {_lower(x)}") for x in found), note))
+
+
+def by_seriousness(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """The findings, the most serious first, in their order within a level."""
+    return tuple(sorted(findings, key=lambda finding: -finding.seriousness))
+
+
+def verdict_of(findings: Iterable[Finding]) -> Verdict:
+    """The verdict by the most serious finding; "usable" only where a finding supports the result.
+
+    Parameters
+    ----------
+    findings : iterable of Finding
+    """
+    levels = {finding.level for finding in findings}
+    if "bad" in levels:
+        return "do not rely on this"
+    return "usable" if "good" in levels and "care" not in levels else "usable with care"
+
+
+def _graded(value: float, good: float, care: float) -> Level:
+    """Level of a value of which less is better."""
+    return "good" if value <= good else "care" if value <= care else "bad"
+
+
+def _lower(text: str) -> str:
+    return text[:1].lower() + text[1:]
+
+
+# ---------------------------------------------------------------------- bounds
+
+
+def _bounds(result: Result) -> Iterator[Finding]:
+    parameters = result.model.parameters
+    for name in result.violations:
+        bounds = parameters[name.partition("[")[0]]
+        value = f"{name} = {number(result.estimate.parameters[name])} {bounds.unit}"
+        yield Finding(
+            "bad",
+            f"{value} is outside its bounds ({bounds_text(bounds)}), which is physically impossible: check the signs "
+            "and units of the log and the terms of the model.",
+        )
+    for name in result.on_bounds:
+        value = number(result.estimate.parameters[name])
+        yield Finding(
+            "bad",
+            f"{name} = {value} is on its bound, where the fit was stopped: its interval is unknown; check the bound, "
+            "or take the parameter out of the model.",
+        )
+    if not (result.violations or result.on_bounds) and any(bounds_text(x) for x in parameters.values()):
+        yield Finding("note", "Every parameter is within its bounds.")
+
+
+def bounds_text(parameter: Parameter) -> str:
+    """Bounds as text: ``> 0``, ``≥ 0``, ``0 to 2``; empty without bounds."""
+    if parameter.positive and parameter.lower <= 0.0:
+        return "> 0" if np.isinf(parameter.upper) else f"> 0, ≤ {number(parameter.upper)}"
+    if np.isinf(parameter.lower) and np.isinf(parameter.upper):
+        return ""
+    if np.isinf(parameter.upper):
+        return f"≥ {number(parameter.lower)}"
+    if np.isinf(parameter.lower):
+        return f"≤ {number(parameter.upper)}"
+    return f"{number(parameter.lower)} to {number(parameter.upper)}"
+
+
+# ---------------------------------------------------------------------- simulation and inliers
+
+
+def _simulation(logs: Sequence[LogSummary], *, restarts: bool) -> Iterator[Finding]:
+    """Errors of the simulations relative to the signals' ranges, of the worst log.
+
+    ``restarts`` says that the method restarts simulations.  Then one of a whole log needs care at worst, because
+    unmodelled forces accumulate in it.
+    """
+    for one, found in _predicted(logs):
+        if np.isfinite(found.divergence):
+            where = f" in {one.source}" if len(logs) > 1 else ""
+            yield Finding(
+                "bad" if np.isfinite(found.restart_period) or not restarts else "care",
+                f"The simulation diverges at t = {number(found.divergence)} s{where}: check the signs and units of the "
+                "log and the terms of the model.",
+            )
+    scored = [x for x in _predicted(logs) if not np.isfinite(x[1].divergence) and x[1].relative_errors]
+    if scored:
+        one, found = max(scored, key=lambda x: max(x[1].relative_errors.values()))
+        yield _median_error(found, _worst_of(one, logs), restarts=restarts)
+    if any(one.prediction is None for one in logs):
+        yield Finding(
+            "care",
+            "No simulation is compared with the log, because its initial state is missing or the file is of an earlier "
+            "version: validate the model on another log.",
+        )
+
+
+def _median_error(found: Prediction, where: str, *, restarts: bool) -> Finding:
+    """Finding on the signal with the largest median error of a simulation."""
+    errors = found.relative_errors
+    name, restarted = max(errors, key=lambda n: errors[n]), bool(np.isfinite(found.restart_period))
+    level = _graded(errors[name], _NEAR, _FAR)
+    what = share(errors[name], "its range")
+    if restarted:
+        method = f"simulations restarted every {number(found.restart_period)} s"
+        what = f"{what} in excess of the noise"
+        if not errors[name]:
+            return Finding(level, f"Median error of {method}: within the noise, in every signal.")
+    else:
+        method = "one simulation of the whole log"
+        level = "care" if restarts and level == "bad" else level
+    others = "the other scored signals are closer" if len(errors) > 1 else "no other signal is scored"
+    advice = "; check the terms of the model and the units of the log" if level == "bad" else ""
+    return Finding(level, f"Median error of {method}: {name} is off by {what}; {others}{where}{advice}.")
+
+
+def _predicted(logs: Sequence[LogSummary]) -> list[tuple[LogSummary, Prediction]]:
+    return [(one, one.prediction) for one in logs if one.prediction is not None]
+
+
+def _worst_of(one: LogSummary, logs: Sequence[LogSummary]) -> str:
+    """The log's name as a suffix, if there are several."""
+    return f" ({one.source}, the worst of {plural(len(logs), 'log')})" if len(logs) > 1 else ""
+
+
+def _inliers(logs: Sequence[LogSummary], fraction: float, *, restarted: bool) -> Iterator[Finding]:
+    """The inlier fraction of all logs, and the window with the fewest inliers."""
+    predicted = _predicted(logs)
+    if not np.isfinite(fraction):
+        return
+    n_rows = sum(found.n_rows for _, found in predicted) or sum(one.n_rows for one in logs)
+    text = f"{percent(fraction)} of {plural(n_rows, 'row')} agree with"
+    if restarted:
+        yield Finding(
+            "note", f"{text} an open-loop simulation of the whole log, in which unmodelled forces accumulate."
+        )
+        return
+    if fraction < _HALF:
+        advice = "check the terms of the model and the units of the log, or use lo-diransac"
+        yield Finding("bad", f"{text} the simulation, which is less than half of the log: {advice}.")
+        return
+    yield Finding("good" if fraction >= _MOST else "care", f"{text} the simulation.")
+    for one, found in predicted:
+        begin, end, lowest = found.weakest_window
+        if lowest < _HALF * fraction:
+            where = f" of {one.source}" if len(logs) > 1 else ""
+            between = f"Between {number(begin)} and {number(end)} s{where}"
+            yield Finding(
+                "care", f"{between} only {percent(lowest)} of the rows agree with the simulation: inspect it."
+            )
+
+
+# ---------------------------------------------------------------------- diagnosis and uncertainty
+
+
+def _diagnosis(result: Result) -> Iterator[Finding]:
+    """Outliers, unexplained accelerations, input delay and parameters that are not identifiable."""
+    found = result.diagnosis
+    if found is None:
+        return
+    name = max(found.outlier_fraction, key=lambda n: found.outlier_fraction[n])
+    most = found.outlier_fraction[name]
+    if most > _FEW:
+        text = f"Up to {percent(most)} of the samples of a signal ({name}) are outliers"
+        if most <= _BREAKDOWN:
+            level: Level = "note" if most <= _HALF else "care"
+            yield Finding(level, f"{text}; the estimate down-weights them.")
+        else:
+            yield Finding(
+                "bad", f"{text}: check its sign and unit and the terms of the model, or leave the signal out."
+            )
+    yield from _unexplained(result.logs)
+    if found.input_delay_significant:
+        sense = "later" if found.input_delay > 0.0 else "earlier"
+        delay = f"Inputs act {number(1e3 * abs(found.input_delay), 3)} ms {sense} than recorded"
+        yield Finding(
+            "care", f"{delay}: the estimate includes this delay; simulations of the model must include it, too."
+        )
+    yield from _unidentifiable(result)
+
+
+def _unexplained(logs: Sequence[LogSummary]) -> Iterator[Finding]:
+    """The largest share of an acceleration that the model leaves unexplained."""
+    having = [(one, found) for one, found in _predicted(logs) if found.unexplained]
+    if not having:
+        return
+    one, found = max(having, key=lambda x: max(x[1].unexplained.values()))
+    name = max(found.unexplained, key=lambda n: found.unexplained[n])
+    left = found.unexplained[name]
+    others = ", less of the others" if len(found.unexplained) > 1 else ""
+    text = f"The model leaves {percent(left)} of {name} unexplained (RMS){others}{_worst_of(one, logs)}"
+    level = _graded(left, _NEAR, _HALF)
+    yield Finding(level, f"{text}: a term is missing, or an input; add it." if level == "bad" else f"{text}.")
+
+
+def _unidentifiable(result: Result) -> Iterator[Finding]:
+    names = result.unidentifiable
+    if names and len(names) == len(result.parameters):
+        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}: record a livelier motion.")
+    elif names:
+        what = f"{', '.join(names)} {'are' if len(names) > 1 else 'is'} not identifiable from {_these(result.logs)}"
+        yield Finding("care", f"{what}; excite {'them' if len(names) > 1 else 'it'}.")
+
+
+def _these(logs: Sequence[LogSummary]) -> str:
+    return "these logs" if len(logs) > 1 else "this log"
+
+
+def _uncertainty(result: Result) -> Iterator[Finding]:
+    """Widths of the confidence intervals."""
+    widths: dict[str, float] = {}
+    intervals = result.intervals()
+    unknown = [name for name, (low, high) in intervals.items() if not np.isfinite(high - low)]
+    stuck = {name.partition("[")[0] for name in result.on_bounds}
+    lost = [name for name in unknown if name not in stuck]
+    if lost and result.diagnosis is None:
+        rows = plural(result.n_fitted, "fitted row")
+        yield Finding(
+            "care", f"The uncertainty of {', '.join(lost)} is unknown: {rows} are too few, or do not excite it."
+        )
+    for name, (low, high) in intervals.items():
+        # The mean of a per-log parameter is of no machine: the table of the logs has its values.
+        if name in unknown or (result.model.parameters[name].per_log and not result.layout.is_shared):
+            continue
+        if low <= 0.0 <= high:
+            possible = result.model.parameters[name].admits(0.0)
+            text = f"{name} does not differ significantly from zero: its 95 % interval includes zero."
+            yield Finding("note" if possible else "care", text)
+        else:
+            widths[name] = 0.5 * (high - low) / abs(result.parameters[name])
+    for name, width in widths.items():
+        if width > _UNCERTAIN:
+            yield Finding("care", f"{name} is uncertain by ±{percent(width)} (95 % interval): excite it more.")
+    if widths and max(widths.values()) <= _UNCERTAIN:
+        name = max(widths, key=lambda n: widths[n])
+        what = f"{name} is" if len(widths) == 1 else f"The least certain parameter is {name},"
+        yield Finding("good", f"{what} uncertain by ±{percent(widths[name])} (95 % interval).")
+
+
+def _bandwidth(result: Result) -> Iterator[Finding]:
+    """Sensitivity of the parameters to the bandwidth of the differentiating filter."""
+    changes = result.bandwidth_sensitivity
+    if not changes:
+        return
+    if any(np.isnan(pair).any() for pair in changes.values()):
+        yield Finding("care", "Identification failed at half or twice the filter's bandwidth.")
+        return
+    name = max(changes, key=lambda n: max(map(abs, changes[n])))
+    change = max(map(abs, changes[name]))
+    text = f"At half or twice the filter's bandwidth no parameter changes by more than {percent(change)} ({name})."
+    if change > _STEADY:
+        text = f"{name} changes by {percent(change)} at half or twice the filter's bandwidth: choose it with care."
+    yield Finding(_graded(change, _STEADY, _UNSTEADY), text)
+
+
+# ---------------------------------------------------------------------- search and logs
+
+
+def _search(result: Result) -> Iterator[Finding]:
+    wanted = result.settings.stop_inlier_fraction
+    if result.iterations and result.diagnosis is None and wanted is not None and result.inlier_fraction < wanted:
+        samples = plural(result.iterations, "sample")
+        yield Finding("note", f"The search ended after {samples}, short of the {percent(wanted)} inliers to stop at.")
+
+
+def _logs(result: Result) -> Iterator[Finding]:
+    """Logs that disagree with the others, excluded rows, and the use of the logs."""
+    for one in result.logs:
+        if one.remark:
+            advice = "leave this log out, or give what differs a value per log"
+            yield Finding("bad", f"{one.remark}. One set of parameters does not describe all logs: {advice}.")
+    yield from _excluded(result.logs)
+    text = f"Evaluated on {_these(result.logs)}, used for identification; held-out data are a stricter test."
+    yield Finding("note", text)
+
+
+def _excluded(logs: Sequence[LogSummary]) -> Iterator[Finding]:
+    """Rows in which a required signal is missing."""
+    n_excluded = sum(found.n_excluded for _, found in _predicted(logs))
+    if n_excluded:
+        total = plural(sum(one.n_rows for one in logs), "row")
+        yield Finding("note", f"{n_excluded:,} of {total} are excluded: a required signal is missing there.")

@@ -1,0 +1,334 @@
+"""The verdict on a result and its findings: what they rest on, and that print, JSON and page show the same."""
+
+import copy
+import html
+import json
+import pickle
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import diransac as dr
+from command_line import MODEL, run, run_both, working_folder
+from diransac.identification.estimate import Finding
+from diransac.identification.findings import by_seriousness, verdict_of
+from diransac.identification.prediction import unexplained
+from diransac.report.runs import simulate_on
+from results import changed
+
+DT, N, MASS, DRAG = 0.01, 1000, 1.5, 2.0
+
+
+def sledge(**parameters):
+    """A mass with viscous drag."""
+    known = {"mass": dr.Parameter("kg", positive=True), "drag": dr.Parameter("N s/m", lower=0.0)}
+    equations = lambda q, v, a, u, p: [p.mass * a.s + p.drag * v.s - u.force]  # noqa: E731
+    return dr.Model("sledge", {"s": "m"}, {"force": "N"}, known | parameters, equations)
+
+
+def slide(push=0.0, noise=0.0, late=0, seed=0, source="sledge"):
+    """A log of the sledge, exact where force and push are held; ``push`` N act that are not recorded."""
+    rng = np.random.default_rng(seed)
+    t = DT * np.arange(N + late)
+    force = 3.0 * np.sin(1.1 * t) + 2.0 * np.sin(3.7 * t + 0.5) + np.sin(7.9 * t)
+    total = np.r_[np.zeros(late), force][: N + late] + push * np.sign(np.sin(0.6 * t))
+    state, decay = np.zeros((N + late + 1, 2)), np.exp(-DRAG / MASS * DT)
+    for k, final in enumerate(total / DRAG):
+        gap = state[k, 1] - final
+        state[k + 1] = state[k, 0] + final * DT + gap * (1.0 - decay) * MASS / DRAG, final + gap * decay
+    columns = {"s": state[:-1, 0], "s_dot": state[:-1, 1], "s_ddot": (total - DRAG * state[:-1, 1]) / MASS}
+    columns = {n: x[late:] + noise * rng.normal(size=N) for n, x in columns.items()}
+    return dr.Log.from_arrays(t[:N], {**columns, "force": force[late:]}, source=source)
+
+
+def inverted(seed):
+    """A model of an unstable machine, and a log of it under feedback: open loop it leaves the log within a second."""
+    model = dr.Model(
+        "inverted",
+        {"x": "rad"},
+        {"torque": "N m"},
+        {"stiffness": dr.Parameter("1/s^2"), "gain": dr.Parameter("1/(kg m^2)")},
+        lambda q, v, a, u, p: [a.x - p.stiffness * q.x - p.gain * u.torque],
+    )
+    rng, t = np.random.default_rng(seed), DT * np.arange(1500)
+    x, torque = np.zeros((1501, 2)), np.zeros(1500)
+    for k in range(1500):
+        torque[k] = -12.0 * x[k, 0] - 4.0 * x[k, 1] + 2.0 * np.sin(2.0 * t[k]) + rng.normal(0.0, 0.5)
+        for _ in range(20):
+            x[k + 1] = x[k] if _ == 0 else x[k + 1]
+            x[k + 1, 1] += DT / 20 * (25.0 * x[k + 1, 0] + 5.0 * torque[k])
+            x[k + 1, 0] += DT / 20 * x[k + 1, 1]
+    signals = {"x": x[:-1, 0] + 2e-3 * rng.normal(size=1500), "x_dot": x[:-1, 1] + 1e-2 * rng.normal(size=1500)}
+    return model, dr.Log.from_arrays(t, {**signals, "torque": torque}, source=f"inverted {seed}")
+
+
+@pytest.fixture(scope="module")
+def cases():
+    """Results of every verdict with the logs that they were identified from."""
+    good, late, pushed, wrong = slide(noise=0.002), slide(late=6), slide(push=1.0), slide(noise=0.002)
+    reversed_ = dr.Log.from_arrays(wrong.time, {**wrong.signals, "force": -wrong["force"]}, source="reversed")
+    ols = dr.identify(sledge(), good, "ols")
+    bounded = dr.identify(sledge(drag=dr.Parameter("N s/m", lower=3.0)), good, "ols")
+    others = [good, slide(noise=0.002, seed=1, source="second"), replace(reversed_, source="third")]
+    return {
+        "least squares": (ols, good),
+        "lo-diransac": (dr.identify(sledge(), good), good),
+        "a delay": (dr.identify(sledge(), late), late),
+        "a push": (dr.identify(sledge(), pushed), pushed),
+        "a wrong sign": (dr.identify(sledge(), reversed_, "ols"), reversed_),
+        "a violated bound": (bounded, good),
+        "logs that disagree": (dr.identify(sledge(), [others[0], others[1], _heavy()], "ols"), others[:2]),
+        "few samples": (dr.identify(sledge(), good, "i-diransac", settings=dr.Settings(max_iterations=5)), good),
+        "derived signals": (dr.identify(sledge(), _positions(good), "ols", differentiate=True), _positions(good)),
+    }
+
+
+def _positions(log):
+    return dr.Log.from_arrays(log.time, {"s": log["s"], "force": log["force"]}, source="positions")
+
+
+def _heavy():
+    log = slide(noise=0.002, seed=2)
+    return dr.Log.from_arrays(log.time, {**log.signals, "force": 2.0 * log["force"]}, source="heavy")
+
+
+CASES = pytest.mark.parametrize(
+    "name",
+    [
+        "least squares",
+        "lo-diransac",
+        "a delay",
+        "a push",
+        "a wrong sign",
+        "a violated bound",
+        "logs that disagree",
+        "few samples",
+        "derived signals",
+    ],
+)
+
+
+# ---------------------------------------------------------------------- the same everywhere
+
+
+@CASES
+def test_print_json_and_page_have_the_same_verdict_and_sentences(cases, name, tmp_path):
+    result, log = cases[name]
+    data = json.loads(json.dumps(result.to_dict()))
+    assert data["verdict"] == result.verdict
+    assert data["findings"] == [{"level": x.level, "text": str(x)} for x in result.findings]
+    lines = str(result).splitlines()
+    assert lines.count(f"verdict: {result.verdict}") == 1
+    printed = [line[2:] for line in lines if line.startswith(("! ", "· "))]
+    assert printed == [x for x in result.findings if x.level in ("bad", "care")]
+    dr.write_report(result, log, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert re.search(r'<span class="method">.*?</span> (.*?)</h3>', page).group(1) == result.verdict
+    shown = re.findall(r'<li class="(\w+)"><span class="sign".*?</span> (.*?)</li>', page)
+    assert [(level, html.unescape(text)) for level, text in shown] == [(x.level, str(x)) for x in result.findings]
+
+
+@CASES
+def test_findings_are_read_back_as_they_were_saved(cases, name, tmp_path):
+    result, _ = cases[name]
+    result.save(tmp_path / "model.json")
+    loaded = dr.Result.load(tmp_path / "model.json")
+    assert loaded.verdict == result.verdict
+    assert [(x.level, x) for x in loaded.findings] == [(x.level, x) for x in result.findings]
+    assert loaded.logs == result.logs
+
+
+@CASES
+def test_every_finding_is_a_sentence_and_the_most_serious_stand_first(cases, name):
+    found = cases[name][0].findings
+    assert all(isinstance(x, str) and x.endswith(".") and x[0] == x[0].lstrip() for x in found)
+    assert [x.seriousness for x in found] == sorted((x.seriousness for x in found), reverse=True)
+
+
+# ---------------------------------------------------------------------- what a verdict rests on
+
+
+@pytest.mark.parametrize(
+    ("name", "verdict", "reason"),
+    [
+        ("least squares", "usable", ""),
+        ("lo-diransac", "usable", ""),
+        ("a delay", "usable with care", "Inputs act 60 ms later than recorded: the estimate includes this delay"),
+        ("a push", "usable with care", "of s_ddot unexplained"),
+        ("a wrong sign", "do not rely on this", "mass = −1.5 kg is outside its bounds"),
+        ("a violated bound", "do not rely on this", "is outside its bounds (≥ 3)"),
+        ("logs that disagree", "do not rely on this", "heavy disagrees with the other logs"),
+    ],
+)
+def test_a_verdict_has_its_reason_among_the_findings(cases, name, verdict, reason):
+    result, _ = cases[name]
+    assert result.verdict == verdict, result.findings
+    assert any(reason in finding for finding in result.findings), result.findings
+
+
+def test_an_unstable_machine_is_judged_by_restarted_simulations_of_held_out_logs_too(tmp_path):
+    model, log = inverted(seed=3)
+    result = dr.identify(model, log, differentiate=True)
+    assert result.parameters["stiffness"] == pytest.approx(25.0, rel=0.05)
+    assert result.inlier_fraction < 0.5
+    assert result.verdict == "usable", result.findings
+    assert result.logs[0].prediction.restart_period < 0.2 * (len(log) - 1) * DT
+    dr.write_report(result, inverted(seed=4)[1], tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "Held out: median error of simulations restarted every" in page
+    assert "</span> usable with care</h3>" in page  # noise of the states that it starts from grows 500 times in 1.25 s
+    falling = changed(result, parameters={"stiffness": -25.0, "gain": 5.0})
+    dr.write_report(falling, inverted(seed=4)[1], tmp_path / "page.html")
+    assert "</span> do not rely on this</h3>" in (tmp_path / "page.html").read_text()
+
+
+def test_a_restarted_simulation_finds_wrong_parameters(cases):
+    """Parameters that do not belong to the diagnosis beside them leave the smoothed motion."""
+    result, log = cases["lo-diransac"]
+    light = changed(result, parameters={"mass": 0.5 * MASS, "drag": 0.2 * DRAG})
+    simulated = simulate_on("light", light, log, light.diagnosis)
+    worse = replace(light, logs=(replace(light.logs[0], prediction=simulated.summary(light.diagnosis)),))
+    assert worse.verdict == "do not rely on this"
+    assert any("restarted every" in x and x.level == "bad" for x in worse.findings)
+
+
+def test_a_coordinate_at_rest_is_no_evidence_against_the_model():
+    """Relative to an acceleration of nothing, all of what is left of it would be unexplained."""
+    units = {"x_ddot": "m/s^2", "y_ddot": "m/s^2", "turn_ddot": "rad/s^2"}
+    left = {"x_ddot": 0.1, "y_ddot": 1e-9, "turn_ddot": 1e-3}
+    modelled = {"x_ddot": 0.9, "y_ddot": 0.0, "turn_ddot": 1e-3}
+    diagnosis = SimpleNamespace(unmodelled_accelerations={n: np.array([x, -x]) for n, x in left.items()})
+    observations = SimpleNamespace(model=SimpleNamespace(units=units))
+    accelerations = {n: np.full(5, x) for n, x in modelled.items()}
+    found = unexplained(diagnosis, SimpleNamespace(observations=observations, accelerations=accelerations))
+    assert found == pytest.approx({"x_ddot": 0.1, "turn_ddot": 0.5})
+
+
+@pytest.mark.parametrize(("outliers", "level"), [(0.3, "note"), (0.6, "care"), (0.9, "bad")])
+def test_a_signal_that_is_mostly_outliers_is_no_evidence_for_the_model(cases, outliers, level):
+    result, _ = cases["lo-diransac"]
+    fractions = {**result.diagnosis.outlier_fraction, "s_dot": outliers}
+    doubtful = changed(result, diagnosis=replace(result.diagnosis, outlier_fraction=fractions))
+    assert next(x.level for x in doubtful.findings if "(s_dot) are outliers" in x) == level
+
+
+def test_noise_that_is_larger_than_the_signal_explains_no_error(cases):
+    """A fit that takes a signal for noise has wrong parameters and small errors beside that noise."""
+    result, log = cases["lo-diransac"]
+    found = result.diagnosis
+    lost = replace(
+        found, noise_std=dict.fromkeys(found.noise_std, 1e6), outliers={n: ~x for n, x in found.outliers.items()}
+    )
+    wrong = changed(result, parameters={"mass": 1e-7, "drag": 1e-7}, diagnosis=lost)
+    prediction = simulate_on("wrong", wrong, log, lost).summary(lost)
+    assert max(prediction.relative_errors.values()) > 1.0
+    wrong = replace(wrong, logs=(replace(wrong.logs[0], prediction=prediction),))
+    assert wrong.verdict == "do not rely on this"
+
+
+@pytest.mark.parametrize(
+    ("unidentifiable", "verdict"), [(("drag",), "usable with care"), (("mass", "drag"), "do not rely on this")]
+)
+def test_one_undetermined_parameter_needs_care_and_all_of_them_are_no_model(cases, unidentifiable, verdict):
+    result, _ = cases["lo-diransac"]
+    vague = changed(result, diagnosis=replace(result.diagnosis, unidentifiable=unidentifiable))
+    assert vague.verdict == verdict
+
+
+def test_less_than_half_inliers_of_least_squares_are_bad_and_of_lo_diransac_a_note(cases):
+    words = "4 % of 1,000 rows agree"
+    poor = [changed(cases[name][0], inlier_fraction=0.4 / 100.0) for name in ("least squares", "lo-diransac")]
+    levels = [next(x.level for x in one.findings if words in x) for one in poor]
+    assert levels == ["bad", "note"]
+    assert [one.verdict for one in poor] == ["do not rely on this", "usable"]
+
+
+def test_what_no_simulation_supports_is_not_usable(cases):
+    """A result of an earlier version has no prediction, one of a log without its initial state neither."""
+    result, _ = cases["least squares"]
+    data = json.loads(json.dumps(result.to_dict()))
+    for key in ("verdict", "findings", "checks"):
+        del data[key]
+    del data["logs"][0]["prediction"]
+    old = dr.Result.from_dict(data)
+    assert old.verdict == "usable with care"
+    assert any("No simulation is compared" in finding for finding in old.findings)
+    assert old.parameters == result.parameters
+
+
+def test_a_methods_own_checks_are_findings_and_are_kept(cases, tmp_path):
+    result, _ = cases["lo-diransac"]
+    alarm = Finding("bad", "Plain least squares lies outside the interval: record a set point.")
+    alarmed = changed(result, checks=(alarm, Finding("note", "The encoder has no bias.")))
+    assert alarmed.verdict == "do not rely on this"
+    assert alarmed.findings[0] == alarm
+    alarmed.save(tmp_path / "model.json")
+    assert dr.Result.load(tmp_path / "model.json") == alarmed
+
+
+@pytest.mark.parametrize(
+    ("levels", "verdict"),
+    [
+        ([], "usable with care"),
+        (["note"], "usable with care"),
+        (["note", "good"], "usable"),
+        (["good", "care"], "usable with care"),
+        (["good", "bad", "care"], "do not rely on this"),
+    ],
+)
+def test_the_verdict_is_that_of_the_most_serious_finding_and_usable_is_earned(levels, verdict):
+    assert verdict_of(Finding(level, "It is so.") for level in levels) == verdict
+
+
+def test_a_finding_is_a_string_with_a_level_that_survives_copies():
+    finding = Finding("care", "Inputs act late.")
+    for other in (copy.deepcopy(finding), pickle.loads(pickle.dumps(finding))):
+        assert (other, other.level, type(other)) == (finding, "care", Finding)
+    assert json.dumps(finding) == '"Inputs act late."'
+    with pytest.raises(ValueError, match="level 'fatal'"):
+        Finding("fatal", "It burns.")
+    assert [x.level for x in by_seriousness([Finding("note", "A."), finding])] == ["care", "note"]
+
+
+# ---------------------------------------------------------------------- the command line
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A good log, ``swim.csv``, and ``back.csv`` with its thrust reversed."""
+    working_folder(tmp_path, monkeypatch)
+    log = dr.read_log("swim.csv")
+    dr.Log.from_arrays(log.time, {**log.signals, "thrust": -log["thrust"]}).write("back.csv")
+    return tmp_path
+
+
+@pytest.mark.parametrize(("log", "strict", "code"), [("swim", True, 0), ("back", True, 3), ("back", False, 0)])
+def test_strict_has_an_exit_code_of_its_own_after_all_outputs(folder, log, strict, code):
+    words = ["--method", "ols", "-o", "model.json", "--report", "page.html", *(["--strict"] if strict else [])]
+    done = run("identify", f"{log}.csv", *MODEL, *words)
+    assert done.exit_code == code
+    result = dr.Result.load("model.json")
+    assert (result.verdict == "do not rely on this") == (log == "back")
+    assert f"verdict: {result.verdict}" in done.stdout
+    assert result.verdict in Path("page.html").read_text()
+
+
+def test_strict_prints_whole_json_before_it_ends(folder):
+    done = run("identify", "back.csv", *MODEL, "--method", "ols", "--json", "--strict")
+    assert done.exit_code == 3
+    assert json.loads(done.stdout)["verdict"] == "do not rely on this"
+
+
+def test_compare_shows_each_methods_verdict_and_sentences(folder, monkeypatch):
+    text, data = run_both(monkeypatch, "compare", "back.csv", *MODEL, "--methods", "ols,tls")
+    for name, found in data["methods"].items():
+        assert found["verdict"] == "do not rely on this"
+        (row,) = [line for line in text.splitlines() if line.startswith(f"{name} ")]
+        assert row.endswith(found["verdict"])
+        serious = [x for x in found["findings"] if x["level"] in ("bad", "care")]
+        assert serious
+        assert all(f" {name}: {x['text']}" in text for x in serious)
