@@ -98,7 +98,7 @@ SCENARIOS: dict[str, Callable[[int], Arrays]] = {
 LEFT_OUT = {
     "nothing": dr.LoDiransac(),
     "random samples": dr.LoDiransac(n_samples=0),
-    "local optimisation": dr.LoDiransac(max_steps=0, instrumental_variables=False),
+    "local optimisation": dr.LoDiransac(max_steps=0, projection=False),
     "further starts": dr.LoDiransac(max_starts=1),
     "starts from neighbouring intervals": dr.LoDiransac(neighbouring_starts=False),
     "outlier component of the noise": dr.LoDiransac(outliers=False),
@@ -109,7 +109,7 @@ LEFT_OUT = {
     "delay by whole samples first": dr.LoDiransac(delay_range=(0.0, 0.0)),
     "robust initial scale": dr.LoDiransac(robust_model_error=False),
     "slow continuity schedule": dr.LoDiransac(gradual_continuity=False),
-    "instrumental variables": dr.LoDiransac(instrumental_variables=False),
+    "projection": dr.LoDiransac(projection=False),
     "screening": dr.LoDiransac(stuck_rows=False),
 }
 

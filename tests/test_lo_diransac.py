@@ -318,7 +318,7 @@ def test_without_outliers_in_the_noise_no_sample_is_an_outlier():
 
 LEFT_OUT = [
     {"n_samples": 0},
-    {"max_steps": 0, "instrumental_variables": False},
+    {"max_steps": 0, "projection": False},
     {"max_starts": 1},
     {"neighbouring_starts": False},
     {"outliers": False},
@@ -328,7 +328,7 @@ LEFT_OUT = [
     {"prior_delay": 1e-8, "max_delay_shifts": 0, "delay_range": (0, 0)},
     {"robust_model_error": False},
     {"gradual_continuity": False},
-    {"instrumental_variables": False},
+    {"projection": False},
     {"stuck_rows": False},
     {"prior_model_error": 0.0},
     {"prior_discrepancy": 0.0},

@@ -11,7 +11,7 @@
 | `mixture.py` | noise: a Gaussian and outliers |
 | `normal_equations.py`, `arrowhead.py` | all intervals as one quadratic, and its solution in O(N) |
 | `refinement.py` | local optimisation, from easy to exact |
-| `instrumental_variables.py` | parameters and covariance |
+| `projection.py` | parameters and covariance |
 """
 
 from diransac.identification.methods.lo_diransac.method import LoDiransac, configured

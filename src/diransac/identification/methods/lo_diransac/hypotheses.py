@@ -31,11 +31,13 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["WeakForm", "find_hypotheses", "robust_scores", "weak_form"]
+__all__ = ["WeakForm", "equation_scales", "find_hypotheses", "robust_scores", "weak_form"]
 
 _OVERLAP = 5
 # Least residual of an equation over its terms: smoothing is not exact.
 _SMALL_RESIDUAL = 0.01
+# Known terms that are as small beside those of another equation are rounding errors.
+_ROUNDING = 1e-9
 
 
 def find_hypotheses(
@@ -104,7 +106,7 @@ def _nonlinear(
 
 @dataclass(frozen=True)
 class WeakForm:
-    """Averaged rows of ``W p = b``, each equation scaled to the same size.
+    """Averaged rows of ``W p = b``.
 
     Parameters
     ----------
@@ -172,24 +174,39 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
 
 
 def _scaled(weak: WeakForm) -> WeakForm:
-    """Rows over the scale of their equation: of its residuals, and a hundredth of its terms at least.
+    scale = equation_scales(weak)
+    return WeakForm(weak.W / scale[:, None], weak.b / scale)
+
+
+def equation_scales(rows: WeakForm) -> FloatArray:
+    """Scale of each equation: the median of its residuals, and a hundredth of its terms at least.
 
     An equation without a known term (``b = 0``) is also solved by parameters of zero.  Its scale is that of its terms
     with the parameters that the other equations determine, so that it cannot dominate them.
+
+    Parameters
+    ----------
+    rows : WeakForm
+        Rows in the units of the equations.
+
+    Returns
+    -------
+    (r,) array
     """
-    known = np.abs(weak.b).max(axis=0) > 0.0
-    scale = np.where(known, _median_size(weak.b - np.median(weak.b, axis=0)), np.inf)
-    scale = np.where(scale > 0.0, scale, np.abs(weak.b).max(axis=0))
+    largest, everything = np.abs(rows.b).max(axis=0), np.ones((1, *rows.b.shape), bool)
+    known = largest > _ROUNDING * largest.max()
+    scale = _median_size(rows.b - np.median(rows.b, axis=0))
+    scale = np.where(scale > 0.0, scale, largest) * known
     for residuals in (False, False, False, True, True):
         scale = np.where(scale > 0.0, scale, np.inf)
-        rows = WeakForm(weak.W / scale[:, None], weak.b / scale)
-        p = rows.solve(np.ones((1, *weak.b.shape), bool))[0]
-        terms = weak.W * p
-        scale = _median_size(np.sqrt(np.square(terms).sum(axis=2) + np.square(weak.b)))
+        terms = rows.W * WeakForm(rows.W / scale[:, None], rows.b / scale).solve(everything)[0]
+        # Noise in equations without a known term shrinks all parameters; the others determine their size.
+        sums, aim = (terms.sum(axis=2) / scale)[:, known], (rows.b / scale)[:, known]
+        terms *= max((sums * aim).sum() / (np.square(sums).sum() + 1e-300), 1.0)
+        scale = _median_size(np.sqrt(np.square(terms).sum(axis=2) + np.square(rows.b)))
         if residuals:
-            scale = np.maximum(_median_size(terms.sum(axis=2) - weak.b), _SMALL_RESIDUAL * scale)
-    scale = np.where(scale > 0.0, scale, 1.0)
-    return WeakForm(weak.W / scale[:, None], weak.b / scale)
+            scale = np.maximum(_median_size(terms.sum(axis=2) - rows.b), _SMALL_RESIDUAL * scale)
+    return np.where(scale > 0.0, scale, 1.0)
 
 
 def _median_size(values: FloatArray) -> FloatArray:

@@ -19,12 +19,14 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
-from diransac.identification.methods.lo_diransac.instrumental_variables import estimate_parameters
 from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
+from diransac.identification.methods.lo_diransac.projection import estimate_parameters
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
@@ -44,6 +46,12 @@ _SHORTEST, _PARTS = 3, 2
 _SIGNIFICANT, _SMALL_DELAY = 3.0, 0.1
 # Half a sample of delay or more is taken up by shifting the inputs.
 _WHOLE_SAMPLE = 0.5
+# Relative difference of parameters that makes a second start.
+_APART = 0.2
+# Log of the factor by which a delay must lower unmodelled accelerations; prior delay of a fit without one.
+_EXPLAINS, _PUNCTUAL = float(np.log(1.25)), 1e-6
+# Decrease of the log residuals of each signal by which a delay is worth to be tried.
+_SMALL_GAIN = 0.03
 # Inputs that vary linearly between samples act half a sample before held ones.
 _LINEAR = (-0.75, -0.25)
 
@@ -57,12 +65,15 @@ class Explanation:
     intervals : ShootingIntervals
         With the timing of the inputs.
     refinement : Refinement
+    prior : Prior
+        Of the fit; without a delay, where its delay is fixed.
     exact : bool
         Whether the fit is one of the model as it is.
     """
 
     intervals: ShootingIntervals
     refinement: Refinement
+    prior: Prior
     exact: bool
 
     @property
@@ -110,23 +121,38 @@ class LocalSearch:
         report(self.callback, "searching for a delay", 0.1)
         delay = self._likeliest_delay(intervals)
         shifted = [intervals, *([replace(intervals, delay=delay)] if delay else [])]
-        found = [self._from_hypotheses(x, k) for k, x in enumerate(shifted)]
-        best = min(found, key=lambda x: x.cost)
+        best, *others = [self._from_hypotheses(x, k) for k, x in enumerate(shifted)]
+        best = self._better(best, others)
         for k in range(self.settings.max_delay_shifts):
             report(self.callback, "timing of the inputs", 0.6 + 0.1 * k)
-            others = [self._refitted(best, timing) for timing in self._timings(best, free_hold=free_hold)]
-            likelier = min([best, *others], key=lambda x: x.cost)
-            if likelier.cost > best.cost - _AS_LIKELY:
+            trial = best if best.exact or k else self._refitted(best, best.intervals)
+            timings = self._timings(trial, free_hold=free_hold)
+            likelier = self._better(best, [trial, *(self._refitted(trial, timing) for timing in timings)])
+            if likelier is best:
                 break
             best = likelier
         return best
 
+    def _better(self, now: Explanation, others: Sequence[Explanation]) -> Explanation:
+        """The likeliest explanation of which another timing of the inputs is worth to be believed.
+
+        A controller's inputs answer disturbances, so that late inputs predict these.  Where the model is not exact, a
+        delay must also explain a good part of the accelerations that are otherwise unmodelled.
+        """
+        others = [
+            x
+            for x in others
+            if x.cost < now.cost - _AS_LIKELY and (x.exact or _unexplained(x) < _unexplained(now) - _EXPLAINS)
+        ]
+        return min(others, key=lambda x: x.cost, default=now)
+
     def _from_hypotheses(self, intervals: ShootingIntervals, k: int) -> Explanation:
         """The likeliest explanation with this timing of the inputs."""
         part = within(self.callback, 0.1 + 0.25 * k, 0.35 + 0.25 * k)
-        return self._simplest(Explanation(intervals, self.best(intervals, part), exact=False))
+        punctual = replace(self.prior, delay=_PUNCTUAL * self.prior.delay)
+        return self._simplest(Explanation(intervals, self.best(intervals, punctual, part), punctual, exact=False))
 
-    def best(self, intervals: ShootingIntervals, callback: Callback | None = None) -> Refinement:
+    def best(self, intervals: ShootingIntervals, prior: Prior, callback: Callback | None = None) -> Refinement:
         """Local optimisation from the best hypothesis; where it is doubtful, from others; the likeliest of these.
 
         A fit is doubtful if most samples of an interval are outliers: either sensors failed there, or the fit did.  The
@@ -136,6 +162,7 @@ class LocalSearch:
         Parameters
         ----------
         intervals : ShootingIntervals
+        prior : Prior
         callback : callable, optional
 
         Returns
@@ -147,8 +174,8 @@ class LocalSearch:
         while waiting and len(found) < self.settings.max_fits:
             share = len(found) / self.settings.max_fits
             report(callback, "local optimisation", share, f"fit {len(found) + 1}")
-            begin = start(self.settings, intervals, self.motion, waiting.pop(0), self.prior)
-            found.append(refine(self.settings, intervals, begin, self.prior))
+            begin = start(self.settings, intervals, self.motion, waiting.pop(0), prior)
+            found.append(refine(self.settings, intervals, begin, prior))
             again = any(abs(found[-1].cost - x.cost) < _AS_LIKELY for x in found[:-1])
             if again or not _is_doubtful(intervals, found[-1]):
                 break
@@ -159,12 +186,15 @@ class LocalSearch:
     def _simplest(self, flexible: Explanation) -> Explanation:
         """The exact model, if it is as likely; otherwise unmodelled accelerations that vary as fast as is likely."""
         intervals, fit = flexible.intervals, flexible.refinement.fit
-        p = estimate_parameters(intervals, fit, self.settings.prior_inflation).parameters
-        if intervals.layout.admits(p[None])[0]:
-            fit = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
-        exact = Explanation(intervals, refine_exact(self.settings, intervals, fit, self.prior), exact=True)
-        if exact.cost < flexible.cost:
-            return exact
+        projected = estimate_parameters(intervals, fit, 1.0).parameters
+        starts = np.array([projected, self.hypotheses[0]])
+        starts = starts[: 1 + bool((np.abs(starts[1] - starts[0]) > _APART * np.abs(starts[0])).any())]
+        for p in starts[intervals.layout.admits(starts)]:
+            begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
+            refined = refine_exact(self.settings, intervals, begin, self.prior)
+            exact = Explanation(intervals, refined, self.prior, exact=True)
+            if exact.cost < flexible.cost:
+                return exact
         while self.settings.model_error and flexible.intervals.length >= _PARTS * _SHORTEST:
             finer = self._split(flexible)
             if finer.cost > flexible.cost - _AS_LIKELY:
@@ -181,7 +211,8 @@ class LocalSearch:
         x = series[:, :: intervals.length, :n_x].reshape(-1, n_x)
         rho = fit.rho ** (1.0 / parts)
         begin = with_residuals(intervals, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
-        return Explanation(intervals, refine(self.settings, intervals, begin, self.prior, settled=True), exact=False)
+        refined = refine(self.settings, intervals, begin, coarse.prior, settled=True)
+        return Explanation(intervals, refined, coarse.prior, exact=False)
 
     def _timings(self, now: Explanation, *, free_hold: bool) -> list[ShootingIntervals]:
         """Other timings of the inputs that the fit suggests: whole samples of delay, a lag, or another hold."""
@@ -211,10 +242,10 @@ class LocalSearch:
         sizes = np.append(fit.prior[:-1], self.prior.delay)
         begin = with_residuals(intervals, replace(fit, shared=np.append(fit.shared[:-1], left), prior=sizes))
         if now.exact:
-            return Explanation(intervals, refine_exact(self.settings, intervals, begin, self.prior), exact=True)
-        return self._simplest(
-            Explanation(intervals, refine(self.settings, intervals, begin, self.prior, settled=True), exact=False)
-        )
+            refined = refine_exact(self.settings, intervals, begin, self.prior)
+            return Explanation(intervals, refined, self.prior, exact=True)
+        refined = refine(self.settings, intervals, begin, self.prior, settled=True)
+        return self._simplest(Explanation(intervals, refined, self.prior, exact=False))
 
     def _likeliest_delay(self, intervals: ShootingIntervals) -> int:
         """Delay in samples with which simulations by the best hypothesis agree best with the log.
@@ -231,6 +262,8 @@ class LocalSearch:
                 scores[rows] = float(robust_scores(delayed, self.motion, self.hypotheses[:1], every)[0])
             return scores[rows]
 
+        if low == high:
+            return 0
         step = max(1, (high - low) // (_DELAYS_AT_A_TIME - 1))
         tried = range(-(-low // step) * step, high + 1, step)
         best = min(tried, key=lambda rows: (score(rows), abs(rows)))
@@ -238,7 +271,14 @@ class LocalSearch:
             step = max(1, step // 2)
             near = [x for x in (best - step, best, best + step) if low <= x <= high]
             best = min(near, key=lambda rows: (score(rows), abs(rows)))
-        return best
+        gain = score(0) - score(best)
+        return best if gain > _SMALL_GAIN * intervals.known.any(axis=0).sum() else 0
+
+
+def _unexplained(found: Explanation) -> float:
+    """Sum over the equations of the log of the RMS acceleration that the model does not explain."""
+    left = estimate_parameters(found.intervals, found.refinement.fit, 1.0).unexplained
+    return float(np.log(np.sqrt(np.square(left).mean(axis=0)) + 1e-300).sum())
 
 
 def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:

@@ -3,13 +3,13 @@
 1. `smoothing`: screening of samples; the motion without a model.
 2. `hypotheses`: parameters from random samples of the equations in weak form, scored by simulation.
 3. `refinement`: the most probable motion and parameters, noise and discrepancies, from the best of them.
-4. `instrumental_variables`: parameters of the whole motion, and their covariance.
+4. `projection`: parameters of the whole motion, and their covariance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,14 +20,14 @@ from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
-from diransac.identification.methods.lo_diransac.instrumental_variables import (
-    InstrumentalEstimate,
+from diransac.identification.methods.lo_diransac.local_search import LocalSearch
+from diransac.identification.methods.lo_diransac.projection import (
+    ProjectedEstimate,
     discrepancy_units,
     estimate_parameters,
+    fitted_parameters,
     parameter_units,
-    unexplained,
 )
-from diransac.identification.methods.lo_diransac.local_search import LocalSearch
 from diransac.identification.methods.lo_diransac.refinement import make_prior
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
@@ -119,9 +119,9 @@ class LoDiransac(LoDiransacSettings):
         until the first convergence.
     prior_delay : float, optional
         Prior standard deviation of the input delay, s.
-    instrumental_variables : bool, optional
-        Whether parameters are estimated from the fitted motion by instrumental variables; otherwise they are those of
-        the fit.
+    projection : bool, optional
+        Whether discrepancies in the column space of the regressor are attributed to the parameters; otherwise these are
+        those of the fit.
     prior_inflation : float, optional
         Factor of the prior on model error whose effect on the parameters is added to their covariance.
 
@@ -190,13 +190,15 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
     intervals, refined = likeliest.intervals, likeliest.refinement
     report(callback, "estimating parameters", 0.9)
-    result = estimate_parameters(intervals, refined.fit, settings.prior_inflation)
-    kept = refined.fit.shared[: intervals.n_p]
-    if not settings.instrumental_variables:
-        result = replace(result, parameters=kept, unexplained=unexplained(intervals, refined.fit, kept))
-    elif not intervals.layout.admits(result.parameters[None])[0]:
-        # The fit satisfies the bounds; least squares on its motion may violate them.
-        result = replace(result, parameters=kept, unexplained=unexplained(intervals, refined.fit, kept))
+    projects = settings.projection and not likeliest.exact
+    result = (
+        estimate_parameters(intervals, refined.fit, settings.prior_inflation)
+        if projects
+        else fitted_parameters(intervals, refined.fit)
+    )
+    if not intervals.layout.admits(result.parameters[None])[0]:
+        # The fit satisfies the bounds; least squares on its motion may violate a strict one.
+        result = fitted_parameters(intervals, refined.fit)
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
     checks = tuple(_checks(settings, intervals, motion, refined))
     late = float(intervals.delay + intervals.lag + refined.fit.shared[-1])
@@ -285,7 +287,7 @@ class _Found:
     intervals: ShootingIntervals
     motion: Motion
     fit: Fit
-    result: InstrumentalEstimate
+    result: ProjectedEstimate
     delay: float
 
 
@@ -359,7 +361,7 @@ def _on_given_logs(dataset: Dataset, intervals: ShootingIntervals, mask: BoolArr
     return dataset.on_given_logs(parts)
 
 
-def _unmodelled_forces(intervals: ShootingIntervals, fit: Fit, result: InstrumentalEstimate) -> FloatArray | None:
+def _unmodelled_forces(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate) -> FloatArray | None:
     """Generalised forces (W, n_v) of the unmodelled accelerations at the intervals' starts, or None."""
     model = intervals.model
     try:

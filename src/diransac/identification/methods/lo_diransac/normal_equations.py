@@ -87,11 +87,16 @@ class NormalEquations:
     right_z : (W, n_x + n_v) array
     right_s : (n_s,) array
         Right-hand side, minus the gradient: of states and unmodelled accelerations, and of the shared unknowns.
+    data_z : (W, n_x + n_v) array
+    data_s : (W, n_s) array
+        The part of each interval's measurements in it.
     """
 
     system: Arrowhead
     right_z: FloatArray
     right_s: FloatArray
+    data_z: FloatArray
+    data_s: FloatArray
 
 
 def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
@@ -127,6 +132,7 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights)
     order = _order(sums.gradient.shape[1] - k, n_x, k)
     H, g = sums.normal_matrix[:, order][:, :, order], -sums.gradient[:, order]
+    data_z, data_s = g[:, :k].copy(), _in_places(intervals, g[:, k:])
     F = sums.final_slopes[:-1][:, :, order]
     linked = intervals.linked
     jumps = np.where(linked[:, None], fit.x[1:] - sums.final_states[:-1], 0.0)
@@ -152,7 +158,19 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     beforehand = 1.0 / np.square(fit.prior)
     border, corner, right = _shared_blocks(intervals, H[:, :k, k:], H[:, k:, k:], g[:, k:])
     system = Arrowhead(H[:, :k, :k], E, border, corner + np.diag(beforehand))
-    return NormalEquations(system, g[:, :k], right - beforehand * fit.shared)
+    return NormalEquations(system, g[:, :k], right - beforehand * fit.shared, data_z, data_s)
+
+
+def _in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
+    """Values of each interval's own shared unknowns in the places of its log, (W, n_s)."""
+    if intervals.layout.is_shared:
+        return values.copy()
+    rest = np.arange(intervals.n_p, intervals.n_shared)
+    index = intervals.layout.index[intervals.log_of]
+    place = np.hstack([index, np.broadcast_to(rest, (len(index), len(rest)))])
+    wide = np.zeros((len(values), intervals.n_shared))
+    np.put_along_axis(wide, place, values, axis=1)
+    return wide
 
 
 def following(intervals: ShootingIntervals) -> BoolArray:

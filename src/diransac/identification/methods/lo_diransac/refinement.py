@@ -51,7 +51,9 @@ _TAU_START, _SHRINK = 0.3, 0.4
 _CONTINUITY = 0.03
 _SIGMA_FLOOR = 1e-4
 # Discrepancies of a model that is taken to be exact, over their prior sizes.
-_EXACT, _EXACT_STEPS = 1e-3, 20
+_EXACT, _EXACT_STEPS = 1e-3, 25
+# Where they start, and the factor by which they are lowered in a step.
+_NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
 # Correlation of unmodelled accelerations from interval to interval at most.
 _MOST_ALIKE = 0.98
 # Tau until convergence, over its prior: noise must not absorb model error.
@@ -244,12 +246,14 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     -------
     Refinement
     """
-    n_p, tau = intervals.n_p, _EXACT * prior.tau
+    n_p, least = intervals.n_p, _EXACT * prior.tau
     shared, sizes = fit.shared.copy(), fit.prior.copy()
     shared[n_p:-1], sizes[n_p:-1] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:-1]
-    begin = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
-    begin = with_residuals(intervals, replace(begin, continuity_std=_continuity(intervals, tau)))
-    damping, converged, steps, fit = 0.0, False, 0, begin
+    sizes[-1] = prior.delay
+    tau = _NEARLY_EXACT * prior.tau
+    fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
+    fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
+    damping, converged, steps = 0.0, False, 0
     while steps < min(_EXACT_STEPS, settings.max_steps) and not converged:
         steps += 1
         moved, solved, damping = _step(intervals, fit, damping)
@@ -257,8 +261,9 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
         noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
         sizes = fit.prior.copy()
         sizes[-1] = _discrepancies(moved, prior, np.diag(solved.var_p), n_p)[-1]
-        updated = replace(moved, noise=noise, prior=sizes)
-        converged = _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
+        tau = np.maximum(least, _TIGHTENED * fit.tau)
+        updated = replace(moved, noise=noise, prior=sizes, tau=tau, continuity_std=_continuity(intervals, tau))
+        converged = bool((tau == fit.tau).all()) and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
         fit = updated
     return Refinement(fit, negative_log_evidence(intervals, fit), steps, converged)
 

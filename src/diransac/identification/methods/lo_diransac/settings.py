@@ -45,7 +45,7 @@ class LoDiransacSettings:
     prior_discrepancy: float = 0.1
     initial_discrepancy: float = 0.01
     prior_delay: float = 3e-4
-    instrumental_variables: bool = True
+    projection: bool = True
     prior_inflation: float = 10.0
 
     name = "lo-diransac"

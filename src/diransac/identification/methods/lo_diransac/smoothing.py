@@ -223,7 +223,7 @@ def _velocities_of_rates(
     at_known, slopes = evaluate(signals[:, :n_q], v_known)
     J = slopes.reshape(len(signals), n_v, n_q).swapaxes(1, 2)[:, :, lacking - n_q]
     seen = known[:, :n_q].any(axis=0)
-    return np.einsum("nvq,nq->nv", np.linalg.pinv(J[:, seen], rcond=1e-6), (rates - at_known)[:, seen])
+    return np.asarray(np.einsum("nvq,nq->nv", np.linalg.pinv(J[:, seen], rcond=1e-6), (rates - at_known)[:, seen]))
 
 
 def _integrate(signals: FloatArray, known: BoolArray, columns: Sequence[int], dt: float) -> None:

@@ -1,18 +1,21 @@
-"""Parameters from the most probable motion by instrumental variables, and their covariance.
+"""Parameters of the whole motion by projection of what the model does not explain, and their covariance.
 
 Where the model is exact, the parameters of the fit are the estimate.  Where it is not, the log is explained by
 parameters and discrepancies together, in proportions that depend on the noise.  The estimate is then that of least
-squares on noise-free data: ``W p = b`` is solved again on the fitted motion, with instruments without the unmodelled
-accelerations, because noise in the accelerations would bias inertias towards zero.
+squares on noise-free data: ``W p = b`` is solved again on the fitted motion, so that the component of the discrepancies
+in the regressor's column space is attributed to the parameters.  Equations are weighted by their residuals.
 
-The covariance has three parts: that of the fit, propagated through the solution; that of the unmodelled forces outside
-the regressor's column space, as a sample of forces that differ from log to log; and the change under a tenfold wider
-prior on model error, because a constant deviation from the model is not averaged out.
+Inputs are no instruments: a controller answers disturbances, and its inputs are correlated with them (Forssell, Ljung
+1999).  Nor are any needed: the fitted accelerations are posterior means, whose errors are uncorrelated with themselves,
+so that they do not bias the slopes of a regression on them (Berkson 1950).
+
+The covariance has three parts: that of the fit, propagated through the projection; that of the unmodelled forces
+outside the regressor's column space, as a sample of forces that differ from log to log; and the change under a tenfold
+wider prior on model error, because a constant deviation from the model is not averaged out.
 
 References
 ----------
-Plumlee 2017 (discrepancies orthogonal to the model); Janot, Vandanjon, Gautier 2014 (instruments from a simulated
-model); White 1982 (inference under a wrong model); Hausman 1978 (specification tests).
+Plumlee 2017 (discrepancies orthogonal to the model); White 1982 (inference under a wrong model).
 """
 
 from __future__ import annotations
@@ -22,8 +25,10 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
+from scipy.special import ndtri, stdtrit
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.identification.methods.lo_diransac.hypotheses import WeakForm, equation_scales
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.simulation.compiler import compile_map
@@ -36,20 +41,21 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler import Map
 
 __all__ = [
-    "InstrumentalEstimate",
+    "ProjectedEstimate",
     "discrepancy_units",
     "estimate_parameters",
+    "fitted_parameters",
     "inertial_forces",
     "parameter_units",
     "unexplained",
 ]
 
 
-_TINY = 1e-300
+_TINY, _UPPER = 1e-300, 0.975
 
 
 @dataclass(frozen=True)
-class InstrumentalEstimate:
+class ProjectedEstimate:
     """Parameters that hold for the whole motion.
 
     Parameters
@@ -69,8 +75,8 @@ class InstrumentalEstimate:
     delay_error: float
 
 
-def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation: float) -> InstrumentalEstimate:
-    """Parameters that solve the equations on the fitted motion by instrumental variables, and their covariance.
+def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation: float) -> ProjectedEstimate:
+    """Parameters that solve the equations on the fitted motion by least squares, and their covariance.
 
     Parameters
     ----------
@@ -82,11 +88,37 @@ def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation:
 
     Returns
     -------
-    InstrumentalEstimate
+    ProjectedEstimate
+        Within the inclusive bounds; parameters on them have an infinite variance.
     """
     found = _solution(intervals, fit)
     change = _solution(intervals, _inflated_prior(intervals, fit, prior_inflation)).parameters - found.parameters
     return replace(found, covariance=found.covariance + np.outer(change, change))
+
+
+def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
+    """The parameters of the fit, and their covariance.
+
+    The covariance of the fit assumes white noise.  It is increased where the scores of neighbouring intervals, which
+    the noise of a sensor correlates, scatter more (the sandwich of Huber 1967, by batches).
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    ProjectedEstimate
+    """
+    n_p, n_s, k = intervals.n_p, len(fit.shared), fit.x.shape[1] + fit.d.shape[1]
+    at = linearize(intervals, fit, weights_of(intervals, fit))
+    z, s = at.system.functional(np.zeros((len(intervals), k, n_p)), np.eye(n_s, n_p))
+    scores = np.einsum("wkp,wk->wp", z, at.data_z) + at.data_s @ s
+    sums = _batch_sums(scores)
+    more = np.sqrt(np.maximum(1.0, np.square(sums).sum(axis=0) / (np.diag(s[:n_p]) + _TINY)))
+    p, delay = fit.shared[:n_p], at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
+    return ProjectedEstimate(p, s[:n_p] * np.outer(more, more), unexplained(intervals, fit, p), float(np.sqrt(delay)))
 
 
 def _inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fit:
@@ -98,17 +130,24 @@ def _inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fi
     return replace(inflated, shared=fit.shared + step.step_p, x=x, d=d)
 
 
-def _solution(intervals: ShootingIntervals, fit: Fit) -> InstrumentalEstimate:
+def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     """Parameters, and the first two parts of their covariance.
 
-    In the fit they hold exactly, with the discrepancies and the unmodelled accelerations besides:
+    In the fit the equations hold exactly, with the discrepancies and the unmodelled accelerations besides:
     ``r(p) = g + M d``.  The component of either in the regressor's column space is attributed to the parameters: of the
     discrepancies row by row; of the unmodelled accelerations, which are constant over an interval, by interval means.
     """
     n_p, n_s, n_x, n_v = intervals.n_p, len(fit.shared), fit.x.shape[1], intervals.model.n_v
-    by_rows, by_means, push, M = _gains(intervals, fit)
+    evaluate, motion = _residual_map(intervals.model), _motion(intervals, fit)
+    logged = intervals.is_logged[:, None]
+    push, W, M = (x * logged for x in evaluate(*motion, _row_parameters(intervals, fit.shared)))
+    W, M = _regressors(intervals, W), _matrices(M, n_v)
+    push = push - np.einsum("nij,nj->ni", M, np.repeat(fit.d, intervals.length, axis=0))
+    M = _means(intervals, M)
     latent = np.einsum("wij,wj->wi", M, fit.d)
-    p = fit.shared[:n_p] - np.einsum("pni,ni->p", by_rows, push) - np.einsum("pwi,wi->p", by_means, latent)
+    means = _means(intervals, W)
+    p, gains, stuck = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent))
+    by_rows, by_means = gains
     of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + n_v, n_p))
     level = np.hstack([np.ones((len(push), 1)), intervals.inputs])
     of_s[:n_p] = np.eye(n_p)
@@ -117,43 +156,53 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> InstrumentalEstimate:
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(of_z, of_s)
     covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s
-    sampled = _sampled(intervals, fit, by_rows, by_means, push, latent)
-    delay = at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
-    return InstrumentalEstimate(p, covariance + sampled, unexplained(intervals, fit, p), float(np.sqrt(delay)))
-
-
-def _gains(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Effect of rows (n, N, n_v) and interval means (n, W, n_v) on the parameters; discrepancies (N, n_v); mean M.
-
-    The instruments are the regressors of the motion without its unmodelled accelerations; M is (W, n_v, n_v).
-    """
-    evaluate, (q, v, a, u) = _residual_map(intervals.model), _motion(intervals, fit)
-    quiet, p = a - np.repeat(fit.d, intervals.length, axis=0), _row_parameters(intervals, fit.shared)
-    push, Z, M = evaluate(q, v, quiet, u, p)
-    W = evaluate(q, v, a, u, p)[1]
-    logged = intervals.is_logged[:, None]
-    W, Z = _regressors(intervals, W * logged), _regressors(intervals, Z * logged)
-    by_means = _instrumented(_means(intervals, W), _means(intervals, Z))
-    return _instrumented(W, Z), by_means, push * logged, _means(intervals, _matrices(M, intervals.model.n_v))
-
-
-def _sampled(
-    intervals: ShootingIntervals,
-    fit: Fit,
-    by_rows: FloatArray,
-    by_means: FloatArray,
-    push: FloatArray,
-    latent: FloatArray,
-) -> FloatArray:
-    """Covariance of the parameters over logs with other unmodelled forces than these, which it estimates."""
-    q, v, a, u = _motion(intervals, fit)
-    p = _row_parameters(intervals, fit.shared)
-    W = _regressors(intervals, _residual_map(intervals.model)(q, v, a, u, p)[1] * intervals.is_logged[:, None])
-    unmade = latent - _means(intervals, W) @ np.einsum("pwi,wi->p", by_means, latent)
+    unmade = latent - means @ np.einsum("pwi,wi->p", by_means, latent)
     unpushed = push - W @ np.einsum("pni,ni->p", by_rows, push)
     of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)
     sums = _batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
-    return np.asarray(sums.T @ sums)
+    covariance = covariance + sums.T @ sums
+    covariance[stuck] = covariance[:, stuck] = 0.0
+    covariance[stuck, stuck] = np.inf
+    delay = at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
+    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p), float(np.sqrt(delay)))
+
+
+def _bounded_projection(
+    intervals: ShootingIntervals,
+    now: FloatArray,
+    rows: tuple[FloatArray, FloatArray],
+    means: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, tuple[FloatArray, FloatArray], BoolArray]:
+    """Parameters within inclusive bounds, gains of rows (n, N, n_v) and of means (n, W, n_v), and those on a bound.
+
+    Arguments are the parameters of the fit, and regressors with residuals of rows and of interval means.
+    """
+    lower = np.array([-np.inf if x.positive else x.lower for x in intervals.layout.bounds])
+    upper = np.array([x.upper for x in intervals.layout.bounds])
+    stuck, p = np.zeros(len(now), bool), now
+    for _ in range(len(now) + 1):
+        free = ~stuck
+        left = means[1] + means[0][:, :, stuck] @ (p - now)[stuck]
+        known = means[0][:, :, free] @ now[free] - left - _means(intervals, rows[1])
+        weights = 1.0 / equation_scales(WeakForm(means[0][:, :, free], known))
+        gains = tuple(np.zeros((len(now), *x.shape[:2])) for x, _ in (rows, means))
+        for gain, (W, _) in zip(gains, (rows, means), strict=True):
+            gain[free] = _least_squares(W[:, :, free], weights)
+        found = now - np.einsum("pni,ni->p", gains[0], rows[1]) - np.einsum("pwi,wi->p", gains[1], left)
+        p = np.where(stuck, p, found)
+        outside = (p < lower) | (p > upper)
+        if not outside.any():
+            break
+        p, stuck = np.clip(p, lower, upper), stuck | outside
+    return p, (gains[0], gains[1]), stuck
+
+
+def _least_squares(W: FloatArray, weights: FloatArray) -> FloatArray:
+    """``(W'VW)^-1 W'V`` of stacked matrices (N, r, n), as (n, N, r); columns scaled to one, V from ``weights (r,)``."""
+    rows = (W * weights[:, None]).reshape(-1, W.shape[2])
+    scale = np.linalg.norm(rows, axis=0) + _TINY
+    solved = np.linalg.lstsq(rows.T @ rows / scale / scale[:, None], (rows / scale).T, rcond=None)[0]
+    return np.asarray((solved / scale[:, None]).reshape(-1, *W.shape[:2]) * weights)
 
 
 def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:
@@ -285,8 +334,12 @@ def _residual_map(model: Model) -> Map:
 
 
 def _batch_sums(values: FloatArray) -> FloatArray:
-    """Sums over about sqrt(W) neighbouring intervals each: their squares count what neighbours have in common."""
-    return np.add.reduceat(values, np.arange(0, len(values), round(np.sqrt(len(values)))), axis=0)
+    """Sums over about sqrt(W) neighbouring intervals each: their squares count what neighbours have in common.
+
+    They are increased by Student's t for their number, so that a normal interval has its level.
+    """
+    sums = np.add.reduceat(values, np.arange(0, len(values), round(np.sqrt(len(values)))), axis=0)
+    return np.asarray(sums * stdtrit(max(len(sums) - 1, 1), _UPPER) / ndtri(_UPPER))
 
 
 def _means(intervals: ShootingIntervals, rows: FloatArray) -> FloatArray:
@@ -297,12 +350,3 @@ def _means(intervals: ShootingIntervals, rows: FloatArray) -> FloatArray:
 def _matrices(columns: FloatArray, n_columns: int) -> FloatArray:
     """Matrices (N, r, n_columns) that were stored column by column."""
     return columns.reshape(len(columns), n_columns, -1).swapaxes(1, 2)
-
-
-def _instrumented(A: FloatArray, Z: FloatArray) -> FloatArray:
-    """``(Z'A)^-1 Z'`` of stacked matrices (N, r, n), as (n, N, r); columns scaled to one."""
-    rows, instruments = A.reshape(-1, A.shape[2]), Z.reshape(-1, A.shape[2])
-    scale = np.linalg.norm(instruments, axis=0) + _TINY
-    instruments = instruments / scale
-    solved = np.linalg.lstsq(instruments.T @ (rows / scale), instruments.T, rcond=None)[0] / scale[:, None]
-    return np.asarray(solved).reshape(-1, *A.shape[:2])
