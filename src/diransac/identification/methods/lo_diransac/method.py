@@ -16,6 +16,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
+from diransac.data.segment import long_runs
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.method import report
@@ -53,6 +54,8 @@ if TYPE_CHECKING:
 __all__ = ["LoDiransac", "configured"]
 
 _FEWEST_INTERVALS = 4
+# Rows without any sample that are a gap, at least.
+_FEWEST_BLIND = 8
 _OUTLIER = 0.5
 # Fraction of a signal's spread from which on its noise leaves nothing to explain.
 _ALL_OF_IT = 0.8
@@ -95,6 +98,8 @@ class LoDiransac(LoDiransacSettings):
         Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation.
     max_delay_shifts : int, optional
         Largest number of shifts of the inputs by whole samples after local optimisation.
+    max_sensor_errors : int, optional
+        Largest number of delays and biases of sensors that are estimated where the model is not exact.
     substeps : int, optional
         Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
         samples or links are light.
@@ -245,7 +250,7 @@ def _prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingI
             f"{_FEWEST_INTERVALS * half}. Give a longer log"
         )
     motions = smooth(model, samples, dt, half)
-    logs = [(x.measured, x.known, u) for x, u in zip(samples, inputs, strict=True)]
+    logs = [(x.measured, x.known, u, x.gaps) for x, u in zip(samples, inputs, strict=True)]
     intervals = ShootingIntervals.of(model, dataset.layout, logs, dt, half, settings.substeps, dataset.hold)
     rows = zip(motions, intervals.rows_of_logs, strict=True)
     signals = np.concatenate([_to_length(x.signals, r.stop - r.start) for x, r in rows])
@@ -273,7 +278,8 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
     if n_leaps:
         notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median replaces them")
     centre = running_median(measured, known, odd_window(settings.median_window, dt, _MOST_SAMPLES))
-    return Samples(measured, known, centre), inputs, notes
+    blind = long_runs(~known.any(axis=1), max(_FEWEST_BLIND, round(settings.smoothing_half_width / dt)))
+    return Samples(measured, known, centre, one.gaps | blind), inputs, notes
 
 
 # ---------------------------------------------------------------------- the estimate

@@ -139,7 +139,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     """
     n_p, n_s, n_x, n_v = intervals.n_p, len(fit.shared), fit.x.shape[1], intervals.model.n_v
     evaluate, motion = _residual_map(intervals.model), _motion(intervals, fit)
-    logged = intervals.is_logged[:, None]
+    logged = intervals.counted[:, None]
     push, W, M = (x * logged for x in evaluate(*motion, _row_parameters(intervals, fit.shared)))
     W, M = _regressors(intervals, W), _matrices(M, n_v)
     push = push - np.einsum("nij,nj->ni", M, np.repeat(fit.d, intervals.length, axis=0))
@@ -221,8 +221,8 @@ def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) 
     p = _row_parameters(intervals, parameters)
     residuals, _, M = _residual_map(intervals.model)(*_motion(intervals, fit), p)
     left = np.linalg.solve(_matrices(M, intervals.model.n_v), residuals[:, :, None])[:, :, 0]
-    logged = intervals.is_logged[:, None].astype(float)
-    return _means(intervals, left * logged) / _means(intervals, logged)
+    logged = intervals.counted[:, None].astype(float)
+    return _means(intervals, left * logged) / np.maximum(_means(intervals, logged), _TINY)
 
 
 def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
@@ -263,7 +263,7 @@ def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
         The smallest over the equations, each in its parameter's unit.
     """
     W = _residual_map(intervals.model)(*_smoothed(intervals, motion), _row_parameters(intervals, p, logged=True))[1]
-    logs = intervals.log_of_row[intervals.is_logged]
+    logs = intervals.log_of_row[intervals.counted]
     sizes = np.sqrt(np.square(_by_log(intervals, _matrices(W, intervals.model.n_p), logs)).mean(axis=0)).T
     return np.asarray((inertial_forces(intervals, motion, p) / np.maximum(sizes, _TINY)).min(axis=1))
 
@@ -292,7 +292,7 @@ def inertial_forces(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
 
 def _smoothed(intervals: ShootingIntervals, motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Smoothed coordinates, velocities, accelerations and the inputs of all logged rows."""
-    model, logged = intervals.model, intervals.is_logged
+    model, logged = intervals.model, intervals.counted
     q, v, a = np.split(motion.signals[logged], [model.n_q, model.n_q + model.n_v], axis=1)
     return q, v, a, intervals.inputs[logged]
 
@@ -307,7 +307,7 @@ def _motion(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatAr
 
 def _row_parameters(intervals: ShootingIntervals, values: FloatArray, *, logged: bool = False) -> FloatArray:
     """Parameters of the model: one vector for all rows, or (N, n_p) where logs differ; of logged rows, or all."""
-    logs = intervals.log_of_row[intervals.is_logged] if logged else intervals.log_of_row
+    logs = intervals.log_of_row[intervals.counted] if logged else intervals.log_of_row
     return intervals.parameters_of(values[: intervals.n_p], logs)
 
 

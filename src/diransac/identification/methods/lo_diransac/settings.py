@@ -32,6 +32,7 @@ class LoDiransacSettings:
     n_finalists: int = 12
     delay_range: tuple[float, float] = (-0.03, 0.08)
     max_delay_shifts: int = 3
+    max_sensor_errors: int = 8
     substeps: int = 5
     max_starts: int = 5
     max_fits: int = 8
@@ -67,7 +68,14 @@ class LoDiransacSettings:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
 
 
-_MAY_BE_ZERO = ("n_samples", "max_delay_shifts", "max_steps", "prior_model_error", "prior_discrepancy")
+_MAY_BE_ZERO = (
+    "n_samples",
+    "max_delay_shifts",
+    "max_sensor_errors",
+    "max_steps",
+    "prior_model_error",
+    "prior_discrepancy",
+)
 
 
 def _checked(name: str, value: Any, default: Any) -> Any:
