@@ -81,9 +81,11 @@ class Explanation:
 
     @property
     def cost(self) -> float:
-        """Negative log evidence, with half the logarithm of the number of rows for each scale of a discrepancy."""
-        n_scales = 0 if self.exact else 2 * self.intervals.model.n_v + 1
-        return self.refinement.cost + 0.5 * n_scales * float(np.log(self.intervals.is_logged.sum()))
+        """Negative log evidence, and half the logarithm of the number of rows for each scale of a discrepancy and delay."""
+        intervals = self.intervals
+        late = abs(intervals.delay + self.refinement.fit.shared[-1]) > _SMALL_DELAY or bool(intervals.lag)
+        n_scales = (0 if self.exact else 2 * intervals.model.n_v + 1) + late
+        return self.refinement.cost + 0.5 * n_scales * float(np.log(intervals.is_logged.sum()))
 
 
 @dataclass(frozen=True)
@@ -256,7 +258,8 @@ class LocalSearch:
         if intervals.hold != old.hold:
             left = 0.0
         prior = now.prior if intervals.sensors is not old.sensors else self.prior
-        sizes = np.append(fit.prior[:-1], prior.delay)
+        # A wide prior that the evidence narrows: a narrow one would never widen where nothing moves.
+        sizes = np.append(fit.prior[:-1], prior.delay if prior is now.prior else max(prior.delay, _WHOLE_SAMPLE))
         begin = with_residuals(intervals, replace(fit, shared=np.append(fit.shared[:-1], left), prior=sizes))
         if now.exact:
             refined = refine_exact(self.settings, intervals, begin, self.prior)

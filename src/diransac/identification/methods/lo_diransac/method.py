@@ -20,6 +20,7 @@ from diransac.data.segment import long_runs
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.method import report
+from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import LocalSearch
 from diransac.identification.methods.lo_diransac.projection import (
@@ -205,7 +206,10 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         # The fit satisfies the bounds; least squares on its motion may violate a strict one.
         result = fitted_parameters(intervals, refined.fit)
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
-    checks = tuple(_checks(settings, intervals, motion, refined))
+    checks = (
+        *_checks(settings, intervals, motion, refined),
+        *findings_of_fit(likeliest, motion, result),
+    )
     late = float(intervals.delay + intervals.lag + refined.fit.shared[-1])
     found = _Found(dataset, intervals, motion, refined.fit, result, late)
     return _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)

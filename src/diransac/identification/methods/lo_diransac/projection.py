@@ -42,7 +42,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ProjectedEstimate",
+    "batch_sums",
+    "by_least_squares",
     "discrepancy_units",
+    "equations_of",
     "estimate_parameters",
     "fitted_parameters",
     "inertial_forces",
@@ -115,7 +118,7 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(np.zeros((len(intervals), k, n_p)), np.eye(n_s, n_p))
     scores = np.einsum("wkp,wk->wp", z, at.data_z) + at.data_s @ s
-    sums = _batch_sums(scores)
+    sums = batch_sums(scores)
     more = np.sqrt(np.maximum(1.0, np.square(sums).sum(axis=0) / (np.diag(s[:n_p]) + _TINY)))
     p, delay = fit.shared[:n_p], at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
     return ProjectedEstimate(p, s[:n_p] * np.outer(more, more), unexplained(intervals, fit, p), float(np.sqrt(delay)))
@@ -159,7 +162,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     unmade = latent - means @ np.einsum("pwi,wi->p", by_means, latent)
     unpushed = push - W @ np.einsum("pni,ni->p", by_rows, push)
     of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)
-    sums = _batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
+    sums = batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
     covariance = covariance + sums.T @ sums
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
@@ -203,6 +206,57 @@ def _least_squares(W: FloatArray, weights: FloatArray) -> FloatArray:
     scale = np.linalg.norm(rows, axis=0) + _TINY
     solved = np.linalg.lstsq(rows.T @ rows / scale / scale[:, None], (rows / scale).T, rcond=None)[0]
     return np.asarray((solved / scale[:, None]).reshape(-1, *W.shape[:2]) * weights)
+
+
+def batch_sums(values: FloatArray) -> FloatArray:
+    """Sums over about sqrt(W) neighbouring intervals each: their squares count what neighbours have in common.
+
+    They are increased by Student's t for their number, so that a normal interval has its level.
+
+    Parameters
+    ----------
+    values : (W, n) array
+
+    Returns
+    -------
+    (n_batches, n) array
+    """
+    sums = np.add.reduceat(values, np.arange(0, len(values), round(np.sqrt(len(values)))), axis=0)
+    return np.asarray(sums * stdtrit(max(len(sums) - 1, 1), _UPPER) / ndtri(_UPPER))
+
+
+def equations_of(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means over each interval of the regressors and of the residuals of the fitted motion.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    parameters : (n,) array
+
+    Returns
+    -------
+    (W, n_v, n) array, (W, n_v) array
+    """
+    logged, p = intervals.counted[:, None], _row_parameters(intervals, parameters)
+    residuals, W, _ = _residual_map(intervals.model)(*_motion(intervals, fit), p)
+    return _means(intervals, _regressors(intervals, W * logged)), _means(intervals, residuals * logged)
+
+
+def by_least_squares(W: FloatArray, residuals: FloatArray) -> FloatArray:
+    """Effect ``(n, N, r)`` of rows on the parameters by least squares with the equations' scales.
+
+    Parameters
+    ----------
+    W : (N, r, n) array
+    residuals : (N, r) array
+
+    Returns
+    -------
+    (n, N, r) array
+    """
+    scale = np.sqrt(np.square(residuals).mean(axis=0))
+    return _least_squares(W, 1.0 / np.maximum(scale, 1e-6 * scale.max() + _TINY))
 
 
 def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:
@@ -331,15 +385,6 @@ def _residual_map(model: Model) -> Map:
     r = model.residual(q, v, a, u, p)
     slopes = [ca.densify(ca.jacobian(r, x)) for x in (p, a)]
     return compile_map(ca.Function("residuals", [q, v, a, u, p], [ca.densify(r), *slopes]))
-
-
-def _batch_sums(values: FloatArray) -> FloatArray:
-    """Sums over about sqrt(W) neighbouring intervals each: their squares count what neighbours have in common.
-
-    They are increased by Student's t for their number, so that a normal interval has its level.
-    """
-    sums = np.add.reduceat(values, np.arange(0, len(values), round(np.sqrt(len(values)))), axis=0)
-    return np.asarray(sums * stdtrit(max(len(sums) - 1, 1), _UPPER) / ndtri(_UPPER))
 
 
 def _means(intervals: ShootingIntervals, rows: FloatArray) -> FloatArray:
