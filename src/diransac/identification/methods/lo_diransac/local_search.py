@@ -56,7 +56,7 @@ _SMALL_GAIN = 0.03
 # Gain of evidence, nats, that an error of a sensor is worth.
 _WORTH = 20.0
 # Inputs that vary linearly between samples act half a sample before held ones.
-_LINEAR = (-0.75, -0.25)
+_LINEAR = (-0.9, -0.1)
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Explanation:
 
     @property
     def cost(self) -> float:
-        """Negative log evidence, and half the logarithm of the number of rows for each scale of a discrepancy and delay."""
+        """Negative log evidence, with half the logarithm of the number of rows for each scale and for a delay."""
         intervals = self.intervals
         late = abs(intervals.delay + self.refinement.fit.shared[-1]) > _SMALL_DELAY or bool(intervals.lag)
         n_scales = (0 if self.exact else 2 * intervals.model.n_v + 1) + late
