@@ -9,6 +9,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from regime_baselines import NoBaselineError, ordinary, total
@@ -76,12 +77,16 @@ class Record:
         return self.off and self.verdict != UNRELIABLE and not self.names_cause
 
 
-def record_all(regime: str, seeds: Sequence[int], methods: Sequence[str]) -> list[Record]:
-    """Let every method at the logs of some seeds."""
+def judge(regime: str, seed: int, seeds: Sequence[int], methods: Sequence[str]) -> list[Record]:
+    """Let every method at the log of one seed; those of all seeds are simulated at once, and kept for the next call."""
     chosen = REGIMES[regime]
-    with np.errstate(over="ignore"):
-        recorded = recordings(chosen, seeds)
-    return [METHODS[method](chosen, seed, one) for seed, one in zip(seeds, recorded, strict=True) for method in methods]
+    log = _recordings(regime, tuple(seeds))[seeds.index(seed)]
+    return [METHODS[method](chosen, seed, log) for method in methods]
+
+
+@lru_cache(maxsize=1)
+def _recordings(regime: str, seeds: tuple[int, ...]) -> list[Recording]:
+    return recordings(REGIMES[regime], seeds)
 
 
 def _lo(regime: Regime, seed: int, recording: Recording) -> Record:
