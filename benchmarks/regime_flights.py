@@ -260,7 +260,7 @@ def _stribeck(rngs: Rngs) -> Force:  # noqa: ARG001
 
 
 def _ripple(rngs: Rngs) -> Force:  # noqa: ARG001
-    """Torque ripple of a fifth of dry friction, 40 periods a radian over 2 pi, in the arm's first joint."""
+    """Torque ripple ``sin(40 q)`` in the arm's first joint, a fifth of its dry friction."""
     return lambda t, q, v, u, p: np.stack([0.2 * p.fc1 * np.sin(40.0 * q[0]), 0.0 * q[1]])
 
 
