@@ -285,11 +285,12 @@ def _late(signals: str, milliseconds: float) -> Fault:
 
 
 _POSE = "x y z phi theta psi"
+_GYRO = "wx wy wz"
 _ALL = [
     Regime("rotor noise .1x", _ROTOR, noise=0.1),
     Regime("rotor noise 1x", _ROTOR),
     Regime("rotor noise 10x", _ROTOR, noise=10.0),
-    Regime("quad mocap and gyro", _QUAD),
+    Regime("quad mocap and gyro", _QUAD, signals=(*_POSE.split(), *_GYRO.split())),
     Regime("car all measured", machines.CAR),
     Regime("car gyro and lateral acceleration", machines.CAR, signals=("yaw_dot", "lateral_ddot")),
     Regime("flexible joint both angles", machines.JOINT),

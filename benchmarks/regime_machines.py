@@ -240,7 +240,7 @@ QUAD = Machine(
     lambda rngs: Multisine(rngs, (1.1, 1.1, 0.5, 0.5), 0.08, 0.45, 5),
     _quad_control,
     {**dict.fromkeys(("x", "y", "z"), 0.002), **dict.fromkeys(("phi", "theta", "psi"), 0.005)}
-    | dict.fromkeys(("wx", "wy", "wz"), 0.02),
+    | dict.fromkeys(("vx", "vy", "vz", "wx", "wy", "wz"), 0.02),
     dt=0.01, duration=20.0, substeps=4, bandwidth=5.0,
     kinematics=lambda q, v: np.concatenate([v[:3], np.stack(_euler_rates(np, q[3], q[4], *v[3:]))]),
     on_reference=_quad_start,

@@ -161,7 +161,7 @@ def _totals(records: Sequence[Record]) -> Iterable[str]:
             yield (
                 f"{'Exact' if exact else 'Mismatched'} models, {len(some)} runs: {sum(one.off for one in some)} off, "
                 f"{wrong} confidently wrong ({100.0 * wrong / len(some):.1f} %), {named} name a cause, "
-                f"{_refusals(some)} refused, coverage {_coverage(some)}."
+                f"refused {_refusals(some)}, coverage {_coverage(some)}."
             )
 
 
