@@ -80,8 +80,7 @@ class Comparison:
         for name, result in diagnosed.items():
             found = result.diagnosis
             assert found is not None
-            if found.unidentifiable:
-                yield f"{name}: not identifiable from this log: {', '.join(found.unidentifiable)}"
+            yield from (f"{name}: {sentence}" for sentence in found.unidentifiable_sentences())
             if found.input_delay_significant:
                 sense = "later" if found.input_delay > 0.0 else "earlier"
                 delay = f"{1e3 * abs(found.input_delay):.3g} ms {sense} than recorded"

@@ -15,7 +15,8 @@ from diransac.errors import DiransacError, SettingsError
 from diransac.identification.agreement import disagreements
 from diransac.identification.estimate import Evaluation, LogSummary
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
-from diransac.identification.method import Callback, Method, report, within
+from diransac.identification.identifiability import check_motion
+from diransac.identification.method import Callback, Method, fit, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, factory
 from diransac.identification.result import Result
 from diransac.identification.settings import Settings
@@ -147,8 +148,9 @@ class _Task:
         criteria = self.method.criteria
         judged = judged_signals(self.model, logs, criteria)
         dataset = Dataset.of(self.model, logs, judged, pointwise=self.pointwise, given=self.given)
+        check_motion(dataset)
         fitted = 0.5 if self.compares else 0.95
-        estimate = self.method.fit(dataset, self.seed, within(progress, 0.0, fitted))
+        estimate = fit(self.method, dataset, self.seed, within(progress, 0.0, fitted))
         report(progress, "evaluating", fitted)
         scoring = choose_scoring(dataset, criteria)
         evaluation = evaluate(estimate, dataset, scoring, criteria)

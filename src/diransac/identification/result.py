@@ -463,7 +463,7 @@ class Result:
         return lines
 
     def _warnings_of_diagnosis(self, found: Diagnosis) -> list[str]:
-        lines = [f"! {name} is not identifiable from this log; excite it" for name in found.unidentifiable]
+        lines = [f"! {sentence}" for sentence in found.unidentifiable_sentences()]
         if found.input_delay_significant:
             sense = "later" if found.input_delay > 0.0 else "earlier"
             lines.append(f"! inputs act {1e3 * abs(found.input_delay):.3g} ms {sense} than recorded")

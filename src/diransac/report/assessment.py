@@ -198,10 +198,7 @@ def _diagnosis(runs: Sequence[Run]) -> Iterator[Finding]:
         yield Finding(
             "care", f"{late}: the estimate includes this delay; simulations of the model must include it, too."
         )
-    if found.unidentifiable:
-        names, several = ", ".join(found.unidentifiable), len(found.unidentifiable) > 1
-        what = f"{names} {'are' if several else 'is'} not identifiable from {_these(runs)}"
-        yield Finding("care", f"{what}; excite {'them' if several else 'it'}.")
+    yield from (Finding("care", f"{sentence}.") for sentence in found.unidentifiable_sentences())
 
 
 def _these(runs: Sequence[Run]) -> str:
