@@ -153,6 +153,31 @@ def test_collinear_estimates_are_named_with_the_combination_that_is_determined()
     assert found[1].combinations == ("2 a + b = 10 ± 0.04",)
 
 
+@pytest.mark.parametrize("method", ["ols", "tls", "nls", "i-diransac"])
+def test_a_log_without_a_known_force_determines_ratios_alone(method):
+    """A mass that coasts: m a + c v = 0 is solved by zero."""
+    v = 2.0 * np.exp(-DRAG / MASS * DT * np.arange(N))
+    columns = {"s": MASS / DRAG * (2.0 - v), "s_dot": v, "s_ddot": -DRAG / MASS * v, "force": np.zeros(N)}
+    with pytest.raises(
+        IdentificationError, match=r"b = 0 in each row of W p = b, since force is zero throughout: only 1 ra"
+    ):
+        dr.identify(sledge(), dr.Log.from_arrays(DT * np.arange(N), columns), method)
+
+
+def test_a_combination_that_two_logs_leave_open_is_that_of_their_own_parameters():
+    """A shared offset and one bias per log appear as a sum in each log."""
+
+    def equation(q, v, a, u, p):
+        return p.mass * a.s + p.drag * v.s + p.offset + p.bias - u.force
+
+    biased = model(equation, mass=POSITIVE, drag=NOT_NEGATIVE, offset=FREE, bias=dr.Parameter("N", per_log=True))
+    logs = [slide(force=lambda x, b=b: x["force"] + b) for b in (0.2, -0.3)]
+    result = dr.identify(biased, logs, compare_logs=False)
+    assert set(result.diagnosis.unidentifiable) == {"offset", "bias[0]", "bias[1]"}
+    assert "only the combination offset + bias is determined" in str(result)
+    assert result.parameters["drag"] == pytest.approx(DRAG, rel=0.02)
+
+
 # ---------------------------------------------------------------------- causes of a refusal
 
 

@@ -33,6 +33,7 @@ __all__ = [
     "MotionRows",
     "NullSpace",
     "cause_of_refusal",
+    "check_known_terms",
     "check_motion",
     "check_signs",
     "check_structure",
@@ -585,17 +586,45 @@ def cause_of_refusal(model: Model, layout: ParameterLayout, logs: Sequence[Motio
     found = _solved(model, layout, logs)
     if found is None:
         return f"the equations are not finite at any row; {_ADVICE}"
+    if not found.has_known_terms:
+        return _no_known_terms(model, layout, logs)
     ambiguous = of_log(layout.names, found.space)
     if ambiguous:
         return in_words(ambiguous, len(logs))
-    outside = layout.violations(found.parameters)
-    named = ", ".join(f"{n} = {x:.4g}" for n, x in zip(layout.names, found.parameters, strict=True) if n in outside)
+    values, outside = dict(zip(layout.names, found.parameters, strict=True)), layout.violations(found.parameters)
+    named = ", ".join(f"{name} = {values[name]:.4g}" for name in outside or values)
     if not outside:
-        return f"simulations with the parameters of samples diverge from the log; {_ADVICE}"
+        return f"least squares of all rows gives {named}, within the bounds, but the method does not; {_ADVICE}"
     where = "outside its bounds" if len(outside) == 1 else "outside their bounds"
     alternatives = _Alternatives(model, layout, logs, found)
     remedy = alternatives.signs() or alternatives.unit() or _ADVICE
     return f"least squares of all rows gives {named}, {where}; {remedy}"
+
+
+def check_known_terms(dataset: Dataset) -> None:
+    """Raise IdentificationError for logs in which ``b = 0`` in each row of ``W p = b``, so that zero solves it.
+
+    Models that are not affine in their parameters pass.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    """
+    model, logs = dataset.model, motion_rows(dataset)
+    if model.nonlinear_parameters:
+        return
+    rows = _equations(model, dataset.layout, logs)
+    if len(rows) and not rows[:, -1].any():
+        raise IdentificationError(f"{dataset.source}: {_no_known_terms(model, dataset.layout, logs)}")
+
+
+def _no_known_terms(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> str:
+    """Sentence about logs in which ``b = 0`` in each row, with the inputs that are zero."""
+    every = Ambiguity(layout.names, max(1, len(layout) - 1), (), "ratio")
+    zero = [name for i, name in enumerate(model.inputs) if not any(one.u[:, i].any() for one in logs)]
+    verb = "is" if len(zero) == 1 else "are"
+    cause = f"{', '.join(zero)} {verb} zero throughout" if zero else "each known term is zero throughout"
+    return every.sentence(f"b = 0 in each row of W p = b, since {cause}: {every.determined()}; record known forces")
 
 
 def check_signs(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows], source: str) -> None:
@@ -675,11 +704,14 @@ class _Solution:
         Median size of the residuals over the median size of the equations' terms.
     space : NullSpace
         Directions that the rows do not determine.
+    has_known_terms : bool
+        Whether b differs from zero in any row.
     """
 
     parameters: FloatArray
     residual: float
     space: NullSpace
+    has_known_terms: bool
 
 
 def _solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> _Solution | None:
@@ -688,6 +720,7 @@ def _solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -
     if not len(rows):
         return None
     scale = np.sqrt(np.square(rows).mean(axis=0))
+    has_known_terms = bool(scale[-1] > 0.0)
     scale = np.where(scale > 0.0, scale, 1.0)
     rows = rows / scale
     A, y, size = rows[:, :-1], rows[:, -1], np.linalg.norm(rows, axis=1)
@@ -699,7 +732,10 @@ def _solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -
         weights = 1.0 / (1.0 + np.square(residuals / (_FAR * middle)))
     whole = np.median(np.abs(A) @ np.abs(p) + np.abs(y)) + _TINY
     return _Solution(
-        p * scale[-1] / scale[:-1], float(middle / whole), null_space(A.T @ A, scale[:-1], _RANK_OF_LOG * len(A))
+        p * scale[-1] / scale[:-1],
+        float(middle / whole),
+        null_space(A.T @ A, scale[:-1], _RANK_OF_LOG * len(A)),
+        has_known_terms,
     )
 
 

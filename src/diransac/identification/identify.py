@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diransac.data import preprocessing
-from diransac.data.dataset import Dataset, as_logs
+from diransac.data.dataset import Dataset, distinct_logs
 from diransac.data.log import Log
 from diransac.errors import DiransacError, SettingsError
 from diransac.identification.agreement import disagreements
@@ -78,7 +78,7 @@ def identify(
     Raises
     ------
     LogError
-        A log lacks a signal, or cannot be used.
+        A log lacks a signal, cannot be used, or is given twice.
     SettingsError
         An argument is out of range, or a setting is not used by the method.
     ModelError
@@ -91,7 +91,7 @@ def identify(
     Dimmig et al. 2023, Algorithm 1.
     """
     chosen = _method(method, settings, estimator)
-    given = as_logs(logs)
+    given = distinct_logs(logs)
     _check_arguments(model, seed)
     filtered = differentiate and chosen.needs_all_signals
     if bandwidth is not None and not filtered:

@@ -19,6 +19,7 @@ from diransac.identification.estimators import (
 )
 from diransac.identification.identifiability import (
     cause_of_refusal,
+    check_known_terms,
     check_structure,
     in_words,
     motion_rows,
@@ -145,6 +146,7 @@ def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
         A parameter is not identifiable from the whole dataset; the message names it.
     """
     check_structure(dataset.model, dataset.source)
+    check_known_terms(dataset)
     bound = estimator.bind(dataset)
     if bound.select([np.arange(bound.n_rows)]).well_defined()[0]:
         return bound
