@@ -578,27 +578,30 @@ def cause_of_refusal(model: Model, layout: ParameterLayout, logs: Sequence[Motio
     -------
     str
     """
-    ambiguous = structural(model)
-    if ambiguous:
-        return "; ".join(x.sentence(x.of_equations()) for x in ambiguous)
-    if model.nonlinear_parameters:
-        return f"no simulation with {', '.join(layout.names)} within their bounds follows the log; {_ADVICE}"
-    found = _solved(model, layout, logs)
+    of_model = structural(model)
+    found = None if model.nonlinear_parameters else _solved(model, layout, logs)
+    if any(x.noun == "ratio" for x in of_model) or (found is None and of_model):
+        return "; ".join(x.sentence(x.of_equations()) for x in of_model)
     if found is None:
-        return f"the equations are not finite at any row; {_ADVICE}"
+        why = "no simulation within the bounds follows the log" if model.nonlinear_parameters else "no row is finite"
+        return f"{', '.join(layout.names)} cannot be estimated, since {why}; {_ADVICE}"
     if not found.has_known_terms:
         return _no_known_terms(model, layout, logs)
-    ambiguous = of_log(layout.names, found.space)
-    if ambiguous:
-        return in_words(ambiguous, len(logs))
+    return _cause_of_solution(_Alternatives(model, layout, logs, found), of_model)
+
+
+def _cause_of_solution(alternatives: _Alternatives, of_model: Sequence[Ambiguity]) -> str:
+    """The cause where least squares of all rows has a solution: signals, ambiguities, or bounds."""
+    found, layout = alternatives.found, alternatives.layout
     values, outside = dict(zip(layout.names, found.parameters, strict=True)), layout.violations(found.parameters)
-    named = ", ".join(f"{name} = {values[name]:.4g}" for name in outside or values)
-    if not outside:
-        return f"least squares of all rows gives {named}, within the bounds, but the method does not; {_ADVICE}"
-    where = "outside its bounds" if len(outside) == 1 else "outside their bounds"
-    alternatives = _Alternatives(model, layout, logs, found)
-    remedy = alternatives.signs() or alternatives.unit() or _ADVICE
-    return f"least squares of all rows gives {named}, {where}; {remedy}"
+    named = f"least squares of all rows gives {', '.join(f'{n} = {values[n]:.4g}' for n in outside or values)}"
+    named += f", outside {'its' if len(outside) == 1 else 'their'} bounds" if outside else ", within the bounds"
+    remedy = (alternatives.signs() or alternatives.unit()) if outside else ""
+    if remedy:
+        return f"{named}; {remedy}"
+    if of_model:
+        return "; ".join(x.sentence(x.of_equations()) for x in of_model)
+    return in_words(of_log(layout.names, found.space), len(alternatives.logs)) or f"{named}; {_ADVICE}"
 
 
 def check_known_terms(dataset: Dataset) -> None:
