@@ -430,7 +430,7 @@ def collinear(
     """
     weak = np.flatnonzero(uncertain & (np.diag(covariance) > 0.0) & np.isfinite(covariance).all(axis=1))
     errors = np.sqrt(np.diag(covariance)[weak])
-    sizes, vectors = np.linalg.eigh(covariance[np.ix_(weak, weak)] / np.outer(errors, errors))
+    sizes, vectors = np.linalg.eigh(covariance[np.ix_(weak, weak)] / errors[:, None] / errors)
     determined = vectors[:, sizes < _COLLINEAR].T
     determined = np.where(np.abs(determined) > _PART_OF_CORRELATION, determined, 0.0)
     found, left = [], np.flatnonzero(uncertain).tolist()
@@ -731,6 +731,8 @@ def _solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -
     for _ in range(_STEPS):
         p = np.linalg.lstsq(A * weights[:, None], y * weights, rcond=None)[0]
         residuals = np.abs(A @ p - y)
+        if not np.isfinite(residuals).all():
+            return None
         middle = np.median(residuals) + _TINY
         weights = 1.0 / (1.0 + np.square(residuals / (_FAR * middle)))
     whole = np.median(np.abs(A) @ np.abs(p) + np.abs(y)) + _TINY

@@ -307,5 +307,8 @@ def _instrumented(A: FloatArray, Z: FloatArray) -> FloatArray:
     scale = np.linalg.norm(instruments, axis=0)
     scale[scale == 0.0] = 1.0
     instruments = instruments / scale
-    solved = np.linalg.lstsq(instruments.T @ (rows / scale), instruments.T, rcond=None)[0] / scale[:, None]
+    normal = instruments.T @ (rows / scale)
+    if not (np.isfinite(normal).all() and np.isfinite(instruments).all()):  # LAPACK would print to the terminal
+        raise np.linalg.LinAlgError("the regressors of the fitted motion are not finite")
+    solved = np.linalg.lstsq(normal, instruments.T, rcond=None)[0] / scale[:, None]
     return np.asarray(solved).reshape(-1, *A.shape[:2])
