@@ -1,5 +1,7 @@
 """Identifiability in words: combinations are those of the equations and logs, and refusals name their planted cause."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -176,6 +178,30 @@ def test_a_combination_that_two_logs_leave_open_is_that_of_their_own_parameters(
     assert set(result.diagnosis.unidentifiable) == {"offset", "bias[0]", "bias[1]"}
     assert "only the combination offset + bias is determined" in str(result)
     assert result.parameters["drag"] == pytest.approx(DRAG, rel=0.02)
+
+
+@pytest.mark.parametrize("method", ["ols", "nls"])
+def test_parameters_that_a_log_hardly_tells_apart_are_named_with_their_sum(method):
+    """The speed stays within a percent of 0.5 m/s: drag and bias are nearly one force, 0.5 drag + bias = 1.4."""
+
+    def equation(q, v, a, u, p):
+        return p.mass * a.s + p.drag * v.s + p.bias - u.force
+
+    rng = np.random.default_rng(6)
+    v, a = 0.5 + 0.005 * np.sin(0.7 * DT * np.arange(N)), rng.normal(size=N)
+    force = MASS * a + DRAG * v + 0.4 + 0.2 * rng.normal(size=N)
+    log = dr.Log.from_arrays(DT * np.arange(N), {"s": np.cumsum(v) * DT, "s_dot": v, "s_ddot": a, "force": force})
+    result = dr.identify(model(equation, mass=POSITIVE, drag=dr.Parameter("N s/m"), bias=FREE), log, method)
+    (found,) = re.findall(
+        r"drag, bias are not .* only the combination drag \+ (\S+) bias = (\S+) ± (\S+) is", str(result)
+    )
+    share, value, error = map(float, found)
+    assert share == pytest.approx(2.0, rel=0.02)
+    assert abs(value - DRAG - 0.4 * share) < 3.0 * error < 0.3
+
+
+def test_certain_parameters_have_no_such_note():
+    assert "combination" not in str(dr.identify(sledge(), slide(), "ols"))
 
 
 # ---------------------------------------------------------------------- causes of a refusal

@@ -77,6 +77,9 @@ class BoundEstimator(Protocol):
     def null_space(self) -> NullSpace:
         """Directions of the parameters that the whole dataset does not determine."""
 
+    def correlations(self) -> FloatArray:
+        """Correlations ``(n, n)`` of the parameters' errors from the whole dataset, which determines them."""
+
 
 class Estimator(Protocol):
     """An unbound estimator: its settings, without data."""
@@ -221,6 +224,9 @@ class _BoundSums:
         gram = self._gram([np.arange(self.n_rows)])[0, :-1, :-1]
         return null_space(gram, self._scale[:-1], self.min_eigenvalue)
 
+    def correlations(self) -> FloatArray:
+        return correlations(self._gram([np.arange(self.n_rows)])[0, :-1, :-1])
+
     @property
     def min_eigenvalue(self) -> float:
         """Threshold of a well-defined set of rows."""
@@ -316,6 +322,9 @@ class _BoundScikitLearn:
 
     def null_space(self) -> NullSpace:
         return self._sums.null_space()
+
+    def correlations(self) -> FloatArray:
+        return self._sums.correlations()
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
         return self.fit([np.setdiff1d(rows, group) for group in groups])
@@ -479,6 +488,23 @@ def smallest_eigenvalue(gram: FloatArray) -> FloatArray:
     finite = np.all(np.isfinite(gram), axis=(-2, -1))
     values = np.linalg.eigvalsh(np.where(finite[..., None, None], gram, 0.0))[..., 0]
     return np.where(finite, values, -np.inf)
+
+
+def correlations(gram: FloatArray) -> FloatArray:
+    """Correlations of estimates whose rows have independent errors.
+
+    Parameters
+    ----------
+    gram : (n, n) array
+        Sum of ``W^T W`` in any scale, positive definite.
+
+    Returns
+    -------
+    (n, n) array
+    """
+    covariance = np.linalg.inv(gram)
+    errors = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / errors[:, None] / errors)
 
 
 def solve_definite(A: FloatArray, g: FloatArray) -> FloatArray:

@@ -44,6 +44,7 @@ __all__ = [
     "of_log",
     "structural",
     "unidentifiable",
+    "vague_parameters",
 ]
 
 # Parameter vectors at which dr/dp is evaluated; random motions for each, at least and per parameter; their decades.
@@ -68,6 +69,8 @@ _AS_GOOD = 1.05
 _MILLI, _DEGREE = 1e-3, np.pi / 180.0
 _ADVICE = "check the model, the signs and units of the signals, and the bounds"
 _WITHIN = "all parameters are within their bounds"
+# Standard errors of a 95 % interval to either side.
+_TWO_SIDED = 1.96
 _HOMOGENEOUS = "since each term has one of them as a factor (b = 0 in W p = b)"
 
 
@@ -443,6 +446,33 @@ def collinear(
         found.append(Ambiguity(tuple(names[i] for i in own), len(rows), texts if len(rows) == 1 else ()))
         left = [i for i in left if i not in own]
     return _joined([*found, Ambiguity(tuple(names[i] for i in left), 0, ())])
+
+
+def vague_parameters(
+    names: Sequence[str], values: FloatArray, covariance: FloatArray, correlations: FloatArray
+) -> tuple[Ambiguity, ...]:
+    """Parameters that do not differ from zero, since their errors are collinear.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of all n parameters.
+    values : (n,) array
+        Estimates, each in its unit.
+    covariance : (n, n) array
+        Of which the variances are used: a jackknife of few blocks has spurious correlations.
+    correlations : (n, n) array
+        Of the errors, from the regressor.
+
+    Returns
+    -------
+    tuple of Ambiguity
+    """
+    errors = np.sqrt(np.diag(covariance))
+    uncertain = np.isfinite(errors) & (_TWO_SIDED * errors > np.abs(values))
+    errors = np.where(uncertain, errors, 0.0)
+    found = collinear(names, values, correlations * errors[:, None] * errors, uncertain)
+    return tuple(x for x in found if x.n_determined)
 
 
 def unidentifiable(

@@ -16,6 +16,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.estimators import (
     BoundEstimator,
     OrdinaryLeastSquares,
+    correlations,
     smallest_eigenvalue,
     solve_definite,
 )
@@ -117,6 +118,9 @@ class _BoundNonlinear:
 
     def null_space(self) -> NullSpace:
         return null_space(self._blocks.sum(axis=0), self._column_scale, self._settings.min_eigenvalue)
+
+    def correlations(self) -> FloatArray:
+        return correlations(self._blocks.sum(axis=0))
 
     def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
         """Parameters ``(n_sets, n)``."""

@@ -24,6 +24,7 @@ from diransac.identification.identifiability import (
     in_words,
     motion_rows,
     of_log,
+    vague_parameters,
 )
 from diransac.identification.method import report
 from diransac.identification.nonlinear import NonlinearLeastSquares
@@ -183,10 +184,12 @@ def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows
     covariance = jackknife_covariance(bound, rows, log_sizes)
     stuck = dataset.layout.on_bounds(parameters)
     covariance[stuck] = covariance[:, stuck] = np.inf
+    vague = vague_parameters(dataset.layout.names, parameters, covariance, bound.correlations())
     return Estimate(
         parameters=dict(zip(dataset.layout.names, parameters.tolist(), strict=True)),
         covariance=covariance,
         degrees_of_freedom=max(1, min(N_BLOCKS, len(rows)) - 1),
         n_fitted=len(rows),
+        notes=(in_words(vague, len(dataset.segments)),) if vague else (),
         **about,
     )
