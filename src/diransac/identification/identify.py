@@ -15,9 +15,9 @@ from diransac.errors import DiransacError, SettingsError
 from diransac.identification.agreement import disagreements
 from diransac.identification.estimate import Evaluation, LogSummary
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
-from diransac.identification.identifiability import check_motion
 from diransac.identification.method import Callback, Method, fit, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, factory
+from diransac.identification.refusal import check_motion
 from diransac.identification.result import Result
 from diransac.identification.settings import Settings
 from diransac.model import Model

@@ -15,7 +15,8 @@ from diransac.data.dataset import Dataset
 from diransac.errors import IdentificationError, LogError
 from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.evaluation import choose_scoring
-from diransac.identification.identifiability import Ambiguity, check_motion, in_words, of_log, structural
+from diransac.identification.identifiability import Ambiguity, in_words, of_log, structural
+from diransac.identification.refusal import check_motion
 from diransac.identification.settings import Settings
 from diransac.identification.uncertainty import jackknife_covariance
 from diransac.text_table import aligned

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from diransac.errors import IdentificationError
-from diransac.identification.identifiability import cause_of_refusal, motion_rows
+from diransac.identification.refusal import cause_of_refusal, motion_rows
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset

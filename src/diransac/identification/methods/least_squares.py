@@ -17,17 +17,10 @@ from diransac.identification.estimators import (
     as_estimator,
     name_of,
 )
-from diransac.identification.identifiability import (
-    cause_of_refusal,
-    check_known_terms,
-    check_structure,
-    in_words,
-    motion_rows,
-    of_log,
-    vague_parameters,
-)
+from diransac.identification.identifiability import check_structure, in_words, of_log, vague_parameters
 from diransac.identification.method import report
 from diransac.identification.nonlinear import NonlinearLeastSquares
+from diransac.identification.refusal import cause_of_refusal, check_known_terms, motion_rows
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
 from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance
 

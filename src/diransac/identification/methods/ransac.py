@@ -27,10 +27,10 @@ from diransac.identification.evaluation import (
     mean_squared_error,
     rms_error,
 )
-from diransac.identification.identifiability import cause_of_refusal, motion_rows
 from diransac.identification.method import report
 from diransac.identification.methods.least_squares import bound_to, fitted
 from diransac.identification.nonlinear import NonlinearLeastSquares
+from diransac.identification.refusal import cause_of_refusal, motion_rows
 from diransac.identification.sampling import sample_rows
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
 

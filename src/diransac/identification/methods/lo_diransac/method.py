@@ -18,13 +18,7 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Resolution
-from diransac.identification.identifiability import (
-    MotionRows,
-    cause_of_refusal,
-    check_signs,
-    check_structure,
-    unidentifiable,
-)
+from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, robust_scores
 from diransac.identification.methods.lo_diransac.instrumental_variables import (
@@ -49,6 +43,7 @@ from diransac.identification.methods.lo_diransac.smoothing import (
     smooth,
     stuck_rows,
 )
+from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
