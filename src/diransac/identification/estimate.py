@@ -135,6 +135,8 @@ class Diagnosis:
         Whether the delay exceeds three standard errors and a quarter of a sample.
     unidentifiable : tuple of str
         Names of the parameters that the logs do not determine.
+    combinations : tuple of str, optional
+        Sentences about these parameters: the combinations that are determined, the reason, the remedy.
     """
 
     noise_std: Values
@@ -150,6 +152,7 @@ class Diagnosis:
     input_delay_error: Number
     input_delay_significant: bool
     unidentifiable: tuple[str, ...]
+    combinations: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         series = [self.window_log, self.unmodelled_time, self.smoothed_time]
@@ -189,6 +192,11 @@ class Diagnosis:
         """Most probable state at the first row of one log, by name."""
         first = self.windows_of(log)[0]
         return {name: float(values[first]) for name, values in self.smoothed_states.items()}
+
+    def unidentifiable_sentences(self) -> tuple[str, ...]:
+        """Sentences about the parameters that are not identifiable, without stops; empty where there is none."""
+        each = (f"{name} is not identifiable from this log; excite it" for name in self.unidentifiable)
+        return self.combinations or tuple(each)
 
     def lines(self, units: Mapping[str, str]) -> list[list[str]]:
         """Rows of a table: signal, noise, outliers, and the RMS that the model does not explain.

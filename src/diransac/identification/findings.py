@@ -11,7 +11,7 @@ from diransac.identification.estimate import Finding, Level
 from diransac.text_table import number, percent, plural, share
 
 if TYPE_CHECKING:
-    from diransac.identification.estimate import LogSummary, Prediction
+    from diransac.identification.estimate import Diagnosis, LogSummary, Prediction
     from diransac.identification.result import Result
     from diransac.model import Parameter
 
@@ -250,7 +250,7 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
         yield Finding(
             "care", f"{delay}: the estimate includes this delay; simulations of the model must include it, too."
         )
-    yield from _unidentifiable(result)
+    yield from _unidentifiable(result, found)
 
 
 def _unexplained(logs: Sequence[LogSummary]) -> Iterator[Finding]:
@@ -267,13 +267,10 @@ def _unexplained(logs: Sequence[LogSummary]) -> Iterator[Finding]:
     yield Finding(level, f"{text}: a term is missing, or an input; add it." if level == "bad" else f"{text}.")
 
 
-def _unidentifiable(result: Result) -> Iterator[Finding]:
-    names = result.unidentifiable
-    if names and len(names) == len(result.parameters):
-        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}: record a livelier motion.")
-    elif names:
-        what = f"{', '.join(names)} {'are' if len(names) > 1 else 'is'} not identifiable from {_these(result.logs)}"
-        yield Finding("care", f"{what}; excite {'them' if len(names) > 1 else 'it'}.")
+def _unidentifiable(result: Result, found: Diagnosis) -> Iterator[Finding]:
+    if len(result.unidentifiable) == len(result.parameters):
+        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}.")
+    yield from (Finding("care", f"{sentence}.") for sentence in found.unidentifiable_sentences())
 
 
 def _these(logs: Sequence[LogSummary]) -> str:

@@ -9,15 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from diransac.data import preprocessing
-from diransac.data.dataset import Dataset, as_logs
+from diransac.data.dataset import Dataset, distinct_logs
 from diransac.data.log import Log
 from diransac.errors import DiransacError, SettingsError
 from diransac.identification.agreement import disagreements
 from diransac.identification.estimate import Evaluation, LogSummary, Prediction
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
-from diransac.identification.method import Callback, Method, report, within
+from diransac.identification.method import Callback, Method, fit, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, factory
 from diransac.identification.prediction import predictions
+from diransac.identification.refusal import check_motion
 from diransac.identification.result import Result
 from diransac.identification.settings import Settings
 from diransac.model import Model
@@ -83,7 +84,7 @@ def identify(
     Raises
     ------
     LogError
-        A log lacks a signal, or cannot be used.
+        A log lacks a signal, cannot be used, or is given twice.
     SettingsError
         An argument is out of range, or a setting is not used by the method.
     ModelError
@@ -96,7 +97,7 @@ def identify(
     Dimmig et al. 2023, Algorithm 1.
     """
     chosen = _method(method, settings, estimator)
-    given = as_logs(logs)
+    given = distinct_logs(logs)
     _check_arguments(model, seed)
     hold = checked_hold(input_hold)
     filtered = differentiate and chosen.needs_all_signals
@@ -170,8 +171,9 @@ class _Task:
         dataset = Dataset.of(
             self.model, logs, judged, pointwise=self.pointwise, given=self.given, input_hold=self.input_hold
         )
+        check_motion(dataset)
         fitted = 0.5 if self.compares else 0.95
-        estimate = self.method.fit(dataset, self.seed, within(progress, 0.0, fitted))
+        estimate = fit(self.method, dataset, self.seed, within(progress, 0.0, fitted))
         report(progress, "evaluating", fitted)
         scoring = choose_scoring(dataset, criteria)
         evaluation = evaluate(estimate, dataset, scoring, criteria)

@@ -18,6 +18,7 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
+from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import LocalSearch
@@ -41,6 +42,7 @@ from diransac.identification.methods.lo_diransac.smoothing import (
     smooth,
     stuck_rows,
 )
+from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -176,15 +178,14 @@ def configured(settings: Settings, **options: Any) -> LoDiransac:
 
 def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
     """Parameters of the dataset's model, step by step."""
+    check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
     report(callback, "smoothing", 0.0)
     intervals, motion, notes = _prepared(settings, dataset)
     report(callback, "drawing hypotheses", 0.1)
     hypotheses = find_hypotheses(settings, intervals, motion, seed, dataset)
     if not len(hypotheses):
-        raise IdentificationError(
-            f"{dataset.source}: no sample of the log gives parameters within their bounds; check the model, "
-            "the signs and units of inputs, and the bounds"
-        )
+        cause = cause_of_refusal(dataset.model, dataset.layout, _rows_of_logs(intervals, motion))
+        raise IdentificationError(f"{dataset.source}: no sample gives parameters within their bounds: {cause}")
     unit = discrepancy_units(intervals, motion, hypotheses[0])
     search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
@@ -200,6 +201,8 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         # The fit satisfies the bounds; least squares on its motion may violate a strict one.
         result = fitted_parameters(intervals, refined.fit)
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
+    if dataset.layout.on_bounds(result.parameters).any():
+        check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
     checks = tuple(_checks(settings, intervals, motion, refined))
     late = float(intervals.delay + intervals.lag + refined.fit.shared[-1])
     found = _Found(dataset, intervals, motion, refined.fit, result, late)
@@ -215,6 +218,14 @@ def _checks(
         yield Finding("bad", f"The model explains almost nothing of this log: {advice}.")
     if not refined.converged and settings.max_steps:
         yield Finding("care", f"Local optimisation did not converge within its limit of {settings.max_steps} steps.")
+
+
+def _rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRows]:
+    """Rows of the smoothed motion of each log."""
+    n_q, n_v = intervals.model.n_q, intervals.model.n_v
+    logged = [np.arange(x.start, x.stop)[intervals.is_logged[x]] for x in intervals.rows_of_logs]
+    parts = [np.split(motion.signals[rows], [n_q, n_q + n_v], axis=1) for rows in logged]
+    return [MotionRows(q, v, a, intervals.inputs[rows]) for (q, v, a), rows in zip(parts, logged, strict=True)]
 
 
 def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
@@ -304,6 +315,7 @@ def _estimate(
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
     units = parameter_units(intervals, found.motion, result.parameters)
     lost = ~((spans < units) | (spans < np.abs(result.parameters)))
+    lost, combinations = unidentifiable(dataset.model, dataset.layout, result.parameters, result.covariance, lost)
     covariance = result.covariance.copy()
     covariance[lost] = covariance[:, lost] = np.inf
     nonlinear = bool(dataset.model.nonlinear_parameters)
@@ -318,12 +330,12 @@ def _estimate(
         stop_reason="converged" if converged else "limit of steps",
         resolution=Resolution("rk4", settings.substeps, intervals.hold),
         notes=notes,
-        diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x)),
+        diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),
         checks=checks,
     )
 
 
-def _diagnosis(found: _Found, unidentifiable: tuple[str, ...]) -> Diagnosis:
+def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ...]) -> Diagnosis:
     """Noise, faults and unmodelled forces, by name and over the rows of the given logs."""
     dataset, intervals, fit, result = found.dataset, found.intervals, found.fit, found.result
     model, dt = dataset.model, intervals.dt
@@ -351,7 +363,8 @@ def _diagnosis(found: _Found, unidentifiable: tuple[str, ...]) -> Diagnosis:
         input_delay=float(found.delay * dt),
         input_delay_error=result.delay_error * dt,
         input_delay_significant=abs(found.delay) > max(_SIGNIFICANT * result.delay_error, _SMALL_DELAY),
-        unidentifiable=unidentifiable,
+        unidentifiable=lost,
+        combinations=combinations,
     )
 
 

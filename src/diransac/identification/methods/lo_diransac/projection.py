@@ -200,9 +200,14 @@ def _bounded_projection(
 def _least_squares(W: FloatArray, weights: FloatArray) -> FloatArray:
     """``(W'VW)^-1 W'V`` of stacked matrices (N, r, n), as (n, N, r); columns scaled to one, V from ``weights (r,)``."""
     rows = (W * weights[:, None]).reshape(-1, W.shape[2])
-    scale = np.linalg.norm(rows, axis=0) + _TINY
-    solved = np.linalg.lstsq(rows.T @ rows / scale / scale[:, None], (rows / scale).T, rcond=None)[0]
-    return np.asarray((solved / scale[:, None]).reshape(-1, *W.shape[:2]) * weights)
+    scale = np.linalg.norm(rows, axis=0)
+    scale[scale == 0.0] = 1.0
+    rows = rows / scale
+    normal = rows.T @ rows
+    if not np.isfinite(normal).all():  # LAPACK would print to the terminal
+        raise np.linalg.LinAlgError("the regressors of the fitted motion are not finite")
+    solved = np.linalg.lstsq(normal, rows.T, rcond=None)[0] / scale[:, None]
+    return np.asarray(solved.reshape(-1, *W.shape[:2]) * weights)
 
 
 def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:
@@ -242,7 +247,8 @@ def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArra
         Infinite for parameters; 1 sample for the delay.
     """
     force = inertial_forces(intervals, motion, p)
-    level = np.append(1.0, np.sqrt(np.square(intervals.inputs).mean(axis=0)) + _TINY)
+    level = np.append(1.0, np.sqrt(np.square(intervals.inputs).mean(axis=0)))
+    level[level == 0.0] = 1.0  # the gain of an input that never acts stays at its prior
     return np.concatenate([np.full(intervals.n_p, np.inf), (force[:, None] / level).ravel(), [1.0]])
 
 
@@ -260,12 +266,13 @@ def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
     Returns
     -------
     (n,) array
-        The smallest over the equations, each in its parameter's unit.
+        The smallest over the equations, each in its parameter's unit; 0 where a parameter never acts.
     """
     W = _residual_map(intervals.model)(*_smoothed(intervals, motion), _row_parameters(intervals, p, logged=True))[1]
     logs = intervals.log_of_row[intervals.is_logged]
     sizes = np.sqrt(np.square(_by_log(intervals, _matrices(W, intervals.model.n_p), logs)).mean(axis=0)).T
-    return np.asarray((inertial_forces(intervals, motion, p) / np.maximum(sizes, _TINY)).min(axis=1))
+    smallest = (inertial_forces(intervals, motion, p) / np.maximum(sizes, _TINY)).min(axis=1)
+    return np.asarray(np.where(sizes.any(axis=1), smallest, 0.0))
 
 
 def inertial_forces(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
