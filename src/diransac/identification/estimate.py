@@ -18,6 +18,7 @@ from diransac.identification.serialization import (
     Values,
     WholeNumbers,
 )
+from diransac.identification.suggestions import Suggestion
 
 __all__ = ["Diagnosis", "Estimate", "Evaluation", "LogSummary", "Resolution"]
 
@@ -167,6 +168,8 @@ class Estimate:
         Findings and changes, a sentence each.
     diagnosis : Diagnosis, optional
         Noise, outliers and unmodelled forces; of lo-diransac alone.
+    suggestions : tuple of Suggestion, optional
+        Terms that the model lacks, by the unmodelled forces; of lo-diransac alone.
     """
 
     parameters: Values
@@ -182,6 +185,7 @@ class Estimate:
     squared_error: bool = False
     notes: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
+    suggestions: tuple[Suggestion, ...] = ()
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, np.float64).reshape(len(self.parameters), len(self.parameters))

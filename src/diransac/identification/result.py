@@ -19,12 +19,13 @@ from diransac.errors import DiransacError, ResultError, SettingsError
 from diransac.identification.estimate import Diagnosis, Estimate, Evaluation, LogSummary
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
+from diransac.identification.suggestions import Suggestion
 from diransac.model import Model
 from diransac.text_table import aligned, telling_digits
 
 __all__ = ["Result"]
 
-_FORMAT = 4
+_FORMAT = 5
 _FEW_INLIERS = 0.5
 _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
@@ -247,6 +248,11 @@ class Result:
         return self.estimate.diagnosis
 
     @property
+    def suggestions(self) -> tuple[Suggestion, ...]:
+        """Terms that would explain the unmodelled forces, the most likely first; from lo-diransac."""
+        return self.estimate.suggestions
+
+    @property
     def fit_error(self) -> float:
         """Fit error of the parameters, eq. (2), or its mean square for DIRANSAC; NaN if nothing could be simulated."""
         return self.evaluation.fit_error
@@ -449,7 +455,8 @@ class Result:
             lines.append(
                 f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice"
             )
-        return lines + [f"  {note}" for note in self.notes if note not in remarks]
+        lines += [f"  {note}" for note in self.notes if note not in remarks]
+        return lines + [line for x in self.suggestions for line in (f"? {x.text}", f"    {x.change}")]
 
     def _warnings_of_search(self) -> list[str]:
         lines = []

@@ -27,6 +27,7 @@ from diransac.identification.methods.lo_diransac.instrumental_variables import (
     parameter_units,
     unexplained,
 )
+from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
 from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.refinement import make_prior, refine, start
@@ -131,6 +132,10 @@ class LoDiransac(LoDiransacSettings):
         the fit.
     prior_inflation : float, optional
         Factor of the prior on model error whose effect on the parameters is added to their covariance.
+    suggestions : bool, optional
+        Whether terms are searched that would explain the unmodelled forces.
+    candidate_terms : callable, optional
+        Further candidates of that search: ``candidate_terms(q, v, u)`` returns expressions by name.
 
     Raises
     ------
@@ -210,7 +215,11 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     if not refined.converged and settings.max_steps:
         notes = (*notes, "local optimisation did not converge within its limit of steps")
     found = _Found(dataset, intervals, motion, refined.fit, result, float(delay + later + refined.fit.shared[-1]))
-    return _estimate(settings, found, len(hypotheses), refined.converged, notes)
+    estimate = _estimate(settings, found, len(hypotheses), refined.converged, notes)
+    if not settings.suggestions:
+        return estimate
+    terms = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
+    return replace(estimate, suggestions=terms)
 
 
 def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
