@@ -1,8 +1,8 @@
 """Suggested terms: machines whose model lacks a known force, and machines whose model is exact.
 
 Run: ``python benchmarks/suggestions.py [--seeds N] [--first SEED] [CASE ...]``.  Simulations are independent of the
-package: classical Runge-Kutta in NumPy, 10 to 20 steps a sample, parameters drawn for every seed.  Of each case one line
-says in how many logs the missing term was the first suggestion; of the exact models, how many suggestions there were.
+package: classical Runge-Kutta in NumPy, 8 or 10 steps a sample, parameters drawn for every seed.  Of each case one
+line says in how many logs the missing term was the first suggestion; of exact models, how many suggestions there were.
 The two real machines need the logs of ``../shared/data`` and are left out, with a line that says so, where they are
 missing.
 """
@@ -53,6 +53,7 @@ class Multisine:
         self.amplitude = amplitude / np.sqrt(n / 2)
 
     def __call__(self, t: float, order: int = 0) -> float:
+        """Value of the order-th derivative."""
         wave = np.sin(self.frequency * t + self.phase + order * np.pi / 2)
         return float(self.amplitude * (self.frequency**order * wave).sum())
 
@@ -187,7 +188,7 @@ def arm(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
 
 
 def rotorcraft(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
-    """The planar rotorcraft under feedback; missing: quadratic drag along both axes, 3 to 10 % of its weight at 2 m/s."""
+    """The planar rotorcraft under feedback; missing: quadratic drag, 3 to 10 % of its weight at 2 m/s."""
     rng = np.random.default_rng([4, seed])
     p = drawn(rng, mass=0.25, inertia=0.004, drag=0.025)
     quadratic = missing * p["mass"] * G / 4 * rng.uniform(0.03, 0.1)
@@ -244,7 +245,7 @@ def emps(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
     signals = {"position": kept.signals["position"][rows], "force": kept.signals["force"][rows]}
     known = dr.models.servo_axis()
 
-    def equations(q, v, a, u, p):  # noqa: ANN001, ANN202
+    def equations(_q, v, a, u, p):  # noqa: ANN001, ANN202
         return [p.mass * a.position + p.viscous_friction * v.position + p.offset - u.force]
 
     own = {n: x for n, x in known.parameters.items() if n != "dry_friction"}
@@ -256,12 +257,14 @@ RUNS = ("00", "01", "02", "03", "04", "05", "11", "12", "13")
 
 
 def double_pendulum(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
-    """A double pendulum (DFKI), one run at 125 Hz; missing: its dry friction."""
-    run = RUNS[seed % len(RUNS)]
+    """A double pendulum (DFKI), three random runs of nine at 125 Hz; missing: its dry friction."""
+    runs = np.random.default_rng([7, seed]).choice(RUNS, 3, replace=False)
     columns = {"t": "time"}
     columns |= {new + k: old + k for k in "12" for new, old in (("q", "pos_meas"), ("torque", "tau_meas"))}
-    log = dr.read_log(SHARED / "dfki_double_pendulum" / f"A0_{run}.parquet", rename=columns, resample=125.0)
-    signals = {n: log.signals[n] for n in ("q1", "q2", "torque1", "torque2")}
+    files = [SHARED / "dfki_double_pendulum" / f"A0_{run}.parquet" for run in runs]
+    read = [dr.read_log(file, rename=columns, resample=125.0) for file in files]
+    measured = ("q1", "q2", "torque1", "torque2")
+    logs = [dr.Log.from_arrays(x.time, {n: x.signals[n] for n in measured}, source=x.source) for x in read]
     known = dr.models.double_pendulum()
     own = {n: x for n, x in known.parameters.items() if not n.startswith("dry")}
 
@@ -271,4 +274,92 @@ def double_pendulum(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
         return list(ca.vertsplit(known.residual(*vectors)))
 
     model = dr.Model("double pendulum", known.coordinates, known.inputs, own, equations) if missing else known
-    return model, [dr.Log.from_arrays(log.time, signals, source=f"double pendulum {run}")]
+    return model, logs
+
+
+# ---------------------------------------------------------------------- the benchmark
+
+
+DEFAULT = dr.LoDiransac()
+
+
+@dataclass(frozen=True)
+class Case:
+    """A machine, the suggestion that is right for it, and settings that its motion needs."""
+
+    make: Callable[[int, bool], tuple[dr.Model, list[dr.Log]]]
+    kinds: tuple[str, ...]
+    equations: tuple[str, ...]
+    data: str = ""
+    method: dr.LoDiransac = DEFAULT
+
+
+CASES = {
+    "pendulum without Coulomb friction": Case(pendulum, ("Coulomb friction",), ("q",)),
+    "cart-pole without Coulomb friction": Case(
+        cart_pole, ("Coulomb friction",), ("x",), method=dr.LoDiransac(smoothing_half_width=0.08)
+    ),
+    "arm without Stribeck friction": Case(arm, ("Stribeck friction",), ("q1", "q2")),
+    "rotorcraft without quadratic drag": Case(rotorcraft, ("quadratic drag",), ("x", "z")),
+    "underwater vehicle in a current": Case(underwater_vehicle, ("asymmetric drag",), ("x",)),
+    "EMPS without dry friction (real)": Case(emps, ("Coulomb friction",), ("position",), "emps"),
+    "double pendulum without dry friction (real)": Case(
+        double_pendulum, ("Coulomb friction",), ("q1", "q2"), "dfki_double_pendulum"
+    ),
+}
+
+
+def identified(case: Case, seed: int, missing: bool) -> tuple[dr.Suggestion, ...] | str:
+    """Suggestions for one log, or the error in a word."""
+    model, logs = case.make(seed, missing)
+    try:
+        result = dr.identify(model, logs, case.method, differentiate=True, compare_logs=False)
+    except dr.DiransacError as error:
+        return type(error).__name__
+    return result.suggestions
+
+
+def row(name: str, case: Case, seeds: Sequence[int]) -> None:
+    """Print in how many logs the missing term came first, and what came first elsewhere."""
+    begin, right, others = time.process_time(), 0, []
+    for seed in seeds:
+        found = identified(case, seed, missing=True)
+        if isinstance(found, str) or not found:
+            others.append(f"{seed}: {found or 'nothing'}")
+        elif found[0].kind in case.kinds and found[0].equation in case.equations:
+            right += 1
+        else:
+            others.append(f"{seed}: {found[0].text}")
+    seconds = (time.process_time() - begin) / len(seeds)
+    print(f"{name:45} {right:3} of {len(seeds)}  {seconds:5.1f} s each  {'; '.join(others)}", flush=True)
+
+
+def exact(cases: Sequence[Case], seeds: Sequence[int]) -> None:
+    """Print the number of suggestions for logs whose model is exact."""
+    found = [(case.make.__name__, seed, identified(case, seed, missing=False)) for case in cases for seed in seeds]
+    false = [f"{name} {seed}: {x.text}" for name, seed, some in found if not isinstance(some, str) for x in some]
+    failed = [f"{name} {seed}: {some}" for name, seed, some in found if isinstance(some, str)]
+    print(f"{'exact models':45} {len(false)} suggestions in {len(found)} logs  {'; '.join(false + failed)}", flush=True)
+
+
+def main() -> None:
+    """Run all cases, or those whose name contains one of the given words."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("words", nargs="*", metavar="CASE")
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0, metavar="SEED")
+    given = parser.parse_args()
+    seeds = range(given.first, given.first + given.seeds)
+    for name, case in CASES.items():
+        if given.words and not any(word in name for word in given.words):
+            continue
+        if case.data and not (SHARED / case.data).exists():
+            print(f"{name:45} LEFT OUT: {SHARED / case.data} is missing", flush=True)
+        else:
+            row(name, case, seeds)
+    if not given.words or "exact" in given.words:
+        exact([case for case in CASES.values() if not case.data], seeds)
+
+
+if __name__ == "__main__":
+    main()

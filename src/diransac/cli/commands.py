@@ -78,6 +78,9 @@ def _identify(
     derivation: Derivation,
     preparation: Preparation,
     method: MethodName = DEFAULT,
+    with_suggestions: Annotated[
+        bool, typer.Option("--with-suggestions", help="Identify again with the terms that the model seems to lack.")
+    ] = False,
     output: Output = None,
     report: Report = None,
     as_json: JsonFlag = False,
@@ -87,7 +90,9 @@ def _identify(
     with staged([output, report], [*files, model_file(model), search.settings]) as (saved, page):
         plant, logs = load_model(model), preparation.read_all(files)
         with screen.bar(method) as progress:
-            result = identify(plant, logs, chosen, seed=search.seed, progress=progress, **derived)
+            result = identify(
+                plant, logs, chosen, seed=search.seed, with_suggestions=with_suggestions, progress=progress, **derived
+            )
         if output:
             result.save(saved)
         if report:

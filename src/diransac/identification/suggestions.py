@@ -172,7 +172,7 @@ class MeanForces:
         Candidates.
     is_input_gain : (K,) bool array
     groups : (K,) int array
-        Of candidates of one group at most one is accepted.
+        Candidates of one group are forms of one effect, of which at most one is accepted.
     log_of : (n,) int array
         Log of each interval.
     """
@@ -320,7 +320,7 @@ class _Step:
         return np.asarray(np.square(self.means.noise / self.scale) + self._by_equation(of_discrepancies).mean(axis=0))
 
     def best(self, allowed: BoolArray) -> int | None:
-        """The candidate with the largest gain, if it is accepted."""
+        """The candidate with the largest gain, if it is accepted, or else the next of its group that is."""
         usable = np.flatnonzero(allowed & self.independent)
         if not len(usable):
             return None
@@ -329,8 +329,10 @@ class _Step:
         possible = ~self.means.is_input_gain[usable] | (np.abs(slopes) < _LARGEST_GAIN)
         squares = np.square(self._by_equation(self.force[:, None] - h * slopes)).sum(axis=0)
         gains = np.where(possible, self._gain(squares), -np.inf)
-        best = int(usable[np.argmax(gains)])
-        return best if self._is_accepted(best, float(gains.max()), len(usable)) else None
+        groups = self.means.groups[usable]
+        order = np.argsort(-gains, kind="stable")
+        tried = (i for i in order if groups[i] == groups[order[0]])
+        return next((int(usable[i]) for i in tried if self._is_accepted(usable[i], gains[i], len(usable))), None)
 
     def _gain(self, squares: FloatArray) -> FloatArray:
         """Gain of the log-likelihood of independent intervals (K,), by squares (e, K) of what candidates leave.

@@ -193,6 +193,8 @@ def _diagnosis(runs: Sequence[Run]) -> Iterator[Finding]:
         others = ", less in the others" if len(run.unmodelled_fraction) > 1 else ""
         text = f"The RMS unmodelled acceleration is {percent(left)} of the modelled one in {name}{others}"
         yield Finding("good" if left <= _NEAR else "care", f"{text}{_where(run, runs)}.")
+    for suggestion in runs[0].result.suggestions:
+        yield Finding("care", f"The model seems to lack a term. {suggestion.text}.")
     if found.input_delay_significant:
         late = f"Inputs act {number(1e3 * found.input_delay, 3)} ms after their time stamps"
         yield Finding(
