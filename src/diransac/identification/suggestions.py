@@ -22,7 +22,7 @@ selection); Brunton, Proctor, Kutz 2016 (sparse identification).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -46,6 +46,8 @@ _INDEPENDENT, _IDENTITY = 1e-2, 1e-8
 _LARGEST_GAIN = 0.5
 _MOST = 5
 _GAIN = "input gain"
+# Weights of neighbouring intervals in the regression for coefficients; smallest number of intervals of a block.
+_KERNEL, _LEAST_BLOCK = (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9), 5
 # Parts of the log; part of the information that a part must have to count; smallest number of such parts.
 _PARTS, _INFORMED, _FEWEST_PARTS = 5, 0.03, 3
 _RANK, _TINY = 1e-8, 1e-300
@@ -229,8 +231,34 @@ def select_terms(means: MeanForces) -> tuple[SelectedTerm, ...]:
         chosen.append(found)
         allowed &= means.groups != means.groups[found]
     chosen = _significant(means, chosen)
-    parts = zip(chosen, *_Step.together(means, chosen).regression(chosen), _shares(means, chosen), strict=True)
+    slopes, errors = _Step.together(_averaged(means), chosen).regression(chosen)
+    parts = zip(chosen, slopes, errors, _shares(means, chosen), strict=True)
     return tuple(SelectedTerm(k, -float(x), float(s), share) for k, x, s, share in parts)
+
+
+def _averaged(means: MeanForces) -> MeanForces:
+    """Weighted means over five neighbouring intervals of one log, for coefficients.
+
+    Accelerations that are constant over an interval overshoot beside a step of the force, as partial sums of a Fourier
+    series do, by a tenth of friction that changes sign.  Overshoots cancel over neighbours.
+    """
+    reach = len(_KERNEL) // 2
+
+    def averaged(values: FloatArray) -> FloatArray:
+        found = np.empty_like(values)
+        for log in np.unique(means.log_of):
+            own = np.flatnonzero(means.log_of == log)
+            padded = np.pad(values[own], [(reach, reach)] + [(0, 0)] * (values.ndim - 1), mode="edge")
+            found[own] = sum(w * padded[k : k + len(own)] for k, w in enumerate(_KERNEL))
+        return found
+
+    return replace(
+        means,
+        force=averaged(means.force),
+        own=averaged(means.own),
+        discrepancies=averaged(means.discrepancies),
+        terms=averaged(means.terms),
+    )
 
 
 def _significant(means: MeanForces, chosen: list[int]) -> list[int]:
@@ -392,7 +420,7 @@ class _Step:
         slopes = inverse @ (C.T @ self.force)
         scores = self._by_equation(C * (self.force - C @ slopes)[:, None]).sum(axis=1)
         n = len(scores)
-        sums = np.add.reduceat(scores, np.arange(0, n, max(1, round(np.sqrt(n)))), axis=0)
+        sums = np.add.reduceat(scores, np.arange(0, n, max(_LEAST_BLOCK, round(np.sqrt(n)))), axis=0)
         common = C.T @ self.discrepancies
         inner = sums.T @ sums + common @ self.means.discrepancy_covariance @ common.T
         return slopes, np.sqrt(np.diag(inverse @ inner @ inverse))
@@ -411,7 +439,8 @@ def _scale(means: MeanForces, chosen: Sequence[int]) -> FloatArray:
 
 def _rows(columns: FloatArray, scale: FloatArray) -> FloatArray:
     """Columns (n, e, c) over the scales as (n e, c)."""
-    return np.asarray((columns / scale[:, None]).reshape(-1, columns.shape[2]))
+    n, e, c = columns.shape
+    return np.asarray((columns / scale[:, None]).reshape(n * e, c))
 
 
 def _basis(columns: FloatArray, scale: FloatArray) -> FloatArray:
