@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
+from command_line import run
 from diransac.identification.candidate_terms import candidate_terms
 from diransac.identification.suggestions import MeanForces, SelectedTerm, select_terms, suggestions_of, with_terms
 from user_models import tumbling
@@ -334,3 +335,24 @@ def test_the_report_shows_the_term_and_the_line_to_add(result, with_dry_friction
     page = (tmp_path / "page.html").read_text()
     assert "The model seems to lack a term. Coulomb friction on q" in page
     assert "add to the equation of q: + p.coulomb_q" in page
+
+
+PENDULUM_FILE = """
+import casadi as ca
+from diransac import Model, Parameter
+model = Model(
+    "pendulum", {"q": "rad"}, {"torque": "N m"},
+    {"inertia": Parameter("kg m^2", positive=True), "damping": Parameter("N m s/rad"), "moment": Parameter("N m")},
+    lambda q, v, a, u, p: [p.inertia * a.q + p.damping * v.q + p.moment * ca.sin(q.q) - u.torque],
+)
+"""
+
+
+def test_the_command_line_refits_on_request(with_dry_friction, tmp_path):
+    (tmp_path / "pendulum.py").write_text(PENDULUM_FILE)
+    with_dry_friction.write(tmp_path / "log.csv")
+    words = ["identify", tmp_path / "log.csv", "--model", tmp_path / "pendulum.py", "--differentiate"]
+    done = run(*words, "--with-suggestions")
+    assert done.exit_code == 0
+    assert "pendulum with coulomb_q by lo-diransac" in done.stdout
+    assert "terms were added to the model as suggested: Coulomb friction on q" in done.stdout
