@@ -22,6 +22,7 @@ from diransac.identification.serialization import (
     Values,
     WholeNumbers,
 )
+from diransac.identification.suggestions import Suggestion
 
 __all__ = ["Diagnosis", "Estimate", "Evaluation", "Finding", "Level", "LogSummary", "Prediction", "Resolution"]
 
@@ -254,6 +255,8 @@ class Estimate:
         Noise, outliers and unmodelled forces; of lo-diransac alone.
     checks : tuple of Finding, optional
         Findings of the method's own tests.
+    suggestions : tuple of Suggestion, optional
+        Terms that the model lacks, by the unmodelled forces; of lo-diransac alone.
     """
 
     parameters: Values
@@ -270,6 +273,7 @@ class Estimate:
     notes: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     checks: tuple[Finding, ...] = ()
+    suggestions: tuple[Suggestion, ...] = ()
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, np.float64).reshape(len(self.parameters), len(self.parameters))

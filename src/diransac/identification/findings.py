@@ -244,6 +244,8 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
                 "bad", f"{text}: check its sign and unit and the terms of the model, or leave the signal out."
             )
     yield from _unexplained(result.logs)
+    for suggestion in result.suggestions:
+        yield Finding("care", f"The model seems to lack a term. {suggestion.text}.")
     if found.input_delay_significant:
         sense = "later" if found.input_delay > 0.0 else "earlier"
         delay = f"Inputs act {number(1e3 * abs(found.input_delay), 3)} ms {sense} than recorded"

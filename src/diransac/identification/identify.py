@@ -21,6 +21,7 @@ from diransac.identification.prediction import predictions
 from diransac.identification.refusal import check_motion
 from diransac.identification.result import Result
 from diransac.identification.settings import Settings
+from diransac.identification.suggestions import with_terms
 from diransac.model import Model
 from diransac.simulation import HOLDS
 
@@ -39,6 +40,7 @@ def identify(
     bandwidth: float | None = None,
     input_hold: str | None = None,
     compare_logs: bool = True,
+    with_suggestions: bool = False,
     progress: Callback | None = None,
 ) -> Result:
     """Parameters of a model from one log, or from several logs of one machine.
@@ -73,6 +75,9 @@ def identify(
     compare_logs : bool, optional
         Whether each of several logs is also identified alone, so that logs that disagree with the others are named;
         that takes about as long again.
+    with_suggestions : bool, optional
+        Whether to identify again with the terms that the first identification suggests (`Result.suggestions`), and to
+        return that result, whose model has them as further parameters; for lo-diransac.
     progress : callable, optional
         Called with a `Progress` at every stage.
 
@@ -105,8 +110,12 @@ def identify(
         raise SettingsError(
             "bandwidth is given without differentiate=True, which alone uses it (and lo-diransac does not)"
         )
+    if with_suggestions and not getattr(chosen, "suggestions", False):
+        raise SettingsError(f"with_suggestions=True needs suggestions, which method {chosen.name} does not give")
     pointwise = chosen.needs_all_signals or not differentiate
     task = _Task(model, given, chosen, int(seed), pointwise, hold, compares=compare_logs and len(given) > 1)
+    if with_suggestions:
+        return task.with_suggestions(progress)
     if not filtered:
         return task.run(given, progress)
     derived = tuple(preprocessing.differentiate(log, model, bandwidth) for log in given)
@@ -194,6 +203,16 @@ class _Task:
             ),
             notes=(*dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x), *incomparable),
         )
+
+    def with_suggestions(self, progress: Callback | None) -> Result:
+        """The result of the model with the terms that a first identification suggests; its notes name them."""
+        found = self.run(self.given, within(progress, 0.0, 0.5))
+        note = "no terms were suggested; the model is the given one"
+        if found.suggestions:
+            note = f"terms were added to the model as suggested: {'; '.join(x.text for x in found.suggestions)}"
+            extended = dataclasses.replace(self, model=with_terms(self.model, found.suggestions))
+            found = extended.run(self.given, within(progress, 0.5, 1.0, "with suggested terms: "))
+        return dataclasses.replace(found, notes=(note, *found.notes))
 
     def with_sensitivity(self, result: Result, derived: Sequence[Log], progress: Callback | None) -> Result:
         """The result with each parameter's relative change at half and twice the bandwidth of every log."""

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from diransac.identification.identifiability import check_structure, unidentifia
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import LocalSearch
+from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
     discrepancy_units,
@@ -126,6 +127,10 @@ class LoDiransac(LoDiransacSettings):
         those of the fit.
     prior_inflation : float, optional
         Factor of the prior on model error whose effect on the parameters is added to their covariance.
+    suggestions : bool, optional
+        Whether terms are searched that would explain the unmodelled forces.
+    candidate_terms : callable, optional
+        Further candidates of that search: ``candidate_terms(q, v, u)`` returns expressions by name.
 
     Raises
     ------
@@ -206,7 +211,11 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     checks = tuple(_checks(settings, intervals, motion, refined))
     late = float(intervals.delay + intervals.lag + refined.fit.shared[-1])
     found = _Found(dataset, intervals, motion, refined.fit, result, late)
-    return _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
+    estimate = _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
+    if likeliest.exact or not settings.suggestions:
+        return estimate
+    terms = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
+    return replace(estimate, suggestions=terms)
 
 
 def _checks(

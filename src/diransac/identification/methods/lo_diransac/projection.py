@@ -47,6 +47,7 @@ __all__ = [
     "fitted_parameters",
     "inertial_forces",
     "parameter_units",
+    "residuals_of_motion",
     "unexplained",
 ]
 
@@ -228,6 +229,34 @@ def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) 
     left = np.linalg.solve(_matrices(M, intervals.model.n_v), residuals[:, :, None])[:, :, 0]
     logged = intervals.is_logged[:, None].astype(float)
     return _means(intervals, left * logged) / _means(intervals, logged)
+
+
+def residuals_of_motion(
+    intervals: ShootingIntervals, fit: Fit, parameters: FloatArray
+) -> tuple[tuple[FloatArray, ...], FloatArray, FloatArray, FloatArray]:
+    """Residuals of the equations on the fitted motion, and their derivatives.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    parameters : (n,) array
+
+    Returns
+    -------
+    tuple of (N, ...) array
+        q, v, a, the inputs as they act, and the model's parameters in every row.
+    (N, n_v) array
+        Residuals r.
+    (N, n_v, n) array
+        dr/dp, columns in the places of each log's parameters.
+    (N, n_v, n_v) array
+        M = dr/da.
+    """
+    model, motion, p = intervals.model, _motion(intervals, fit), _row_parameters(intervals, parameters)
+    r, W, M = _residual_map(model)(*motion, p)
+    rows = np.broadcast_to(p, (len(r), model.n_p))
+    return (*motion, rows), r, _regressors(intervals, W), _matrices(M, model.n_v)
 
 
 def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
