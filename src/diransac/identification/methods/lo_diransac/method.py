@@ -202,11 +202,12 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         if projects
         else fitted_parameters(intervals, refined.fit)
     )
-    if not intervals.layout.admits(result.parameters[None])[0]:
+    reached = not intervals.layout.admits(result.parameters[None])[0]
+    if reached:
         # The fit satisfies the bounds; least squares on its motion may violate a strict one.
         result = fitted_parameters(intervals, refined.fit)
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
-    if dataset.layout.on_bounds(result.parameters).any():
+    if reached or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
     checks = tuple(_checks(settings, intervals, motion, refined))
     late = float(intervals.delay + intervals.lag + refined.fit.shared[-1])
@@ -353,22 +354,24 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
     sigma, fraction = (np.where(seen, x, np.nan) for x in (fit.noise.sigma, fit.noise.pi))
     inlying = fit.noise.inlying(fit.residuals, intervals.known)
     outliers = intervals.known & (inlying < _OUTLIER)
-    begins = np.array([one.log.time[one.offset] for one in dataset.segments])[intervals.log_of]
-    place = intervals.starts - intervals.first_of_log[intervals.log_of]
+    shown = intervals.occupied
+    window_log = intervals.log_of[shown]
+    begins = np.array([one.log.time[one.offset] for one in dataset.segments])[window_log]
+    place = intervals.starts[shown] - intervals.first_of_log[window_log]
     forces = _unmodelled_forces(intervals, fit, result)
     per_equation: Callable[[FloatArray], dict[str, FloatArray]] = lambda x: dict(  # noqa: E731
-        zip(model.accelerations, x.T.copy(), strict=True)
+        zip(model.accelerations, x[shown].T.copy(), strict=True)
     )
     return Diagnosis(
         noise_std={name: float(sigma[k]) for name, k in columns.items()},
         outlier_fraction={name: float(fraction[k]) for name, k in columns.items()},
         outliers={name: _on_given_logs(dataset, intervals, outliers[:, k]) for name, k in columns.items()},
-        window_log=intervals.log_of.copy(),
+        window_log=window_log,
         unmodelled_time=begins + dt * (place + 0.5 * (intervals.length - 1)),
         unmodelled_accelerations=per_equation(result.unexplained),
         unmodelled_forces={} if forces is None else per_equation(forces),
         smoothed_time=begins + dt * place.astype(float),
-        smoothed_states=dict(zip(model.state, fit.x.T.copy(), strict=True)),
+        smoothed_states=dict(zip(model.state, fit.x[shown].T.copy(), strict=True)),
         input_delay=float(found.delay * dt),
         input_delay_error=result.delay_error * dt,
         input_delay_significant=abs(found.delay) > max(_SIGNIFICANT * result.delay_error, _SMALL_DELAY),

@@ -48,7 +48,7 @@ def missing_terms(
 
 
 class _Rows:
-    """Fitted motion and residuals in the rows of the intervals, and their means over the logged rows of each."""
+    """Fitted motion and residuals in the rows of the intervals, and means over those of an interval that are logged."""
 
     def __init__(
         self,
@@ -64,9 +64,10 @@ class _Rows:
         self.weights = logged / np.repeat(counts, intervals.length)
 
     def mean(self, values: FloatArray) -> FloatArray:
-        """Mean over the logged rows of each interval, (W, ...)."""
+        """Mean of each interval that has logged rows, (n, ...)."""
         weighted = values * self.weights.reshape(-1, *(1,) * (values.ndim - 1))
-        return np.asarray(weighted.reshape(len(self.intervals), -1, *values.shape[1:]).sum(axis=1))
+        sums = weighted.reshape(len(self.intervals), -1, *values.shape[1:]).sum(axis=1)
+        return np.asarray(sums[self.intervals.occupied])
 
     def input_rates(self, candidates: CandidateTerms) -> FloatArray:
         """``dr/du_j du_j/dt`` (N, n_v, n_u): the effect of a delay of each input."""
@@ -81,7 +82,7 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForce
     n_p, n_v, n_u = intervals.n_p, intervals.model.n_v, intervals.model.n_u
     at = linearize(intervals, fit, weights_of(intervals, fit))
     found = at.system.solve(at.right_z, at.right_s)
-    alone = found.var_z - found.gain @ found.var_p @ found.gain.swapaxes(1, 2)
+    alone = (found.var_z - found.gain @ found.var_p @ found.gain.swapaxes(1, 2))[intervals.occupied]
     M = rows.mean(rows.M)
     of_force = np.einsum("wij,wjk,wik->wi", M, alone[:, n_x:, n_x:], M)
     inertial = np.einsum("nij,nj->ni", rows.M, rows.motion[2])[intervals.is_logged]
@@ -97,10 +98,10 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForce
         own=own,
         discrepancies=discrepancies,
         discrepancy_covariance=found.var_p[place, place],
-        terms=candidates.means(rows.motion, rows.weights, intervals.length),
+        terms=candidates.means(rows.motion, rows.weights, intervals.length)[intervals.occupied],
         is_input_gain=candidates.is_input_gain,
         groups=candidates.groups,
-        log_of=intervals.log_of,
+        log_of=intervals.log_of[intervals.occupied],
     )
 
 

@@ -65,7 +65,8 @@ class ProjectedEstimate:
         Each in its unit, per-log parameters of every log included.
     covariance : (n, n) array
     unexplained : (W, n_v) array
-        Mean over each interval of the accelerations that the model with these parameters does not explain.
+        Mean over each interval of the accelerations that the model with these parameters does not explain; 0 where an
+        interval has no row of a log.
     delay_error : float
         Standard error of the delay, samples.
     """
@@ -223,12 +224,14 @@ def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) 
     Returns
     -------
     (W, n_v) array
+        0 where an interval has no row of a log.
     """
     p = _row_parameters(intervals, parameters)
     residuals, _, M = _residual_map(intervals.model)(*_motion(intervals, fit), p)
     left = np.linalg.solve(_matrices(M, intervals.model.n_v), residuals[:, :, None])[:, :, 0]
     logged = intervals.is_logged[:, None].astype(float)
-    return _means(intervals, left * logged) / _means(intervals, logged)
+    shares = np.where(intervals.occupied[:, None], _means(intervals, logged), 1.0)
+    return np.asarray(_means(intervals, left * logged) / shares)
 
 
 def residuals_of_motion(

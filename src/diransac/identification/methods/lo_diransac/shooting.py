@@ -138,6 +138,11 @@ class ShootingIntervals:
         """Log of each row ``(N,)``."""
         return np.repeat(self.log_of, self.length)
 
+    @cached_property
+    def occupied(self) -> BoolArray:
+        """Mask ``(W,)`` of the intervals with a row of a log; short ones may have padded rows alone."""
+        return np.asarray(self.is_logged.reshape(len(self), -1).any(axis=1))
+
     @property
     def duration(self) -> float:
         """Duration of an interval, s."""
