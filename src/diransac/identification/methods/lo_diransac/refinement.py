@@ -50,6 +50,8 @@ _TAU_START, _SHRINK = 0.3, 0.4
 # Continuity is exact for practical purposes: jumps are as small a part of the effect of tau in an interval.
 _CONTINUITY = 0.03
 _SIGMA_FLOOR = 1e-4
+# Prior size of the unmodelled accelerations at least, in spreads of the accelerations: none would make them singular.
+_LEAST_PRIOR = 1e-6
 # Discrepancies of a model that is taken to be exact, over their prior sizes.
 _EXACT, _EXACT_STEPS = 1e-3, 25
 # Where they start, and the factor by which they are lowered in a step.
@@ -125,7 +127,7 @@ def make_prior(settings: LoDiransacSettings, intervals: ShootingIntervals, motio
     Prior
     """
     return Prior(
-        tau=settings.prior_model_error * motion.spread[-intervals.model.n_v :],
+        tau=max(settings.prior_model_error, _LEAST_PRIOR) * motion.spread[-intervals.model.n_v :],
         unit=unit,
         discrepancy=settings.prior_discrepancy,
         guarded=settings.initial_discrepancy,
