@@ -71,7 +71,8 @@ def identify(
         Bandwidth of the differentiating filter, Hz; None: chosen from each log.
     input_hold : str, optional
         Inputs between samples in every simulation: "zero-order", held, as those of a digital controller are; "linear",
-        interpolated, for continuous inputs such as those of a sensor.  None: "zero-order".
+        interpolated, for continuous inputs such as those of a sensor.  None: "zero-order"; lo-diransac chooses the
+        likelier one.
     compare_logs : bool, optional
         Whether each of several logs is also identified alone, so that logs that disagree with the others are named;
         that takes about as long again.
