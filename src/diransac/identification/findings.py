@@ -164,8 +164,8 @@ def _simulation(logs: Sequence[LogSummary], *, restarts: bool) -> Iterator[Findi
     if any(one.prediction is None for one in logs):
         yield Finding(
             "care",
-            "No simulation is compared with the log, because its initial state is missing or the file is of an earlier "
-            "version: validate the model on another log.",
+            "No simulation is compared with the log, because its initial state is missing: validate the model on "
+            "another log.",
         )
 
 
