@@ -174,6 +174,7 @@ def test_shooting_intervals_of_a_log_do_not_depend_on_the_next_log(length):
 
 def _intervals(logs, length):
     layout = ParameterLayout(PENDULUM.parameters, len(logs))
+    logs = [(*log, np.zeros(len(log[-1]), bool)) for log in logs]
     return ShootingIntervals.of(PENDULUM, layout, logs, 0.05, length, 5, "linear")
 
 

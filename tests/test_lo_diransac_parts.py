@@ -34,7 +34,9 @@ def intervals_over(measured, inputs, model=ROTORCRAFT, dt=0.01, length=25):
     """Intervals of one log in which everything is measured, with the default integration steps."""
     layout, known = ParameterLayout(model.parameters), np.ones(measured.shape, bool)
     substeps = dr.LoDiransac().substeps
-    return ShootingIntervals.of(model, layout, [(measured, known, inputs)], dt, length, substeps)
+    return ShootingIntervals.of(
+        model, layout, [(measured, known, inputs, np.zeros(len(inputs), bool))], dt, length, substeps
+    )
 
 
 def intervals_of(n_rows=200, length=25, dt=0.01):
@@ -44,7 +46,7 @@ def intervals_of(n_rows=200, length=25, dt=0.01):
 
 def smoothed(measured, known):
     """The motion of a log at 100 Hz, from 25 rows to either side."""
-    samples = Samples(measured, known, running_median(measured, known, 31))
+    samples = Samples(measured, known, running_median(measured, known, 31), np.zeros(len(measured), bool))
     return smooth(ROTORCRAFT, [samples], 0.01, 25)[0]
 
 
@@ -167,7 +169,7 @@ def test_half_width_is_wider_where_the_motion_is_slower():
     known = np.zeros((4000, 9), bool)
     known[:, :3] = True
     logs = [np.repeat(np.sin(w * t)[:, None], 9, axis=1) + noise for w in (10.0, 0.5)]
-    samples = [Samples(log, known, running_median(log, known, 31)) for log in logs]
+    samples = [Samples(log, known, running_median(log, known, 31), ~known.any(axis=1)) for log in logs]
     widths = [choose_half_width(ROTORCRAFT, [log], 0.01, 0.25) for log in samples]
     assert widths[0] == 25
     assert widths[1] > 25

@@ -50,6 +50,8 @@ class Segment:
         Rows in which every signal in use is finite.
     notes : tuple of str
         Findings and changes, a sentence each.
+    gaps : (N,) bool array
+        Rows of gaps of several samples in an input.
     """
 
     model: Model
@@ -60,6 +62,7 @@ class Segment:
     inputs: FloatArray
     valid: BoolArray
     notes: tuple[str, ...]
+    gaps: BoolArray
 
     def __len__(self) -> int:
         return len(self.valid)
@@ -206,7 +209,27 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
         )
     offset = int(np.argmax(valid))
     notes = [*log.notes, *_row_notes(log, valid, held)]
-    return Segment(model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], tuple(notes))
+    gaps = long_runs(held, _LONG_HOLD)[offset:]
+    return Segment(model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], tuple(notes), gaps)
+
+
+def long_runs(mask: BoolArray, least: int) -> BoolArray:
+    """Elements of a mask ``(N,)`` in runs of ``least`` or more.
+
+    Parameters
+    ----------
+    mask : (N,) bool array
+    least : int
+
+    Returns
+    -------
+    (N,) bool array
+    """
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
+    kept = np.zeros(len(mask), bool)
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        kept[begin:end] = end - begin >= least
+    return kept
 
 
 def _raise_missing(model: Model, log: Log, name: str) -> None:

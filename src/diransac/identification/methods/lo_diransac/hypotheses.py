@@ -164,6 +164,8 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
         q, v, a = np.split(motion.signals[rows][logged], [model.n_q, model.n_q + n_v], axis=1)
         W, b = compile_map(model.regressor)(q, v, a, intervals.inputs[rows][logged])
         firsts = np.arange(0, len(b) - H + 1, max(1, H // _OVERLAP))
+        gaps = np.concatenate([[0], np.cumsum(intervals.gaps[rows][logged])])
+        firsts = firsts[gaps[firsts + H] == gaps[firsts]]
         if not len(firsts):
             continue
         both = np.concatenate([W, b], axis=1)

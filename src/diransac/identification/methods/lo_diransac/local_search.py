@@ -23,6 +23,7 @@ from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import estimate_parameters
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
+from diransac.identification.methods.lo_diransac.sensors import clearest_error, with_error
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,6 +53,8 @@ _APART = 0.2
 _EXPLAINS, _PUNCTUAL = float(np.log(1.25)), 1e-6
 # Decrease of the log residuals of each signal by which a delay is worth to be tried.
 _SMALL_GAIN = 0.03
+# Gain of evidence, nats, that an error of a sensor is worth.
+_WORTH = 20.0
 # Inputs that vary linearly between samples act half a sample before held ones.
 _LINEAR = (-0.75, -0.25)
 
@@ -78,9 +81,11 @@ class Explanation:
 
     @property
     def cost(self) -> float:
-        """Negative log evidence, with half the logarithm of the number of rows for each scale of a discrepancy."""
-        n_scales = 0 if self.exact else 2 * self.intervals.model.n_v + 1
-        return self.refinement.cost + 0.5 * n_scales * float(np.log(self.intervals.is_logged.sum()))
+        """Negative log evidence, with half the log of the number of rows for each scale of discrepancies and a delay."""
+        intervals = self.intervals
+        late = abs(intervals.delay + self.refinement.fit.shared[-1]) > _SMALL_DELAY or bool(intervals.lag)
+        n_scales = (0 if self.exact else 2 * intervals.model.n_v + 1) + late
+        return self.refinement.cost + 0.5 * n_scales * float(np.log(intervals.is_logged.sum()))
 
 
 @dataclass(frozen=True)
@@ -131,6 +136,19 @@ class LocalSearch:
             if likelier is best:
                 break
             best = likelier
+        return self._with_sensors(best)
+
+    def _with_sensors(self, best: Explanation) -> Explanation:
+        """The explanation with errors of the sensors, one after the other, as long as they make it likelier."""
+        for k in range(self.settings.max_sensor_errors if not best.exact else 0):
+            report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
+            error = clearest_error(best.intervals, best.refinement.fit)
+            if error is None:
+                break
+            other = self._refitted(best, with_error(best.intervals, best.refinement.fit, error))
+            if other.cost > best.cost - _WORTH:
+                break
+            best = other
         return best
 
     def _better(self, now: Explanation, others: Sequence[Explanation]) -> Explanation:
@@ -238,13 +256,15 @@ class LocalSearch:
         left = old.delay + old.lag + fit.shared[-1] - intervals.delay - intervals.lag
         if intervals.hold != old.hold:
             left = 0.0
-        sizes = np.append(fit.prior[:-1], self.prior.delay)
+        prior = now.prior if intervals.sensors is not old.sensors else self.prior
+        # A wide prior that the evidence narrows: a narrow one would never widen where nothing moves.
+        sizes = np.append(fit.prior[:-1], prior.delay if prior is now.prior else max(prior.delay, _WHOLE_SAMPLE))
         begin = with_residuals(intervals, replace(fit, shared=np.append(fit.shared[:-1], left), prior=sizes))
         if now.exact:
             refined = refine_exact(self.settings, intervals, begin, self.prior)
             return Explanation(intervals, refined, self.prior, exact=True)
-        refined = refine(self.settings, intervals, begin, self.prior, settled=True)
-        return self._simplest(Explanation(intervals, refined, self.prior, exact=False))
+        refined = refine(self.settings, intervals, begin, prior, settled=True)
+        return self._simplest(Explanation(intervals, refined, prior, exact=False))
 
     def _likeliest_delay(self, intervals: ShootingIntervals) -> int:
         """Delay in samples with which simulations by the best hypothesis agree best with the log.

@@ -16,10 +16,12 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
+from diransac.data.segment import long_runs
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report
+from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import LocalSearch
 from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
@@ -56,6 +58,8 @@ if TYPE_CHECKING:
 __all__ = ["LoDiransac", "configured"]
 
 _FEWEST_INTERVALS = 4
+# Rows without any sample that are a gap, at least.
+_FEWEST_BLIND = 8
 _OUTLIER = 0.5
 # Fraction of a signal's spread from which on its noise leaves nothing to explain.
 _ALL_OF_IT = 0.8
@@ -98,6 +102,8 @@ class LoDiransac(LoDiransacSettings):
         Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation.
     max_delay_shifts : int, optional
         Largest number of shifts of the inputs by whole samples after local optimisation.
+    max_sensor_errors : int, optional
+        Largest number of delays and biases of sensors that are estimated where the model is not exact.
     substeps : int, optional
         Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
         samples or links are light.
@@ -209,7 +215,10 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
     if reached or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
-    checks = tuple(_checks(settings, intervals, motion, refined))
+    checks = (
+        *_checks(settings, intervals, motion, refined),
+        *findings_of_fit(likeliest, motion, result),
+    )
     late = float(intervals.delay + intervals.lag + refined.fit.shared[-1])
     found = _Found(dataset, intervals, motion, refined.fit, result, late)
     estimate = _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
@@ -266,7 +275,7 @@ def _prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingI
             f"{_FEWEST_INTERVALS * half}. Give a longer log"
         )
     motions = smooth(model, samples, dt, half)
-    logs = [(x.measured, x.known, u) for x, u in zip(samples, inputs, strict=True)]
+    logs = [(x.measured, x.known, u, x.gaps) for x, u in zip(samples, inputs, strict=True)]
     intervals = ShootingIntervals.of(model, dataset.layout, logs, dt, half, settings.substeps, dataset.hold)
     rows = zip(motions, intervals.rows_of_logs, strict=True)
     signals = np.concatenate([_to_length(x.signals, r.stop - r.start) for x, r in rows])
@@ -294,7 +303,8 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
     if n_leaps:
         notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median replaces them")
     centre = running_median(measured, known, odd_window(settings.median_window, dt, _MOST_SAMPLES))
-    return Samples(measured, known, centre), inputs, notes
+    blind = long_runs(~known.any(axis=1), max(_FEWEST_BLIND, round(settings.smoothing_half_width / dt)))
+    return Samples(measured, known, centre, one.gaps | blind), inputs, notes
 
 
 # ---------------------------------------------------------------------- the estimate
@@ -354,7 +364,7 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
     sigma, fraction = (np.where(seen, x, np.nan) for x in (fit.noise.sigma, fit.noise.pi))
     inlying = fit.noise.inlying(fit.residuals, intervals.known)
     outliers = intervals.known & (inlying < _OUTLIER)
-    shown = intervals.occupied
+    shown = intervals.is_logged[intervals.starts]
     window_log = intervals.log_of[shown]
     begins = np.array([one.log.time[one.offset] for one in dataset.segments])[window_log]
     place = intervals.starts[shown] - intervals.first_of_log[window_log]

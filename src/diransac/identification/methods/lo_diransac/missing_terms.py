@@ -42,13 +42,13 @@ def missing_terms(
     tuple of Suggestion
     """
     rows = _Rows(intervals, *residuals_of_motion(intervals, fit, parameters))
-    speeds = np.sqrt(np.square(rows.motion[1][intervals.is_logged]).mean(axis=0))
+    speeds = np.sqrt(np.square(rows.motion[1][intervals.counted]).mean(axis=0))
     candidates = candidate_terms(intervals.model, speeds, library)
     return suggestions_of(candidates, select_terms(_mean_forces(rows, fit, candidates)))
 
 
 class _Rows:
-    """Fitted motion and residuals in the rows of the intervals, and means over those of an interval that are logged."""
+    """Fitted motion and residuals in the rows of the intervals, and means over those of an interval that count."""
 
     def __init__(
         self,
@@ -59,12 +59,12 @@ class _Rows:
         M: FloatArray,
     ) -> None:
         self.intervals, self.motion, self.r, self.W, self.M = intervals, motion, r, W, M
-        logged = intervals.is_logged.astype(float)
-        counts = np.maximum(logged.reshape(len(intervals), -1).sum(axis=1), 1.0)
-        self.weights = logged / np.repeat(counts, intervals.length)
+        counted = intervals.counted.astype(float)
+        counts = np.maximum(counted.reshape(len(intervals), -1).sum(axis=1), 1.0)
+        self.weights = counted / np.repeat(counts, intervals.length)
 
     def mean(self, values: FloatArray) -> FloatArray:
-        """Mean of each interval that has logged rows, (n, ...)."""
+        """Mean of each interval that has any, (n, ...)."""
         weighted = values * self.weights.reshape(-1, *(1,) * (values.ndim - 1))
         sums = weighted.reshape(len(self.intervals), -1, *values.shape[1:]).sum(axis=1)
         return np.asarray(sums[self.intervals.occupied])
@@ -85,7 +85,7 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForce
     alone = (found.var_z - found.gain @ found.var_p @ found.gain.swapaxes(1, 2))[intervals.occupied]
     M = rows.mean(rows.M)
     of_force = np.einsum("wij,wjk,wik->wi", M, alone[:, n_x:, n_x:], M)
-    inertial = np.einsum("nij,nj->ni", rows.M, rows.motion[2])[intervals.is_logged]
+    inertial = np.einsum("nij,nj->ni", rows.M, rows.motion[2])[intervals.counted]
     force = rows.mean(rows.r)
     own = rows.mean(np.concatenate([rows.W, rows.input_rates(candidates)], axis=2))
     level = rows.mean(np.hstack([np.ones((len(rows.r), 1)), intervals.inputs]))

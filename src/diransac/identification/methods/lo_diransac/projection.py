@@ -42,7 +42,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ProjectedEstimate",
+    "batch_sums",
+    "by_least_squares",
     "discrepancy_units",
+    "equations_of",
     "estimate_parameters",
     "fitted_parameters",
     "inertial_forces",
@@ -66,7 +69,7 @@ class ProjectedEstimate:
     covariance : (n, n) array
     unexplained : (W, n_v) array
         Mean over each interval of the accelerations that the model with these parameters does not explain; 0 where an
-        interval has no row of a log.
+        interval has no row that counts.
     delay_error : float
         Standard error of the delay, samples.
     """
@@ -117,7 +120,7 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(np.zeros((len(intervals), k, n_p)), np.eye(n_s, n_p))
     scores = np.einsum("wkp,wk->wp", z, at.data_z) + at.data_s @ s
-    sums = _batch_sums(scores)
+    sums = batch_sums(scores)
     more = np.sqrt(np.maximum(1.0, np.square(sums).sum(axis=0) / (np.diag(s[:n_p]) + _TINY)))
     p, delay = fit.shared[:n_p], at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
     return ProjectedEstimate(p, s[:n_p] * np.outer(more, more), unexplained(intervals, fit, p), float(np.sqrt(delay)))
@@ -141,7 +144,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     """
     n_p, n_s, n_x, n_v = intervals.n_p, len(fit.shared), fit.x.shape[1], intervals.model.n_v
     evaluate, motion = _residual_map(intervals.model), _motion(intervals, fit)
-    logged = intervals.is_logged[:, None]
+    logged = intervals.counted[:, None]
     push, W, M = (x * logged for x in evaluate(*motion, _row_parameters(intervals, fit.shared)))
     W, M = _regressors(intervals, W), _matrices(M, n_v)
     push = push - np.einsum("nij,nj->ni", M, np.repeat(fit.d, intervals.length, axis=0))
@@ -161,7 +164,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     unmade = latent - means @ np.einsum("pwi,wi->p", by_means, latent)
     unpushed = push - W @ np.einsum("pni,ni->p", by_rows, push)
     of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)
-    sums = _batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
+    sums = batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
     covariance = covariance + sums.T @ sums
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
@@ -212,6 +215,57 @@ def _least_squares(W: FloatArray, weights: FloatArray) -> FloatArray:
     return np.asarray(solved.reshape(-1, *W.shape[:2]) * weights)
 
 
+def batch_sums(values: FloatArray) -> FloatArray:
+    """Sums over about sqrt(W) neighbouring intervals each: their squares count what neighbours have in common.
+
+    They are increased by Student's t for their number, so that a normal interval has its level.
+
+    Parameters
+    ----------
+    values : (W, n) array
+
+    Returns
+    -------
+    (n_batches, n) array
+    """
+    sums = np.add.reduceat(values, np.arange(0, len(values), round(np.sqrt(len(values)))), axis=0)
+    return np.asarray(sums * stdtrit(max(len(sums) - 1, 1), _UPPER) / ndtri(_UPPER))
+
+
+def equations_of(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means over each interval of the regressors and of the residuals of the fitted motion.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    parameters : (n,) array
+
+    Returns
+    -------
+    (W, n_v, n) array, (W, n_v) array
+    """
+    logged, p = intervals.counted[:, None], _row_parameters(intervals, parameters)
+    residuals, W, _ = _residual_map(intervals.model)(*_motion(intervals, fit), p)
+    return _means(intervals, _regressors(intervals, W * logged)), _means(intervals, residuals * logged)
+
+
+def by_least_squares(W: FloatArray, residuals: FloatArray) -> FloatArray:
+    """Effect ``(n, N, r)`` of rows on the parameters by least squares with the equations' scales.
+
+    Parameters
+    ----------
+    W : (N, r, n) array
+    residuals : (N, r) array
+
+    Returns
+    -------
+    (n, N, r) array
+    """
+    scale = np.sqrt(np.square(residuals).mean(axis=0))
+    return _least_squares(W, 1.0 / np.maximum(scale, 1e-6 * scale.max() + _TINY))
+
+
 def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:
     """``M^-1 r``: mean over each interval of the fitted accelerations that the model does not explain.
 
@@ -224,14 +278,13 @@ def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) 
     Returns
     -------
     (W, n_v) array
-        0 where an interval has no row of a log.
+        0 where an interval has no row that counts.
     """
     p = _row_parameters(intervals, parameters)
     residuals, _, M = _residual_map(intervals.model)(*_motion(intervals, fit), p)
     left = np.linalg.solve(_matrices(M, intervals.model.n_v), residuals[:, :, None])[:, :, 0]
-    logged = intervals.is_logged[:, None].astype(float)
-    shares = np.where(intervals.occupied[:, None], _means(intervals, logged), 1.0)
-    return np.asarray(_means(intervals, left * logged) / shares)
+    logged = intervals.counted[:, None].astype(float)
+    return _means(intervals, left * logged) / np.maximum(_means(intervals, logged), _TINY)
 
 
 def residuals_of_motion(
@@ -301,7 +354,7 @@ def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
         The smallest over the equations, each in its parameter's unit; 0 where a parameter never acts.
     """
     W = _residual_map(intervals.model)(*_smoothed(intervals, motion), _row_parameters(intervals, p, logged=True))[1]
-    logs = intervals.log_of_row[intervals.is_logged]
+    logs = intervals.log_of_row[intervals.counted]
     sizes = np.sqrt(np.square(_by_log(intervals, _matrices(W, intervals.model.n_p), logs)).mean(axis=0)).T
     smallest = (inertial_forces(intervals, motion, p) / np.maximum(sizes, _TINY)).min(axis=1)
     return np.asarray(np.where(sizes.any(axis=1), smallest, 0.0))
@@ -331,7 +384,7 @@ def inertial_forces(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
 
 def _smoothed(intervals: ShootingIntervals, motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Smoothed coordinates, velocities, accelerations and the inputs of all logged rows."""
-    model, logged = intervals.model, intervals.is_logged
+    model, logged = intervals.model, intervals.counted
     q, v, a = np.split(motion.signals[logged], [model.n_q, model.n_q + model.n_v], axis=1)
     return q, v, a, intervals.inputs[logged]
 
@@ -346,7 +399,7 @@ def _motion(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatAr
 
 def _row_parameters(intervals: ShootingIntervals, values: FloatArray, *, logged: bool = False) -> FloatArray:
     """Parameters of the model: one vector for all rows, or (N, n_p) where logs differ; of logged rows, or all."""
-    logs = intervals.log_of_row[intervals.is_logged] if logged else intervals.log_of_row
+    logs = intervals.log_of_row[intervals.counted] if logged else intervals.log_of_row
     return intervals.parameters_of(values[: intervals.n_p], logs)
 
 
@@ -370,15 +423,6 @@ def _residual_map(model: Model) -> Map:
     r = model.residual(q, v, a, u, p)
     slopes = [ca.densify(ca.jacobian(r, x)) for x in (p, a)]
     return compile_map(ca.Function("residuals", [q, v, a, u, p], [ca.densify(r), *slopes]))
-
-
-def _batch_sums(values: FloatArray) -> FloatArray:
-    """Sums over about sqrt(W) neighbouring intervals each: their squares count what neighbours have in common.
-
-    They are increased by Student's t for their number, so that a normal interval has its level.
-    """
-    sums = np.add.reduceat(values, np.arange(0, len(values), round(np.sqrt(len(values)))), axis=0)
-    return np.asarray(sums * stdtrit(max(len(sums) - 1, 1), _UPPER) / ndtri(_UPPER))
 
 
 def _means(intervals: ShootingIntervals, rows: FloatArray) -> FloatArray:

@@ -57,6 +57,8 @@ _EXACT, _EXACT_STEPS = 1e-3, 25
 # Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
 # the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
 _UNBROKEN = 0.003
+# Size, samples, of the error of a lag before it is estimated.
+_FREE_LAG = 1.0
 # Where they start, and the factor by which they are lowered in a step.
 _NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
 # Correlation of unmodelled accelerations from interval to interval at most.
@@ -254,7 +256,7 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     n_p, least = intervals.n_p, _EXACT * prior.tau
     shared, sizes = fit.shared.copy(), fit.prior.copy()
     shared[n_p:-1], sizes[n_p:-1] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:-1]
-    sizes[-1] = prior.delay
+    sizes[-1] = max(prior.delay, _FREE_LAG) if intervals.lag else prior.delay
     tau = _NEARLY_EXACT * prior.tau
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))

@@ -33,6 +33,7 @@ class LoDiransacSettings:
     n_finalists: int = 12
     delay_range: tuple[float, float] = (-0.03, 0.08)
     max_delay_shifts: int = 3
+    max_sensor_errors: int = 8
     substeps: int = 5
     max_starts: int = 5
     max_fits: int = 8
@@ -76,7 +77,14 @@ class LoDiransacSettings:
 
 
 _NOT_NUMBERS = ("criteria", "candidate_terms")
-_MAY_BE_ZERO = ("n_samples", "max_delay_shifts", "max_steps", "prior_model_error", "prior_discrepancy")
+_MAY_BE_ZERO = (
+    "n_samples",
+    "max_delay_shifts",
+    "max_sensor_errors",
+    "max_steps",
+    "prior_model_error",
+    "prior_discrepancy",
+)
 
 
 def _checked(name: str, value: Any, default: Any) -> Any:

@@ -26,6 +26,27 @@ _WELL_CONDITIONED = 1e8
 
 
 @dataclass(frozen=True)
+class Sensors:
+    """Systematic errors of the sensors, and what they measured.
+
+    Parameters
+    ----------
+    measured : (N, n_s) array
+    sampled : (N, n_s) bool array
+        As recorded.
+    delay : (n_s,) array
+        Samples by which each signal is recorded late.
+    bias : (n_s,) array
+        Constant error of each signal, its unit.
+    """
+
+    measured: FloatArray
+    sampled: BoolArray
+    delay: FloatArray
+    bias: FloatArray
+
+
+@dataclass(frozen=True)
 class ShootingIntervals:
     """Rows of all logs as intervals of ``length`` rows; made by `of`, which pads the last interval of each log.
 
@@ -37,12 +58,14 @@ class ShootingIntervals:
         Positions of each log's parameters.
     measured : (N, n_s) array
         Every signal of the model, in its order and its unit.
-    known : (N, n_s) bool array
+    sampled : (N, n_s) bool array
         Samples that are measured; False in padded rows.
     recorded : (N, n_u) array
         Recorded inputs, each in its unit; `inputs` are those that act.
     is_logged : (N,) bool array
         Rows of the logs, as opposed to padded ones.
+    gaps : (N,) bool array
+        Rows of gaps: no simulation passes through them.
     log_of : (W,) int array
         Log of each interval.
     dt : float
@@ -58,14 +81,17 @@ class ShootingIntervals:
         Samples by which the inputs act later than they are recorded.
     lag : float, optional
         Time constant of a first-order lag of the actuators, samples; 0 without one.
+    sensors : Sensors, optional
+        Errors of the sensors of which ``measured`` is corrected.
     """
 
     model: Model
     layout: ParameterLayout
     measured: FloatArray
-    known: BoolArray
+    sampled: BoolArray
     recorded: FloatArray
     is_logged: BoolArray
+    gaps: BoolArray
     log_of: IntArray
     dt: float
     length: int
@@ -73,13 +99,14 @@ class ShootingIntervals:
     hold: str = "zero-order"
     delay: int = 0
     lag: float = 0.0
+    sensors: Sensors | None = None
 
     @classmethod
     def of(
         cls,
         model: Model,
         layout: ParameterLayout,
-        logs: Sequence[tuple[FloatArray, BoolArray, FloatArray]],
+        logs: Sequence[tuple[FloatArray, BoolArray, FloatArray, BoolArray]],
         dt: float,
         length: int,
         substeps: int,
@@ -91,8 +118,8 @@ class ShootingIntervals:
         ----------
         model : Model
         layout : ParameterLayout
-        logs : sequence of ((N, n_s) array, (N, n_s) bool array, (N, n_u) array)
-            Measured signals, known samples, and inputs of each log.
+        logs : sequence of ((N, n_s) array, (N, n_s) bool array, (N, n_u) array, (N,) bool array)
+            Measured signals, known samples, inputs, and rows of gaps of each log.
         dt : float
             Sampling time, s.
         length : int
@@ -106,14 +133,15 @@ class ShootingIntervals:
         -------
         ShootingIntervals
         """
-        missing = [-len(inputs) % length for _, _, inputs in logs]
+        sizes = [len(log[2]) for log in logs]
+        missing = [-n % length for n in sizes]
         measured = np.concatenate([_filled_up(log[0], more) for log, more in zip(logs, missing, strict=True)])
-        inputs = np.concatenate([_filled_up(log[2], more) for log, more in zip(logs, missing, strict=True)])
-        known = np.concatenate([np.pad(log[1], ((0, n), (0, 0))) for log, n in zip(logs, missing, strict=True)])
-        sizes = [len(inputs) for _, _, inputs in logs]
+        recorded = np.concatenate([_filled_up(log[2], more) for log, more in zip(logs, missing, strict=True)])
+        sampled = np.concatenate([np.pad(log[1], ((0, n), (0, 0))) for log, n in zip(logs, missing, strict=True)])
+        gaps = np.concatenate([np.pad(log[3], (0, n)) for log, n in zip(logs, missing, strict=True)])
         is_logged = np.concatenate([np.arange(n + more) < n for n, more in zip(sizes, missing, strict=True)])
         log_of = np.repeat(np.arange(len(logs)), [-(-n // length) for n in sizes])
-        return cls(model, layout, measured, known, inputs, is_logged, log_of, dt, length, substeps, hold)
+        return cls(model, layout, measured, sampled, recorded, is_logged, gaps, log_of, dt, length, substeps, hold)
 
     def __len__(self) -> int:
         return len(self.log_of)
@@ -125,8 +153,25 @@ class ShootingIntervals:
 
     @cached_property
     def linked(self) -> BoolArray:
-        """Mask ``(W - 1,)`` of the intervals that continue in the next one, which is of the same log."""
-        return np.asarray(self.log_of[1:] == self.log_of[:-1])
+        """Mask ``(W - 1,)`` of the intervals that continue in the next one, of the same log and without a gap."""
+        reached = self._reached.reshape(len(self), self.length)[:-1, -1] & ~self.gaps[self.starts[1:]]
+        return np.asarray((self.log_of[1:] == self.log_of[:-1]) & reached)
+
+    @cached_property
+    def _reached(self) -> BoolArray:
+        """Rows ``(N,)`` that a simulation reaches from its interval's start without passing through a gap."""
+        clear = ~self.gaps.reshape(len(self), self.length)
+        return np.logical_and.accumulate(clear, axis=1).ravel()
+
+    @cached_property
+    def known(self) -> BoolArray:
+        """Samples ``(N, n_s)`` that are measured, and reached by a simulation."""
+        return self.sampled & self._reached[:, None]
+
+    @cached_property
+    def counted(self) -> BoolArray:
+        """Rows ``(N,)`` of the logs that a simulation reaches."""
+        return self.is_logged & self._reached
 
     @cached_property
     def first_of_log(self) -> IntArray:
@@ -140,8 +185,8 @@ class ShootingIntervals:
 
     @cached_property
     def occupied(self) -> BoolArray:
-        """Mask ``(W,)`` of the intervals with a row of a log; short ones may have padded rows alone."""
-        return np.asarray(self.is_logged.reshape(len(self), -1).any(axis=1))
+        """Mask ``(W,)`` of the intervals with a row that counts; others begin in a gap, or after the end of a log."""
+        return np.asarray(self.counted[self.starts])
 
     @property
     def duration(self) -> float:
@@ -202,6 +247,34 @@ class ShootingIntervals:
         """Rows of each log, padded ones included."""
         edges = [*self.first_of_log.tolist(), len(self.recorded)]
         return [slice(a, b) for a, b in pairwise(edges)]
+
+    def corrected(self, delay: FloatArray, bias: FloatArray, rates: FloatArray) -> ShootingIntervals:
+        """The intervals with measurements that are corrected of errors of the sensors.
+
+        Parameters
+        ----------
+        delay : (n_s,) array
+            Samples by which each signal is recorded late.
+        bias : (n_s,) array
+            Constant error of each signal, its unit.
+        rates : (N, n_s) array
+            Change of each signal per sample, for the fractions of a sample.
+
+        Returns
+        -------
+        ShootingIntervals
+        """
+        old = self.sensors or Sensors(self.measured, self.sampled, np.zeros(len(delay)), np.zeros(len(bias)))
+        measured, sampled = old.measured.copy(), old.sampled.copy()
+        for i, whole in enumerate(np.round(delay).astype(int)):
+            for rows in self.rows_of_logs:
+                at = np.arange(rows.start, rows.stop) + whole
+                inside = (at >= rows.start) & (at < rows.stop)
+                at = np.clip(at, rows.start, rows.stop - 1)
+                measured[rows, i], sampled[rows, i] = old.measured[at, i], old.sampled[at, i] & inside
+        measured += (delay - np.round(delay)) * rates - bias
+        sensors = replace(old, delay=delay, bias=bias)
+        return replace(self, measured=np.where(sampled, measured, 0.0), sampled=sampled, sensors=sensors)
 
     def split(self, parts: int) -> ShootingIntervals:
         """The same rows in intervals of a fraction of the length."""

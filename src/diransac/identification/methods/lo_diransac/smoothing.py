@@ -46,6 +46,8 @@ _SHRINK = 0.3
 _FLOOR = 1e-4
 _AT_REST = 0.1
 _TRIALS = 24
+# Weight of a polynomial that was fitted to fewer samples than it has coefficients.
+_UNINFORMED = 1e-9
 # Samples that a window has at least, and those to either side of a knot that always suffice.
 _FEWEST, _ENOUGH_SAMPLES = 5, 25
 # Residuals that a scale is taken from; more would only cost time.
@@ -64,11 +66,14 @@ class Samples:
         Samples that are measured.
     centre : (N, n_signals) array
         Running median.
+    gaps : (N,) bool array
+        Rows of gaps in inputs, or in all sensors.
     """
 
     measured: FloatArray
     known: BoolArray
     centre: FloatArray
+    gaps: BoolArray
 
 
 @dataclass(frozen=True)
@@ -197,12 +202,13 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
         lacking = model.n_q + np.flatnonzero(~known[:, model.n_q : model.n_q + model.n_v].any(axis=0))
         if len(lacking):
             inferred = _velocities_of_rates(model, signals, rates, measured, known, lacking)
-            measured[:, lacking], known[:, lacking], centre[:, lacking] = inferred, True, inferred
+            measured[:, lacking], known[:, lacking], centre[:, lacking] = inferred, ~log.gaps[:, None], inferred
         chains = chains[model.n_q :]
     for columns in chains:
         signals[:, columns], _ = smoother.smoothed(measured[:, columns], known[:, columns], centre[:, columns])
         _integrate(signals, known, columns, dt)
-    return signals
+    rows, seen = np.arange(len(signals)), np.flatnonzero(~log.gaps)
+    return signals if log.gaps.all() else np.column_stack([np.interp(rows, seen, x[seen]) for x in signals.T])
 
 
 def _velocities_of_rates(
@@ -273,7 +279,8 @@ class _Smoother:
         first = (values - centre)[rows]
         coefficients = _coefficients(values[rows], oks, first, self.basis[:c], _spread(centre))
         fitted = np.einsum("ka,jta->ktj", coefficients, self.basis[: c + 1])
-        weight = np.broadcast_to(self.blend, rows.shape)[inside]
+        informed = oks.any(axis=2).sum(axis=1) > _DEGREE + 1
+        weight = (self.blend * np.where(informed, 1.0, _UNINFORMED)[:, None])[inside]
         total = np.bincount(rows[inside], weight, len(values))
         blended = [np.bincount(rows[inside], fitted[inside, j] * weight, len(values)) / total for j in range(c + 1)]
         return np.column_stack(blended[:c]), blended[c]

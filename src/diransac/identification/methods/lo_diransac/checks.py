@@ -1,0 +1,120 @@
+"""Findings of a fit on itself: errors of sensors and actuators, parameters that change, methods that disagree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray
+from diransac.identification.estimate import Finding
+from diransac.identification.methods.lo_diransac.hypotheses import weak_form
+from diransac.identification.methods.lo_diransac.projection import batch_sums, by_least_squares, equations_of
+from diransac.text_table import number
+
+if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.local_search import Explanation
+    from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.methods.lo_diransac.smoothing import Motion
+
+__all__ = ["findings_of_fit"]
+
+# A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious.
+_CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
+
+
+def findings_of_fit(found: Explanation, motion: Motion, result: ProjectedEstimate) -> Iterator[Finding]:
+    """Findings for and against an estimate.
+
+    Parameters
+    ----------
+    found : Explanation
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+    result : ProjectedEstimate
+
+    Returns
+    -------
+    iterator of Finding
+    """
+    yield from _of_actuators(found.intervals)
+    yield from _of_sensors(found.intervals)
+    if not found.exact:
+        yield from _of_halves(found, result)
+        yield from _of_plain_least_squares(found.intervals, motion, result)
+
+
+def _of_actuators(intervals: ShootingIntervals) -> Iterator[Finding]:
+    """A first-order lag of the actuators."""
+    if intervals.lag:
+        lag = number(1e3 * intervals.lag * intervals.dt, 3)
+        text = (
+            f"The actuators follow the recorded inputs with a first-order lag of {lag} ms, which the estimate includes"
+        )
+        yield Finding("care", f"{text}: simulations of the model must include it, too.")
+    if intervals.hold == "linear" and not intervals.lag:
+        yield Finding("note", "Inputs that vary linearly between samples explain this log better than held ones.")
+
+
+def _of_sensors(intervals: ShootingIntervals) -> Iterator[Finding]:
+    """Delays and biases of sensors."""
+    sensors = intervals.sensors
+    if sensors is None:
+        return
+    for i, name in enumerate(intervals.model.signals):
+        if sensors.delay[i]:
+            time = number(1e3 * abs(sensors.delay[i]) * intervals.dt, 3)
+            sense = "late" if sensors.delay[i] > 0.0 else "early"
+            yield Finding("care", f"{name} is recorded {time} ms {sense}, a sensor delay that the estimate includes.")
+        if sensors.bias[i]:
+            size, unit = number(sensors.bias[i], 3), intervals.model.units[name]
+            yield Finding("care", f"{name} has a sensor bias of {size} {unit}, which the estimate includes.")
+
+
+def _of_halves(found: Explanation, result: ProjectedEstimate) -> Iterator[Finding]:
+    """Parameters that differ between the halves of the logs: a payload, a battery, a machine that wears."""
+    intervals = found.intervals
+    W, residuals = equations_of(intervals, found.refinement.fit, result.parameters)
+    place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
+    first = place < 0.5 * np.bincount(intervals.log_of)[intervals.log_of]
+    changes, variances = zip(*(_change(W[half], residuals[half]) for half in (first, ~first)), strict=True)
+    p = result.parameters[None] + np.array(changes)
+    error = np.sqrt(sum(variances))
+    determined = np.isfinite(np.diag(result.covariance))
+    for name, (a, b), s, ok in zip(intervals.layout.names, p.T, error, determined, strict=True):
+        apart, size = abs(a - b), 0.5 * (abs(a) + abs(b))
+        if ok and apart > _CLEAR * s and apart > _DIFFERENT * size:
+            text = (
+                f"{name} changes during the log, from {number(a, 3)} in its first half to {number(b, 3)} in its second"
+            )
+            advice = "a payload, a drifting gain or another regime; identify stretches of the log one by one"
+            yield Finding("bad" if apart > _SERIOUS * size else "care", f"{text}: {advice}.")
+
+
+def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Change ``(n,)`` of parameters by least squares of some rows, and its variance by batches of them."""
+    gains = by_least_squares(W, residuals)
+    change = -np.einsum("pwi,wi->p", gains, residuals)
+    left = residuals + W @ change
+    sums = batch_sums(np.einsum("pwi,wi->wp", gains, left))
+    return change, np.square(sums).sum(axis=0)
+
+
+def _of_plain_least_squares(
+    intervals: ShootingIntervals, motion: Motion, result: ProjectedEstimate
+) -> Iterator[Finding]:
+    """Parameters of plain least squares of the smoothed motion that lie far outside their intervals."""
+    if intervals.model.nonlinear_parameters:
+        return
+    weak = weak_form(intervals, motion)
+    everything: BoolArray = np.ones((1, *weak.b.shape), bool)
+    plain = weak.solve(everything)[0]
+    _, variance = _change(weak.W, weak.W @ plain - weak.b)
+    error = np.sqrt(variance + np.diag(result.covariance))
+    for name, a, b, s in zip(intervals.layout.names, plain, result.parameters, error, strict=True):
+        apart, size = abs(a - b), abs(b)
+        if np.isfinite(s) and apart > _CLEAR * s and apart > _SERIOUS * size:
+            text = f"Plain least squares gives {name} = {number(a, 3)}, far outside the interval"
+            yield Finding("care", f"{text}: outliers and noise explain that, or the model lacks a term.")

@@ -1,0 +1,146 @@
+"""Systematic errors of the sensors: a delay of each signal or group of signals, and a bias.
+
+An error of a sensor that no parameter and no discrepancy explains leaves a trace in the residuals: a delay in
+proportion to the signal's rate, a bias a constant.  A score test finds the error whose trace is the clearest, given all
+else that is estimated; it costs a call of the simulator, and no fit.  The error is then estimated jointly with all
+other unknowns, by one Newton step and a new fit.
+
+References
+----------
+Rao 1948 (score test); Furgale, Rehder, Siegwart 2013 (delays of sensors).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray
+from diransac.identification.methods.lo_diransac.normal_equations import linearize
+from diransac.identification.methods.lo_diransac.refinement import weights_of
+
+if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+
+__all__ = ["SensorError", "clearest_error", "with_error"]
+
+# Standard errors from which on an error of a sensor is tried, and its least delay, samples.
+_CLEAR, _LEAST_DELAY = 3.0, 0.1
+# Signals that are known in fewer rows than this are not tested.
+_FEWEST = 50
+
+
+@dataclass(frozen=True)
+class SensorError:
+    """An error of one signal or of a group.
+
+    Parameters
+    ----------
+    signals : (n_s,) bool array
+        Signals that have it.
+    is_delay : bool
+        A delay in samples, or a bias in the signal's unit.
+    size : float
+        Its estimate.
+    ratio : float
+        Its size over its standard error.
+    """
+
+    signals: BoolArray
+    is_delay: bool
+    size: float
+    ratio: float
+
+
+def clearest_error(intervals: ShootingIntervals, fit: Fit) -> SensorError | None:
+    """The error of the sensors that the residuals show most clearly.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        At its optimum.
+
+    Returns
+    -------
+    SensorError or None
+        None if no error is clear.
+    """
+    weights, rates = weights_of(intervals, fit), signal_rates(intervals, fit)
+    at = linearize(intervals, fit, weights)
+    batch = np.arange(0, len(intervals), max(1, round(np.sqrt(len(intervals)))))
+    found: list[SensorError] = []
+    for signals, is_delay in _candidates(intervals):
+        trace = np.where(signals, -rates if is_delay else 1.0, 0.0)
+        # The gradient J' W e with errors that are larger by the trace, of which no derivative is needed.
+        moved = linearize(replace(intervals, measured=intervals.measured - trace), fit, weights)
+        of_z, of_s = at.data_z - moved.data_z, (at.data_s - moved.data_s).sum(axis=0)
+        z, s = (x[..., 0] for x in at.system.functional(of_z[:, :, None], of_s[:, None]))
+        information = float((weights * np.square(trace)).sum() - (of_z * z).sum() - of_s @ s)
+        rows = (weights * trace * fit.residuals).sum(axis=1)
+        scores = rows.reshape(len(intervals), -1).sum(axis=1) + (at.data_z * z).sum(axis=1) + at.data_s @ s
+        variance = max(information, float(np.square(np.add.reduceat(scores, batch)).sum()))
+        if information > 0.0:
+            score = float(rows.sum())
+            found.append(SensorError(signals, is_delay, -score / information, abs(score) / np.sqrt(variance)))
+    clear = [x for x in found if x.ratio > _CLEAR and (not x.is_delay or abs(x.size) > _LEAST_DELAY)]
+    return max(clear, key=lambda x: x.ratio, default=None)
+
+
+def with_error(intervals: ShootingIntervals, fit: Fit, error: SensorError) -> ShootingIntervals:
+    """The intervals with measurements that are corrected of an error, too.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        Of which the rates of signals are taken.
+    error : SensorError
+
+    Returns
+    -------
+    ShootingIntervals
+    """
+    n = len(error.signals)
+    old = intervals.sensors
+    delay = np.zeros(n) if old is None else old.delay
+    bias = np.zeros(n) if old is None else old.bias
+    more = np.where(error.signals, error.size, 0.0)
+    delay, bias = (delay + more, bias) if error.is_delay else (delay, bias + more)
+    return intervals.corrected(delay, bias, signal_rates(intervals, fit))
+
+
+def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+    """Change of each simulated signal per sample.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    (N, n_s) array
+    """
+    series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
+    signals = series.reshape(intervals.measured.shape)
+    rates = np.zeros_like(signals)
+    for rows in intervals.rows_of_logs:
+        if rows.stop - rows.start > 1:
+            rates[rows] = np.gradient(signals[rows], axis=0)
+    return np.nan_to_num(rates, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _candidates(intervals: ShootingIntervals) -> list[tuple[BoolArray, bool]]:
+    """Signals and kinds of the errors that are tested: of each signal, and delays of coordinates, velocities, ..."""
+    model = intervals.model
+    seen = intervals.known.sum(axis=0) >= _FEWEST
+    kind = np.repeat([0, 1, 2], [model.n_q, model.n_v, model.n_v])
+    single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen)]
+    groups = [(kind == g) & seen for g in range(3)]
+    groups = [x for x in groups if 1 < x.sum() < seen.sum()]
+    delays = [(x, True) for x in [*groups, *single] if not (x == seen).all()]
+    return [*delays, *((x, False) for x in single)]
