@@ -81,7 +81,7 @@ class Explanation:
 
     @property
     def cost(self) -> float:
-        """Negative log evidence, with half the log of the number of rows for each scale of discrepancies and a delay."""
+        """Negative log evidence, with half the log of the number of rows per scale of a discrepancy and delay."""
         intervals = self.intervals
         late = abs(intervals.delay + self.refinement.fit.shared[-1]) > _SMALL_DELAY or bool(intervals.lag)
         n_scales = (0 if self.exact else 2 * intervals.model.n_v + 1) + late
