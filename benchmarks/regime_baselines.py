@@ -3,7 +3,7 @@
 Both know the bandwidth of the machine, and how its inputs are held.  Nothing happens when this file is run.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import casadi as ca
@@ -162,7 +162,7 @@ def _stacked(jacobian: Array, weight: Array) -> Array:
     return rows.reshape(-1, rows.shape[-1])
 
 
-def _equations(model: dr.Model, data: Filtered):  # noqa: ANN202
+def _equations(model: dr.Model, data: Filtered) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
     """Functions of p: filtered residuals (n_v, N) and their derivatives (n_v, n_p, N)."""
     n_rows = data.q.shape[1]
     q, v, a, u, p = (ca.SX.sym(n, k) for n, k in zip("qvaup", (*_sizes(model), model.n_p), strict=True))

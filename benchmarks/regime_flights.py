@@ -260,7 +260,7 @@ def _stribeck(rngs: Rngs) -> Force:  # noqa: ARG001
 
 
 def _ripple(rngs: Rngs) -> Force:  # noqa: ARG001
-    """Torque ripple of a fifth of dry friction, 40 periods a radian over 2 pi, in the arm's first joint."""
+    """Torque ripple ``sin(40 q)`` in the arm's first joint, a fifth of its dry friction."""
     return lambda t, q, v, u, p: np.stack([0.2 * p.fc1 * np.sin(40.0 * q[0]), 0.0 * q[1]])
 
 
@@ -285,11 +285,12 @@ def _late(signals: str, milliseconds: float) -> Fault:
 
 
 _POSE = "x y z phi theta psi"
+_GYRO = "wx wy wz"
 _ALL = [
     Regime("rotor noise .1x", _ROTOR, noise=0.1),
     Regime("rotor noise 1x", _ROTOR),
     Regime("rotor noise 10x", _ROTOR, noise=10.0),
-    Regime("quad mocap and gyro", _QUAD),
+    Regime("quad mocap and gyro", _QUAD, signals=(*_POSE.split(), *_GYRO.split())),
     Regime("car all measured", machines.CAR),
     Regime("car gyro and lateral acceleration", machines.CAR, signals=("yaw_dot", "lateral_ddot")),
     Regime("flexible joint both angles", machines.JOINT),

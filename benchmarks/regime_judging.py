@@ -9,6 +9,8 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from regime_baselines import NoBaselineError, ordinary, total
@@ -63,7 +65,7 @@ class Record:
     @property
     def off(self) -> bool:
         """Whether a parameter is off by more than `WRONG` and outside its interval."""
-        return any(abs(x) > WRONG and not self.inside.get(name, True) for name, x in self.errors.items())
+        return any(not abs(x) <= WRONG and not self.inside.get(name, True) for name, x in self.errors.items())
 
     @property
     def names_cause(self) -> bool:
@@ -76,35 +78,49 @@ class Record:
         return self.off and self.verdict != UNRELIABLE and not self.names_cause
 
 
-def record_all(regime: str, seeds: Sequence[int], methods: Sequence[str]) -> list[Record]:
-    """Let every method at the logs of some seeds."""
+def judge(regime: str, seed: int, seeds: Sequence[int], methods: Sequence[str]) -> list[Record]:
+    """Let every method at the log of one seed; those of all seeds are simulated at once, and kept for the next call."""
     chosen = REGIMES[regime]
-    with np.errstate(over="ignore"):
-        recorded = recordings(chosen, seeds)
-    return [METHODS[method](chosen, seed, one) for seed, one in zip(seeds, recorded, strict=True) for method in methods]
+    log = _recordings(regime, tuple(seeds))[seeds.index(seed)]
+    return [METHODS[method](chosen, seed, log) for method in methods]
 
 
-def _lo(regime: Regime, seed: int, recording: Recording) -> Record:
-    """The default method as a user runs it."""
-    begin = time.process_time()
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            result = dr.identify(regime.machine.model, recording.log, differentiate=True)
-    except dr.DiransacError as error:
-        return Record(regime.name, seed, "lo", refusal=str(error), seconds=time.process_time() - begin)
-    except Exception as error:  # noqa: BLE001 a crash is what the benchmark counts
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        text = f"{type(error).__name__}: {error} (in {where.name})"
-        return Record(regime.name, seed, "lo", refusal=text, crashed=True, seconds=time.process_time() - begin)
-    seconds = time.process_time() - begin
-    intervals, truth = result.intervals(0.95), recording.truth
-    inside = {
-        name: bool(low <= truth[name] <= high) for name, (low, high) in intervals.items() if np.isfinite(high - low)
-    }
+@lru_cache(maxsize=1)
+def _recordings(regime: str, seeds: tuple[int, ...]) -> list[Recording]:
+    return recordings(REGIMES[regime], seeds)
+
+
+Method = Callable[[Regime, Recording], dict[str, Any]]
+"""Fields of a `Record` that an estimate has."""
+
+
+def _judged(name: str, method: Method) -> Callable[[Regime, int, Recording], Record]:
+    """A method whose refusals and crashes are recorded, as is its time."""
+
+    def judged(regime: Regime, seed: int, recording: Recording) -> Record:
+        begin = time.process_time()
+        try:
+            outcome = method(regime, recording)
+        except (dr.DiransacError, NoBaselineError) as error:
+            outcome = {"refusal": str(error)}
+        except Exception as error:  # noqa: BLE001 crashes are counted
+            where = traceback.extract_tb(error.__traceback__)[-1].name
+            outcome = {"refusal": f"{type(error).__name__}: {error} (in {where})", "crashed": True}
+        return Record(regime.name, seed, name, seconds=time.process_time() - begin, **outcome)
+
+    return judged
+
+
+def _lo(regime: Regime, recording: Recording) -> dict[str, Any]:
+    """The default method as a user runs it, and what it says."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        result = dr.identify(regime.machine.model, recording.log, differentiate=True)
+    truth, intervals = recording.truth, result.intervals(0.95)
+    finite = {name: pair for name, pair in intervals.items() if np.isfinite(pair).all()}
+    inside = {name: bool(low <= truth[name] <= high) for name, (low, high) in finite.items()}
     verdict, findings = _said(result)
-    errors = _errors(result.parameters, truth)
-    return Record(regime.name, seed, "lo", errors, inside, verdict, findings, seconds=seconds)
+    return {"errors": _errors(result.parameters, truth), "inside": inside, "verdict": verdict, "findings": findings}
 
 
 def _said(result: dr.Result) -> tuple[str, tuple[str, ...]]:
@@ -122,25 +138,17 @@ def _errors(found: Mapping[str, float], truth: Mapping[str, float]) -> dict[str,
     return {name: 100.0 * (found[name] - x) / abs(x) for name, x in truth.items()}
 
 
-def _baseline(
-    name: str, method: Callable[[Regime, Recording], Mapping[str, float]]
-) -> Callable[[Regime, int, Recording], Record]:
-    def judged(regime: Regime, seed: int, recording: Recording) -> Record:
-        begin = time.process_time()
-        try:
-            found = method(regime, recording)
-        except (NoBaselineError, np.linalg.LinAlgError, ValueError) as error:
-            return Record(regime.name, seed, name, refusal=str(error), seconds=time.process_time() - begin)
-        errors = _errors(found, recording.truth)
-        return Record(regime.name, seed, name, errors, seconds=time.process_time() - begin)
-
-    return judged
+def _baseline(method: Callable[[Regime, Recording], Mapping[str, float]]) -> Method:
+    return lambda regime, recording: {"errors": _errors(method(regime, recording), recording.truth)}
 
 
 METHODS = {
-    "lo": _lo,
-    "ols": _baseline("ols", ordinary),
-    "tls": _baseline("tls", total),
-    "oe": _baseline("oe", output_error),
+    name: _judged(name, method)
+    for name, method in {
+        "lo": _lo,
+        "ols": _baseline(ordinary),
+        "tls": _baseline(total),
+        "oe": _baseline(output_error),
+    }.items()
 }
 """``(regime, seed, recording) -> Record`` by name."""

@@ -50,7 +50,7 @@ class Machine:
     ----------
     name : of the machine; machines of a name have the same parameters and reference at the same seed
     model : what a user would identify
-    base : by parameter, the middle of what is drawn; parameters of the plant alone come after the model's
+    base : by parameter, the middle of what is drawn
     accelerations : ``(q, v, u, p, f) -> (n_v, L)``, with generalised forces f (n_v, L) that the model lacks
     reference : ``rngs -> Multisine``
     control : ``(t, q, v, r, p) -> u (n_u, L)``, with the reference r
@@ -60,6 +60,8 @@ class Machine:
     bandwidth : of the baselines' filter, Hz; about the best for ordinary least squares at seeds from 1000 on
     kinematics : ``(q, v) -> dq/dt``; None: v
     on_reference : ``r -> (q, v)`` at the start; None: at rest in 0
+    modelled : accelerations as the model has them; None: those of the plant
+    n_plant : coordinates of a plant that has more than the model, the model's first; None: as many
     """
 
     name: str
@@ -75,11 +77,12 @@ class Machine:
     bandwidth: float
     kinematics: Callable[[Array, Array], Array] | None = None
     on_reference: Callable[[Multisine], tuple[Array, Array]] | None = None
+    modelled: Callable[..., Array] | None = None
     n_plant: int | None = None
 
     @property
     def n_q(self) -> int:
-        """Coordinates of the plant: those of the model come first."""
+        """Coordinates of the plant."""
         return self.n_plant or self.model.n_q
 
     @property
@@ -237,7 +240,7 @@ QUAD = Machine(
     lambda rngs: Multisine(rngs, (1.1, 1.1, 0.5, 0.5), 0.08, 0.45, 5),
     _quad_control,
     {**dict.fromkeys(("x", "y", "z"), 0.002), **dict.fromkeys(("phi", "theta", "psi"), 0.005)}
-    | dict.fromkeys(("wx", "wy", "wz"), 0.02),
+    | dict.fromkeys(("vx", "vy", "vz", "wx", "wy", "wz"), 0.02),
     dt=0.01, duration=20.0, substeps=4, bandwidth=5.0,
     kinematics=lambda q, v: np.concatenate([v[:3], np.stack(_euler_rates(np, q[3], q[4], *v[3:]))]),
     on_reference=_quad_start,
@@ -534,7 +537,9 @@ def _geared_accelerations(q: Array, v: Array, u: Array, p: SimpleNamespace, f: A
     )
 
 
-GEARED_MOTOR = replace(MOTOR, accelerations=_geared_accelerations, substeps=40, n_plant=2)
+GEARED_MOTOR = replace(
+    MOTOR, accelerations=_geared_accelerations, modelled=_motor_accelerations, substeps=40, n_plant=2
+)
 """The motor with its load behind backlash: the model has the motor's angle alone."""
 
 

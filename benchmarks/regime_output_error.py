@@ -141,12 +141,12 @@ class _Segments:
         machine, copies = self.machine, x.shape[1] // self.first.shape[1]
         p = SimpleNamespace(**dict(zip(machine.model.parameters, values, strict=True)))
         n_q, none = machine.model.n_q, np.zeros((machine.model.n_v, 1))
-        kinematics = machine.kinematics or (lambda q, v: v)
+        kinematics, modelled = machine.kinematics or (lambda q, v: v), machine.modelled or machine.accelerations
         steps = (machine.substeps + 1) // 2
         h, found = machine.dt / steps, []
 
         def accelerations(x: Array, u: Array) -> Array:
-            return machine.accelerations(x[:n_q], x[n_q:], u, p, none)
+            return modelled(x[:n_q], x[n_q:], u, p, none)
 
         with np.errstate(all="ignore"):
             for k in range(len(self.measured)):

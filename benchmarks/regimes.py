@@ -11,19 +11,18 @@ import json
 import math
 import multiprocessing
 import os
+import signal
 import sys
 from collections.abc import Iterable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from statistics import median
 
 from regime_flights import REGIMES
-from regime_judging import METHODS, Record, record_all
+from regime_judging import METHODS, Record, judge
 
 ONE_THREAD = ("DIRANSAC_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_BATCH = 5
-"""Seeds that are simulated at once: a simulation of few takes as long."""
 VERDICTS = ("usable", "usable with care", "do not rely on this")
 
 
@@ -52,7 +51,9 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--methods", type=_methods, default=list(METHODS), metavar="A,B", help=f"of {', '.join(METHODS)}"
     )
-    parser.add_argument("--seeds", type=_seeds, default=range(20), metavar="A:B", help="from A to B - 1 (0:20)")
+    parser.add_argument(
+        "--seeds", type=_seeds, default=range(20), metavar="A:B", help="from A to B - 1 (0:20, those reported)"
+    )
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes, of one thread each")
     parser.add_argument("-o", "--output", type=Path, help="a file to write the same to")
     parser.add_argument("--json", action="store_true", help="every record instead of the table")
@@ -89,24 +90,15 @@ def _seeds(text: str) -> range:
 def _run_all(regimes: Sequence[str], seeds: range, methods: Sequence[str], jobs: int) -> list[Record]:
     """Every method on every log, in processes of one thread each; says on stderr how far it is."""
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    records = list[Record]()
-    total = len(regimes) * len(seeds)
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        batch = min(_BATCH, math.ceil(len(seeds) / jobs))
-        waiting: list[Future[list[Record]]] = [
-            pool.submit(record_all, name, seeds[i : i + batch], methods)
-            for name in regimes
-            for i in range(0, len(seeds), batch)
-        ]
+    records, n_logs = list[Record](), len(regimes) * len(seeds)
+    dies = (signal.SIGINT, signal.SIG_DFL)  # processes end with the run that is interrupted
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, spawn, initializer=signal.signal, initargs=dies) as pool:
+        waiting = [pool.submit(judge, regime, seed, seeds, methods) for regime in regimes for seed in seeds]
         try:
-            for done in as_completed(waiting):
-                found = done.result()
-                records += found
-                print(
-                    f"{len({(r.regime, r.seed) for r in records})}/{total} {found[0].regime}",
-                    file=sys.stderr,
-                    flush=True,
-                )
+            for k, done in enumerate(as_completed(waiting), start=1):
+                records += done.result()
+                print(f"{k}/{n_logs} {records[-1].regime}, seed {records[-1].seed}", file=sys.stderr, flush=True)
         except (KeyboardInterrupt, BrokenProcessPool) as reason:
             print(f"ended early: {type(reason).__name__}", file=sys.stderr)
             pool.shutdown(wait=False, cancel_futures=True)
@@ -169,7 +161,7 @@ def _totals(records: Sequence[Record]) -> Iterable[str]:
             yield (
                 f"{'Exact' if exact else 'Mismatched'} models, {len(some)} runs: {sum(one.off for one in some)} off, "
                 f"{wrong} confidently wrong ({100.0 * wrong / len(some):.1f} %), {named} name a cause, "
-                f"{_refusals(some)} refused, coverage {_coverage(some)}."
+                f"refused {_refusals(some)}, coverage {_coverage(some)}."
             )
 
 

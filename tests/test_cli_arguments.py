@@ -100,6 +100,14 @@ def test_a_setting_that_no_method_uses_is_refused(folder: Path, words: list[str]
     assert 'no setting "sample_size"' in done.stderr.splitlines()[0]
 
 
+@pytest.mark.parametrize(("typed", "meant"), [("substep", "substeps"), ("n_sample", "n_samples")])
+def test_a_misspelt_setting_is_answered_with_the_nearest_alone(folder: Path, typed: str, meant: str):
+    done = run("identify", "swim.csv", "--set", f"{typed}=3", *MODEL)
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert f'no setting "{typed}"; did you mean {meant}?' in " ".join(done.stderr.split())
+    assert "largest_sample" not in done.stderr
+
+
 def test_a_method_s_own_setting_is_used_and_reported(folder: Path):
     words = ["identify", "swim.csv", *MODEL, "--json"]
     said, usual = (json.loads(run(*words, *more).stdout) for more in (["--set", "substeps=10"], []))

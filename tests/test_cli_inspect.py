@@ -58,7 +58,7 @@ def test_inspect_says_which_parameters_the_motion_shows(folder: Path):
     assert lively["excitation"]["mass"]["estimate"] == pytest.approx(TRUE["mass"], rel=1e-6)
     assert set(dull["verdicts"].values()) == {"not"}
     assert "mass" in dull["verdicts"]
-    assert "is missing" in dull["reason"]
+    assert "not identifiable" in dull["reason"]
 
 
 def test_inspect_doubts_an_estimate_from_a_log_with_spikes(folder: Path):

@@ -373,7 +373,7 @@ def test_estimate_that_is_not_finite_is_refused():
 def test_nothing_accepted_says_how_many_failed_at_which_step():
     signals, inputs = flight(PLANE, 300, 0.02)
     log = as_log(PLANE, signals, -inputs, 0.02)
-    with pytest.raises(IdentificationError, match=r"in 40 samples \(40 out of bounds\); check units and signs"):
+    with pytest.raises(IdentificationError, match=r"in 40 samples \(40 out of bounds\): .* signs of thrust, moment"):
         dr.identify(MODEL, log, "i-diransac", settings=QUICK)
 
 

@@ -1,6 +1,7 @@
 """The parts of lo-diransac, each against an oracle of its own: dense algebra, plain loops, finite differences."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from diransac.data.dataset import ParameterLayout
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 from diransac.identification.methods.lo_diransac.augmented_model import augmented_model
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
+from diransac.identification.methods.lo_diransac.local_search import fewest_parts
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import Fit, cost, linearize, with_residuals
+from diransac.identification.methods.lo_diransac.projection import unexplained
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
     Samples,
@@ -31,7 +34,9 @@ def intervals_over(measured, inputs, model=ROTORCRAFT, dt=0.01, length=25):
     """Intervals of one log in which everything is measured, with the default integration steps."""
     layout, known = ParameterLayout(model.parameters), np.ones(measured.shape, bool)
     substeps = dr.LoDiransac().substeps
-    return ShootingIntervals.of(model, layout, [(measured, known, inputs)], dt, length, substeps)
+    return ShootingIntervals.of(
+        model, layout, [(measured, known, inputs, np.zeros(len(inputs), bool))], dt, length, substeps
+    )
 
 
 def intervals_of(n_rows=200, length=25, dt=0.01):
@@ -41,7 +46,7 @@ def intervals_of(n_rows=200, length=25, dt=0.01):
 
 def smoothed(measured, known):
     """The motion of a log at 100 Hz, from 25 rows to either side."""
-    samples = Samples(measured, known, running_median(measured, known, 31))
+    samples = Samples(measured, known, running_median(measured, known, 31), np.zeros(len(measured), bool))
     return smooth(ROTORCRAFT, [samples], 0.01, 25)[0]
 
 
@@ -75,6 +80,10 @@ def test_arrowhead_gives_what_dense_algebra_gives(n_blocks):
     assert np.allclose(found.var_p, inverse[p, p], rtol=1e-6)
     for w, s in enumerate(z):
         assert np.allclose(found.var_z[w], inverse[s, s], rtol=1e-6, atol=1e-9 * np.abs(inverse[s, s]).max())
+    for w, (s, following) in enumerate(pairwise(z)):
+        expected = inverse[following, s]
+        assert np.allclose(found.var_below[w], expected, rtol=1e-6, atol=1e-9 * np.abs(inverse[s, s]).max())
+    assert found.log_det == pytest.approx(np.linalg.slogdet(A)[1], rel=1e-9)
 
 
 def test_arrowhead_functionals_are_columns_of_the_inverse():
@@ -160,7 +169,7 @@ def test_half_width_is_wider_where_the_motion_is_slower():
     known = np.zeros((4000, 9), bool)
     known[:, :3] = True
     logs = [np.repeat(np.sin(w * t)[:, None], 9, axis=1) + noise for w in (10.0, 0.5)]
-    samples = [Samples(log, known, running_median(log, known, 31)) for log in logs]
+    samples = [Samples(log, known, running_median(log, known, 31), ~known.any(axis=1)) for log in logs]
     widths = [choose_half_width(ROTORCRAFT, [log], 0.01, 0.25) for log in samples]
     assert widths[0] == 25
     assert widths[1] > 25
@@ -210,10 +219,28 @@ def test_a_last_interval_that_is_not_full_has_rows_in_which_nothing_is_known():
     assert not intervals.known[210:].any()
 
 
+def test_what_short_intervals_leave_unexplained_is_finite_where_a_log_ends_within_a_long_one():
+    intervals, signals = intervals_of(n_rows=210)
+    short = intervals.split(5)
+    assert len(short) == 45
+    assert np.flatnonzero(~short.occupied).tolist() == [42, 43, 44]
+    signals = np.pad(signals, ((0, 15), (0, 0)), mode="edge")
+    left = unexplained(short, perturbed_fit(short, signals), TRUTH)
+    assert np.isfinite(left).all()
+    assert not left[42:].any()
+    assert left[:42].any()
+
+
+def test_intervals_are_split_into_equal_parts_of_three_rows_at_least():
+    for length in range(1, 80):
+        possible = [k for k in range(2, length + 1) if length % k == 0 and length // k >= 3]
+        assert fewest_parts(length) == min(possible, default=0)
+
+
 def test_delay_moves_the_inputs_by_rows():
     intervals, _ = intervals_of()
-    assert np.array_equal(intervals.delayed(2).inputs[2:], intervals.inputs[:-2])
-    assert np.array_equal(intervals.delayed(-3).inputs[:-3], intervals.inputs[3:])
+    assert np.array_equal(replace(intervals, delay=2).inputs[2:], intervals.inputs[:-2])
+    assert np.array_equal(replace(intervals, delay=-3).inputs[:-3], intervals.inputs[3:])
 
 
 # ---------------------------------------------------------------------- normal equations
@@ -227,7 +254,7 @@ def perturbed_fit(intervals, signals, seed=9):
     shared = np.append(TRUTH, np.zeros(n - 3)) * 1.05 + np.r_[0, 0, 0, 1e-3 * rng.normal(size=n - 3)]
     noise = Mixture(np.full(9, 0.1), np.full(9, 0.1), np.full(9, 10.0), np.full(9, 1e-6))
     prior = np.r_[np.full(3, np.inf), np.full(n - 3, 0.01)]
-    sizes = (np.full(3, 0.1), np.full(6, 0.02), prior)
+    sizes = (np.full(3, 0.1), np.array([0.0, 0.4, 0.9]), np.full(6, 0.02), prior)
     return with_residuals(intervals, Fit(shared, x, d, np.zeros_like(signals), noise, *sizes))
 
 
@@ -263,7 +290,7 @@ def test_a_gauss_newton_step_solves_a_linear_problem_at_once():
     intervals = intervals_over(measured, inputs, model, dt, 20)
     noise = Mixture(np.ones(3), np.full(3, 0.1), np.full(3, 10.0), np.full(3, 1e-6))
     shared = np.zeros(intervals.n_shared)
-    sizes = (np.array([0.3]), np.array([0.1, 0.1]), np.r_[np.inf, 0.1, 0.1, 1e-9])
+    sizes = (np.array([0.3]), np.array([0.6]), np.array([0.1, 0.1]), np.r_[np.inf, 0.1, 0.1, 1e-9])
     fit = with_residuals(intervals, Fit(shared, np.zeros((5, 2)), np.zeros((5, 1)), measured, noise, *sizes))
     weights = rng.uniform(0.5, 2.0, (n, 3))
     first = linearize(intervals, fit, weights)

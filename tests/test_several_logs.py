@@ -316,6 +316,19 @@ def test_parameter_that_one_log_does_not_determine_is_named_with_its_log():
         dr.identify(model, logs, "ols")
 
 
+@pytest.mark.parametrize("call", [dr.identify, dr.cross_validate])
+def test_a_log_that_is_given_twice_is_refused(call):
+    """Its copy is no further evidence, though it would narrow every interval."""
+    first, second = biased_logs(biases=(4.0, 1.0))
+    copy = dr.Log.from_arrays(first.time, dict(first.signals), source="copy")
+    with pytest.raises(
+        dr.LogError, match=f"{first.source} and copy have the same time and samples; give each log once"
+    ):
+        call(vehicle(), [first, second, copy], "ols")
+    with pytest.raises(dr.LogError, match=f"{second.source} is given twice"):
+        call(vehicle(), [first, second, second], "ols")
+
+
 # ---------------------------------------------------------------------- agreement
 
 

@@ -277,7 +277,7 @@ def test_what_people_call_things_and_how_many_there_are_decide_nothing():
         ({"methods.a": {"method": "ols", "preset": "best"}}, "methods.a.preset is 'best'; there are default, table-iv"),
         (
             {"methods.ols.settings": {"sample_sise": 3}},
-            'methods.ols.settings: there is no setting "sample_sise"; there',
+            'methods.ols.settings: there is no setting "sample_sise"; did you mean sample_size',
         ),
         ({"methods.ols.settings": {"sample_size": 0}}, "methods.ols.settings: sample_size is 0"),
         ({"methods.a,b": {"method": "ols"}}, 'the label "a,b" has other characters'),

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from diransac.identification.nonlinear import NonlinearLeastSquares
     from diransac.identification.result import Result
     from diransac.identification.settings import Settings
+    from diransac.identification.suggestions import Suggestion
     from diransac.identification.validation import CrossValidation, Validation, cross_validate, validate
     from diransac.plots import plot_flight
     from diransac.report import write_report
@@ -78,6 +79,7 @@ __all__ = [
     "SettingsError",
     "Study",
     "StudyError",
+    "Suggestion",
     "TotalLeastSquares",
     "Trajectory",
     "Validation",
@@ -130,6 +132,7 @@ _FOUND_IN = {
     "identification.nonlinear": ("NonlinearLeastSquares",),
     "identification.result": ("Result",),
     "identification.settings": ("Settings",),
+    "identification.suggestions": ("Suggestion",),
     "identification.validation": ("CrossValidation", "Validation", "cross_validate", "validate"),
     "plots": ("plot_flight",),
     "report": ("write_report",),

@@ -13,7 +13,7 @@ import typer
 from diransac.errors import ModelError, SettingsError
 from diransac.identification.method import Method
 from diransac.identification.methods import configured, setting_names
-from diransac.identification.settings import Settings
+from diransac.identification.settings import Settings, nearest_names
 from diransac.model import Model
 from diransac.user_files import definitions, file_and_name
 
@@ -149,8 +149,8 @@ def load_methods(names: Sequence[str], settings: Mapping[str, Any]) -> list[Meth
     for key in settings:
         if not any(key in own for own in known.values()):
             of_one = f'method "{names[0]}" has' if len(names) == 1 else "none of the methods has"
-            own = ", ".join(dict.fromkeys(x for own in known.values() for x in own))
-            raise typer.BadParameter(f'{of_one} no setting "{key}"; there are {own}')
+            own = list(dict.fromkeys(x for own in known.values() for x in own))
+            raise typer.BadParameter(f'{of_one} no setting "{key}"; {nearest_names(key, own)}')
     return [configured(name, {key: value for key, value in settings.items() if key in known[name]}) for name in names]
 
 

@@ -79,6 +79,9 @@ def _identify(
     derivation: Derivation,
     preparation: Preparation,
     method: MethodName = DEFAULT,
+    with_suggestions: Annotated[
+        bool, typer.Option("--with-suggestions", help="Identify again with the terms that the model seems to lack.")
+    ] = False,
     output: Output = None,
     report: Report = None,
     as_json: JsonFlag = False,
@@ -89,7 +92,8 @@ def _identify(
     with staged([output, report], [*files, model_file(model), search.settings]) as (saved, page):
         plant, logs = load_model(model), preparation.read_all(files)
         with screen.bar(method) as progress:
-            result = identify(plant, logs, chosen, progress=progress, **search.arguments(), **derived)
+            arguments = search.arguments() | derived
+            result = identify(plant, logs, chosen, with_suggestions=with_suggestions, progress=progress, **arguments)
         if output:
             result.save(saved)
         if report:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,7 @@ from diransac.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from diransac.model import Model, Parameter
 
-__all__ = ["Dataset", "ParameterLayout", "as_logs"]
+__all__ = ["Dataset", "ParameterLayout", "as_logs", "distinct_logs"]
 
 
 # Relative difference of two sampling times below which they are one rate with another jitter.
@@ -120,6 +121,33 @@ def as_logs(logs: Log | Iterable[Log]) -> tuple[Log, ...]:
             raise SettingsError(f"log is a {type(one).__name__}; give a dr.Log, such as dr.read_log(path), or several")
     if not several:
         raise SettingsError("there is no log; give one dr.Log or several")
+    return several
+
+
+def distinct_logs(logs: Log | Iterable[Log]) -> tuple[Log, ...]:
+    """As `as_logs`, of logs that are to be independent evidence.
+
+    Parameters
+    ----------
+    logs : Log or iterable of Log
+
+    Returns
+    -------
+    tuple of Log
+
+    Raises
+    ------
+    SettingsError
+        As `as_logs`.
+    LogError
+        Two logs have the same time and samples.
+    """
+    several = as_logs(logs)
+    for one, other in combinations(several, 2):
+        if one.fingerprint == other.fingerprint:
+            same = f"{one.source} and {other.source} have the same time and samples"
+            found = f"{one.source} is given twice" if one.source == other.source else same
+            raise LogError(f"{found}; give each log once: repeated samples are no further evidence")
     return several
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.errors import DiransacError
-from diransac.identification.method import within
+from diransac.identification.method import fit, within
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -74,7 +74,7 @@ def disagreements(
 def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callback | None) -> Estimate | str:
     """The estimate of one log, or the reason why that log alone gives none."""
     try:
-        return method.fit(dataset.subset([i]), seed, callback)
+        return fit(method, dataset.subset([i]), seed, callback)
     except (DiransacError, np.linalg.LinAlgError) as error:
         return str(error)
 

@@ -22,6 +22,7 @@ from diransac.identification.serialization import (
     Values,
     WholeNumbers,
 )
+from diransac.identification.suggestions import Suggestion
 
 __all__ = ["Diagnosis", "Estimate", "Evaluation", "Finding", "Level", "LogSummary", "Prediction", "Resolution"]
 
@@ -135,6 +136,8 @@ class Diagnosis:
         Whether the delay exceeds three standard errors and a quarter of a sample.
     unidentifiable : tuple of str
         Names of the parameters that the logs do not determine.
+    combinations : tuple of str, optional
+        Sentences about these parameters: the combinations that are determined, the reason, the remedy.
     """
 
     noise_std: Values
@@ -150,6 +153,7 @@ class Diagnosis:
     input_delay_error: Number
     input_delay_significant: bool
     unidentifiable: tuple[str, ...]
+    combinations: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         series = [self.window_log, self.unmodelled_time, self.smoothed_time]
@@ -189,6 +193,11 @@ class Diagnosis:
         """Most probable state at the first row of one log, by name."""
         first = self.windows_of(log)[0]
         return {name: float(values[first]) for name, values in self.smoothed_states.items()}
+
+    def unidentifiable_sentences(self) -> tuple[str, ...]:
+        """Sentences about the parameters that are not identifiable, without stops; empty where there is none."""
+        each = (f"{name} is not identifiable from this log; excite it" for name in self.unidentifiable)
+        return self.combinations or tuple(each)
 
     def lines(self, units: Mapping[str, str]) -> list[list[str]]:
         """Rows of a table: signal, noise, outliers, and the RMS that the model does not explain.
@@ -246,6 +255,8 @@ class Estimate:
         Noise, outliers and unmodelled forces; of lo-diransac alone.
     checks : tuple of Finding, optional
         Findings of the method's own tests.
+    suggestions : tuple of Suggestion, optional
+        Terms that the model lacks, by the unmodelled forces; of lo-diransac alone.
     """
 
     parameters: Values
@@ -262,6 +273,7 @@ class Estimate:
     notes: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     checks: tuple[Finding, ...] = ()
+    suggestions: tuple[Suggestion, ...] = ()
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, np.float64).reshape(len(self.parameters), len(self.parameters))

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
 from diransac.errors import IdentificationError, SettingsError
+from diransac.identification.identifiability import NullSpace, null_space
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
@@ -73,8 +74,11 @@ class BoundEstimator(Protocol):
         (n_groups, n) array
         """
 
-    def unidentifiable(self) -> tuple[int, ...]:
-        """Indices of the parameters that are not identifiable from the whole dataset."""
+    def null_space(self) -> NullSpace:
+        """Directions of the parameters that the whole dataset does not determine."""
+
+    def correlations(self) -> FloatArray:
+        """Correlations ``(n, n)`` of the parameters' errors from the whole dataset, which determines them."""
 
 
 class Estimator(Protocol):
@@ -216,9 +220,12 @@ class _BoundSums:
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
         return self.solve(self._gram([rows]) - self._gram(groups))
 
-    def unidentifiable(self) -> tuple[int, ...]:
+    def null_space(self) -> NullSpace:
         gram = self._gram([np.arange(self.n_rows)])[0, :-1, :-1]
-        return loose_parameters(gram, self.min_eigenvalue)
+        return null_space(gram, self._scale[:-1], self.min_eigenvalue)
+
+    def correlations(self) -> FloatArray:
+        return correlations(self._gram([np.arange(self.n_rows)])[0, :-1, :-1])
 
     @property
     def min_eigenvalue(self) -> float:
@@ -313,8 +320,11 @@ class _BoundScikitLearn:
     def select(self, row_sets: Sequence[IntArray]) -> _SelectedRows:
         return _SelectedRows(self._sums.select(row_sets), self, row_sets)
 
-    def unidentifiable(self) -> tuple[int, ...]:
-        return self._sums.unidentifiable()
+    def null_space(self) -> NullSpace:
+        return self._sums.null_space()
+
+    def correlations(self) -> FloatArray:
+        return self._sums.correlations()
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
         return self.fit([np.setdiff1d(rows, group) for group in groups])
@@ -480,22 +490,21 @@ def smallest_eigenvalue(gram: FloatArray) -> FloatArray:
     return np.where(finite, values, -np.inf)
 
 
-def loose_parameters(gram: FloatArray, min_eigenvalue: float) -> tuple[int, ...]:
-    """Indices of the parameters in the eigenvectors whose eigenvalue is too small.
+def correlations(gram: FloatArray) -> FloatArray:
+    """Correlations of estimates whose rows have independent errors.
 
     Parameters
     ----------
     gram : (n, n) array
-    min_eigenvalue : float
-        Largest eigenvalue that is too small.
+        Sum of ``W^T W`` in any scale, positive definite.
 
     Returns
     -------
-    tuple of int
+    (n, n) array
     """
-    values, vectors = np.linalg.eigh(gram)
-    weak = values <= min_eigenvalue
-    return tuple(int(i) for i in np.flatnonzero((np.abs(vectors[:, weak]) > 0.1).any(axis=1)))
+    covariance = np.linalg.inv(gram)
+    errors = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / errors[:, None] / errors)
 
 
 def solve_definite(A: FloatArray, g: FloatArray) -> FloatArray:

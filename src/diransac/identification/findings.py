@@ -11,7 +11,7 @@ from diransac.identification.estimate import Finding, Level
 from diransac.text_table import number, percent, plural, share
 
 if TYPE_CHECKING:
-    from diransac.identification.estimate import LogSummary, Prediction
+    from diransac.identification.estimate import Diagnosis, LogSummary, Prediction
     from diransac.identification.result import Result
     from diransac.model import Parameter
 
@@ -164,8 +164,8 @@ def _simulation(logs: Sequence[LogSummary], *, restarts: bool) -> Iterator[Findi
     if any(one.prediction is None for one in logs):
         yield Finding(
             "care",
-            "No simulation is compared with the log, because its initial state is missing or the file is of an earlier "
-            "version: validate the model on another log.",
+            "No simulation is compared with the log, because its initial state is missing: validate the model on "
+            "another log.",
         )
 
 
@@ -244,13 +244,15 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
                 "bad", f"{text}: check its sign and unit and the terms of the model, or leave the signal out."
             )
     yield from _unexplained(result.logs)
+    for suggestion in result.suggestions:
+        yield Finding("care", f"The model seems to lack a term. {suggestion.text}.")
     if found.input_delay_significant:
         sense = "later" if found.input_delay > 0.0 else "earlier"
         delay = f"Inputs act {number(1e3 * abs(found.input_delay), 3)} ms {sense} than recorded"
         yield Finding(
             "care", f"{delay}: the estimate includes this delay; simulations of the model must include it, too."
         )
-    yield from _unidentifiable(result)
+    yield from _unidentifiable(result, found)
 
 
 def _unexplained(logs: Sequence[LogSummary]) -> Iterator[Finding]:
@@ -267,13 +269,10 @@ def _unexplained(logs: Sequence[LogSummary]) -> Iterator[Finding]:
     yield Finding(level, f"{text}: a term is missing, or an input; add it." if level == "bad" else f"{text}.")
 
 
-def _unidentifiable(result: Result) -> Iterator[Finding]:
-    names = result.unidentifiable
-    if names and len(names) == len(result.parameters):
-        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}: record a livelier motion.")
-    elif names:
-        what = f"{', '.join(names)} {'are' if len(names) > 1 else 'is'} not identifiable from {_these(result.logs)}"
-        yield Finding("care", f"{what}; excite {'them' if len(names) > 1 else 'it'}.")
+def _unidentifiable(result: Result, found: Diagnosis) -> Iterator[Finding]:
+    if len(result.unidentifiable) == len(result.parameters):
+        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}.")
+    yield from (Finding("care", f"{sentence}.") for sentence in found.unidentifiable_sentences())
 
 
 def _these(logs: Sequence[LogSummary]) -> str:

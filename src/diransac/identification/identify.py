@@ -9,17 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from diransac.data import preprocessing
-from diransac.data.dataset import Dataset, as_logs
+from diransac.data.dataset import Dataset, distinct_logs
 from diransac.data.log import Log
 from diransac.errors import DiransacError, SettingsError
 from diransac.identification.agreement import disagreements
 from diransac.identification.estimate import Evaluation, LogSummary, Prediction
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
-from diransac.identification.method import Callback, Method, report, within
+from diransac.identification.method import Callback, Method, fit, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, factory
 from diransac.identification.prediction import predictions
+from diransac.identification.refusal import check_motion
 from diransac.identification.result import Result
 from diransac.identification.settings import Settings
+from diransac.identification.suggestions import with_terms
 from diransac.model import Model
 from diransac.simulation import HOLDS
 
@@ -38,6 +40,7 @@ def identify(
     bandwidth: float | None = None,
     input_hold: str | None = None,
     compare_logs: bool = True,
+    with_suggestions: bool = False,
     progress: Callback | None = None,
 ) -> Result:
     """Parameters of a model from one log, or from several logs of one machine.
@@ -68,10 +71,14 @@ def identify(
         Bandwidth of the differentiating filter, Hz; None: chosen from each log.
     input_hold : str, optional
         Inputs between samples in every simulation: "zero-order", held, as those of a digital controller are; "linear",
-        interpolated, for continuous inputs such as those of a sensor.  None: "zero-order".
+        interpolated, for continuous inputs such as those of a sensor.  None: "zero-order"; lo-diransac chooses the
+        likelier one.
     compare_logs : bool, optional
         Whether each of several logs is also identified alone, so that logs that disagree with the others are named;
         that takes about as long again.
+    with_suggestions : bool, optional
+        Whether to identify again with the terms that the first identification suggests (`Result.suggestions`), and to
+        return that result, whose model has them as further parameters; for lo-diransac.
     progress : callable, optional
         Called with a `Progress` at every stage.
 
@@ -83,7 +90,7 @@ def identify(
     Raises
     ------
     LogError
-        A log lacks a signal, or cannot be used.
+        A log lacks a signal, cannot be used, or is given twice.
     SettingsError
         An argument is out of range, or a setting is not used by the method.
     ModelError
@@ -96,7 +103,7 @@ def identify(
     Dimmig et al. 2023, Algorithm 1.
     """
     chosen = _method(method, settings, estimator)
-    given = as_logs(logs)
+    given = distinct_logs(logs)
     _check_arguments(model, seed)
     hold = checked_hold(input_hold)
     filtered = differentiate and chosen.needs_all_signals
@@ -104,8 +111,12 @@ def identify(
         raise SettingsError(
             "bandwidth is given without differentiate=True, which alone uses it (and lo-diransac does not)"
         )
+    if with_suggestions and not getattr(chosen, "suggestions", False):
+        raise SettingsError(f"with_suggestions=True needs suggestions, which method {chosen.name} does not give")
     pointwise = chosen.needs_all_signals or not differentiate
     task = _Task(model, given, chosen, int(seed), pointwise, hold, compares=compare_logs and len(given) > 1)
+    if with_suggestions:
+        return task.with_suggestions(progress)
     if not filtered:
         return task.run(given, progress)
     derived = tuple(preprocessing.differentiate(log, model, bandwidth) for log in given)
@@ -170,8 +181,9 @@ class _Task:
         dataset = Dataset.of(
             self.model, logs, judged, pointwise=self.pointwise, given=self.given, input_hold=self.input_hold
         )
+        check_motion(dataset)
         fitted = 0.5 if self.compares else 0.95
-        estimate = self.method.fit(dataset, self.seed, within(progress, 0.0, fitted))
+        estimate = fit(self.method, dataset, self.seed, within(progress, 0.0, fitted))
         report(progress, "evaluating", fitted)
         scoring = choose_scoring(dataset, criteria)
         evaluation = evaluate(estimate, dataset, scoring, criteria)
@@ -192,6 +204,16 @@ class _Task:
             ),
             notes=(*dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x), *incomparable),
         )
+
+    def with_suggestions(self, progress: Callback | None) -> Result:
+        """The result of the model with the terms that a first identification suggests; its notes name them."""
+        found = self.run(self.given, within(progress, 0.0, 0.5))
+        note = "no terms were suggested; the model is the given one"
+        if found.suggestions:
+            note = f"terms were added to the model as suggested: {'; '.join(x.text for x in found.suggestions)}"
+            extended = dataclasses.replace(self, model=with_terms(self.model, found.suggestions))
+            found = extended.run(self.given, within(progress, 0.5, 1.0, "with suggested terms: "))
+        return dataclasses.replace(found, notes=(note, *found.notes))
 
     def with_sensitivity(self, result: Result, derived: Sequence[Log], progress: Callback | None) -> Result:
         """The result with each parameter's relative change at half and twice the bandwidth of every log."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,9 +12,11 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data import preprocessing
 from diransac.data.dataset import Dataset
-from diransac.errors import LogError
+from diransac.errors import IdentificationError, LogError
 from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.evaluation import choose_scoring
+from diransac.identification.identifiability import Ambiguity, in_words, of_log, structural
+from diransac.identification.refusal import check_motion
 from diransac.identification.settings import Settings
 from diransac.identification.uncertainty import jackknife_covariance
 from diransac.text_table import aligned
@@ -246,10 +248,15 @@ def _fitness(log: Log, model: Model) -> Fitness:
         )
     try:
         dataset = Dataset.of(model, derived)
+        check_motion(dataset)
+        ambiguous = structural(model)
+        if ambiguous:
+            reason = "; ".join(x.sentence(x.of_equations()) for x in ambiguous)
+            return Fitness(model.name, missing, derivable, _not_excited(ambiguous, model), reason)
         excitation, reason = _excitation(OrdinaryLeastSquares().bind(dataset), model)
         if not reason:
-            choose_scoring(dataset, Settings())  # raises for a log in which nothing moves, as identify does
-    except LogError as error:
+            choose_scoring(dataset, Settings())  # raises for a log that cannot be scored, as identify does
+    except (LogError, IdentificationError) as error:
         return Fitness(model.name, missing, derivable, {}, str(error))
     return Fitness(model.name, missing, derivable, excitation, reason)
 
@@ -270,18 +277,20 @@ def _derived(log: Log, model: Model) -> Log:
         return log
 
 
+def _not_excited(ambiguous: Sequence[Ambiguity], model: Model) -> dict[str, Excitation]:
+    """Excitation of parameters that are not identifiable."""
+    names = [name for x in ambiguous for name in x.names]
+    return {name: Excitation(model.parameters[name].unit, np.nan, np.inf) for name in names}
+
+
 def _excitation(bound: BoundEstimator, model: Model) -> tuple[dict[str, Excitation], str]:
     """Excitation of each parameter; where some are not identifiable, of those alone, with the reason."""
     names, units = list(model.parameters), [parameter.unit for parameter in model.parameters.values()]
     rows = np.arange(bound.n_rows)
     selected = bound.select([rows])
     if not selected.well_defined()[0]:
-        loose = bound.unidentifiable() or range(len(names))
-        found = {names[i]: Excitation(units[i], np.nan, np.inf) for i in loose}
-        return (
-            found,
-            f"excitation of {', '.join(found)} is missing, or in combination only; record a richer motion",
-        )
+        ambiguous = of_log(names, bound.null_space())
+        return _not_excited(ambiguous, model), in_words(ambiguous, 1)
     estimates = selected.fit()[0]
     errors = np.sqrt(np.diag(jackknife_covariance(bound, rows)))
     relative = np.divide(errors, np.abs(estimates), out=np.full(len(names), np.inf), where=estimates != 0.0)

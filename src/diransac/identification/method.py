@@ -6,12 +6,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
+
+from diransac.errors import IdentificationError
+from diransac.identification.refusal import cause_of_refusal, motion_rows
+
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
     from diransac.identification.estimate import Estimate
     from diransac.identification.settings import Settings
 
-__all__ = ["Callback", "Method", "Progress", "report", "within"]
+__all__ = ["Callback", "Method", "Progress", "fit", "report", "within"]
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,41 @@ class Method(Protocol):
         -------
         Estimate
         """
+
+
+def fit(method: Method, dataset: Dataset, seed: int, callback: Callback | None = None) -> Estimate:
+    """The method's estimate; numbers that overflow, and matrices without an inverse, are refused in words.
+
+    Parameters
+    ----------
+    method : Method
+    dataset : Dataset
+    seed : int
+    callback : callable, optional
+        Arguments of `Method.fit`.
+
+    Returns
+    -------
+    Estimate
+
+    Raises
+    ------
+    IdentificationError
+        As `Method.fit`; or its equations are singular or not finite, and the message names the cause.
+    """
+    try:
+        with np.errstate(all="ignore"):  # what is not finite is refused, or an infinite error
+            found = method.fit(dataset, seed, callback)
+    except np.linalg.LinAlgError as error:
+        raise IdentificationError(_not_finite(method, dataset)) from error
+    if not np.isfinite(found.values).all():
+        raise IdentificationError(_not_finite(method, dataset))
+    return found
+
+
+def _not_finite(method: Method, dataset: Dataset) -> str:
+    cause = cause_of_refusal(dataset.model, dataset.layout, motion_rows(dataset))
+    return f"{dataset.source}: {method.name} finds no finite parameters: {cause}"
 
 
 def report(callback: Callback | None, stage: str, fraction: float, note: str = "") -> None:

@@ -16,10 +16,11 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.estimators import (
     BoundEstimator,
     OrdinaryLeastSquares,
-    loose_parameters,
+    correlations,
     smallest_eigenvalue,
     solve_definite,
 )
+from diransac.identification.identifiability import NullSpace, null_space
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -105,6 +106,7 @@ class _BoundNonlinear:
         scale = np.sqrt(np.square(J).mean(axis=(0, 1)))
         J = J / np.where(scale > 0.0, scale, 1.0)
         self._blocks = np.einsum("nri,nrj->nij", J, J)
+        self._column_scale = scale / self._chart.slope(whole)[0]
 
     def select(self, row_sets: Sequence[IntArray]) -> _SelectedRows:
         return _SelectedRows(self, row_sets)
@@ -114,8 +116,11 @@ class _BoundNonlinear:
         gram = np.array([self._blocks[rows].sum(axis=0) for rows in row_sets])
         return np.asarray(smallest_eigenvalue(gram) > self._settings.min_eigenvalue)
 
-    def unidentifiable(self) -> tuple[int, ...]:
-        return loose_parameters(self._blocks.sum(axis=0), self._settings.min_eigenvalue)
+    def null_space(self) -> NullSpace:
+        return null_space(self._blocks.sum(axis=0), self._column_scale, self._settings.min_eigenvalue)
+
+    def correlations(self) -> FloatArray:
+        return correlations(self._blocks.sum(axis=0))
 
     def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
         """Parameters ``(n_sets, n)``."""

@@ -20,16 +20,15 @@ from diransac.identification.estimate import Diagnosis, Estimate, Evaluation, Fi
 from diransac.identification.findings import Verdict, findings_of, verdict_of
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
+from diransac.identification.suggestions import Suggestion
 from diransac.model import Model
 from diransac.text_table import aligned, telling_digits
 
 __all__ = ["MARKS", "Result"]
 
-_FORMAT = 4
+_FORMAT = 5
 _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
-_ADDED: Mapping[str, Any] = {"checks": []}
-"""Keys that the first files of this format lack, with their values."""
 MARKS = {"bad": "!", "care": "·"}
 """Marks of the findings that are printed."""
 
@@ -263,6 +262,11 @@ class Result:
         return self.estimate.diagnosis
 
     @property
+    def suggestions(self) -> tuple[Suggestion, ...]:
+        """Terms that would explain the unmodelled forces, the most likely first; from lo-diransac."""
+        return self.estimate.suggestions
+
+    @property
     def fit_error(self) -> float:
         """Fit error of the parameters, eq. (2), or its mean square for DIRANSAC; NaN if nothing could be simulated."""
         return self.evaluation.fit_error
@@ -343,7 +347,7 @@ class Result:
 
     @classmethod
     def _from_checked(cls, data: Mapping[str, Any]) -> Result:
-        data = {**_ADDED, **data, **{key: data[f"{key}_of_logs"] for key in _BY_LOG if f"{key}_of_logs" in data}}
+        data = {**data, **{key: data[f"{key}_of_logs"] for key in _BY_LOG if f"{key}_of_logs" in data}}
         model, plain = Model.from_dict(data["model"]), load(_Provenance, data)
         estimate, evaluation = load(Estimate, data), load(Evaluation, data)
         layout = ParameterLayout(model.parameters, len(plain.logs))
@@ -467,4 +471,5 @@ class Result:
                 f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice"
             )
         remarks = [log.remark for log in self.logs]
-        return lines + [f"  {note}" for note in self.notes if note not in remarks]
+        lines += [f"  {note}" for note in self.notes if note not in remarks]
+        return lines + [f"? {suggestion.change}" for suggestion in self.suggestions]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping
+import difflib
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,10 @@ import numpy as np
 from diransac.errors import SettingsError
 from diransac.simulation import INTEGRATORS
 
-__all__ = ["EXECUTION", "JUDGING", "SIMULATION", "Settings", "check_used"]
+__all__ = ["EXECUTION", "JUDGING", "SIMULATION", "Settings", "check_used", "nearest_names"]
+
+# Similarity of names, 0 to 1, from which on one is taken for a misspelling of the other.
+_NEAR = 0.75
 
 REFITS = ("inliers", "none")
 INITIAL_STATES = ("first", "robust")
@@ -156,17 +160,33 @@ class Settings:
         Raises
         ------
         SettingsError
-            A name is unknown; the message lists all.  A value is out of range.
+            A name is unknown; the message has the nearest.  A value is out of range.
         """
         known = [f.name for f in dataclasses.fields(cls)]
         unknown = [name for name in data if name not in known]
         if unknown:
-            raise SettingsError(f'there is no setting "{unknown[0]}"; there are {", ".join(known)}')
+            raise SettingsError(f'there is no setting "{unknown[0]}"; {nearest_names(unknown[0], known)}')
         return cls(**data)
 
     def to_dict(self) -> dict[str, Any]:
         """Every setting by name, ready for JSON."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
+
+
+def nearest_names(name: str, known: Sequence[str]) -> str:
+    """Clause that follows an unknown name: ``did you mean substeps?``, or all known names where none is close.
+
+    Parameters
+    ----------
+    name : str
+    known : sequence of str
+
+    Returns
+    -------
+    str
+    """
+    nearest = difflib.get_close_matches(name, known, cutoff=_NEAR)
+    return f"did you mean {' or '.join(nearest)}?" if nearest else f"there are {', '.join(known)}"
 
 
 def check_used(settings: Settings, used: Collection[str], method: str) -> None:

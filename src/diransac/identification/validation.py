@@ -10,7 +10,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.data import preprocessing
-from diransac.data.dataset import Dataset, as_logs
+from diransac.data.dataset import Dataset, as_logs, distinct_logs
 from diransac.data.log import Log
 from diransac.data.segment import Segment
 from diransac.errors import DiransacError, LogError, SettingsError
@@ -368,8 +368,10 @@ def cross_validate(
     ------
     SettingsError
         There are fewer than two logs, or an argument is out of range.
+    LogError
+        A log is given twice.
     """
-    several = as_logs(logs)
+    several = distinct_logs(logs)
     if len(several) < 2:
         raise SettingsError("cross-validation leaves one log out; give at least two logs")
     results, validations = list[Any](), list[Any]()

@@ -195,6 +195,11 @@ class Model:
         self._mass_matrix, self._bias = derivation.affine_in_acceleration(self._label, self._probe, self.accelerations)
         self._definite = derivation.mass_matrix_sign(self._label, self._probe, self._mass_matrix, self.accelerations)
 
+    @property
+    def force_sign(self) -> int:
+        """1 or -1 where ``M = dr/da`` is symmetric and positive or negative definite, so that r is a force; else 0."""
+        return self._definite
+
     @cached_property
     def nonlinear_parameters(self) -> tuple[str, ...]:
         """Names of the parameters in which the residuals are not affine; empty where ``W p = b`` holds."""

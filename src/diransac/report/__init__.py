@@ -89,6 +89,7 @@ def _content(entries: Sequence[Entry], logs: Sequence[Log]) -> dict[str, Any]:
         "parameters": sections.parameters(entries),
         "sensitivity": sections.sensitivity(entries),
         "diagnosis": sections.diagnosis(entries),
+        "suggestions": sections.suggestions(entries),
         "logs": [figures_of(log, runs, len(logs)) for log, runs in zip(logs, by_log, strict=True)],
         "scores": [
             (runs[0].log_name, sections.short_term_scores(runs), [sections.scores(run) for run in runs])

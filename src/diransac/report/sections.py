@@ -26,6 +26,7 @@ __all__ = [
     "scores",
     "sensitivity",
     "short_term_scores",
+    "suggestions",
 ]
 
 _LEVELS: Mapping[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}
@@ -281,6 +282,27 @@ def sensitivity(entries: Sequence[Entry]) -> Table | None:
 def diagnosis(entries: Sequence[Entry]) -> list[tuple[Table, str]]:
     """Noise, outliers and unmodelled acceleration of each signal, and the input delay, by each result that has them."""
     return [(_signal_table(e, len(entries) > 1), _delay(e)) for e in entries if e.result.diagnosis is not None]
+
+
+def suggestions(entries: Sequence[Entry]) -> list[Table]:
+    """Terms that each result suggests, with the change of the model."""
+    header = ("Suggested term", "Coefficient", "Unit", "Explained", "Change of the model")
+    tables = []
+    for entry in entries:
+        rows = [
+            (
+                f"{x.kind}, {x.equation}",
+                f"{number(x.value)} ± {number(x.standard_error, 2)}",
+                x.unit,
+                percent(x.explained),
+                x.change,
+            )
+            for x in entry.result.suggestions
+        ]
+        caption = "Terms that would explain the unmodelled forces"
+        if rows:
+            tables.append(Table(header, rows, f"{caption}, by {entry.label}" if len(entries) > 1 else caption))
+    return tables
 
 
 def _signal_table(entry: Entry, several: bool) -> Table:

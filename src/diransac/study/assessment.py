@@ -18,6 +18,7 @@ from diransac.data.dataset import Dataset
 from diransac.data.log import Log
 from diransac.errors import IdentificationError
 from diransac.identification.estimators import Estimator, OrdinaryLeastSquares
+from diransac.identification.identifiability import of_log
 from diransac.identification.nonlinear import NonlinearLeastSquares
 from diransac.model.plant import DisturbedModel, Plant
 from diransac.simulation.compiler import compile_map
@@ -84,7 +85,7 @@ def pseudo_true_parameters(plant: Plant, log: Log) -> dict[str, float]:
     bound = estimator.bind(Dataset.of(model, calm))
     selected = bound.select([np.arange(bound.n_rows)])
     if not selected.well_defined()[0]:
-        loose = ", ".join(list(model.parameters)[i] for i in bound.unidentifiable())
+        loose = ", ".join(name for x in of_log(list(model.parameters), bound.null_space()) for name in x.names)
         raise IdentificationError(
             f"the flight without noise does not determine {loose or 'the parameters'}: there are no pseudo-true "
             "parameters to compare with; fly more for data, or leave evaluation.parameters out"

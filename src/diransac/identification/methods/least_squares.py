@@ -17,8 +17,10 @@ from diransac.identification.estimators import (
     as_estimator,
     name_of,
 )
+from diransac.identification.identifiability import check_structure, in_words, of_log, vague_parameters
 from diransac.identification.method import report
 from diransac.identification.nonlinear import NonlinearLeastSquares
+from diransac.identification.refusal import cause_of_refusal, check_known_terms, motion_rows
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
 from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance
 
@@ -137,16 +139,17 @@ def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
     IdentificationError
         A parameter is not identifiable from the whole dataset; the message names it.
     """
+    check_structure(dataset.model, dataset.source)
+    check_known_terms(dataset)
     bound = estimator.bind(dataset)
     if bound.select([np.arange(bound.n_rows)]).well_defined()[0]:
         return bound
-    names = [dataset.layout.names[i] for i in bound.unidentifiable()] or list(dataset.layout.names)
-    one, logs = len(names) == 1, "this log" if len(dataset.segments) == 1 else "these logs"
-    raise IdentificationError(
-        f"{dataset.source}: {', '.join(names)} {'is' if one else 'are'} not identifiable from {logs}: the motion does "
-        f"not excite {'it' if one else 'them, or only in combination'}; record a motion that does, or fix "
-        f"{'it' if one else 'one of them'} in the model"
-    )
+    if isinstance(estimator, NonlinearLeastSquares) and not dataset.model.nonlinear_parameters:
+        # A fit within bounds that exclude the solution runs to a bound, where its Jacobian may be singular.
+        cause = cause_of_refusal(dataset.model, dataset.layout, motion_rows(dataset))
+        raise IdentificationError(f"{dataset.source}: {cause}")
+    found = of_log(dataset.layout.names, bound.null_space())
+    raise IdentificationError(f"{dataset.source}: {in_words(found, len(dataset.segments))}")
 
 
 def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows: np.ndarray, **about: Any) -> Estimate:
@@ -174,10 +177,12 @@ def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows
     covariance = jackknife_covariance(bound, rows, log_sizes)
     stuck = dataset.layout.on_bounds(parameters)
     covariance[stuck] = covariance[:, stuck] = np.inf
+    vague = vague_parameters(dataset.layout.names, parameters, covariance, bound.correlations())
     return Estimate(
         parameters=dict(zip(dataset.layout.names, parameters.tolist(), strict=True)),
         covariance=covariance,
         degrees_of_freedom=max(1, min(N_BLOCKS, len(rows)) - 1),
         n_fitted=len(rows),
+        notes=(in_words(vague, len(dataset.segments)),) if vague else (),
         **about,
     )

@@ -30,6 +30,7 @@ from diransac.identification.evaluation import (
 from diransac.identification.method import report
 from diransac.identification.methods.least_squares import bound_to, fitted
 from diransac.identification.nonlinear import NonlinearLeastSquares
+from diransac.identification.refusal import cause_of_refusal, motion_rows
 from diransac.identification.sampling import sample_rows
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
 
@@ -44,6 +45,7 @@ __all__ = [
     "Evaluator",
     "Hypothesis",
     "IDiransac",
+    "NothingAcceptedError",
     "RansacMethod",
     "Score",
     "ScoredBatch",
@@ -54,6 +56,7 @@ __all__ = [
 Sampler = Callable[[int, IntArray, int, int, int], IntArray]
 
 _FIRST_BATCH = 16
+_OUT_OF_BOUNDS = "out of bounds"
 _SEARCH = ("sample_size", "max_iterations", "refit")
 
 
@@ -141,7 +144,13 @@ class RansacMethod(ABC):
                 f"{dataset.source}: {bound.n_rows} usable rows are fewer than sample_size = "
                 f"{settings.sample_size}; give a longer log or a smaller sample_size"
             )
-        found = search(self, bound, evaluator, sample_rows, int(seed), callback)
+        try:
+            found = search(self, bound, evaluator, sample_rows, int(seed), callback)
+        except NothingAcceptedError as error:
+            if set(error.rejected) != {_OUT_OF_BOUNDS}:
+                raise
+            cause = cause_of_refusal(dataset.model, dataset.layout, motion_rows(dataset))
+            raise IdentificationError(f"{dataset.source}: {error.counts}: {cause}") from error
         assert found.best is not None
         return fitted(
             bound,
@@ -380,6 +389,32 @@ class SearchState:
         return Score() if self.best is None else self.best.score
 
 
+class NothingAcceptedError(IdentificationError):
+    """No hypothesis of a search was accepted.
+
+    Parameters
+    ----------
+    state : SearchState
+        State at the end of the search.
+
+    Attributes
+    ----------
+    rejected : mapping of str to int
+        Number of rejected hypotheses by reason.
+    counts : str
+        The number of samples, and these numbers, as a clause.
+    """
+
+    def __init__(self, state: SearchState) -> None:
+        self.rejected = dict(state.rejected)
+        counts = ", ".join(f"{n} {reason}" for reason, n in state.rejected.most_common())
+        self.counts = f"no hypothesis was accepted in {state.iterations} samples ({counts})"
+        super().__init__(
+            f"{self.counts}; check units and signs of the inputs, widen the parameter bounds or the inlier thresholds, "
+            "or clean the log"
+        )
+
+
 def search(
     variant: RansacMethod,
     estimator: BoundEstimator,
@@ -409,8 +444,10 @@ def search(
 
     Raises
     ------
+    NothingAcceptedError
+        No hypothesis was accepted.
     IdentificationError
-        The whole log is not well-defined, or no hypothesis was accepted.
+        The whole log is not well-defined.
 
     References
     ----------
@@ -429,7 +466,7 @@ def search(
         if variant.is_finished(state.score, settings.stop_inlier_fraction):
             break
     if state.best is None:
-        raise IdentificationError(_nothing_accepted(state))
+        raise NothingAcceptedError(state)
     finished = variant.is_finished(state.score, settings.stop_inlier_fraction)
     state.stop_reason = "inlier fraction reached" if finished else "iteration limit reached"
     return state
@@ -479,7 +516,7 @@ def _grow(sample: IntArray, k: IntArray, estimator: BoundEstimator, sampler: Sam
     while not estimator.select([whole]).well_defined()[0]:
         low = len(whole)
         if low == estimator.n_rows:
-            raise IdentificationError("the whole log is not well-defined: parameters are not identifiable; excite them")
+            raise IdentificationError("the whole log is not well-defined: its parameters are not identifiable")
         more = sampler(seed, k, estimator.n_rows, low, min(2 * low, estimator.n_rows))[0]
         whole = np.concatenate([whole, more])
     high = len(whole)
@@ -502,7 +539,7 @@ def _replay(
     while True:
         state.n_hypotheses += 1
         if hypothesis is None:
-            state.rejected["out of bounds"] += 1
+            state.rejected[_OUT_OF_BOUNDS] += 1
             return
         stored = _judge(hypothesis, state, variant)
         if stored is None or settings.refit == "none" or not variant.refits(stored=stored):
@@ -546,11 +583,3 @@ def _refit(inliers: IntArray, parameters: FloatArray, evaluator: Evaluator) -> H
         return None
     scored = evaluator.score(parameters)
     return Hypothesis(parameters[0], inliers, scored.scores[0], scored, 0)
-
-
-def _nothing_accepted(state: SearchState) -> str:
-    counts: Sequence[str] = [f"{n} {reason}" for reason, n in state.rejected.most_common()]
-    return (
-        f"no hypothesis was accepted in {state.iterations} samples ({', '.join(counts)}); check units and signs of "
-        "the inputs, widen the parameter bounds or the inlier thresholds, or clean the log"
-    )

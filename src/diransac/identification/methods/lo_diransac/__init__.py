@@ -11,7 +11,11 @@
 | `mixture.py` | noise: a Gaussian and outliers |
 | `normal_equations.py`, `arrowhead.py` | all intervals as one quadratic, and its solution in O(N) |
 | `refinement.py` | local optimisation, from easy to exact |
+| `local_search.py` | explanations of a log, of which the likeliest is chosen |
+| `sensors.py` | delays and biases of sensors |
 | `projection.py` | parameters and covariance |
+| `checks.py` | findings of a fit on itself |
+| `missing_terms.py` | terms that explain the unmodelled forces |
 """
 
 from diransac.identification.methods.lo_diransac.method import LoDiransac, configured

@@ -114,8 +114,7 @@ class Arrowhead:
 
         Unknowns are scaled to a diagonal of one first: metres and radians per second squared differ by decades.
         """
-        sz = 1.0 / np.sqrt(np.einsum("wii->wi", self.diagonal) + _TINY)
-        sp = 1.0 / np.sqrt(np.diag(self.corner) + _TINY)
+        sz, sp = _scale(np.einsum("wii->wi", self.diagonal)), _scale(np.diag(self.corner))
         k, m = self.border.shape[1:]
         D = self.diagonal * sz[:, :, None] * sz[:, None, :] + (damping + _RIDGE) * np.eye(k)
         E = self.below * sz[1:, :, None] * sz[:-1, None, :]
@@ -141,7 +140,12 @@ class Arrowhead:
 
 
 # Below what rounding leaves of a diagonal of one; keeps what no measurement shows (a heading that nothing depends on).
-_RIDGE, _TINY = 1e-13, 1e-300
+_RIDGE = 1e-13
+
+
+def _scale(diagonal: FloatArray) -> FloatArray:
+    """Scale of unknowns; 1 where an unknown has no effect and the ridge alone determines it."""
+    return np.asarray(1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)))
 
 
 def _inverse(A: FloatArray) -> FloatArray:

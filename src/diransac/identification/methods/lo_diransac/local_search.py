@@ -34,15 +34,15 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["Explanation", "LocalSearch"]
+__all__ = ["Explanation", "LocalSearch", "fewest_parts"]
 
 # Difference of two fits' evidence, nats, below which both are as likely.
 _AS_LIKELY = 5.0
 _OUTLIER = 0.5
 # Delays that are tried at a time, before they are refined to a sample.
 _DELAYS_AT_A_TIME = 12
-# Shortest interval, samples, and the factor by which intervals are shortened at a time.
-_SHORTEST, _PARTS = 3, 2
+# Shortest interval, samples.
+_SHORTEST = 3
 # A delay that is worth an explanation: so many standard errors, and so many samples.
 _SIGNIFICANT, _SMALL_DELAY = 3.0, 0.1
 # Half a sample of delay or more is taken up by shifting the inputs.
@@ -213,16 +213,15 @@ class LocalSearch:
             exact = Explanation(intervals, refined, self.prior, exact=True)
             if exact.cost < flexible.cost:
                 return exact
-        while self.settings.model_error and flexible.intervals.length >= _PARTS * _SHORTEST:
-            finer = self._split(flexible)
+        while self.settings.model_error and (parts := fewest_parts(flexible.intervals.length)):
+            finer = self._split(flexible, parts)
             if finer.cost > flexible.cost - _AS_LIKELY:
                 break
             flexible = finer
         return flexible
 
-    def _split(self, coarse: Explanation) -> Explanation:
+    def _split(self, coarse: Explanation, parts: int) -> Explanation:
         """The fit with unmodelled accelerations that vary faster."""
-        parts = next(k for k in range(_PARTS, coarse.intervals.length + 1) if coarse.intervals.length % k == 0)
         fit, intervals = coarse.refinement.fit, coarse.intervals.split(parts)
         n_x = fit.x.shape[1]
         series = coarse.intervals.rollouts.trajectories(coarse.intervals.batch(fit.shared, fit.x, fit.d))
@@ -295,10 +294,26 @@ class LocalSearch:
         return best if gain > _SMALL_GAIN * intervals.known.any(axis=0).sum() else 0
 
 
+def fewest_parts(length: int) -> int:
+    """Number of equal parts into which an interval is split.
+
+    Parameters
+    ----------
+    length : int
+        Samples of the interval.
+
+    Returns
+    -------
+    int
+        The smallest above one with parts that are not too short; 0 where there is none.
+    """
+    return next((k for k in range(2, length // _SHORTEST + 1) if length % k == 0), 0)
+
+
 def _unexplained(found: Explanation) -> float:
     """Sum over the equations of the log of the RMS acceleration that the model does not explain."""
     left = estimate_parameters(found.intervals, found.refinement.fit, 1.0).unexplained
-    return float(np.log(np.sqrt(np.square(left).mean(axis=0)) + 1e-300).sum())
+    return float(np.log(np.sqrt(np.square(left[found.intervals.occupied]).mean(axis=0)) + 1e-300).sum())
 
 
 def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:

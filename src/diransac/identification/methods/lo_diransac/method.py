@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,10 +19,12 @@ from diransac.blas import single_threaded
 from diransac.data.segment import long_runs
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
+from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import LocalSearch
+from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
     discrepancy_units,
@@ -43,6 +45,7 @@ from diransac.identification.methods.lo_diransac.smoothing import (
     smooth,
     stuck_rows,
 )
+from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -130,6 +133,10 @@ class LoDiransac(LoDiransacSettings):
         those of the fit.
     prior_inflation : float, optional
         Factor of the prior on model error whose effect on the parameters is added to their covariance.
+    suggestions : bool, optional
+        Whether terms are searched that would explain the unmodelled forces.
+    candidate_terms : callable, optional
+        Further candidates of that search: ``candidate_terms(q, v, u)`` returns expressions by name.
 
     Raises
     ------
@@ -182,15 +189,14 @@ def configured(settings: Settings, **options: Any) -> LoDiransac:
 
 def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
     """Parameters of the dataset's model, step by step."""
+    check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
     report(callback, "smoothing", 0.0)
     intervals, motion, notes = _prepared(settings, dataset)
     report(callback, "drawing hypotheses", 0.1)
     hypotheses = find_hypotheses(settings, intervals, motion, seed, dataset)
     if not len(hypotheses):
-        raise IdentificationError(
-            f"{dataset.source}: no sample of the log gives parameters within their bounds; check the model, "
-            "the signs and units of inputs, and the bounds"
-        )
+        cause = cause_of_refusal(dataset.model, dataset.layout, _rows_of_logs(intervals, motion))
+        raise IdentificationError(f"{dataset.source}: no sample gives parameters within their bounds: {cause}")
     unit = discrepancy_units(intervals, motion, hypotheses[0])
     search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
@@ -202,17 +208,24 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         if projects
         else fitted_parameters(intervals, refined.fit)
     )
-    if not intervals.layout.admits(result.parameters[None])[0]:
+    reached = not intervals.layout.admits(result.parameters[None])[0]
+    if reached:
         # The fit satisfies the bounds; least squares on its motion may violate a strict one.
         result = fitted_parameters(intervals, refined.fit)
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
+    if reached or dataset.layout.on_bounds(result.parameters).any():
+        check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
     checks = (
         *_checks(settings, intervals, motion, refined),
         *findings_of_fit(likeliest, motion, result),
     )
     late = float(intervals.delay + intervals.lag + refined.fit.shared[-1])
     found = _Found(dataset, intervals, motion, refined.fit, result, late)
-    return _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
+    estimate = _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
+    if likeliest.exact or not settings.suggestions:
+        return estimate
+    terms = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
+    return replace(estimate, suggestions=terms)
 
 
 def _checks(
@@ -224,6 +237,14 @@ def _checks(
         yield Finding("bad", f"The model explains almost nothing of this log: {advice}.")
     if not refined.converged and settings.max_steps:
         yield Finding("care", f"Local optimisation did not converge within its limit of {settings.max_steps} steps.")
+
+
+def _rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRows]:
+    """Rows of the smoothed motion of each log."""
+    n_q, n_v = intervals.model.n_q, intervals.model.n_v
+    logged = [np.arange(x.start, x.stop)[intervals.is_logged[x]] for x in intervals.rows_of_logs]
+    parts = [np.split(motion.signals[rows], [n_q, n_q + n_v], axis=1) for rows in logged]
+    return [MotionRows(q, v, a, intervals.inputs[rows]) for (q, v, a), rows in zip(parts, logged, strict=True)]
 
 
 def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
@@ -314,6 +335,7 @@ def _estimate(
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
     units = parameter_units(intervals, found.motion, result.parameters)
     lost = ~((spans < units) | (spans < np.abs(result.parameters)))
+    lost, combinations = unidentifiable(dataset.model, dataset.layout, result.parameters, result.covariance, lost)
     covariance = result.covariance.copy()
     covariance[lost] = covariance[:, lost] = np.inf
     nonlinear = bool(dataset.model.nonlinear_parameters)
@@ -328,12 +350,12 @@ def _estimate(
         stop_reason="converged" if converged else "limit of steps",
         resolution=Resolution("rk4", settings.substeps, intervals.hold),
         notes=notes,
-        diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x)),
+        diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),
         checks=checks,
     )
 
 
-def _diagnosis(found: _Found, unidentifiable: tuple[str, ...]) -> Diagnosis:
+def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ...]) -> Diagnosis:
     """Noise, faults and unmodelled forces, by name and over the rows of the given logs."""
     dataset, intervals, fit, result = found.dataset, found.intervals, found.fit, found.result
     model, dt = dataset.model, intervals.dt
@@ -342,26 +364,29 @@ def _diagnosis(found: _Found, unidentifiable: tuple[str, ...]) -> Diagnosis:
     sigma, fraction = (np.where(seen, x, np.nan) for x in (fit.noise.sigma, fit.noise.pi))
     inlying = fit.noise.inlying(fit.residuals, intervals.known)
     outliers = intervals.known & (inlying < _OUTLIER)
-    begins = np.array([one.log.time[one.offset] for one in dataset.segments])[intervals.log_of]
-    place = intervals.starts - intervals.first_of_log[intervals.log_of]
+    shown = intervals.is_logged[intervals.starts]
+    window_log = intervals.log_of[shown]
+    begins = np.array([one.log.time[one.offset] for one in dataset.segments])[window_log]
+    place = intervals.starts[shown] - intervals.first_of_log[window_log]
     forces = _unmodelled_forces(intervals, fit, result)
     per_equation: Callable[[FloatArray], dict[str, FloatArray]] = lambda x: dict(  # noqa: E731
-        zip(model.accelerations, x.T.copy(), strict=True)
+        zip(model.accelerations, x[shown].T.copy(), strict=True)
     )
     return Diagnosis(
         noise_std={name: float(sigma[k]) for name, k in columns.items()},
         outlier_fraction={name: float(fraction[k]) for name, k in columns.items()},
         outliers={name: _on_given_logs(dataset, intervals, outliers[:, k]) for name, k in columns.items()},
-        window_log=intervals.log_of.copy(),
+        window_log=window_log,
         unmodelled_time=begins + dt * (place + 0.5 * (intervals.length - 1)),
         unmodelled_accelerations=per_equation(result.unexplained),
         unmodelled_forces={} if forces is None else per_equation(forces),
         smoothed_time=begins + dt * place.astype(float),
-        smoothed_states=dict(zip(model.state, fit.x.T.copy(), strict=True)),
+        smoothed_states=dict(zip(model.state, fit.x[shown].T.copy(), strict=True)),
         input_delay=float(found.delay * dt),
         input_delay_error=result.delay_error * dt,
         input_delay_significant=abs(found.delay) > max(_SIGNIFICANT * result.delay_error, _SMALL_DELAY),
-        unidentifiable=unidentifiable,
+        unidentifiable=lost,
+        combinations=combinations,
     )
 
 

@@ -50,6 +50,7 @@ __all__ = [
     "fitted_parameters",
     "inertial_forces",
     "parameter_units",
+    "residuals_of_motion",
     "unexplained",
 ]
 
@@ -67,7 +68,8 @@ class ProjectedEstimate:
         Each in its unit, per-log parameters of every log included.
     covariance : (n, n) array
     unexplained : (W, n_v) array
-        Mean over each interval of the accelerations that the model with these parameters does not explain.
+        Mean over each interval of the accelerations that the model with these parameters does not explain; 0 where an
+        interval has no row that counts.
     delay_error : float
         Standard error of the delay, samples.
     """
@@ -203,9 +205,14 @@ def _bounded_projection(
 def _least_squares(W: FloatArray, weights: FloatArray) -> FloatArray:
     """``(W'VW)^-1 W'V`` of stacked matrices (N, r, n), as (n, N, r); columns scaled to one, V from ``weights (r,)``."""
     rows = (W * weights[:, None]).reshape(-1, W.shape[2])
-    scale = np.linalg.norm(rows, axis=0) + _TINY
-    solved = np.linalg.lstsq(rows.T @ rows / scale / scale[:, None], (rows / scale).T, rcond=None)[0]
-    return np.asarray((solved / scale[:, None]).reshape(-1, *W.shape[:2]) * weights)
+    scale = np.linalg.norm(rows, axis=0)
+    scale[scale == 0.0] = 1.0
+    rows = rows / scale
+    normal = rows.T @ rows
+    if not np.isfinite(normal).all():  # LAPACK would print to the terminal
+        raise np.linalg.LinAlgError("the regressors of the fitted motion are not finite")
+    solved = np.linalg.lstsq(normal, rows.T, rcond=None)[0] / scale[:, None]
+    return np.asarray(solved.reshape(-1, *W.shape[:2]) * weights)
 
 
 def batch_sums(values: FloatArray) -> FloatArray:
@@ -271,12 +278,41 @@ def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) 
     Returns
     -------
     (W, n_v) array
+        0 where an interval has no row that counts.
     """
     p = _row_parameters(intervals, parameters)
     residuals, _, M = _residual_map(intervals.model)(*_motion(intervals, fit), p)
     left = np.linalg.solve(_matrices(M, intervals.model.n_v), residuals[:, :, None])[:, :, 0]
     logged = intervals.counted[:, None].astype(float)
     return _means(intervals, left * logged) / np.maximum(_means(intervals, logged), _TINY)
+
+
+def residuals_of_motion(
+    intervals: ShootingIntervals, fit: Fit, parameters: FloatArray
+) -> tuple[tuple[FloatArray, ...], FloatArray, FloatArray, FloatArray]:
+    """Residuals of the equations on the fitted motion, and their derivatives.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    parameters : (n,) array
+
+    Returns
+    -------
+    tuple of (N, ...) array
+        q, v, a, the inputs as they act, and the model's parameters in every row.
+    (N, n_v) array
+        Residuals r.
+    (N, n_v, n) array
+        dr/dp, columns in the places of each log's parameters.
+    (N, n_v, n_v) array
+        M = dr/da.
+    """
+    model, motion, p = intervals.model, _motion(intervals, fit), _row_parameters(intervals, parameters)
+    r, W, M = _residual_map(model)(*motion, p)
+    rows = np.broadcast_to(p, (len(r), model.n_p))
+    return (*motion, rows), r, _regressors(intervals, W), _matrices(M, model.n_v)
 
 
 def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
@@ -296,7 +332,8 @@ def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArra
         Infinite for parameters; 1 sample for the delay.
     """
     force = inertial_forces(intervals, motion, p)
-    level = np.append(1.0, np.sqrt(np.square(intervals.inputs).mean(axis=0)) + _TINY)
+    level = np.append(1.0, np.sqrt(np.square(intervals.inputs).mean(axis=0)))
+    level[level == 0.0] = 1.0  # the gain of an input that never acts stays at its prior
     return np.concatenate([np.full(intervals.n_p, np.inf), (force[:, None] / level).ravel(), [1.0]])
 
 
@@ -314,12 +351,13 @@ def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
     Returns
     -------
     (n,) array
-        The smallest over the equations, each in its parameter's unit.
+        The smallest over the equations, each in its parameter's unit; 0 where a parameter never acts.
     """
     W = _residual_map(intervals.model)(*_smoothed(intervals, motion), _row_parameters(intervals, p, logged=True))[1]
     logs = intervals.log_of_row[intervals.counted]
     sizes = np.sqrt(np.square(_by_log(intervals, _matrices(W, intervals.model.n_p), logs)).mean(axis=0)).T
-    return np.asarray((inertial_forces(intervals, motion, p) / np.maximum(sizes, _TINY)).min(axis=1))
+    smallest = (inertial_forces(intervals, motion, p) / np.maximum(sizes, _TINY)).min(axis=1)
+    return np.asarray(np.where(sizes.any(axis=1), smallest, 0.0))
 
 
 def inertial_forces(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:

@@ -50,10 +50,15 @@ _TAU_START, _SHRINK = 0.3, 0.4
 # Continuity is exact for practical purposes: jumps are as small a part of the effect of tau in an interval.
 _CONTINUITY = 0.03
 _SIGMA_FLOOR = 1e-4
+# Prior size of the unmodelled accelerations at least, in spreads of the accelerations: none would make them singular.
+_LEAST_PRIOR = 1e-6
 # Discrepancies of a model that is taken to be exact, over their prior sizes.
 _EXACT, _EXACT_STEPS = 1e-3, 25
 # Size of a delay, samples, before the evidence narrows it; a prior that leaves none.
 _FREE_DELAY, _PINNED = 1.0, 1e-5
+# Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
+# the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
+_UNBROKEN = 0.003
 # Where they start, and the factor by which they are lowered in a step.
 _NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
 # Correlation of unmodelled accelerations from interval to interval at most.
@@ -127,7 +132,7 @@ def make_prior(settings: LoDiransacSettings, intervals: ShootingIntervals, motio
     Prior
     """
     return Prior(
-        tau=settings.prior_model_error * motion.spread[-intervals.model.n_v :],
+        tau=max(settings.prior_model_error, _LEAST_PRIOR) * motion.spread[-intervals.model.n_v :],
         unit=unit,
         discrepancy=settings.prior_discrepancy,
         guarded=settings.initial_discrepancy,
@@ -264,7 +269,8 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
         sizes = fit.prior.copy()
         sizes[-1] = _discrepancies(moved, prior, np.diag(solved.var_p), n_p)[-1]
         tau = np.maximum(least, _TIGHTENED * fit.tau)
-        updated = replace(moved, noise=noise, prior=sizes, tau=tau, continuity_std=_continuity(intervals, tau))
+        continuity = np.maximum(_unbroken(fit, solved), _TIGHTENED * fit.continuity_std)
+        updated = replace(moved, noise=noise, prior=sizes, tau=tau, continuity_std=continuity)
         converged = bool((tau == fit.tau).all()) and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
         fit = updated
     return Refinement(fit, negative_log_evidence(intervals, fit), steps, converged)
@@ -412,6 +418,12 @@ def _continuity(intervals: ShootingIntervals, tau: FloatArray) -> FloatArray:
     derived = intervals.model.kinematics is None
     coordinate = velocity * T if derived else np.full(intervals.model.n_q, velocity.max() * T)
     return np.concatenate([coordinate, velocity])
+
+
+def _unbroken(fit: Fit, solved: Factored) -> FloatArray:
+    """Jumps ``(n_x,)`` that are negligible beside the uncertainty of the states, over all intervals together."""
+    variance = np.einsum("wii->wi", solved.var_z)[:, : fit.x.shape[1]]
+    return np.asarray(_UNBROKEN * np.sqrt(np.median(variance, axis=0) / len(fit.x)))
 
 
 def _unchanged(old: Fit, new: Fit, errors: FloatArray) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from diransac.errors import SettingsError
+from diransac.identification.candidate_terms import TermLibrary
 from diransac.identification.settings import JUDGING, Settings, check_used
 
 __all__ = ["LoDiransacSettings"]
@@ -48,6 +49,8 @@ class LoDiransacSettings:
     prior_delay: float = 3e-4
     projection: bool = True
     prior_inflation: float = 10.0
+    suggestions: bool = True
+    candidate_terms: TermLibrary | None = None
 
     name = "lo-diransac"
     needs_all_signals = False
@@ -57,17 +60,23 @@ class LoDiransacSettings:
         check_used(self.criteria, self.uses, self.name)
         for f in dataclasses.fields(self):
             value = getattr(self, f.name)
-            if f.name != "criteria":
+            if f.name not in _NOT_NUMBERS:
                 object.__setattr__(self, f.name, _checked(f.name, value, f.default))
+        if self.candidate_terms is not None and not callable(self.candidate_terms):
+            raise SettingsError(
+                f"candidate_terms is {self.candidate_terms!r}; give a function of (q, v, u) that returns expressions "
+                "by name"
+            )
         if not -np.inf < self.delay_range[0] <= 0.0 <= self.delay_range[1] < np.inf:
             raise SettingsError(f"delay_range is {self.delay_range}; give (earliest, latest) in s, with 0 between them")
 
     def options(self) -> Mapping[str, Any]:
-        """All settings but the criteria."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "criteria"}
+        """All settings but the criteria and the user's candidate terms."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _NOT_NUMBERS}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
 
 
+_NOT_NUMBERS = ("criteria", "candidate_terms")
 _MAY_BE_ZERO = (
     "n_samples",
     "max_delay_shifts",

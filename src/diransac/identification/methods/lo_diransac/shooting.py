@@ -183,6 +183,11 @@ class ShootingIntervals:
         """Log of each row ``(N,)``."""
         return np.repeat(self.log_of, self.length)
 
+    @cached_property
+    def occupied(self) -> BoolArray:
+        """Mask ``(W,)`` of the intervals with a row that counts; others begin in a gap, or after the end of a log."""
+        return np.asarray(self.counted[self.starts])
+
     @property
     def duration(self) -> float:
         """Duration of an interval, s."""

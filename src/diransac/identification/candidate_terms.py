@@ -1,0 +1,302 @@
+"""Candidate terms of equations of motion: friction, drag, stiffness, harmonics, products, input gains, a user's own.
+
+A candidate is an addition ``theta h(q, v, a, u, p)`` to the residuals of a model, with one new parameter theta.
+Friction switches smoothly over a hundredth of the RMS speed, so that columns, printed code and simulations are the same
+function.
+
+References
+----------
+Armstrong-Helouvry, Dupont, Canudas de Wit 1994 (models of friction); Brunton, Proctor, Kutz 2016 (libraries of
+candidate terms); Fossen 2011, section 8 (currents).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations_with_replacement
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.errors import ModelError
+from diransac.model import Model
+from diransac.model.derivation import Symbols, call_user
+
+__all__ = ["CandidateTerm", "CandidateTerms", "TermLibrary", "candidate_terms"]
+
+TermLibrary = Callable[[Symbols, Symbols, Symbols], Mapping[str, Any]]
+"""A user's candidates: ``library(q, v, u)`` returns expressions by name, each of which is tried in every equation."""
+
+# Speed over which sign(v) is smooth, and speeds of the Stribeck effect, over the RMS speed.
+_SMOOTH, _STRIBECK = 0.01, (0.03, 0.06, 0.12, 0.25)
+_HARMONICS = (1, 2, 3)
+_FORCES = {"m": "N", "rad": "N m"}
+_BLOCK = 4096
+
+
+@dataclass(frozen=True)
+class CandidateTerm:
+    """One addition to the residuals of a model, up to its coefficient.
+
+    Parameters
+    ----------
+    kind : str
+        Effect, such as ``"Coulomb friction"``.
+    equation : int
+        Index of the equation; -1 for an input gain, which acts in every equation that the input enters.
+    place : str
+        Coordinate, velocity or input in the name of the parameter and in sentences.
+    formula : str
+        The term for readers, such as ``sign(x_dot)``.
+    code : str
+        Python code, with CasADi as ``ca``: a summand of the residual with its sign, or the input with its gain.
+    parameter : str
+        Name of the new parameter.
+    unit : str
+        Unit of its coefficient; empty if unknown.
+    residuals : casadi.SX
+        ``h (n_v)`` of the symbols of `CandidateTerms`.
+    """
+
+    kind: str
+    equation: int
+    place: str
+    formula: str
+    code: str
+    parameter: str
+    unit: str
+    residuals: ca.SX
+
+    @property
+    def is_input_gain(self) -> bool:
+        """True if the term scales an input."""
+        return self.equation < 0
+
+
+@dataclass(frozen=True)
+class CandidateTerms:
+    """Candidates over common symbols.
+
+    Parameters
+    ----------
+    symbols : tuple of casadi.SX
+        q, v, a, u, p.
+    terms : tuple of CandidateTerm
+    """
+
+    symbols: tuple[ca.SX, ...]
+    terms: tuple[CandidateTerm, ...]
+
+    def __len__(self) -> int:
+        return len(self.terms)
+
+    @property
+    def is_input_gain(self) -> BoolArray:
+        """Mask of the terms that scale an input."""
+        return np.array([x.is_input_gain for x in self.terms])
+
+    @property
+    def groups(self) -> IntArray:
+        """Number of the parameter of each term: Stribeck friction at several speeds has the same."""
+        return np.unique([x.parameter for x in self.terms], return_inverse=True)[1].astype(np.int64)
+
+    @cached_property
+    def _entries(self) -> tuple[ca.Function, IntArray, IntArray]:
+        """Function of the terms' structurally nonzero entries; equation and term of each."""
+        stacked = ca.sparsify(ca.horzcat(*(x.residuals for x in self.terms)))
+        rows, columns = stacked.sparsity().get_triplet()
+        nonzeros = ca.vertcat(*(stacked[i, j] for i, j in zip(rows, columns, strict=True)))
+        entries = ca.Function("entries", list(self.symbols), [nonzeros])
+        return entries, np.array(rows), np.array(columns)
+
+    def means(self, motion: Sequence[FloatArray], weights: FloatArray, length: int) -> FloatArray:
+        """Weighted means of every term over intervals of ``length`` rows.
+
+        Parameters
+        ----------
+        motion : sequence of (N, n) array
+            q, v, a, u and p of every row.
+        weights : (N,) array
+            Sum over each interval is 1.
+        length : int
+
+        Returns
+        -------
+        (N / length, n_v, n_terms) array
+        """
+        entries, rows, columns = self._entries
+        n = len(weights) // length
+        found = np.zeros((n, self.terms[0].residuals.numel(), len(self)))
+        step = max(1, _BLOCK // length)
+        for k in range(0, n, step):
+            part = slice(k * length, (k + step) * length)
+            values = np.array(entries(*(x[part].T for x in motion))).T * weights[part, None]
+            found[k : k + step, rows, columns] = values.reshape(-1, length, len(rows)).sum(axis=1)
+        return found
+
+
+def candidate_terms(model: Model, speeds: FloatArray, library: TermLibrary | None = None) -> CandidateTerms:
+    """The library of candidates of a model.
+
+    In the equation of each velocity v: ``sign(v)``, Stribeck friction at several speeds, ``v``, ``|v| v``, ``|v|``
+    (drag in a current), a constant, the position, harmonics of every angle, other velocities and all products of
+    velocities; besides them a gain of each input, and the user's expressions.
+
+    Parameters
+    ----------
+    model : Model
+    speeds : (n_v,) array
+        RMS of each velocity, its unit; velocities that are zero get no friction.
+    library : callable, optional
+        The user's expressions by name.
+
+    Returns
+    -------
+    CandidateTerms
+
+    Raises
+    ------
+    ModelError
+        The user's library fails, or returns a name that cannot be that of a parameter.
+    """
+    symbols = tuple(ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup"))
+    maker = _Maker(model, symbols, speeds)
+    terms = [x for i in range(model.n_v) for x in maker.of_equation(i)]
+    if library is not None:
+        terms += maker.of_user(library)
+    return CandidateTerms(symbols, (*terms, *maker.gains()))
+
+
+@dataclass(frozen=True)
+class _Maker:
+    """Makes the candidates of one model."""
+
+    model: Model
+    symbols: tuple[ca.SX, ...]
+    speeds: FloatArray
+
+    def of_equation(self, i: int) -> Iterator[CandidateTerm]:
+        """Candidates in one equation, the simplest first."""
+        if self.speeds[i] > 0.0:
+            yield from self._of_own_speed(i)
+        yield self._term("constant force", i, "bias", "", "", ca.SX(1), "")
+        yield from self._of_positions(i)
+        yield from self._of_other_speeds(i)
+
+    def _of_own_speed(self, i: int) -> Iterator[CandidateTerm]:
+        v, name, code = self.symbols[1][i], list(self.model.velocities)[i], f"v.{self.model.rate_names[i]}"
+        unit = list(self.model.velocities.values())[i]
+        speed = float(f"{_SMOOTH * self.speeds[i]:.1g}")
+        sign, smooth = ca.tanh(v / speed), f"ca.tanh({code} / {speed:g})"
+        yield self._term("Coulomb friction", i, "coulomb", f"sign({name})", smooth, sign, "")
+        yield self._term("viscous friction", i, "viscous", name, code, v, unit)
+        drag = f"ca.fabs({code}) * {code}"
+        yield self._term("quadratic drag", i, "quadratic", f"|{name}| {name}", drag, ca.fabs(v) * v, f"({unit})^2")
+        yield self._term("asymmetric drag", i, "current", f"|{name}|", f"ca.fabs({code})", ca.fabs(v), unit)
+        for factor in _STRIBECK:
+            slow = float(f"{factor * self.speeds[i]:.2g}")
+            yield self._term(
+                "Stribeck friction",
+                i,
+                "stribeck",
+                f"sign({name}) exp(-({name} / {slow:g})^2)",
+                f"{smooth} * ca.exp(-(({code} / {slow:g}) ** 2))",
+                sign * ca.exp(-((v / slow) ** 2)),
+                "",
+            )
+
+    def _of_positions(self, i: int) -> Iterator[CandidateTerm]:
+        derived = self.model.kinematics is None
+        for k, (name, unit) in enumerate(self.model.coordinates.items()):
+            q = self.symbols[0][k]
+            if derived and k == i:
+                yield self._term("stiffness", i, "stiffness", name, f"q.{name}", q, unit)
+            for n in _HARMONICS if unit == "rad" else ():
+                many = f"{n} " if n > 1 else ""
+                kind = f"harmonic {n} of {name}" if n > 1 else f"gravity or first harmonic of {name}"
+                for function in ("sin", "cos"):
+                    code = f"ca.{function}({n} * q.{name})" if n > 1 else f"ca.{function}(q.{name})"
+                    value = getattr(ca, function)(n * q)
+                    label = f"{function}{n if n > 1 else ''}_{name}"
+                    yield self._term(kind, i, label, f"{function}({many}{name})", code, value, "")
+
+    def _of_other_speeds(self, i: int) -> Iterator[CandidateTerm]:
+        v, signals, rates = self.symbols[1], list(self.model.velocities), self.model.rate_names
+        units = list(self.model.velocities.values())
+        for j in range(self.model.n_v):
+            if j != i:
+                yield self._term(
+                    f"coupling to {signals[j]}", i, f"coupling_{rates[j]}", signals[j], f"v.{rates[j]}", v[j], units[j]
+                )
+        for j, k in combinations_with_replacement(range(self.model.n_v), 2):
+            formula, code = f"{signals[j]} {signals[k]}", f"v.{rates[j]} * v.{rates[k]}"
+            unit = f"({units[j]}) ({units[k]})"
+            label = f"product_{rates[j]}_{rates[k]}"
+            yield self._term("product of velocities", i, label, formula, code, v[j] * v[k], unit)
+
+    def of_user(self, library: TermLibrary) -> Iterator[CandidateTerm]:
+        """The user's expressions in every equation."""
+        q, v, _, u, _ = self.model.named(*self.symbols)
+        label, names = f'model "{self.model.name}"', list[str]()
+
+        def expressions(q: Symbols, v: Symbols, u: Symbols) -> list[Any]:
+            found = library(q, v, u)
+            if not isinstance(found, Mapping):
+                raise TypeError(f"{found!r:.60} is no mapping from names to expressions")
+            names.extend(found)
+            return list(found.values())
+
+        column = call_user(label, "candidate terms", expressions, q, v, u)
+        for name, value in zip(names, ca.vertsplit(column) if names else [], strict=True):
+            if not str(name).isidentifier():
+                raise ModelError(f"{label}: {name!r} cannot name a candidate term; use letters, digits and underscores")
+            for i in range(self.model.n_v):
+                yield self._term(name, i, name, name, name, value, None)
+
+    def gains(self) -> Iterator[CandidateTerm]:
+        """A relative error of each input's gain, in every equation that it enters."""
+        q, v, a, u, p = self.symbols
+        r = self.model.residual(q, v, a, u, p)
+        for j, name in enumerate(self.model.inputs):
+            slope = ca.jacobian(r, u[j])
+            parameter = self._free(f"gain_error_{name}")
+            code = f"u.{name} * (1 + p.{parameter})"
+            yield CandidateTerm("input gain", -1, name, name, code, parameter, "1", ca.densify(slope * u[j]))
+
+    def _term(
+        self, kind: str, i: int, label: str, formula: str, code: str, value: ca.SX, unit: str | None
+    ) -> CandidateTerm:
+        """A term in one equation; ``unit`` is that of the expression, None if unknown."""
+        place = self.model.rate_names[i]
+        sign, parameter = -1 if self.model.force_sign < 0 else 1, self._free(f"{label}_{place}")
+        residuals = ca.SX(self.model.n_v, 1)
+        residuals[i] = sign * value
+        factor = f" * {code}" if code else ""
+        line = f"{'-' if sign < 0 else '+'} p.{parameter}{factor}"
+        coordinates = list(self.model.coordinates.values())
+        force = _FORCES.get(coordinates[i], "") if self.model.kinematics is None and self.model.force_sign else ""
+        whole = "" if unit is None or not force else _over(force, unit)
+        return CandidateTerm(kind, i, place, formula, line, parameter, whole, residuals)
+
+    def _free(self, name: str) -> str:
+        """The name, or the next that no signal and no parameter has."""
+        model = self.model
+        taken = {*model.units, *model.parameters}
+        names = (name, *(f"{name}_{k}" for k in range(2, len(taken) + 3)))
+        return next(x for x in names if x not in taken)
+
+
+_QUOTIENTS = {
+    "m": "/m", "rad": "/rad", "m/s": " s/m", "rad/s": " s/rad", "(m/s)^2": " s^2/m^2", "(rad/s)^2": " s^2/rad^2",
+    "(m/s) (m/s)": " s^2/m^2", "(rad/s) (rad/s)": " s^2/rad^2", "(m/s) (rad/s)": " s^2/(m rad)",
+    "(rad/s) (m/s)": " s^2/(m rad)",
+}  # fmt: skip
+
+
+def _over(force: str, unit: str) -> str:
+    """Unit of a force over that of an expression: ``N`` over ``m/s`` is ``N s/m``."""
+    return force + _QUOTIENTS.get(unit, f"/({unit})") if unit else force

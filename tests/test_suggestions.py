@@ -1,0 +1,358 @@
+"""Suggested terms: what is planted is found, what is not there is not, and the printed code is the term itself."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import diransac as dr
+from command_line import run
+from diransac.identification.candidate_terms import candidate_terms
+from diransac.identification.suggestions import MeanForces, SelectedTerm, select_terms, suggestions_of, with_terms
+from user_models import tumbling
+
+RNG = np.random.default_rng(20240607)
+
+# ---------------------------------------------------------------------- selection, on arrays
+
+
+def means(rng, n=120, n_terms=40, noise=None, **changes):
+    """Two equations, two own columns, and candidates that have nothing to do with the force."""
+    force = rng.standard_normal((n, 2)) if noise is None else noise
+    terms = np.zeros((n, 2, n_terms))
+    for k in range(n_terms):
+        terms[:, k % 2, k] = rng.standard_normal(n)
+    parts = {
+        "force": force,
+        "noise": np.full(2, 0.1),
+        "inertial": np.ones(2),
+        "own": rng.standard_normal((n, 2, 2)),
+        "discrepancies": np.zeros((n, 2, 0)),
+        "discrepancy_covariance": np.zeros((0, 0)),
+        "terms": terms,
+        "is_input_gain": np.zeros(n_terms, bool),
+        "groups": np.arange(n_terms),
+        "log_of": np.zeros(n, np.int64),
+    }
+    return MeanForces(**(parts | changes))
+
+
+def autocorrelated(rng, n, rho=0.9):
+    """A Gauss-Markov sequence (n, 2) of unit variance."""
+    x = rng.standard_normal((n, 2))
+    for k in range(1, n):
+        x[k] = rho * x[k - 1] + np.sqrt(1 - rho**2) * x[k]
+    return x
+
+
+def test_planted_terms_are_found_with_their_coefficients_within_five_standard_errors():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        made = means(rng, noise=0.3 * rng.standard_normal((120, 2)))
+        force = made.force - 0.8 * made.terms[:, :, 6] + 0.5 * made.terms[:, :, 9] + made.own @ [3.0, -2.0]
+        found = select_terms(replace(made, force=force))
+        assert [x.index for x in found] == [6, 9]
+        for one, true in zip(found, (0.8, -0.5), strict=True):
+            assert abs(one.value - true) < 5.0 * one.standard_error
+        assert 0.6 < found[0].explained <= 1.0
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_forces_without_a_term_have_at_most_two_suggestions_in_fifty_logs(rho):
+    found = 0
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        made = means(rng, noise=autocorrelated(rng, 120, rho))
+        slow = np.cumsum(made.terms, axis=0) if rho else made.terms
+        found += len(select_terms(replace(made, terms=slow)))
+    assert found <= 2
+
+
+def test_a_term_that_own_columns_span_is_not_suggested():
+    rng = np.random.default_rng(0)
+    made = means(rng)
+    terms = made.terms.copy()
+    terms[:, :, 0] = made.own @ [1.0, 2.0]
+    force = 0.1 * made.force + 5.0 * terms[:, :, 0]
+    assert not select_terms(replace(made, terms=terms, force=force))
+
+
+def test_a_term_whose_sign_changes_within_the_log_is_not_suggested():
+    rng = np.random.default_rng(1)
+    made = means(rng)
+    turning = np.where(np.arange(120) < 84, 1.0, -1.0)[:, None]
+    assert not select_terms(replace(made, force=0.1 * made.force + turning * made.terms[:, :, 4]))
+
+
+def test_a_term_of_less_than_a_thousandth_of_the_inertial_force_is_not_suggested():
+    rng = np.random.default_rng(2)
+    made = means(rng)
+    force = 0.1 * made.force + made.terms[:, :, 4]
+    assert select_terms(replace(made, force=force))
+    assert not select_terms(replace(made, force=force, inertial=np.full(2, 2000.0)))
+
+
+def test_a_force_within_the_error_of_a_discrepancy_is_not_suggested():
+    rng = np.random.default_rng(3)
+    made = means(rng)
+    force = 0.01 * made.force + made.terms[:, :, 4]
+    loose = {"discrepancies": made.terms[:, :, 4:5], "discrepancy_covariance": np.eye(1)}
+    assert select_terms(replace(made, force=force))
+    assert not select_terms(replace(made, force=force, **loose))
+
+
+def test_an_input_gain_that_satisfies_an_equation_with_its_parameters_identically_is_not_suggested():
+    rng = np.random.default_rng(4)
+    made = means(rng)
+    u = rng.standard_normal(120)
+    terms, is_gain = made.terms.copy(), made.is_input_gain.copy()
+    terms[:, 0, 0], is_gain[0] = -u, True
+    missing = 0.3 * made.terms[:, 0, 2]
+    own = made.own.copy()
+    own[:, 0, 0] = u - missing - own[:, 0, 1]  # the equation holds: own @ [1, 1] + missing = u
+    force = np.stack([own[:, 0].sum(axis=1) - u, 0.01 * made.force[:, 1]], axis=1)
+    found = select_terms(replace(made, terms=terms, is_input_gain=is_gain, own=own, force=force))
+    assert [x.index for x in found] == [2]
+
+
+def test_of_one_group_only_one_form_is_suggested():
+    rng = np.random.default_rng(5)
+    made = means(rng)
+    groups = made.groups.copy()
+    groups[8] = groups[4]
+    force = 0.1 * made.force + made.terms[:, :, 4] + made.terms[:, :, 8]
+    assert len({x.index for x in select_terms(replace(made, force=force, groups=groups))} & {4, 8}) == 1
+
+
+# ---------------------------------------------------------------------- the library, and its code
+
+
+def crane(sign=1):
+    """A cart with a hanging load and a parameter that has the name of a candidate."""
+    return dr.Model(
+        "crane",
+        {"x": "m", "angle": "rad"},
+        {"force": "N"},
+        {
+            "cart": dr.Parameter("kg", positive=True),
+            "load": dr.Parameter("kg", positive=True),
+            "coulomb_x": dr.Parameter("N"),
+        },
+        lambda q, v, a, u, p: [
+            sign * ((p.cart + p.load) * a.x + p.load * ca.cos(q.angle) * a.angle + p.coulomb_x - u.force),
+            sign * p.load * (ca.cos(q.angle) * a.x + a.angle + 9.81 * ca.sin(q.angle)),
+        ],
+    )
+
+
+def all_suggested(model, library=None):
+    """Every candidate as a suggestion."""
+    candidates = candidate_terms(model, np.ones(model.n_v), library)
+    chosen = [SelectedTerm(k, 0.5, 0.01, 0.9) for k in range(len(candidates))]
+    return candidates, suggestions_of(candidates, chosen)
+
+
+def points(model, n=7):
+    """Random q, v, a, u, p, each (n_i, n)."""
+    return [RNG.uniform(0.3, 1.5, (model.residual.size1_in(i), n)) for i in range(5)]
+
+
+@pytest.mark.parametrize("model", [crane(), crane(-1), tumbling(), dr.models.planar_rotorcraft()])
+def test_printed_code_is_the_term_that_with_terms_adds(model):
+    candidates, suggested = all_suggested(model)
+    motion = points(model)
+    before = np.array(model.residual(*motion))
+    q, v, a, u, p = candidates.symbols
+    for term, one in zip(candidates.terms, suggested, strict=True):
+        extended = with_terms(model, [one])
+        assert list(extended.parameters) == [*model.parameters, one.parameter]
+        after = np.array(extended.residual(*motion[:4], np.vstack([motion[4], np.full(7, 0.7)])))
+        if term.is_input_gain:
+            more = motion[3].copy()
+            more[list(model.inputs).index(term.place)] *= 1.7
+            np.testing.assert_allclose(after, np.array(model.residual(*motion[:3], more, motion[4])), rtol=1e-9)
+            continue
+        named = dict(zip("qvau", model.named(q, v, a, u), strict=True))
+        coefficient = type("Parameters", (), {one.parameter: ca.SX(0.7)})
+        written = eval(f"0 {one.code}", {"ca": ca, "p": coefficient, **named})
+        values = np.array(ca.Function("written", [q, v, a, u, p], [written])(*motion))
+        np.testing.assert_allclose((after - before)[term.equation], np.ravel(values), rtol=1e-9, atol=1e-12)
+
+
+def test_parameters_of_candidates_are_new_names_one_per_effect():
+    candidates, _ = all_suggested(crane())
+    names = {x.parameter for x in candidates.terms}
+    assert "coulomb_x_2" in names
+    assert not names & set(crane().parameters)
+    stribeck = {x.parameter for x in candidates.terms if x.kind == "Stribeck friction" and x.place == "x"}
+    assert stribeck == {"stribeck_x"}
+    assert len(set(candidates.groups.tolist())) == len(names)
+
+
+def test_units_of_coefficients_give_forces():
+    units = {x.formula: x.unit for x in all_suggested(crane())[0].terms if x.place == "x"}
+    assert units["sign(x_dot)"] == "N"
+    assert units["x_dot"] == "N s/m"
+    assert units["|x_dot| x_dot"] == "N s^2/m^2"
+    assert units["sin(angle)"] == "N"
+    assert units["x"] == "N/m"
+
+
+def test_means_of_candidates_are_those_of_numpy():
+    model = crane()
+    candidates, _ = all_suggested(model)
+    motion = [x.T for x in points(model, 60)]
+    weights = np.repeat([0.1, 0.0, 0.2], 20) * np.tile([1.0, 0.0], 30)
+    found = candidates.means(motion, weights, 20)
+    x_dot, angle = motion[1][:, 0], motion[0][:, 1]
+    for formula, rows in {"|x_dot| x_dot": x_dot * abs(x_dot), "cos(2 angle)": np.cos(2 * angle)}.items():
+        k = next(k for k, t in enumerate(candidates.terms) if t.formula == formula and t.equation == 0)
+        expected = (rows * weights).reshape(3, 20).sum(axis=1)
+        np.testing.assert_allclose(found[:, 0, k], expected, rtol=1e-12)
+        np.testing.assert_array_equal(found[:, 1, k], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("library", "reason"),
+    [
+        (lambda q, v, u: [v.x], "no mapping"),
+        (lambda q, v, u: {"a b": v.x}, "cannot name"),
+        (lambda q, v, u: 1 / 0, "Zero"),
+    ],
+)
+def test_a_wrong_library_is_refused_by_its_fault(library, reason):
+    with pytest.raises(dr.ModelError, match=reason):
+        candidate_terms(crane(), np.ones(2), library)
+
+
+# ---------------------------------------------------------------------- from a log to a suggestion
+
+
+INERTIA, DAMPING, MOMENT, COULOMB = 0.06, 0.04, 1.0, 0.03
+
+
+def pendulum():
+    return dr.Model(
+        "pendulum",
+        {"q": "rad"},
+        {"torque": "N m"},
+        {
+            "inertia": dr.Parameter("kg m^2", positive=True),
+            "damping": dr.Parameter("N m s/rad"),
+            "moment": dr.Parameter("N m"),
+        },
+        lambda q, v, a, u, p: [p.inertia * a.q + p.damping * v.q + p.moment * ca.sin(q.q) - u.torque],
+    )
+
+
+def swing(friction, seed=0, rows=1500, dt=0.01):
+    """A log of the pendulum with another friction of its speed, by midpoint steps of a tenth of a sample."""
+    rng, x = np.random.default_rng(seed), np.zeros((rows + 1, 2))
+    t = dt * np.arange(rows)
+    torque = sum(0.3 * np.sin(w * t + rng.uniform(0, 6)) for w in rng.uniform(1.0, 9.0, 5))
+
+    def rate(x, u):
+        return np.array([x[1], (u - DAMPING * x[1] - friction(x[1]) - MOMENT * np.sin(x[0])) / INERTIA])
+
+    for k, u in enumerate(torque):
+        y = x[k]
+        for begin, end in pairwise(np.linspace(0.0, dt, 11)):
+            y = y + (end - begin) * rate(y + 0.5 * (end - begin) * rate(y, u), u)
+        x[k + 1] = y
+    return dr.Log.from_arrays(t, {"q": x[:-1, 0] + 2e-4 * rng.standard_normal(rows), "torque": torque})
+
+
+@pytest.fixture(scope="module")
+def with_dry_friction():
+    return swing(lambda w: COULOMB * np.tanh(w / 0.01))
+
+
+@pytest.fixture(scope="module")
+def result(with_dry_friction):
+    return dr.identify(pendulum(), with_dry_friction, differentiate=True)
+
+
+def test_missing_dry_friction_is_suggested_with_its_size(result):
+    (found,) = result.suggestions
+    assert (found.kind, found.equation, found.unit) == ("Coulomb friction", "q", "N m")
+    assert abs(found.value - COULOMB) < 0.15 * COULOMB
+    assert found.explained > 0.8
+    assert found.text.startswith("Coulomb friction on q: 0.0")
+    assert "sign(q_dot) explains" in found.text
+
+
+def test_suggestions_are_printed_and_survive_json(result):
+    (found,) = result.suggestions
+    assert found.text in str(result)
+    assert found.code in str(result)
+    assert found.declaration in str(result)
+    assert dr.Result.from_dict(result.to_dict()).suggestions == result.suggestions
+
+
+def test_the_refit_has_the_parameters_of_the_machine(with_dry_friction):
+    refit = dr.identify(pendulum(), with_dry_friction, differentiate=True, with_suggestions=True)
+    true = {"inertia": INERTIA, "damping": DAMPING, "moment": MOMENT, "coulomb_q": COULOMB}
+    assert refit.parameters == pytest.approx(true, rel=0.05)
+    assert "terms were added to the model as suggested: Coulomb friction on q" in refit.notes[0]
+    assert dr.Result.from_dict(refit.to_dict()) == refit
+    assert not refit.suggestions
+
+
+def test_of_an_exact_model_nothing_is_suggested_and_nothing_added():
+    found = dr.identify(pendulum(), swing(lambda w: 0.0), differentiate=True, with_suggestions=True)
+    assert not found.suggestions
+    assert list(found.parameters) == ["inertia", "damping", "moment"]
+    assert "no terms were suggested" in found.notes[0]
+
+
+def test_a_users_own_term_is_suggested_where_it_explains_more():
+    log = swing(lambda w: 0.004 * w * w * w)
+    method = dr.LoDiransac(candidate_terms=lambda q, v, u: {"cubic": v.q**3})
+    assert dr.identify(pendulum(), log, method, differentiate=True).suggestions[0].kind == "cubic"
+
+
+def test_suggestions_can_be_switched_off(with_dry_friction):
+    method = dr.LoDiransac(suggestions=False)
+    assert not dr.identify(pendulum(), with_dry_friction, method, differentiate=True).suggestions
+    with pytest.raises(dr.SettingsError, match="needs suggestions"):
+        dr.identify(pendulum(), with_dry_friction, method, differentiate=True, with_suggestions=True)
+
+
+def test_methods_without_suggestions_refuse_a_refit(with_dry_friction):
+    with pytest.raises(dr.SettingsError, match="method ols"):
+        dr.identify(pendulum(), with_dry_friction, "ols", differentiate=True, with_suggestions=True)
+
+
+def test_candidate_terms_must_be_a_function():
+    with pytest.raises(dr.SettingsError, match="candidate_terms is 3"):
+        dr.LoDiransac(candidate_terms=3)
+
+
+def test_the_report_shows_the_term_and_the_line_to_add(result, with_dry_friction, tmp_path):
+    dr.write_report(result, with_dry_friction, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "The model seems to lack a term. Coulomb friction on q" in page
+    assert "add to the equation of q: + p.coulomb_q" in page
+
+
+PENDULUM_FILE = """
+import casadi as ca
+from diransac import Model, Parameter
+model = Model(
+    "pendulum", {"q": "rad"}, {"torque": "N m"},
+    {"inertia": Parameter("kg m^2", positive=True), "damping": Parameter("N m s/rad"), "moment": Parameter("N m")},
+    lambda q, v, a, u, p: [p.inertia * a.q + p.damping * v.q + p.moment * ca.sin(q.q) - u.torque],
+)
+"""
+
+
+def test_the_command_line_refits_on_request(with_dry_friction, tmp_path):
+    (tmp_path / "pendulum.py").write_text(PENDULUM_FILE)
+    with_dry_friction.write(tmp_path / "log.csv")
+    words = ["identify", tmp_path / "log.csv", "--model", tmp_path / "pendulum.py", "--differentiate"]
+    done = run(*words, "--with-suggestions")
+    assert done.exit_code == 0
+    assert "pendulum with coulomb_q by lo-diransac" in done.stdout
+    assert "terms were added to the model as suggested: Coulomb friction on q" in done.stdout
