@@ -56,7 +56,7 @@ _LEAST_PRIOR = 1e-6
 _EXACT, _EXACT_STEPS = 1e-3, 25
 # Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
 # the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
-_UNBROKEN = 0.003
+_UNBROKEN = 0.01
 # Size, samples, of the error of a lag before it is estimated.
 _FREE_LAG = 1.0
 # Where they start, and the factor by which they are lowered in a step.
@@ -260,7 +260,7 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     tau = _NEARLY_EXACT * prior.tau
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
-    damping, converged, steps = 0.0, False, 0
+    damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
     while steps < min(_EXACT_STEPS, settings.max_steps) and not converged:
         steps += 1
         moved, solved, damping = _step(intervals, fit, damping)
@@ -269,7 +269,8 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
         sizes = fit.prior.copy()
         sizes[-1] = _discrepancies(moved, prior, np.diag(solved.var_p), n_p)[-1]
         tau = np.maximum(least, _TIGHTENED * fit.tau)
-        continuity = np.maximum(_unbroken(fit, solved), _TIGHTENED * fit.continuity_std)
+        jumps = _unbroken(fit, solved) if steps == 1 else jumps
+        continuity = np.maximum(jumps, _TIGHTENED * fit.continuity_std)
         updated = replace(moved, noise=noise, prior=sizes, tau=tau, continuity_std=continuity)
         converged = bool((tau == fit.tau).all()) and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
         fit = updated
