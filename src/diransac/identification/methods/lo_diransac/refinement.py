@@ -54,11 +54,11 @@ _SIGMA_FLOOR = 1e-4
 _LEAST_PRIOR = 1e-6
 # Discrepancies of a model that is taken to be exact, over their prior sizes.
 _EXACT, _EXACT_STEPS = 1e-3, 25
-# Size of a delay, samples, before the evidence narrows it; a prior that leaves none.
-_FREE_DELAY, _PINNED = 1.0, 1e-5
 # Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
 # the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
-_UNBROKEN = 0.003
+_UNBROKEN = 0.01
+# Size of a delay, samples, before the evidence narrows it; a prior that leaves none.
+_FREE_DELAY, _PINNED = 1.0, 1e-5
 # Where they start, and the factor by which they are lowered in a step.
 _NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
 # Correlation of unmodelled accelerations from interval to interval at most.
@@ -260,7 +260,7 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     tau = _NEARLY_EXACT * prior.tau
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
-    damping, converged, steps = 0.0, False, 0
+    damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
     while steps < min(_EXACT_STEPS, settings.max_steps) and not converged:
         steps += 1
         moved, solved, damping = _step(intervals, fit, damping)
@@ -269,7 +269,8 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
         sizes = fit.prior.copy()
         sizes[-1] = _discrepancies(moved, prior, np.diag(solved.var_p), n_p)[-1]
         tau = np.maximum(least, _TIGHTENED * fit.tau)
-        continuity = np.maximum(_unbroken(fit, solved), _TIGHTENED * fit.continuity_std)
+        jumps = np.clip(_unbroken(fit, solved), _continuity(intervals, least), jumps) if steps == 1 else jumps
+        continuity = np.maximum(jumps, _TIGHTENED * fit.continuity_std)
         updated = replace(moved, noise=noise, prior=sizes, tau=tau, continuity_std=continuity)
         converged = bool((tau == fit.tau).all()) and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
         fit = updated
@@ -423,7 +424,7 @@ def _continuity(intervals: ShootingIntervals, tau: FloatArray) -> FloatArray:
 def _unbroken(fit: Fit, solved: Factored) -> FloatArray:
     """Jumps ``(n_x,)`` that are negligible beside the uncertainty of the states, over all intervals together."""
     variance = np.einsum("wii->wi", solved.var_z)[:, : fit.x.shape[1]]
-    return np.asarray(_UNBROKEN * np.sqrt(np.median(variance, axis=0) / len(fit.x)))
+    return np.asarray(_UNBROKEN * np.sqrt(np.median(variance, axis=0).clip(0.0) / len(fit.x)))
 
 
 def _unchanged(old: Fit, new: Fit, errors: FloatArray) -> bool:
