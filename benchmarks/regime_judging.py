@@ -124,14 +124,8 @@ def _lo(regime: Regime, recording: Recording) -> dict[str, Any]:
 
 
 def _said(result: dr.Result) -> tuple[str, tuple[str, ...]]:
-    """Verdict and findings; from what is printed where the result has none."""
-    if hasattr(result, "verdict"):
-        return str(result.verdict), tuple(map(str, result.findings))
-    warned = tuple(line.strip() for line in str(result).splitlines() if line.startswith("!"))
-    findings = (*warned, *result.notes)
-    if any("do not rely" in text for text in findings):
-        return UNRELIABLE, findings
-    return ("usable with care" if warned else "usable"), findings
+    """Verdict, and the findings against the result: a sentence in its favour names no cause."""
+    return result.verdict, tuple(str(x) for x in result.findings if x.level in ("care", "bad"))
 
 
 def _errors(found: Mapping[str, float], truth: Mapping[str, float]) -> dict[str, float]:
