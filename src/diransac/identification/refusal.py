@@ -28,6 +28,8 @@ __all__ = ["MotionRows", "cause_of_refusal", "check_known_terms", "check_motion"
 _LAGS, _SIGNIFICANT, _CORRELATED = 5, 3.0, 0.1
 # Fewest rows for it; clipping, in robust standard deviations; variation over the size of a signal that is rounding.
 _FEWEST_ROWS, _CLIP, _ROUNDING = 30, 1.5, 1e-12
+# Ratio of small differences of neighbours to those of distant samples below which a signal moves, and samples for it.
+_NEARER, _ENOUGH_FOR_QUANTILES = 0.5, 150
 # Steps of iteratively reweighted least squares, and the residual, in median ones, from which on a row counts less.
 _STEPS, _FAR = 10, 3.0
 # Rows of a log that are enough to find a cause; size from which on the square of a number overflows.
@@ -63,7 +65,10 @@ def check_motion(dataset: Dataset) -> None:
 
 
 def _moves(values: FloatArray) -> bool:
-    """True if a signal ``(N,)`` is not constant and has serial correlation, or is too short for a decision."""
+    """True if a signal ``(N,)`` is not constant and has serial correlation, or is too short for a decision.
+
+    Where half of the samples are outliers, their size hides a correlation; the small differences do not.
+    """
     known = np.flatnonzero(np.isfinite(values))
     if not len(known):
         return False
@@ -79,7 +84,16 @@ def _moves(values: FloatArray) -> bool:
     pairs = [(known[:-k] & known[k:], x[:-k] * x[k:]) for k in range(1, _LAGS + 1)]
     covariances = np.array([both @ product / max(1, both.sum()) for both, product in pairs])
     correlation = np.sqrt(np.mean(np.square(covariances))) / np.mean(np.square(x[known]))
-    return bool(correlation > max(_CORRELATED, _SIGNIFICANT / np.sqrt(known.sum())))
+    if correlation > max(_CORRELATED, _SIGNIFICANT / np.sqrt(known.sum())):
+        return True
+    good = values[known]
+    near, far = (_small_difference(good, apart) for apart in (1, len(good) // 3))
+    return bool(near < _NEARER * far and len(good) > _ENOUGH_FOR_QUANTILES)
+
+
+def _small_difference(values: FloatArray, apart: int) -> float:
+    """The 10 % quantile of the differences of samples that are so many apart."""
+    return float(np.quantile(np.abs(values[apart:] - values[:-apart]), 0.1))
 
 
 def _samples_held(values: FloatArray) -> int:

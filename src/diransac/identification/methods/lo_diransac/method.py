@@ -195,6 +195,10 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     report(callback, "drawing hypotheses", 0.1)
     hypotheses = find_hypotheses(settings, intervals, motion, seed, dataset)
     if not len(hypotheses):
+        blind = _unmeasured(intervals)
+        if blind:
+            what = f"nothing measures {', '.join(blind)}, nor a derivative"
+            raise IdentificationError(f"{dataset.source}: {what}; lo-diransac needs a signal of each coordinate")
         cause = cause_of_refusal(dataset.model, dataset.layout, _rows_of_logs(intervals, motion))
         raise IdentificationError(f"{dataset.source}: no sample gives parameters within their bounds: {cause}")
     unit = discrepancy_units(intervals, motion, hypotheses[0])
@@ -247,6 +251,16 @@ def _rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRo
     return [MotionRows(q, v, a, intervals.inputs[rows]) for (q, v, a), rows in zip(parts, logged, strict=True)]
 
 
+def _unmeasured(intervals: ShootingIntervals) -> list[str]:
+    """Coordinates, or velocities of a model with kinematics, of which neither value nor derivative is measured."""
+    model, seen = intervals.model, np.asarray(intervals.known.any(axis=0))
+    n_q, n_v = model.n_q, model.n_v
+    if model.kinematics is None:
+        return [n for i, n in enumerate(model.coordinates) if not seen[[i, n_q + i, n_q + n_v + i]].any()]
+    lost = [n for i, n in enumerate(model.velocities) if not seen[[n_q + i, n_q + n_v + i]].any()]
+    return [] if seen[:n_q].any() else lost
+
+
 def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
     """True if the noise of every signal is as large as the signal."""
     seen = intervals.known.any(axis=0)
@@ -273,6 +287,11 @@ def _prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingI
         raise LogError(
             f"{dataset.source}: {n_rows} rows are too few; lo-diransac needs at least "
             f"{_FEWEST_INTERVALS * half}. Give a longer log"
+        )
+    if not any(long_runs(~x.gaps, half).any() for x in samples):
+        raise LogError(
+            f"{dataset.source}: no {half} rows in a row are without a gap in the inputs or in all sensors; give a log "
+            "with longer stretches"
         )
     motions = smooth(model, samples, dt, half)
     logs = [(x.measured, x.known, u, x.gaps) for x, u in zip(samples, inputs, strict=True)]

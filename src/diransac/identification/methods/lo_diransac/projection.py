@@ -56,6 +56,8 @@ __all__ = [
 
 
 _TINY, _UPPER = 1e-300, 0.975
+# Steps of reweighting, the width of Cauchy's loss in standard deviations, and what is rounding of an equation's scale.
+_REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
 
 
 @dataclass(frozen=True)
@@ -189,10 +191,12 @@ def _bounded_projection(
         free = ~stuck
         left = means[1] + means[0][:, :, stuck] @ (p - now)[stuck]
         known = means[0][:, :, free] @ now[free] - left - _means(intervals, rows[1])
-        weights = 1.0 / equation_scales(WeakForm(means[0][:, :, free], known))
+        weights = _robust_weights(intervals, WeakForm(means[0][:, :, free], known))
         gains = tuple(np.zeros((len(now), *x.shape[:2])) for x, _ in (rows, means))
-        for gain, (W, _) in zip(gains, (rows, means), strict=True):
-            gain[free] = _least_squares(W[:, :, free], weights)
+        for gain, (W, _), one in zip(
+            gains, (rows, means), (np.repeat(weights, intervals.length, axis=0), weights), strict=True
+        ):
+            gain[free] = _least_squares(W[:, :, free], one)
         found = now - np.einsum("pni,ni->p", gains[0], rows[1]) - np.einsum("pwi,wi->p", gains[1], left)
         p = np.where(stuck, p, found)
         outside = (p < lower) | (p > upper)
@@ -202,9 +206,24 @@ def _bounded_projection(
     return p, (gains[0], gains[1]), stuck
 
 
+def _robust_weights(intervals: ShootingIntervals, rows: WeakForm) -> FloatArray:
+    """Square roots of the weights ``(W, n_v)``: of the equations by their scales, and of intervals by Cauchy's loss.
+
+    A gust of a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.
+    """
+    scale, loss = equation_scales(rows), np.ones(rows.b.shape)
+    for _ in range(_REWEIGHTED):
+        gains = _least_squares(rows.W, loss / scale)
+        left = rows.b - rows.W @ np.einsum("pwi,wi->p", gains, rows.b)
+        spread = 1.4826 * np.median(np.abs(left[intervals.occupied]), axis=0)
+        loss = 1.0 / np.sqrt(1.0 + np.square(left / (_CAUCHY * np.maximum(spread, _ROUNDING * scale))))
+    return np.asarray(loss / scale)
+
+
 def _least_squares(W: FloatArray, weights: FloatArray) -> FloatArray:
-    """``(W'VW)^-1 W'V`` of stacked matrices (N, r, n), as (n, N, r); columns scaled to one, V from ``weights (r,)``."""
-    rows = (W * weights[:, None]).reshape(-1, W.shape[2])
+    """``(W'VW)^-1 W'V`` of stacked matrices (N, r, n), as (n, N, r), V of ``weights (N, r)``; columns scaled to one."""
+    weights = np.broadcast_to(weights, W.shape[:2])
+    rows = (W * weights[:, :, None]).reshape(-1, W.shape[2])
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0.0] = 1.0
     rows = rows / scale

@@ -49,7 +49,7 @@ __all__ = ["Prior", "Refinement", "make_prior", "refine", "refine_exact", "start
 _TAU_START, _SHRINK = 0.3, 0.4
 # Continuity is exact for practical purposes: jumps are as small a part of the effect of tau in an interval.
 _CONTINUITY = 0.03
-_SIGMA_FLOOR = 1e-4
+_SIGMA_FLOOR = 1e-5
 # Prior size of the unmodelled accelerations at least, in spreads of the accelerations: none would make them singular.
 _LEAST_PRIOR = 1e-6
 # Discrepancies of a model that is taken to be exact, over their prior sizes.

@@ -1,0 +1,75 @@
+"""What lo-diransac takes a log to be: exact or not, late, lagging, with gaps, with sensors that err, with a payload."""
+
+import numpy as np
+import pytest
+import regime_flights as flights
+from regime_judging import METHODS
+
+SEED = 1000
+
+
+def judged(name, seed=SEED):
+    """The record of one log of a regime, made by simulations that are not the package's."""
+    return METHODS["lo"](flights.REGIMES[name], seed, flights.recordings(flights.REGIMES[name], [seed])[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "worst"),
+    [
+        ("car all measured", 2.0),  # no known term in the yaw equation
+        ("car gyro and lateral acceleration", 2.0),  # neither angle nor lateral velocity is measured
+        ("car continuous input", 2.0),  # half a sample early, if taken as held
+        ("viscous cart-pole smooth", 0.5),  # one input, two equations
+        ("differential drive all measured", 4.0),  # kinematics of its own, three equations without a known term
+        ("cart-pole 20 Hz", 1.0),
+        ("servo 1 s missing", 0.1),
+        ("servo 1 s of sensors missing", 0.1),
+    ],
+)
+def test_an_exact_model_is_found_and_called_usable(name, worst):
+    found = judged(name)
+    assert found.worst < worst
+    assert found.verdict == "usable"
+
+
+def test_velocities_that_are_not_logged_follow_from_the_kinematics():
+    found = judged("quad mocap and gyro")
+    assert found.worst < 0.5
+    assert found.verdict == "usable"
+
+
+def test_a_lag_of_the_actuators_is_estimated_and_named():
+    found = judged("rotor motor lag 50 ms")
+    assert found.worst < 0.2
+    assert any("first-order lag of 4" in x or "first-order lag of 5" in x for x in found.findings)
+
+
+def test_late_sensors_are_named():
+    found = judged("rotor x and z 10 ms late")
+    assert found.worst < 2.0
+    for signal in ("x", "z"):
+        assert any(f"{signal} is recorded" in x and "ms late" in x for x in found.findings)
+
+
+@pytest.mark.parametrize("name", ["rotor payload -30 %", "rotor battery sag 15 %"])
+def test_a_parameter_that_changes_during_the_log_is_not_relied_on(name):
+    found = judged(name)
+    assert found.verdict == "do not rely on this"
+    assert any("mass changes during the log" in x for x in found.findings)
+
+
+def test_a_controller_that_answers_gusts_is_no_delay():
+    found = judged("rotor slight gusts")
+    assert found.worst < 5.0
+    assert not any("time stamps" in x or "lag of" in x for x in found.findings)
+
+
+def test_the_seed_does_not_matter():
+    import diransac as dr
+
+    regime = flights.REGIMES["cart-pole 40 Hz"]
+    log = flights.recordings(regime, [SEED])[0].log
+    results = [dr.identify(regime.machine.model, log, differentiate=True, seed=seed) for seed in range(3)]
+    for name, error in results[0].standard_errors.items():
+        values = [result.parameters[name] for result in results]
+        assert np.ptp(values) < 0.2 * error
