@@ -209,7 +209,7 @@ class LocalSearch:
         starts = starts[: 1 + bool((np.abs(starts[1] - starts[0]) > _APART * np.abs(starts[0])).any())]
         for p in starts[intervals.layout.admits(starts)]:
             begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
-            refined = refine_exact(self.settings, intervals, begin, self.prior)
+            refined = refine_exact(self.settings, intervals, begin, self.prior, flexible.cost)
             exact = Explanation(intervals, refined, self.prior, exact=True)
             if exact.cost < flexible.cost:
                 return exact
@@ -261,7 +261,7 @@ class LocalSearch:
         sizes = np.append(fit.prior[:-1], prior.delay if prior is now.prior else max(prior.delay, _WHOLE_SAMPLE))
         begin = with_residuals(intervals, replace(fit, shared=np.append(fit.shared[:-1], left), prior=sizes))
         if now.exact:
-            refined = refine_exact(self.settings, intervals, begin, self.prior)
+            refined = refine_exact(self.settings, intervals, begin, self.prior, now.cost)
             return Explanation(intervals, refined, self.prior, exact=True)
         refined = refine(self.settings, intervals, begin, prior, settled=True)
         return self._simplest(Explanation(intervals, refined, prior, exact=False))

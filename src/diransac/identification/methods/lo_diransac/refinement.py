@@ -238,7 +238,9 @@ def refine(
     return Refinement(fit, negative_log_evidence(intervals, fit), steps, converged and not robust)
 
 
-def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
+def refine_exact(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, to_beat: float
+) -> Refinement:
     """Fit of the model as it is, without unmodelled accelerations and input gain and bias discrepancies.
 
     Parameters
@@ -248,6 +250,8 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     fit : Fit
         Initial fit, as from `refine`.
     prior : Prior
+    to_beat : float
+        Negative log evidence of another fit; this one is given up where it is far from converging to a likelier one.
 
     Returns
     -------
@@ -261,7 +265,9 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
     damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
-    while steps < min(_EXACT_STEPS, settings.max_steps) and not converged:
+    while steps < settings.max_steps and not converged:
+        if steps == _EXACT_STEPS and negative_log_evidence(intervals, fit) > to_beat:
+            break
         steps += 1
         moved, solved, damping = _step(intervals, fit, damping)
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
