@@ -23,6 +23,8 @@ __all__ = ["findings_of_fit"]
 
 # A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious.
 _CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
+# Intervals of half the logs from which parameters and their scatter are estimated, at least.
+_FEWEST_INTERVALS = 9
 
 
 def findings_of_fit(found: Explanation, motion: Motion, result: ProjectedEstimate) -> Iterator[Finding]:
@@ -79,6 +81,8 @@ def _of_halves(found: Explanation, result: ProjectedEstimate) -> Iterator[Findin
     W, residuals = equations_of(intervals, found.refinement.fit, result.parameters)
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
     first = place < 0.5 * np.bincount(intervals.log_of)[intervals.log_of]
+    if min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
+        return
     changes, variances = zip(*(_change(W[half], residuals[half]) for half in (first, ~first)), strict=True)
     p = result.parameters[None] + np.array(changes)
     error = np.sqrt(sum(variances))
