@@ -10,7 +10,12 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.estimate import Finding
 from diransac.identification.methods.lo_diransac.hypotheses import weak_form
-from diransac.identification.methods.lo_diransac.projection import batch_sums, by_least_squares, equations_of
+from diransac.identification.methods.lo_diransac.projection import (
+    batch_sums,
+    least_squares_gains,
+    means_of_intervals,
+    residuals_of_motion,
+)
 from diransac.text_table import number
 
 if TYPE_CHECKING:
@@ -23,6 +28,8 @@ __all__ = ["findings_of_fit"]
 
 # A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious.
 _CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
+# Residual of an equation over that of the worst, at least.
+_SMALLEST = 1e-6
 # Intervals of half the logs from which parameters and their scatter are estimated, at least.
 _FEWEST_INTERVALS = 9
 
@@ -78,7 +85,9 @@ def _of_sensors(intervals: ShootingIntervals) -> Iterator[Finding]:
 def _of_halves(found: Explanation, result: ProjectedEstimate) -> Iterator[Finding]:
     """Parameters that differ between the halves of the logs: a payload, a battery, a machine that wears."""
     intervals = found.intervals
-    W, residuals = equations_of(intervals, found.refinement.fit, result.parameters)
+    _, rows, regressors, _ = residuals_of_motion(intervals, found.refinement.fit, result.parameters)
+    W = means_of_intervals(intervals, regressors * intervals.counted[:, None, None])
+    residuals = means_of_intervals(intervals, rows * intervals.counted[:, None])
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
     first = place < 0.5 * np.bincount(intervals.log_of)[intervals.log_of]
     if min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
@@ -99,7 +108,8 @@ def _of_halves(found: Explanation, result: ProjectedEstimate) -> Iterator[Findin
 
 def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Change ``(n,)`` of parameters by least squares of some rows, and its variance by batches of them."""
-    gains = by_least_squares(W, residuals)
+    scale = np.sqrt(np.square(residuals).mean(axis=0))
+    gains = least_squares_gains(W, 1.0 / np.maximum(scale, _SMALLEST * scale.max() + 1e-300))
     change = -np.einsum("pwi,wi->p", gains, residuals)
     left = residuals + W @ change
     sums = batch_sums(np.einsum("pwi,wi->wp", gains, left))

@@ -50,7 +50,7 @@ _WHOLE_SAMPLE = 0.5
 # Relative difference of parameters that makes a second start.
 _APART = 0.2
 # Log of the factor by which a delay must lower unmodelled accelerations; prior delay of a fit without one.
-_EXPLAINS, _PUNCTUAL = float(np.log(1.25)), 1e-6
+_EXPLAINS, _FIXED = float(np.log(1.25)), 1e-6
 # Decrease of the log residuals of each signal by which a delay is worth to be tried.
 _SMALL_GAIN = 0.03
 # Gain of evidence, nats, that an error of a sensor is worth.
@@ -167,8 +167,8 @@ class LocalSearch:
     def _from_hypotheses(self, intervals: ShootingIntervals, k: int) -> Explanation:
         """The likeliest explanation with this timing of the inputs."""
         part = within(self.callback, 0.1 + 0.25 * k, 0.35 + 0.25 * k)
-        punctual = replace(self.prior, delay=_PUNCTUAL * self.prior.delay)
-        return self._simplest(Explanation(intervals, self.best(intervals, punctual, part), punctual, exact=False))
+        undelayed = replace(self.prior, delay=_FIXED * self.prior.delay)
+        return self._simplest(Explanation(intervals, self.best(intervals, undelayed, part), undelayed, exact=False))
 
     def best(self, intervals: ShootingIntervals, prior: Prior, callback: Callback | None = None) -> Refinement:
         """Local optimisation from the best hypothesis; where it is doubtful, from others; the likeliest of these.

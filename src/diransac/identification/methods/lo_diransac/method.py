@@ -59,7 +59,7 @@ __all__ = ["LoDiransac", "configured"]
 
 _FEWEST_INTERVALS = 4
 # Rows without any sample that are a gap, at least.
-_FEWEST_BLIND = 8
+_FEWEST_UNMEASURED = 8
 _OUTLIER = 0.5
 # Fraction of a signal's spread from which on its noise leaves nothing to explain.
 _ALL_OF_IT = 0.8
@@ -101,7 +101,7 @@ class LoDiransac(LoDiransacSettings):
     delay_range : (float, float), optional
         Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation.
     max_delay_shifts : int, optional
-        Largest number of shifts of the inputs by whole samples after local optimisation.
+        Rounds in which other delays, a lag and another hold of the inputs are tried after the first optimisations.
     max_sensor_errors : int, optional
         Largest number of delays and biases of sensors that are estimated where the model is not exact.
     substeps : int, optional
@@ -193,14 +193,7 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     report(callback, "smoothing", 0.0)
     intervals, motion, notes = _prepared(settings, dataset)
     report(callback, "drawing hypotheses", 0.1)
-    hypotheses = find_hypotheses(settings, intervals, motion, seed, dataset)
-    if not len(hypotheses):
-        blind = _unmeasured(intervals)
-        if blind:
-            what = f"nothing measures {', '.join(blind)}, nor a derivative"
-            raise IdentificationError(f"{dataset.source}: {what}; lo-diransac needs a signal of each coordinate")
-        cause = cause_of_refusal(dataset.model, dataset.layout, _rows_of_logs(intervals, motion))
-        raise IdentificationError(f"{dataset.source}: no sample gives parameters within their bounds: {cause}")
+    hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
     unit = discrepancy_units(intervals, motion, hypotheses[0])
     search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
@@ -230,6 +223,21 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         return estimate
     terms = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
     return replace(estimate, suggestions=terms)
+
+
+def _hypotheses(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
+) -> FloatArray:
+    """Hypotheses, best first.  Raises IdentificationError: there are none, and the message names the cause."""
+    found = find_hypotheses(settings, intervals, motion, seed, dataset)
+    if len(found):
+        return found
+    unmeasured = _unmeasured(intervals)
+    if unmeasured:
+        what = f"nothing measures {', '.join(unmeasured)}, nor a derivative"
+        raise IdentificationError(f"{dataset.source}: {what}; lo-diransac needs a signal of each coordinate")
+    cause = cause_of_refusal(dataset.model, dataset.layout, _rows_of_logs(intervals, motion))
+    raise IdentificationError(f"{dataset.source}: no sample gives parameters within their bounds: {cause}")
 
 
 def _checks(
@@ -322,8 +330,8 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
     if n_leaps:
         notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median replaces them")
     centre = running_median(measured, known, odd_window(settings.median_window, dt, _MOST_SAMPLES))
-    blind = long_runs(~known.any(axis=1), max(_FEWEST_BLIND, round(settings.smoothing_half_width / dt)))
-    return Samples(measured, known, centre, one.gaps | blind), inputs, notes
+    unmeasured = long_runs(~known.any(axis=1), max(_FEWEST_UNMEASURED, round(settings.smoothing_half_width / dt)))
+    return Samples(measured, known, centre, one.gaps | unmeasured), inputs, notes
 
 
 # ---------------------------------------------------------------------- the estimate

@@ -43,12 +43,12 @@ if TYPE_CHECKING:
 __all__ = [
     "ProjectedEstimate",
     "batch_sums",
-    "by_least_squares",
     "discrepancy_units",
-    "equations_of",
     "estimate_parameters",
     "fitted_parameters",
     "inertial_forces",
+    "least_squares_gains",
+    "means_of_intervals",
     "parameter_units",
     "residuals_of_motion",
     "unexplained",
@@ -150,9 +150,9 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     push, W, M = (x * logged for x in evaluate(*motion, _row_parameters(intervals, fit.shared)))
     W, M = _regressors(intervals, W), _matrices(M, n_v)
     push = push - np.einsum("nij,nj->ni", M, np.repeat(fit.d, intervals.length, axis=0))
-    M = _means(intervals, M)
+    M = means_of_intervals(intervals, M)
     latent = np.einsum("wij,wj->wi", M, fit.d)
-    means = _means(intervals, W)
+    means = means_of_intervals(intervals, W)
     p, gains, stuck = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent))
     by_rows, by_means = gains
     of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + n_v, n_p))
@@ -190,13 +190,13 @@ def _bounded_projection(
     for _ in range(len(now) + 1):
         free = ~stuck
         left = means[1] + means[0][:, :, stuck] @ (p - now)[stuck]
-        known = means[0][:, :, free] @ now[free] - left - _means(intervals, rows[1])
+        known = means[0][:, :, free] @ now[free] - left - means_of_intervals(intervals, rows[1])
         weights = _robust_weights(intervals, WeakForm(means[0][:, :, free], known))
         gains = tuple(np.zeros((len(now), *x.shape[:2])) for x, _ in (rows, means))
         for gain, (W, _), one in zip(
             gains, (rows, means), (np.repeat(weights, intervals.length, axis=0), weights), strict=True
         ):
-            gain[free] = _least_squares(W[:, :, free], one)
+            gain[free] = least_squares_gains(W[:, :, free], one)
         found = now - np.einsum("pni,ni->p", gains[0], rows[1]) - np.einsum("pwi,wi->p", gains[1], left)
         p = np.where(stuck, p, found)
         outside = (p < lower) | (p > upper)
@@ -213,15 +213,26 @@ def _robust_weights(intervals: ShootingIntervals, rows: WeakForm) -> FloatArray:
     """
     scale, loss = equation_scales(rows), np.ones(rows.b.shape)
     for _ in range(_REWEIGHTED):
-        gains = _least_squares(rows.W, loss / scale)
+        gains = least_squares_gains(rows.W, loss / scale)
         left = rows.b - rows.W @ np.einsum("pwi,wi->p", gains, rows.b)
         spread = 1.4826 * np.median(np.abs(left[intervals.occupied]), axis=0)
         loss = 1.0 / np.sqrt(1.0 + np.square(left / (_CAUCHY * np.maximum(spread, _ROUNDING * scale))))
     return np.asarray(loss / scale)
 
 
-def _least_squares(W: FloatArray, weights: FloatArray) -> FloatArray:
-    """``(W'VW)^-1 W'V`` of stacked matrices (N, r, n), as (n, N, r), V of ``weights (N, r)``; columns scaled to one."""
+def least_squares_gains(W: FloatArray, weights: FloatArray) -> FloatArray:
+    """``(W'VW)^-1 W'V`` of stacked matrices: the effect of each row of each equation on the parameters.
+
+    Parameters
+    ----------
+    W : (N, r, n) array
+    weights : (N, r) or (r,) array
+        Square roots of the diagonal of V.
+
+    Returns
+    -------
+    (n, N, r) array
+    """
     weights = np.broadcast_to(weights, W.shape[:2])
     rows = (W * weights[:, :, None]).reshape(-1, W.shape[2])
     scale = np.linalg.norm(rows, axis=0)
@@ -251,40 +262,6 @@ def batch_sums(values: FloatArray) -> FloatArray:
     return np.asarray(sums * stdtrit(max(len(sums) - 1, 1), _UPPER) / ndtri(_UPPER))
 
 
-def equations_of(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means over each interval of the regressors and of the residuals of the fitted motion.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-    parameters : (n,) array
-
-    Returns
-    -------
-    (W, n_v, n) array, (W, n_v) array
-    """
-    logged, p = intervals.counted[:, None], _row_parameters(intervals, parameters)
-    residuals, W, _ = _residual_map(intervals.model)(*_motion(intervals, fit), p)
-    return _means(intervals, _regressors(intervals, W * logged)), _means(intervals, residuals * logged)
-
-
-def by_least_squares(W: FloatArray, residuals: FloatArray) -> FloatArray:
-    """Effect ``(n, N, r)`` of rows on the parameters by least squares with the equations' scales.
-
-    Parameters
-    ----------
-    W : (N, r, n) array
-    residuals : (N, r) array
-
-    Returns
-    -------
-    (n, N, r) array
-    """
-    scale = np.sqrt(np.square(residuals).mean(axis=0))
-    return _least_squares(W, 1.0 / np.maximum(scale, 1e-6 * scale.max() + _TINY))
-
-
 def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:
     """``M^-1 r``: mean over each interval of the fitted accelerations that the model does not explain.
 
@@ -303,7 +280,7 @@ def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) 
     residuals, _, M = _residual_map(intervals.model)(*_motion(intervals, fit), p)
     left = np.linalg.solve(_matrices(M, intervals.model.n_v), residuals[:, :, None])[:, :, 0]
     logged = intervals.counted[:, None].astype(float)
-    return _means(intervals, left * logged) / np.maximum(_means(intervals, logged), _TINY)
+    return means_of_intervals(intervals, left * logged) / np.maximum(means_of_intervals(intervals, logged), _TINY)
 
 
 def residuals_of_motion(
@@ -444,8 +421,18 @@ def _residual_map(model: Model) -> Map:
     return compile_map(ca.Function("residuals", [q, v, a, u, p], [ca.densify(r), *slopes]))
 
 
-def _means(intervals: ShootingIntervals, rows: FloatArray) -> FloatArray:
-    """Mean of each interval, (W, ...)."""
+def means_of_intervals(intervals: ShootingIntervals, rows: FloatArray) -> FloatArray:
+    """Mean of each interval.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    rows : (N, ...) array
+
+    Returns
+    -------
+    (W, ...) array
+    """
     return np.asarray(rows.reshape(len(intervals), intervals.length, *rows.shape[1:]).mean(axis=1))
 
 

@@ -1,7 +1,7 @@
 """Systematic errors of the sensors: a delay of each signal or group of signals, and a bias.
 
-An error of a sensor that no parameter and no discrepancy explains leaves a trace in the residuals: a delay in
-proportion to the signal's rate, a bias a constant.  A score test finds the error whose trace is the clearest, given all
+An error of a sensor that no parameter and no discrepancy explains is in the residuals: a delay in
+proportion to the signal's rate, a bias a constant.  A score test finds the most significant error, given all
 else that is estimated; it costs a call of the simulator, and no fit.  The error is then estimated jointly with all
 other unknowns, by one Newton step and a new fit.
 
@@ -74,13 +74,13 @@ def clearest_error(intervals: ShootingIntervals, fit: Fit) -> SensorError | None
     batch = np.arange(0, len(intervals), max(1, round(np.sqrt(len(intervals)))))
     found: list[SensorError] = []
     for signals, is_delay in _candidates(intervals):
-        trace = np.where(signals, -rates if is_delay else 1.0, 0.0)
-        # The gradient J' W e with errors that are larger by the trace, of which no derivative is needed.
-        moved = linearize(replace(intervals, measured=intervals.measured - trace), fit, weights)
+        sensitivity = np.where(signals, -rates if is_delay else 1.0, 0.0)
+        # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
+        moved = linearize(replace(intervals, measured=intervals.measured - sensitivity), fit, weights)
         of_z, of_s = at.data_z - moved.data_z, (at.data_s - moved.data_s).sum(axis=0)
         z, s = (x[..., 0] for x in at.system.functional(of_z[:, :, None], of_s[:, None]))
-        information = float((weights * np.square(trace)).sum() - (of_z * z).sum() - of_s @ s)
-        rows = (weights * trace * fit.residuals).sum(axis=1)
+        information = float((weights * np.square(sensitivity)).sum() - (of_z * z).sum() - of_s @ s)
+        rows = (weights * sensitivity * fit.residuals).sum(axis=1)
         scores = rows.reshape(len(intervals), -1).sum(axis=1) + (at.data_z * z).sum(axis=1) + at.data_s @ s
         variance = max(information, float(np.square(np.add.reduceat(scores, batch)).sum()))
         if information > 0.0:
