@@ -9,9 +9,10 @@ Inputs are no instruments: a controller answers disturbances, and its inputs are
 1999).  Nor are any needed: the fitted accelerations are posterior means, whose errors are uncorrelated with themselves,
 so that they do not bias the slopes of a regression on them (Berkson 1950).
 
-The covariance has three parts: that of the fit, propagated through the projection; that of the unmodelled forces
-outside the regressor's column space, as a sample of forces that differ from log to log; and the change under a tenfold
-wider prior on model error, because a constant deviation from the model is not averaged out.
+The covariance has four parts: that of the fit, propagated through the projection; that of the unmodelled forces
+outside the regressor's column space, as a sample of forces that differ from log to log; and, because a constant
+deviation from the model is not averaged out, the changes under a tenfold wider prior on model error and under least
+squares without a robust loss.
 
 References
 ----------
@@ -153,7 +154,8 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     M = means_of_intervals(intervals, M)
     latent = np.einsum("wij,wj->wi", M, fit.d)
     means = means_of_intervals(intervals, W)
-    p, gains, stuck = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent))
+    p, gains, stuck = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent), _REWEIGHTED)
+    plain = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent), 0)[0]
     by_rows, by_means = gains
     of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + n_v, n_p))
     level = np.hstack([np.ones((len(push), 1)), intervals.inputs])
@@ -167,7 +169,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     unpushed = push - W @ np.einsum("pni,ni->p", by_rows, push)
     of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)
     sums = batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
-    covariance = covariance + sums.T @ sums
+    covariance = covariance + sums.T @ sums + np.outer(plain - p, plain - p)
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
     delay = at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
@@ -179,10 +181,12 @@ def _bounded_projection(
     now: FloatArray,
     rows: tuple[FloatArray, FloatArray],
     means: tuple[FloatArray, FloatArray],
+    reweighted: int,
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], BoolArray]:
     """Parameters within inclusive bounds, gains of rows (n, N, n_v) and of means (n, W, n_v), and those on a bound.
 
-    Arguments are the parameters of the fit, and regressors with residuals of rows and of interval means.
+    Arguments are the parameters of the fit, regressors with residuals of rows and of interval means, and the number of
+    steps of reweighting.
     """
     lower = np.array([-np.inf if x.positive else x.lower for x in intervals.layout.bounds])
     upper = np.array([x.upper for x in intervals.layout.bounds])
@@ -191,7 +195,7 @@ def _bounded_projection(
         free = ~stuck
         left = means[1] + means[0][:, :, stuck] @ (p - now)[stuck]
         known = means[0][:, :, free] @ now[free] - left - means_of_intervals(intervals, rows[1])
-        weights = _robust_weights(intervals, WeakForm(means[0][:, :, free], known))
+        weights = _robust_weights(intervals, WeakForm(means[0][:, :, free], known), reweighted)
         gains = tuple(np.zeros((len(now), *x.shape[:2])) for x, _ in (rows, means))
         for gain, (W, _), one in zip(
             gains, (rows, means), (np.repeat(weights, intervals.length, axis=0), weights), strict=True
@@ -206,13 +210,13 @@ def _bounded_projection(
     return p, (gains[0], gains[1]), stuck
 
 
-def _robust_weights(intervals: ShootingIntervals, rows: WeakForm) -> FloatArray:
+def _robust_weights(intervals: ShootingIntervals, rows: WeakForm, steps: int) -> FloatArray:
     """Square roots of the weights ``(W, n_v)``: of the equations by their scales, and of intervals by Cauchy's loss.
 
     A gust of a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.
     """
     scale, loss = equation_scales(rows), np.ones(rows.b.shape)
-    for _ in range(_REWEIGHTED):
+    for _ in range(steps):
         gains = least_squares_gains(rows.W, loss / scale)
         left = rows.b - rows.W @ np.einsum("pwi,wi->p", gains, rows.b)
         spread = 1.4826 * np.median(np.abs(left[intervals.occupied]), axis=0)
