@@ -332,6 +332,7 @@ def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArra
         Infinite for parameters; 1 sample for the delay.
     """
     force = inertial_forces(intervals, motion, p)
+    force[force == 0.0] = 1.0  # nor do discrepancies of what is at rest
     level = np.append(1.0, np.sqrt(np.square(intervals.inputs).mean(axis=0)))
     level[level == 0.0] = 1.0  # the gain of an input that never acts stays at its prior
     return np.concatenate([np.full(intervals.n_p, np.inf), (force[:, None] / level).ravel(), [1.0]])
