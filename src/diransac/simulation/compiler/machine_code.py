@@ -28,7 +28,7 @@ PASSES = ("sroa", "simplify_cfg", "loop_rotate")
 
 CODE_GENERATION = 1
 """LLVM's level of code generation. From 2 on, instructions are scheduled again after registers are allocated, in a time
-quadratic in the length of a block: up to 1.8 times the compilation, for the same bits and no measurable speed."""
+quadratic in the length of a block: up to 1.7 times the compilation, for the same bits and no measurable speed."""
 
 LLVM: TypeAlias = Any
 """An object of llvmlite, which has no type annotations."""
