@@ -16,7 +16,8 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
-from diransac.data.segment import long_runs
+from diransac.data.input_timing import InputTiming
+from diransac.data.segment import long_runs, silent_rows
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
@@ -58,8 +59,6 @@ if TYPE_CHECKING:
 __all__ = ["LoDiransac", "configured"]
 
 _FEWEST_INTERVALS = 4
-# Rows without any sample that are a gap, at least.
-_FEWEST_UNMEASURED = 8
 _OUTLIER = 0.5
 # Fraction of a signal's spread from which on its noise leaves nothing to explain.
 _ALL_OF_IT = 0.8
@@ -216,8 +215,7 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         *_checks(settings, intervals, motion, refined),
         *findings_of_fit(likeliest, motion, result),
     )
-    late = float(intervals.delay + intervals.lag + refined.fit.shared[-1])
-    found = _Found(dataset, intervals, motion, refined.fit, result, late)
+    found = _Found(dataset, intervals, motion, refined.fit, result)
     estimate = _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
     if likeliest.exact or not settings.suggestions:
         return estimate
@@ -330,8 +328,7 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
     if n_leaps:
         notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median replaces them")
     centre = running_median(measured, known, odd_window(settings.median_window, dt, _MOST_SAMPLES))
-    unmeasured = long_runs(~known.any(axis=1), max(_FEWEST_UNMEASURED, round(settings.smoothing_half_width / dt)))
-    return Samples(measured, known, centre, one.gaps | unmeasured), inputs, notes
+    return Samples(measured, known, centre, one.gaps | silent_rows(known, dt)), inputs, notes
 
 
 # ---------------------------------------------------------------------- the estimate
@@ -339,14 +336,29 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
 
 @dataclass(frozen=True)
 class _Found:
-    """Parts of an estimate; the delay is in samples."""
+    """Parts of an estimate."""
 
     dataset: Dataset
     intervals: ShootingIntervals
     motion: Motion
     fit: Fit
     result: ProjectedEstimate
-    delay: float
+
+    @property
+    def late(self) -> float:
+        """Delay of the inputs, lag included, samples."""
+        return float(self.intervals.delay + self.intervals.lag + self.fit.shared[-1])
+
+    @property
+    def is_late(self) -> bool:
+        """True for a significant delay."""
+        return abs(self.late) > max(_SIGNIFICANT * self.result.delay_error, _SMALL_DELAY)
+
+    @property
+    def timing(self) -> InputTiming:
+        """Delay or lag of the inputs where it is significant."""
+        time = self.late * self.intervals.dt if self.is_late else 0.0
+        return InputTiming(lag=time) if self.intervals.lag else InputTiming(delay=time)
 
 
 def _estimate(
@@ -375,7 +387,7 @@ def _estimate(
         iterations=settings.n_nonlinear_samples if nonlinear else settings.n_samples,
         n_hypotheses=n_hypotheses,
         stop_reason="converged" if converged else "limit of steps",
-        resolution=Resolution("rk4", settings.substeps, intervals.hold),
+        resolution=Resolution("rk4", settings.substeps, intervals.hold, found.timing),
         notes=notes,
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),
         checks=checks,
@@ -409,9 +421,9 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
         unmodelled_forces={} if forces is None else per_equation(forces),
         smoothed_time=begins + dt * place.astype(float),
         smoothed_states=dict(zip(model.state, fit.x[shown].T.copy(), strict=True)),
-        input_delay=float(found.delay * dt),
+        input_delay=found.late * dt,
         input_delay_error=result.delay_error * dt,
-        input_delay_significant=abs(found.delay) > max(_SIGNIFICANT * result.delay_error, _SMALL_DELAY),
+        input_delay_significant=found.is_late,
         unidentifiable=lost,
         combinations=combinations,
     )
