@@ -18,13 +18,13 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
 from diransac.data.input_timing import InputTiming
 from diransac.data.segment import long_runs, silent_rows
-from diransac.errors import IdentificationError, LogError, ModelError
+from diransac.errors import IdentificationError, LogError, ModelError, SettingsError
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
-from diransac.identification.methods.lo_diransac.local_search import LocalSearch
+from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
 from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
@@ -99,10 +99,16 @@ class LoDiransac(LoDiransacSettings):
         Number of intervals on which all hypotheses are scored; number of hypotheses that are scored on all intervals.
     delay_range : (float, float), optional
         Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation.
+    input_delay, input_lag : bool, optional
+        Whether inputs act after a delay, or after a first-order lag of the actuators: True, always; False, never; None,
+        where that is the likelier explanation of the log.
     max_delay_shifts : int, optional
         Rounds in which other delays, a lag and another hold of the inputs are tried after the first optimisations.
+    sensor_delays, sensor_biases : sequence of str, optional
+        Signals whose delay, or bias, is estimated in any case; that of no other is.  None: those that the residuals
+        show clearly.
     max_sensor_errors : int, optional
-        Largest number of delays and biases of sensors that are estimated where the model is not exact.
+        Largest number of delays and biases of unnamed sensors that are estimated where the model is not exact.
     substeps : int, optional
         Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
         samples or links are light.
@@ -162,6 +168,8 @@ class LoDiransac(LoDiransacSettings):
         ------
         LogError
             The logs are too short, or sampled at different rates.
+        SettingsError
+            A sensor is named that the logs lack.
         IdentificationError
             No sample gives parameters within their bounds.
         """
@@ -188,6 +196,7 @@ def configured(settings: Settings, **options: Any) -> LoDiransac:
 
 def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
     """Parameters of the dataset's model, step by step."""
+    _check_sensors(settings, dataset)
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
     report(callback, "smoothing", 0.0)
     intervals, motion, notes = _prepared(settings, dataset)
@@ -215,12 +224,21 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         *_checks(settings, intervals, motion, refined),
         *findings_of_fit(likeliest, motion, result),
     )
-    found = _Found(dataset, intervals, motion, refined.fit, result)
+    found = _Found(dataset, intervals, motion, refined.fit, result, bool(settings.input_delay or settings.input_lag))
     estimate = _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
     if likeliest.exact or not settings.suggestions:
         return estimate
     terms = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
     return replace(estimate, suggestions=terms)
+
+
+def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:
+    """Raises SettingsError: a sensor is named that the logs lack."""
+    for setting in ("sensor_delays", "sensor_biases"):
+        unknown = [name for name in getattr(settings, setting) or () if name not in dataset.signals]
+        if unknown:
+            has = ", ".join(dataset.signals)
+            raise SettingsError(f'{setting} names "{unknown[0]}", which {dataset.source} lacks; it has {has}')
 
 
 def _hypotheses(
@@ -336,13 +354,14 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
 
 @dataclass(frozen=True)
 class _Found:
-    """Parts of an estimate."""
+    """Parts of an estimate; a forced delay or lag of the inputs need not be significant."""
 
     dataset: Dataset
     intervals: ShootingIntervals
     motion: Motion
     fit: Fit
     result: ProjectedEstimate
+    forced: bool
 
     @property
     def late(self) -> float:
@@ -356,9 +375,12 @@ class _Found:
 
     @property
     def timing(self) -> InputTiming:
-        """Delay or lag of the inputs where it is significant."""
-        time = self.late * self.intervals.dt if self.is_late else 0.0
-        return InputTiming(lag=time) if self.intervals.lag else InputTiming(delay=time)
+        """Delay or lag of the inputs where it is significant, or forced."""
+        if not (self.is_late or self.forced):
+            return InputTiming()
+        if self.intervals.lag:
+            return InputTiming(lag=max(self.late, LEAST_LAG) * self.intervals.dt)
+        return InputTiming(delay=self.late * self.intervals.dt)
 
 
 def _estimate(
