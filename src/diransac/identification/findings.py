@@ -247,11 +247,11 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
     for suggestion in result.suggestions:
         yield Finding("care", f"The model seems to lack a term. {suggestion.text}.")
     if found.input_delay_significant:
-        sense = "later" if found.input_delay > 0.0 else "earlier"
-        delay = f"Inputs act {number(1e3 * abs(found.input_delay), 3)} ms {sense} than recorded"
-        yield Finding(
-            "care", f"{delay}: the estimate includes this delay; simulations of the model must include it, too."
-        )
+        sense, lag = "later" if found.input_delay > 0.0 else "earlier", result.estimate.resolution.timing.lag
+        late = f"Inputs act {number(1e3 * abs(found.input_delay), 3)} ms {sense} than recorded"
+        how, what = (", after a first-order lag of the actuators", "lag") if lag else ("", "delay")
+        included = f"the estimate includes this {what}, as do its evaluation and validation"
+        yield Finding("care", f"{late}{how}: {included}; other simulations of the model must include it, too.")
     yield from _unidentifiable(result, found)
 
 

@@ -26,7 +26,7 @@ from diransac.text_table import aligned, telling_digits
 
 __all__ = ["MARKS", "Result"]
 
-_FORMAT = 5
+_FORMAT = 6
 _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
 MARKS = {"bad": "!", "care": "·"}

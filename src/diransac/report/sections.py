@@ -326,7 +326,8 @@ def _delay(entry: Entry) -> str:
     if not found.input_delay_significant:
         return ""
     delay, error = number(1e3 * found.input_delay, 3), number(1e3 * found.input_delay_error, 2)
-    return f"Input delay: {delay} ± {error} ms (standard error). The estimate and the simulations shown include it."
+    kind = "lag" if entry.result.estimate.resolution.timing.lag else "delay"
+    return f"Input {kind}: {delay} ± {error} ms (standard error). The estimate and the simulations shown include it."
 
 
 def short_term_scores(runs: Sequence[Run]) -> Table | None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["SensorError", "clearest_error", "with_error"]
+__all__ = ["SensorError", "clearest_error", "error_of_sensor", "with_error"]
 
 # Standard errors from which on an error of a sensor is tried, and its least delay, samples.
 _CLEAR, _LEAST_DELAY = 3.0, 0.1
@@ -55,7 +55,7 @@ class SensorError:
     ratio: float
 
 
-def clearest_error(intervals: ShootingIntervals, fit: Fit) -> SensorError | None:
+def clearest_error(intervals: ShootingIntervals, fit: Fit, *, delays: bool, biases: bool) -> SensorError | None:
     """The error of the sensors that the residuals show most clearly.
 
     Parameters
@@ -63,17 +63,49 @@ def clearest_error(intervals: ShootingIntervals, fit: Fit) -> SensorError | None
     intervals : ShootingIntervals
     fit : Fit
         At its optimum.
+    delays, biases : bool
+        Kinds of errors that are tested.
 
     Returns
     -------
     SensorError or None
         None if no error is clear.
     """
+    tested = [x for x in _candidates(intervals) if (delays if x[1] else biases)]
+    found = _score_tests(intervals, fit, tested) if tested else []
+    clear = [x for x in found if x.ratio > _CLEAR and (not x.is_delay or abs(x.size) > _LEAST_DELAY)]
+    return max(clear, key=lambda x: x.ratio, default=None)
+
+
+def error_of_sensor(intervals: ShootingIntervals, fit: Fit, name: str, *, is_delay: bool) -> SensorError | None:
+    """The error of one signal, clear or not.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        At its optimum.
+    name : str
+        Signal of the model.
+    is_delay : bool
+        A delay, or a bias.
+
+    Returns
+    -------
+    SensorError or None
+        None if the log does not determine it.
+    """
+    signal = np.array([x == name for x in intervals.model.signals])
+    return next(iter(_score_tests(intervals, fit, [(signal, is_delay)])), None)
+
+
+def _score_tests(intervals: ShootingIntervals, fit: Fit, candidates: list[tuple[BoolArray, bool]]) -> list[SensorError]:
+    """Estimates of errors of the sensors, each given all else that is estimated."""
     weights, rates = weights_of(intervals, fit), signal_rates(intervals, fit)
     at = linearize(intervals, fit, weights)
     batch = np.arange(0, len(intervals), max(1, round(np.sqrt(len(intervals)))))
     found: list[SensorError] = []
-    for signals, is_delay in _candidates(intervals):
+    for signals, is_delay in candidates:
         sensitivity = np.where(signals, -rates if is_delay else 1.0, 0.0)
         # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
         moved = linearize(replace(intervals, measured=intervals.measured - sensitivity), fit, weights)
@@ -86,8 +118,7 @@ def clearest_error(intervals: ShootingIntervals, fit: Fit) -> SensorError | None
         if information > 0.0:
             score = float(rows.sum())
             found.append(SensorError(signals, is_delay, -score / information, abs(score) / np.sqrt(variance)))
-    clear = [x for x in found if x.ratio > _CLEAR and (not x.is_delay or abs(x.size) > _LEAST_DELAY)]
-    return max(clear, key=lambda x: x.ratio, default=None)
+    return found
 
 
 def with_error(intervals: ShootingIntervals, fit: Fit, error: SensorError) -> ShootingIntervals:
