@@ -94,14 +94,19 @@ class Ambiguity:
         reason = f", {self.reason}" if self.reason else ""
         n_free = len(self.names) - self.n_determined
         which = f"one, for example {self.names[0]}," if n_free == 1 else f"{n_free} of them"
-        return f"{self.determined()}{reason}; no motion helps: fix {which} at a known value in the model"
+        return f"{self.determined()}{reason}; no motion helps: fix {which} at a known value, {self._remedy()}"
 
     def of_motion(self) -> str:
         """Clause about an ambiguity of a log: what is determined, and what to do."""
         if not self.n_determined:
             them = "it" if len(self.names) == 1 else "them"
-            return f"the motion does not excite {them}; record a livelier motion, or fix {them} in the model"
-        return f"{self.determined()} by this motion; record a livelier motion, or fix one of them in the model"
+            return f"the motion does not excite {them}; record a livelier motion, or fix {them}, {self._remedy()}"
+        return f"{self.determined()} by this motion; record a livelier motion, or fix one of them, {self._remedy()}"
+
+    def _remedy(self) -> str:
+        """The argument that fixes the first parameter, for example."""
+        name = self.names[0].partition("[")[0]
+        return f'by fixed={{"{name}": ...}} or --fix {name}=...'
 
     def sentence(self, clause: str, logs: str = "") -> str:
         """The names, ``is not identifiable``, and a clause."""
