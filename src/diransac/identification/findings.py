@@ -136,14 +136,14 @@ def _known(result: Result) -> Iterator[Finding]:
     for name in result.fixed:
         value = f"{number(result.parameters[name])} {result.units[name]}".rstrip()
         yield Finding("note", f"{name} is fixed at {value}, not identified.")
-    for name, value in result.estimate.parameters.items():
+    for name, x in result.estimate.parameters.items():
         mean, std = result.priors.get(name.partition("[")[0], (np.nan, np.nan))
-        away = abs(value - mean) / std
+        away = abs(x - mean) / std
         if away > _CONTRADICTION:
             text = (
                 f"{_these(result.logs)} {'contradict' if len(result.logs) > 1 else 'contradicts'} the prior of {name}"
             )
-            far = f"{number(value)} lies {number(away, 2)} prior standard deviations from its mean {number(mean)}"
+            far = f"{number(x)} lies {number(away, 2)} prior standard deviations from its mean {number(mean)}"
             yield Finding("care", f"{text[0].upper()}{text[1:]}: the estimate {far}; check the prior, and the model.")
         elif np.isfinite(away):
             yield Finding("note", f"The estimate of {name} uses the prior {number(mean)} ± {number(std, 2)}.")

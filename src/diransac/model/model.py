@@ -317,14 +317,14 @@ class Model:
         if not values:
             return self
 
-        def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[ca.SX]:
+        def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[Any]:
             motion = [ca.vertcat(*x) for x in (q, v, a, u)]
             own = ca.vertcat(*(values[n] if n in values else p[n] for n in self.parameters))
-            return ca.vertsplit(self.residual(*motion, own))  # type: ignore[no-any-return]
+            return [self.residual(*motion, own)]
 
-        def kinematics(q: Symbols, v: Symbols) -> list[ca.SX]:
+        def kinematics(q: Symbols, v: Symbols) -> list[Any]:
             assert self.kinematics is not None
-            return ca.vertsplit(self.kinematics(ca.vertcat(*q), ca.vertcat(*v)))  # type: ignore[no-any-return]
+            return [self.kinematics(ca.vertcat(*q), ca.vertcat(*v))]
 
         has_kinematics = self.kinematics is not None
         return Model(
