@@ -12,7 +12,7 @@ Bellman and Astrom 1970 (structural identifiability); Gautier and Khalil 1990 (b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -37,6 +37,7 @@ __all__ = [
     "of_log",
     "structural",
     "unidentifiable",
+    "unresolved",
     "vague_parameters",
 ]
 
@@ -94,17 +95,17 @@ class Ambiguity:
         reason = f", {self.reason}" if self.reason else ""
         n_free = len(self.names) - self.n_determined
         which = f"one, for example {self.names[0]}," if n_free == 1 else f"{n_free} of them"
-        return f"{self.determined()}{reason}; no motion helps: fix {which} at a known value, {self._remedy()}"
+        return f"{self.determined()}{reason}; no motion helps: fix {which} at a known value, {self.remedy()}"
 
     def of_motion(self) -> str:
         """Clause about an ambiguity of a log: what is determined, and what to do."""
         if not self.n_determined:
             them = "it" if len(self.names) == 1 else "them"
-            return f"the motion does not excite {them}; record a livelier motion, or fix {them}, {self._remedy()}"
-        return f"{self.determined()} by this motion; record a livelier motion, or fix one of them, {self._remedy()}"
+            return f"the motion does not excite {them}; record a livelier motion, or fix {them}, {self.remedy()}"
+        return f"{self.determined()} by this motion; record a livelier motion, or fix one of them, {self.remedy()}"
 
-    def _remedy(self) -> str:
-        """The argument that fixes the first parameter, for example."""
+    def remedy(self) -> str:
+        """Argument and option that fix the first parameter, for example."""
         name = self.names[0].partition("[")[0]
         return f'by fixed={{"{name}": ...}} or --fix {name}=...'
 
@@ -155,7 +156,32 @@ def structural(model: Model) -> tuple[Ambiguity, ...]:
     return _joined(found)
 
 
-def check_structure(model: Model, source: str, allow: int = 0) -> None:
+def unresolved(model: Model, priors: Collection[str], *, scales: bool = True) -> tuple[Ambiguity, ...]:
+    """Ambiguities of the equations that remain where some parameters have a prior.
+
+    Parameters
+    ----------
+    model : Model
+    priors : collection of str
+        Names of the parameters with a prior.
+    scales : bool, optional
+        Whether a prior determines the scale of homogeneous equations.  It does not in a linear regression: noise in W
+        draws all parameters to zero, which solves ``W p = 0``.
+
+    Returns
+    -------
+    tuple of Ambiguity
+    """
+    return tuple(
+        x
+        for x in structural(model)
+        if sum(n in priors for n in x.names) < len(x.names) - x.n_determined or (x.noun == "ratio" and not scales)
+    )
+
+
+def check_structure(
+    model: Model, source: str, allow: int = 0, priors: Collection[str] = (), *, scales: bool = True
+) -> None:
     """Raise IdentificationError for parameters that the equations do not determine, whatever the motion.
 
     Parameters
@@ -165,8 +191,11 @@ def check_structure(model: Model, source: str, allow: int = 0) -> None:
         Name of the logs in the message.
     allow : int, optional
         Number of such parameters that the caller can do with.
+    priors : collection of str, optional
+    scales : bool, optional
+        As in `unresolved`.
     """
-    found = structural(model)
+    found = unresolved(model, priors, scales=scales)
     if sum(len(x.names) for x in found) > allow:
         raise IdentificationError(f"{source}: {'; '.join(x.sentence(x.of_equations()) for x in found)}")
 
@@ -485,7 +514,7 @@ def unidentifiable(
     sentences : tuple of str
         The names, the combinations that are determined, and what to do.
     """
-    of_model = structural(model)
+    of_model = unresolved(model, layout.priors)
     ambiguous = {name for x in of_model for name in x.names}
     by_equations = np.array([name.partition("[")[0] in ambiguous for name in layout.names])
     from_log = collinear(layout.names, values, covariance, uncertain & ~by_equations)

@@ -1,10 +1,12 @@
 """The quadratic model of all intervals together: measurements, continuity, and priors.
 
 Unknowns are those that all intervals share (parameters, discrepancies, delay), and at the start of each interval w the
-state x_w and an unmodelled acceleration d_w that acts over the interval.  With ``F`` the rollout of an interval and
-``kappa`` the standard deviation of continuity, twice the cost is
+state x_w and an unmodelled acceleration d_w that acts over the interval.  With ``F`` the rollout of an interval,
+``kappa`` the standard deviation of continuity and m the prior means of the shared unknowns (zero for discrepancies and
+delay), twice the cost is
 
-    sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / kappa^2 + sum |e_w|^2 / tau^2 + |s|^2 / prior^2
+    sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / kappa^2 + sum |e_w|^2 / tau^2
+        + |s - m|^2 / prior^2
 
 The second sum is over neighbours within one log.  Unmodelled accelerations are a first-order Gauss-Markov process:
 ``e_w`` is ``(d_w - rho d_{w-1}) / sqrt(1 - rho^2)``, and ``d_w`` where a log begins.
@@ -63,7 +65,9 @@ class Fit:
     continuity_std : (n_x,) array
         Size of the jumps from interval to interval.
     prior : (n_s,) array
-        Size of the discrepancies and of the delay; infinite for the parameters.
+        Size of the discrepancies and of the delay; prior standard deviation of the parameters, infinite without one.
+    prior_mean : (n_s,) array
+        Prior means of the parameters; zero for the others.
     """
 
     shared: FloatArray
@@ -75,6 +79,7 @@ class Fit:
     rho: FloatArray
     continuity_std: FloatArray
     prior: FloatArray
+    prior_mean: FloatArray
 
 
 @dataclass(frozen=True)
@@ -158,7 +163,7 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     beforehand = 1.0 / np.square(fit.prior)
     border, corner, right = _shared_blocks(intervals, H[:, :k, k:], H[:, k:, k:], g[:, k:])
     system = Arrowhead(H[:, :k, :k], E, border, corner + np.diag(beforehand))
-    return NormalEquations(system, g[:, :k], right - beforehand * fit.shared, data_z, data_s)
+    return NormalEquations(system, g[:, :k], right - beforehand * (fit.shared - fit.prior_mean), data_z, data_s)
 
 
 def _in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
@@ -264,7 +269,7 @@ def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
         (weights * np.square(fit.residuals)).sum(),
         np.square((fit.x[1:] - ends) / fit.continuity_std).sum(),
         np.square(innovations(intervals, fit)).sum(),
-        np.square(fit.shared / fit.prior).sum(),
+        np.square((fit.shared - fit.prior_mean) / fit.prior).sum(),
     )
     total = float(sum(terms))
     return total if np.isfinite(total) else np.inf

@@ -13,6 +13,12 @@ The covariance has three parts: that of the fit, propagated through the projecti
 outside the regressor's column space, as a sample of forces that differ from log to log; and the change under a tenfold
 wider prior on model error, because a constant deviation from the model is not averaged out.
 
+A Gaussian prior of a parameter is a term of the fit, so that the parameters of an exact model have it already.  The
+projection is a regression on the motion, which leaves priors out: its result and covariance are combined with them as
+two independent Gaussian estimates, which is exact where the model is affine in its parameters and the errors are
+Gaussian.  So that no prior counts twice, the covariance of the fit is taken with priors that are a hundred times as
+wide, and the combination has what is left of their precision.
+
 References
 ----------
 Plumlee 2017 (discrepancies orthogonal to the model); White 1982 (inference under a wrong model).
@@ -56,6 +62,8 @@ __all__ = [
 
 
 _TINY, _UPPER = 1e-300, 0.975
+# Factor of the standard deviations of priors in the covariance that is combined with them.
+_WIDER = 100.0
 # Steps of reweighting, the width of Cauchy's loss in standard deviations, and what is rounding of an equation's scale.
 _REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
 
@@ -98,9 +106,11 @@ def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation:
     ProjectedEstimate
         Within the inclusive bounds; parameters on them have an infinite variance.
     """
-    found = _solution(intervals, fit)
-    change = _solution(intervals, _inflated_prior(intervals, fit, prior_inflation)).parameters - found.parameters
-    return replace(found, covariance=found.covariance + np.outer(change, change))
+    wide = _with_wide_priors(intervals, fit)
+    found = _solution(intervals, wide)
+    change = _solution(intervals, _inflated_prior(intervals, wide, prior_inflation)).parameters - found.parameters
+    found = replace(found, covariance=found.covariance + np.outer(change, change))
+    return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
 
 
 def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -126,6 +136,31 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     more = np.sqrt(np.maximum(1.0, np.square(sums).sum(axis=0) / (np.diag(s[:n_p]) + _TINY)))
     p, delay = fit.shared[:n_p], at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
     return ProjectedEstimate(p, s[:n_p] * np.outer(more, more), unexplained(intervals, fit, p), float(np.sqrt(delay)))
+
+
+def _with_wide_priors(intervals: ShootingIntervals, fit: Fit) -> Fit:
+    """The fit with priors of the parameters that hardly count, but keep its equations definite."""
+    factor = np.where(np.arange(len(fit.prior)) < intervals.n_p, _WIDER, 1.0)
+    return replace(fit, prior=factor * fit.prior)
+
+
+def _combined_with_priors(intervals: ShootingIntervals, fit: Fit, found: ProjectedEstimate) -> ProjectedEstimate:
+    """Estimate combined with the priors: ``p + K (m - p)`` and ``C - K H C`` with ``K = C H' (H C H' + S)^-1``.
+
+    H selects the parameters with a prior of mean m and covariance S; those on a bound stay there.
+    """
+    C, layout = found.covariance, intervals.layout
+    known = np.isfinite(np.diag(C))
+    with_prior = layout.with_prior[known[layout.with_prior]]
+    finite = np.where(np.outer(known, known), C, 0.0)
+    S = np.diag(np.square(layout.prior_std[with_prior]) / (1.0 - _WIDER**-2))
+    scale = np.sqrt(np.diag(finite)[with_prior] + np.diag(S))
+    inner = (finite[np.ix_(with_prior, with_prior)] + S) / np.outer(scale, scale)
+    K = np.linalg.solve(inner, (finite[with_prior] / scale[:, None])).T / scale
+    p = found.parameters + K @ (layout.prior_mean - found.parameters)[with_prior]
+    combined = finite - K @ finite[with_prior]
+    covariance = np.where(np.outer(known, known), 0.5 * (combined + combined.T), C)
+    return replace(found, parameters=p, covariance=covariance, unexplained=unexplained(intervals, fit, p))
 
 
 def _inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fit:
