@@ -12,7 +12,7 @@ Bellman and Astrom 1970 (structural identifiability); Gautier and Khalil 1990 (b
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -36,8 +36,8 @@ __all__ = [
     "null_space",
     "of_log",
     "structural",
+    "structural_slopes",
     "unidentifiable",
-    "unresolved",
     "vague_parameters",
 ]
 
@@ -156,32 +156,7 @@ def structural(model: Model) -> tuple[Ambiguity, ...]:
     return _joined(found)
 
 
-def unresolved(model: Model, priors: Collection[str], *, scales: bool = True) -> tuple[Ambiguity, ...]:
-    """Ambiguities of the equations that remain where some parameters have a prior.
-
-    Parameters
-    ----------
-    model : Model
-    priors : collection of str
-        Names of the parameters with a prior.
-    scales : bool, optional
-        Whether a prior determines the scale of homogeneous equations.  It does not in a linear regression: noise in W
-        draws all parameters to zero, which solves ``W p = 0``.
-
-    Returns
-    -------
-    tuple of Ambiguity
-    """
-    return tuple(
-        x
-        for x in structural(model)
-        if sum(n in priors for n in x.names) < len(x.names) - x.n_determined or (x.noun == "ratio" and not scales)
-    )
-
-
-def check_structure(
-    model: Model, source: str, allow: int = 0, priors: Collection[str] = (), *, scales: bool = True
-) -> None:
+def check_structure(model: Model, source: str, allow: int = 0) -> None:
     """Raise IdentificationError for parameters that the equations do not determine, whatever the motion.
 
     Parameters
@@ -191,13 +166,32 @@ def check_structure(
         Name of the logs in the message.
     allow : int, optional
         Number of such parameters that the caller can do with.
-    priors : collection of str, optional
-    scales : bool, optional
-        As in `unresolved`.
     """
-    found = unresolved(model, priors, scales=scales)
+    found = structural(model)
     if sum(len(x.names) for x in found) > allow:
         raise IdentificationError(f"{source}: {'; '.join(x.sentence(x.of_equations()) for x in found)}")
+
+
+def structural_slopes(model: Model, parameters: FloatArray, given: IntArray) -> FloatArray:
+    """Changes of the parameters that leave every motion as it is, per change of some of them.
+
+    Parameters
+    ----------
+    model : Model
+        Whose equations do not determine all parameters.
+    parameters : (n_p,) array
+        Each in its unit.
+    given : (k,) int array
+        Positions of parameters which, if they were known, would make the others identifiable.
+
+    Returns
+    -------
+    (n_p, k) array
+        1 and 0 in the rows of the given ones.
+    """
+    space = _null_space(_random_jacobian(model, parameters, np.random.default_rng(20240607)))
+    directions = space.directions / space.scale
+    return np.asarray((np.linalg.pinv(directions[:, given]) @ directions).T)
 
 
 def _random_parameters(bounds: Sequence[Parameter], rng: np.random.Generator) -> FloatArray:
@@ -514,7 +508,7 @@ def unidentifiable(
     sentences : tuple of str
         The names, the combinations that are determined, and what to do.
     """
-    of_model = unresolved(model, layout.priors)
+    of_model = structural(model)
     ambiguous = {name for x in of_model for name in x.names}
     by_equations = np.array([name.partition("[")[0] in ambiguous for name in layout.names])
     from_log = collinear(layout.names, values, covariance, uncertain & ~by_equations)

@@ -195,7 +195,7 @@ class _Task:
             pointwise=self.pointwise,
             given=self.given,
             input_hold=self.input_hold,
-            priors=self.known.priors,
+            priors=self.known.priors_of_fit,
         )
         check_motion(dataset)
         fitted = 0.5 if self.compares else 0.95

@@ -1,7 +1,12 @@
 """Parameters that are known beforehand: fixed ones, and those with a Gaussian prior.
 
 A fixed parameter is a constant of the equations that a method sees, so that no method distinguishes it; the estimate is
-completed by it afterwards.  A prior is part of the layout of a dataset's parameters.
+completed by it afterwards.  A prior is part of the layout of a dataset's parameters, for the method to use.
+
+Where the equations alone do not determine a parameter, such as the scale of homogeneous ones, its prior is all that
+is known of it.  The method sees its mean as a constant, and its deviation is added afterwards, along the changes of the
+parameters that leave every motion as it is.  A regression could not do that: noise in W draws the solution of
+``W p = 0`` to zero.
 """
 
 from __future__ import annotations
@@ -9,6 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -16,9 +22,12 @@ import numpy as np
 
 from diransac.data.dataset import ParameterLayout
 from diransac.errors import SettingsError
+from diransac.identification.identifiability import structural, structural_slopes
+from diransac.identification.uncertainty import combined
 from diransac.model.derivation import deserialize
 
 if TYPE_CHECKING:
+    from diransac.arrays import FloatArray
     from diransac.identification.estimate import Estimate
     from diransac.identification.suggestions import Suggestion
     from diransac.model import Model
@@ -71,12 +80,41 @@ class KnownParameters:
             raise SettingsError(f"{both[0]} is fixed and has a prior; give one of them")
         return cls(model, values, beforehand)
 
+    @cached_property
+    def held(self) -> tuple[str, ...]:
+        """Parameters with a prior that are constants of `free`, because the equations do not determine them.
+
+        Of as many parameters as are ambiguous, those with the smallest relative deviation.
+        """
+        model, found = self.model.with_fixed(self.fixed), list[str]()
+        for ambiguity in structural(model) if self.priors else ():
+            shared = [n for n in ambiguity.names if n in self.priors and not model.parameters[n].per_log]
+            shared.sort(key=lambda n: self.priors[n][1] / (abs(self.priors[n][0]) or np.finfo(float).tiny))
+            n_free = len(ambiguity.names) - ambiguity.n_determined
+            found += shared[:n_free] if len(shared) >= n_free else []
+        return tuple(found)
+
+    @cached_property
+    def _late(self) -> tuple[str, ...]:
+        """Parameters with a prior in the same ambiguity as one that is held: combined with the finished estimate."""
+        groups = structural(self.model.with_fixed(self.fixed)) if self.held else ()
+        names = [n for x in groups if set(x.names) & set(self.held) for n in x.names]
+        return tuple(n for n in names if n in self.priors and n not in self.held)
+
     def free(self) -> Model:
         """The model whose parameters are those to be identified."""
-        return self.model.with_fixed(self.fixed)
+        return self.model.with_fixed({**self.fixed, **{n: self.priors[n][0] for n in self.held}})
+
+    @property
+    def priors_of_fit(self) -> dict[str, tuple[float, float]]:
+        """Priors that are part of the estimation of `free`."""
+        return {n: x for n, x in self.priors.items() if n not in (*self.held, *self._late)}
 
     def completed(self, estimate: Estimate, n_logs: int) -> Estimate:
-        """The estimate of `free` with the fixed parameters: their values, and a covariance of zero.
+        """The estimate of `free` with all parameters.
+
+        Fixed ones have their values, and a covariance of zero.  Those that are held have their priors: the logs say
+        nothing of them, and the others change with them as the equations require, to first order.
 
         Parameters
         ----------
@@ -87,32 +125,51 @@ class KnownParameters:
         -------
         Estimate
         """
-        if not self.fixed:
+        if not (self.fixed or self.held):
             return estimate
-        names = ParameterLayout(self.model.parameters, n_logs).names
-        found = {**{n: self.fixed.get(n.partition("[")[0]) for n in names}, **estimate.parameters}
-        places = [names.index(n) for n in estimate.parameters]
-        covariance = np.zeros((len(names), len(names)))
+        layout = ParameterLayout(self.model.parameters, n_logs, self.priors)
+        known = {**self.fixed, **{n: self.priors[n][0] for n in self.held}}
+        every = {n: estimate.parameters.get(n, known.get(n.partition("[")[0], np.nan)) for n in layout.names}
+        values, covariance = np.array(list(every.values())), np.zeros((len(layout), len(layout)))
+        places = [layout.names.index(n) for n in estimate.parameters]
         covariance[np.ix_(places, places)] = estimate.covariance
+        if self.held:
+            values, covariance = self._with_held(layout, values, covariance)
         return replace(
             estimate,
-            parameters={n: float(found[n]) for n in names},  # type: ignore[arg-type]  # none is missing
+            parameters=dict(zip(layout.names, values.tolist(), strict=True)),
             covariance=covariance,
             suggestions=tuple(self._suggestion(x) for x in estimate.suggestions),
         )
 
+    def _with_held(
+        self, layout: ParameterLayout, values: FloatArray, covariance: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Values and covariance with the uncertainty of the parameters that are held, and late priors."""
+        names, changes = list(self.model.parameters), np.zeros((len(layout), len(self.held)))
+        free = np.array([i for i, n in enumerate(names) if n not in self.fixed])
+        model = self.model.with_fixed(self.fixed)
+        given = np.array([list(model.parameters).index(n) for n in self.held])
+        for i in range(layout.n_logs):
+            own = layout.index[i, free]
+            changes[own] = structural_slopes(model, values[own], given)
+        changes *= [self.priors[n][1] for n in self.held]
+        late = np.array([k for k, n in enumerate(layout.names) if n.partition("[")[0] in self._late], np.int64)
+        return combined(
+            values, covariance + changes @ changes.T, late, layout.prior_mean[late], np.square(layout.prior_std[late])
+        )
+
     def _suggestion(self, found: Suggestion) -> Suggestion:
-        """A suggestion for `free` as one for the whole model, under a name that no fixed parameter has."""
-        name = found.parameter
-        while name in self.fixed:
+        """A suggestion for `free` as one for the whole model, under a name that no other parameter has."""
+        name, constants = found.parameter, (*self.fixed, *self.held)
+        while name in constants:
             name += "_2"
         code = re.sub(rf"\bp\.{found.parameter}\b", f"p.{name}", found.code)
         term = deserialize(found.term)
         q, v, a, u = (ca.SX.sym(n, term.size1_in(i)) for i, n in enumerate("qvau"))
         p = ca.vertcat(*(ca.SX.sym(n) for n in self.model.parameters))
-        own = ca.vertcat(
-            *(x for n, x in zip(self.model.parameters, ca.vertsplit(p), strict=True) if n not in self.fixed)
-        )
+        every = zip(self.model.parameters, ca.vertsplit(p), strict=True)
+        own = ca.vertcat(*(x for n, x in every if n not in constants))
         h = ca.Function("term", [q, v, a, u, p], [term(q, v, a, u, own)], list("qvaup"), ["h"])
         return replace(found, parameter=name, code=code, term=h.serialize())
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from diransac.identification.estimators import BoundEstimator
 
-__all__ = ["N_BLOCKS", "jackknife_covariance", "score_inflation"]
+__all__ = ["N_BLOCKS", "combined", "jackknife_covariance", "score_inflation"]
 
 
 # Few and long: intervals have their nominal coverage while residuals are correlated over up to an eighth of a stretch
@@ -93,3 +93,35 @@ def score_inflation(scores: FloatArray, information: FloatArray, variance: float
     observed = (sums * np.linalg.solve(definite, sums.T).T).sum() * n_blocks / max(1, n_blocks - 1)
     ratio = observed / (n * variance) if variance > 0.0 else 1.0
     return max(1.0, float(ratio)) if np.isfinite(ratio) else 1.0
+
+
+def combined(
+    p: FloatArray, covariance: FloatArray, places: IntArray, mean: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Gaussian estimate combined with independent Gaussian knowledge of some parameters.
+
+    ``p + K (m - H p)`` and ``C - K H C`` with ``K = C H' (H C H' + S)^-1``, where H selects the parameters.
+
+    Parameters
+    ----------
+    p : (n,) array
+    covariance : (n, n) array
+        C; parameters of infinite variance are left as they are.
+    places : (k,) int array
+        Positions of the parameters that are known.
+    mean, variance : (k,) array
+        m and the diagonal of S.
+
+    Returns
+    -------
+    (n,) array, (n, n) array
+    """
+    finite = np.isfinite(np.diag(covariance))
+    among = finite[places]
+    places, mean, variance = places[among], mean[among], variance[among]
+    C = np.where(np.outer(finite, finite), covariance, 0.0)
+    scale = np.sqrt(np.diag(C)[places] + variance)
+    inner = (C[np.ix_(places, places)] + np.diag(variance)) / np.outer(scale, scale)
+    K = np.linalg.solve(inner, C[places] / scale[:, None]).T / scale
+    less = C - K @ C[places]
+    return p + K @ (mean - p[places]), np.where(np.outer(finite, finite), 0.5 * (less + less.T), covariance)

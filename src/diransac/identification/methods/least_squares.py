@@ -139,10 +139,8 @@ def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
     IdentificationError
         A parameter is not identifiable from the whole dataset; the message names it.
     """
-    priors, linear = dataset.layout.priors, not isinstance(estimator, NonlinearLeastSquares)
-    check_structure(dataset.model, dataset.source, priors=priors, scales=not linear)
-    if linear or not priors:
-        check_known_terms(dataset)
+    check_structure(dataset.model, dataset.source)
+    check_known_terms(dataset)
     bound = estimator.bind(dataset)
     if bound.select([np.arange(bound.n_rows)]).well_defined()[0]:
         return bound

@@ -41,6 +41,9 @@ __all__ = [
     "with_residuals",
 ]
 
+# A prior may alone determine a parameter, with less than the ridge's part of the precision of continuity.
+_FINE_RIDGE = 1e-15
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -162,7 +165,8 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     g[:-1, n_x:k] += rho * deviation[1:]
     beforehand = 1.0 / np.square(fit.prior)
     border, corner, right = _shared_blocks(intervals, H[:, :k, k:], H[:, k:, k:], g[:, k:])
-    system = Arrowhead(H[:, :k, :k], E, border, corner + np.diag(beforehand))
+    blocks = (H[:, :k, :k], E, border, corner + np.diag(beforehand))
+    system = Arrowhead(*blocks, _FINE_RIDGE) if len(intervals.layout.with_prior) else Arrowhead(*blocks)
     return NormalEquations(system, g[:, :k], right - beforehand * (fit.shared - fit.prior_mean), data_z, data_s)
 
 

@@ -37,6 +37,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.hypotheses import WeakForm, equation_scales
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.refinement import weights_of
+from diransac.identification.uncertainty import combined
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
@@ -145,21 +146,11 @@ def _with_wide_priors(intervals: ShootingIntervals, fit: Fit) -> Fit:
 
 
 def _combined_with_priors(intervals: ShootingIntervals, fit: Fit, found: ProjectedEstimate) -> ProjectedEstimate:
-    """Estimate combined with the priors: ``p + K (m - p)`` and ``C - K H C`` with ``K = C H' (H C H' + S)^-1``.
-
-    H selects the parameters with a prior of mean m and covariance S; those on a bound stay there.
-    """
-    C, layout = found.covariance, intervals.layout
-    known = np.isfinite(np.diag(C))
-    with_prior = layout.with_prior[known[layout.with_prior]]
-    finite = np.where(np.outer(known, known), C, 0.0)
-    S = np.diag(np.square(layout.prior_std[with_prior]) / (1.0 - _WIDER**-2))
-    scale = np.sqrt(np.diag(finite)[with_prior] + np.diag(S))
-    inner = (finite[np.ix_(with_prior, with_prior)] + S) / np.outer(scale, scale)
-    K = np.linalg.solve(inner, (finite[with_prior] / scale[:, None])).T / scale
-    p = found.parameters + K @ (layout.prior_mean - found.parameters)[with_prior]
-    combined = finite - K @ finite[with_prior]
-    covariance = np.where(np.outer(known, known), 0.5 * (combined + combined.T), C)
+    """The estimate combined with what its covariance lacks of the priors.  Parameters on a bound stay there."""
+    layout = intervals.layout
+    variance = np.square(layout.prior_std[layout.with_prior]) / (1.0 - _WIDER**-2)
+    mean = layout.prior_mean[layout.with_prior]
+    p, covariance = combined(found.parameters, found.covariance, layout.with_prior, mean, variance)
     return replace(found, parameters=p, covariance=covariance, unexplained=unexplained(intervals, fit, p))
 
 
