@@ -55,13 +55,17 @@ class KnownParameters:
 
     @classmethod
     def of(cls, model: Model, fixed: object, priors: object) -> KnownParameters:
-        """What the arguments ``fixed`` and ``priors`` of `identify` say of a model.
+        """Fixed values and priors from the arguments of `identify`, checked.
 
         Parameters
         ----------
         model : Model
         fixed : mapping of str to float or None, iterable of str, or None
         priors : mapping of str to (float, float), or None
+
+        Returns
+        -------
+        KnownParameters
 
         Raises
         ------

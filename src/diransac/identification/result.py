@@ -445,6 +445,7 @@ class Result:
         return aligned(rows)
 
     def _prior_lines(self) -> list[str]:
+        """The priors, in a line; none without them."""
         texts = [f"{n} = {mean:.6g} ± {std:.2g} {self.units[n]}" for n, (mean, std) in self.priors.items()]
         return [f"prior of {'; '.join(texts)}"] if texts else []
 
