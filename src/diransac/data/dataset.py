@@ -34,6 +34,8 @@ class ParameterLayout:
         Parameters of the model by name.
     n_logs : int, optional
         Number of logs that are identified together.
+    priors : mapping of str to (float, float), optional
+        Mean and standard deviation of the Gaussian prior of a parameter, in its unit; for a per-log one, of each value.
 
     Attributes
     ----------
@@ -43,10 +45,17 @@ class ParameterLayout:
         Unit and bounds of each of the n.
     index : (n_logs, n_p) int array
         Positions of each log's parameters in the vector.
+    prior_mean, prior_std : (n,) array
+        Mean and standard deviation of the prior of each of the n; 0 and infinite without one.
     """
 
-    def __init__(self, parameters: Mapping[str, Parameter], n_logs: int = 1) -> None:
-        self.parameters, self.n_logs = dict(parameters), n_logs
+    def __init__(
+        self,
+        parameters: Mapping[str, Parameter],
+        n_logs: int = 1,
+        priors: Mapping[str, tuple[float, float]] | None = None,
+    ) -> None:
+        self.parameters, self.n_logs, self.priors = dict(parameters), n_logs, dict(priors or {})
         names: list[str] = []
         columns: list[list[int]] = []
         for name, parameter in parameters.items():
@@ -56,9 +65,16 @@ class ParameterLayout:
         self.names = tuple(names)
         self.bounds = tuple(self.parameters[name.partition("[")[0]] for name in names)
         self.index: IntArray = np.array(columns, np.int64).reshape(len(columns), n_logs).T
+        beforehand = np.array([self.priors.get(name.partition("[")[0], (0.0, np.inf)) for name in names])
+        self.prior_mean, self.prior_std = beforehand.T
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @cached_property
+    def with_prior(self) -> IntArray:
+        """Positions of the parameters that have a prior."""
+        return np.flatnonzero(np.isfinite(self.prior_std))
 
     @property
     def is_shared(self) -> bool:
@@ -185,6 +201,7 @@ class Dataset:
         pointwise: bool = True,
         given: Sequence[Log] | None = None,
         input_hold: str | None = None,
+        priors: Mapping[str, tuple[float, float]] | None = None,
     ) -> Dataset:
         """The dataset of one log or several.
 
@@ -200,6 +217,8 @@ class Dataset:
             Logs as the user gave them, where ``logs`` were derived from them.
         input_hold : str, optional
             Requested hold of the inputs.
+        priors : mapping of str to (float, float), optional
+            Mean and standard deviation of the Gaussian prior of a parameter.
 
         Returns
         -------
@@ -214,7 +233,7 @@ class Dataset:
         segments = [bind_log(model, log, also, pointwise=pointwise) for log in several]
         found = {name for one in segments for name in one.signals}
         signals = tuple(name for name in model.signals if name in found)
-        layout = ParameterLayout(model.parameters, len(several))
+        layout = ParameterLayout(model.parameters, len(several), priors)
         own = several if given is None else tuple(given)
         return cls(model, own, tuple(x.with_signals(signals) for x in segments), layout, input_hold)
 
@@ -319,7 +338,8 @@ class Dataset:
         signals = tuple(n for n in self.signals if n in found)
         narrowed = tuple(one.with_signals(signals) for one in segments)
         given = tuple(self.given[i] for i in logs)
-        return replace(self, given=given, segments=narrowed, layout=ParameterLayout(self.model.parameters, len(logs)))
+        layout = ParameterLayout(self.model.parameters, len(logs), self.layout.priors)
+        return replace(self, given=given, segments=narrowed, layout=layout)
 
     def on_given_logs(self, masks: Sequence[BoolArray]) -> BoolArray:
         """Mask over the rows of all given logs, log after log, from one mask per segment."""

@@ -26,7 +26,7 @@ from diransac.simulation import Measurements, RolloutBatch, rollouts
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset
+    from diransac.data.dataset import Dataset, ParameterLayout
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
@@ -76,7 +76,7 @@ def _linear(settings: LoDiransacSettings, intervals: ShootingIntervals, motion: 
     weak = weak_form(intervals, motion)
     n = len(intervals)
     few = np.unique(np.linspace(0, n - 1, min(settings.n_screening_intervals, n)).astype(int))
-    samples = _admitted(intervals, weak.solve(_samples(settings, weak, seed)))
+    samples = _admitted(intervals, weak.solve(_samples(settings, weak, seed), intervals.layout))
     if not len(samples):
         return samples
     order = np.argsort(robust_scores(intervals, motion, samples, few), kind="stable")
@@ -117,12 +117,18 @@ class WeakForm:
     W: FloatArray
     b: FloatArray
 
-    def solve(self, chosen: BoolArray) -> FloatArray:
-        """Parameters ``(n_sets, n_p)`` by least squares of each set of rows ``(n_sets, n, r)``."""
+    def solve(self, chosen: BoolArray, layout: ParameterLayout | None = None) -> FloatArray:
+        """Parameters ``(n_sets, n_p)`` by least squares of each set of rows ``(n_sets, n, r)``.
+
+        Rows have residuals of order one; the priors of a layout are further rows.
+        """
         n, r, n_p = self.W.shape
         masks = chosen.reshape(len(chosen), -1).astype(np.float64)
         G = (masks @ np.einsum("nri,nrj->nrij", self.W, self.W).reshape(n * r, -1)).reshape(-1, n_p, n_p)
         h = masks @ (self.W * self.b[:, :, None]).reshape(n * r, -1)
+        if layout is not None:
+            precision = 1.0 / np.square(layout.prior_std)
+            G, h = G + np.diag(precision), h + precision * layout.prior_mean
         d = np.sqrt(np.einsum("kii->ki", G)) + 1e-300
         G = G / d[:, :, None] / d[:, None, :] + 1e-10 * np.eye(n_p)
         return np.asarray(np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d)

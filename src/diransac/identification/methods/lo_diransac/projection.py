@@ -14,6 +14,12 @@ outside the regressor's column space, as a sample of forces that differ from log
 deviation from the model is not averaged out, the changes under a tenfold wider prior on model error and under least
 squares without a robust loss.
 
+A Gaussian prior of a parameter is a term of the fit, so that the parameters of an exact model have it already.  The
+projection is a regression on the motion, which leaves priors out: its result and covariance are combined with them as
+two independent Gaussian estimates, which is exact where the model is affine in its parameters and the errors are
+Gaussian.  So that no prior counts twice, the covariance of the fit is taken with priors that are a hundred times as
+wide, and the combination has what is left of their precision.
+
 References
 ----------
 Plumlee 2017 (discrepancies orthogonal to the model); White 1982 (inference under a wrong model).
@@ -32,6 +38,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.hypotheses import WeakForm, equation_scales
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.refinement import weights_of
+from diransac.identification.uncertainty import combined
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
@@ -57,6 +64,8 @@ __all__ = [
 
 
 _TINY, _UPPER = 1e-300, 0.975
+# Factor of the standard deviations of priors in the covariance that is combined with them.
+_WIDER = 100.0
 # Steps of reweighting, the width of Cauchy's loss in standard deviations, and what is rounding of an equation's scale.
 _REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
 
@@ -99,9 +108,11 @@ def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation:
     ProjectedEstimate
         Within the inclusive bounds; parameters on them have an infinite variance.
     """
-    found = _solution(intervals, fit)
-    change = _solution(intervals, _inflated_prior(intervals, fit, prior_inflation)).parameters - found.parameters
-    return replace(found, covariance=found.covariance + np.outer(change, change))
+    wide = _with_wide_priors(intervals, fit)
+    found = _solution(intervals, wide)
+    change = _solution(intervals, _inflated_prior(intervals, wide, prior_inflation)).parameters - found.parameters
+    found = replace(found, covariance=found.covariance + np.outer(change, change))
+    return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
 
 
 def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -127,6 +138,21 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     more = np.sqrt(np.maximum(1.0, np.square(sums).sum(axis=0) / (np.diag(s[:n_p]) + _TINY)))
     p, delay = fit.shared[:n_p], at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
     return ProjectedEstimate(p, s[:n_p] * np.outer(more, more), unexplained(intervals, fit, p), float(np.sqrt(delay)))
+
+
+def _with_wide_priors(intervals: ShootingIntervals, fit: Fit) -> Fit:
+    """The fit with priors of the parameters that hardly count, but keep its equations definite."""
+    factor = np.where(np.arange(len(fit.prior)) < intervals.n_p, _WIDER, 1.0)
+    return replace(fit, prior=factor * fit.prior)
+
+
+def _combined_with_priors(intervals: ShootingIntervals, fit: Fit, found: ProjectedEstimate) -> ProjectedEstimate:
+    """The estimate combined with what its covariance lacks of the priors.  Parameters on a bound stay there."""
+    layout = intervals.layout
+    variance = np.square(layout.prior_std[layout.with_prior]) / (1.0 - _WIDER**-2)
+    mean = layout.prior_mean[layout.with_prior]
+    p, covariance = combined(found.parameters, found.covariance, layout.with_prior, mean, variance)
+    return replace(found, parameters=p, covariance=covariance, unexplained=unexplained(intervals, fit, p))
 
 
 def _inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fit:
