@@ -130,9 +130,10 @@ class Segment:
         coordinate = name.removesuffix("_dot")
         if rule == "robust" and self.model.kinematics is None and coordinate in self.present:
             return self._line(coordinate, _ROWS_FOR_SLOPE)[1]
+        hint = "" if name in self.model.first_order else "pass --differentiate, or "
         raise LogError(
-            f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; pass '
-            f"--differentiate, or give initial_state = {{{name} = ...}}"
+            f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; {hint}give '
+            f"initial_state = {{{name} = ...}}"
         )
 
     def _first(self, name: str) -> float:
@@ -233,7 +234,7 @@ def long_runs(mask: BoolArray, least: int) -> BoolArray:
 
 
 def _raise_missing(model: Model, log: Log, name: str) -> None:
-    derivable = name in model.velocities or name in model.accelerations
+    derivable = name in model.velocities_of_motion or name in model.accelerations
     hint = (
         "pass --differentiate to estimate velocities and accelerations" if derivable else "name its column with --map"
     )

@@ -260,13 +260,14 @@ def _rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRo
 
 
 def _unmeasured(intervals: ShootingIntervals) -> list[str]:
-    """Coordinates, or velocities of a model with kinematics, of which neither value nor derivative is measured."""
-    model, seen = intervals.model, np.asarray(intervals.known.any(axis=0))
-    n_q, n_v = model.n_q, model.n_v
+    """Coordinates, velocities of a model with kinematics, and states of first order that no signal determines."""
+    model = intervals.model
+    seen = {n for n, k in zip(model.signals, intervals.known.any(axis=0), strict=True) if k}
+    lost = [chain[0] for chain in model.chains if seen.isdisjoint(chain)]
     if model.kinematics is None:
-        return [n for i, n in enumerate(model.coordinates) if not seen[[i, n_q + i, n_q + n_v + i]].any()]
-    lost = [n for i, n in enumerate(model.velocities) if not seen[[n_q + i, n_q + n_v + i]].any()]
-    return [] if seen[:n_q].any() else lost
+        return lost
+    inferred = not seen.isdisjoint(model.coordinates)
+    return [n for n in lost if n in model.first_order or (n in model.velocities and not inferred)]
 
 
 def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
