@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from diransac.model import Model, Parameter
     from diransac.simulation.compiler import Map
 
-__all__ = ["NonlinearLeastSquares"]
+__all__ = ["NonlinearLeastSquares", "ParameterChart"]
 
 
 _START_DECADES = 3.0
@@ -93,7 +93,7 @@ class _BoundNonlinear:
         self._log_of_row = np.repeat(np.arange(len(parts)), [len(x) for x, _, _ in parts])
         self._scale = np.sqrt(np.square(self._accelerations).mean(axis=0))
         self._scale[self._scale == 0.0] = 1.0
-        self._chart = _Chart(self._layout.bounds)
+        self._chart = ParameterChart(self._layout.bounds)
         self._evaluate = _compiled(model, known)
         self.n_rows = len(self._state)
         self._n_p = len(self._layout)
@@ -234,7 +234,7 @@ def _usable(one: Segment, known: Sequence[int]) -> tuple[FloatArray, FloatArray,
     return np.hstack([q, v]), one.acting_inputs()[one.valid], a[:, known]
 
 
-class _Chart:
+class ParameterChart:
     """Free coordinates of bounded parameters: the logarithm where a parameter is positive, itself elsewhere."""
 
     def __init__(self, parameters: Sequence[Parameter]) -> None:

@@ -45,6 +45,7 @@ from diransac.identification.methods.lo_diransac.smoothing import (
     smooth,
     stuck_rows,
 )
+from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states, with_unmeasured_states
 from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
 
 if TYPE_CHECKING:
@@ -192,6 +193,9 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
     report(callback, "smoothing", 0.0)
     intervals, motion, notes = _prepared(settings, dataset)
+    if unmeasured_states(intervals):
+        report(callback, "unmeasured states", 0.05)
+        motion = _completed(intervals, motion, dataset)
     report(callback, "drawing hypotheses", 0.1)
     hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
     unit = discrepancy_units(intervals, motion, hypotheses[0])
@@ -225,6 +229,18 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     return replace(estimate, suggestions=terms)
 
 
+def _completed(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -> Motion:
+    """The motion with its unmeasured states.  Raises IdentificationError: no simulation gives them."""
+    found = with_unmeasured_states(intervals, motion)
+    if found is None:
+        names = ", ".join(unmeasured_states(intervals))
+        raise IdentificationError(
+            f"{dataset.source}: nothing measures {names}, nor a derivative, and every simulation of {names} from the "
+            "other signals diverges; measure it, or bound the parameters of its equation"
+        )
+    return found
+
+
 def _hypotheses(
     settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
 ) -> FloatArray:
@@ -232,10 +248,6 @@ def _hypotheses(
     found = find_hypotheses(settings, intervals, motion, seed, dataset)
     if len(found):
         return found
-    unmeasured = _unmeasured(intervals)
-    if unmeasured:
-        what = f"nothing measures {', '.join(unmeasured)}, nor a derivative"
-        raise IdentificationError(f"{dataset.source}: {what}; lo-diransac needs a signal of each coordinate")
     cause = cause_of_refusal(dataset.model, dataset.layout, _rows_of_logs(intervals, motion))
     raise IdentificationError(f"{dataset.source}: no sample gives parameters within their bounds: {cause}")
 
@@ -257,17 +269,6 @@ def _rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRo
     logged = [np.arange(x.start, x.stop)[intervals.is_logged[x]] for x in intervals.rows_of_logs]
     parts = [np.split(motion.signals[rows], [n_q, n_q + n_v], axis=1) for rows in logged]
     return [MotionRows(q, v, a, intervals.inputs[rows]) for (q, v, a), rows in zip(parts, logged, strict=True)]
-
-
-def _unmeasured(intervals: ShootingIntervals) -> list[str]:
-    """Coordinates, velocities of a model with kinematics, and states of first order that no signal determines."""
-    model = intervals.model
-    seen = {n for n, k in zip(model.signals, intervals.known.any(axis=0), strict=True) if k}
-    lost = [chain[0] for chain in model.chains if seen.isdisjoint(chain)]
-    if model.kinematics is None:
-        return lost
-    inferred = not seen.isdisjoint(model.coordinates)
-    return [n for n in lost if n in model.first_order or (n in model.velocities and not inferred)]
 
 
 def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
