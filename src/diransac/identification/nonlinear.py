@@ -246,9 +246,11 @@ class ParameterChart:
             self._upper = np.where(self._log, np.minimum(np.log(np.maximum(upper, 0.0)), _LOG_BOUND), upper)
 
     def to_parameters(self, free: FloatArray) -> FloatArray:
+        """Parameters ``(..., n_p)`` of free coordinates."""
         return np.where(self._log, np.exp(np.where(self._log, free, 0.0)), free)
 
     def to_free(self, parameters: FloatArray) -> FloatArray:
+        """Free coordinates ``(..., n_p)`` of parameters."""
         return np.where(self._log, np.log(np.where(self._log, np.maximum(parameters, 1e-300), 1.0)), parameters)
 
     def slope(self, free: FloatArray) -> FloatArray:
@@ -256,6 +258,7 @@ class ParameterChart:
         return np.where(self._log, self.to_parameters(free), 1.0)
 
     def clip(self, free: FloatArray) -> FloatArray:
+        """Free coordinates within their bounds."""
         return np.clip(free, self._lower, self._upper)
 
     def starts(self, n: int) -> FloatArray:

@@ -45,7 +45,11 @@ from diransac.identification.methods.lo_diransac.smoothing import (
     smooth,
     stuck_rows,
 )
-from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states, with_unmeasured_states
+from diransac.identification.methods.lo_diransac.unmeasured import (
+    measured_signals,
+    unmeasured_states,
+    with_unmeasured_states,
+)
 from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
 
 if TYPE_CHECKING:
@@ -195,6 +199,8 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     intervals, motion, notes = _prepared(settings, dataset)
     if unmeasured_states(intervals):
         report(callback, "unmeasured states", 0.05)
+        allowed, measured = len(dataset.model.parameters) - 1, measured_signals(intervals)
+        check_structure(dataset.model, dataset.source, allowed, measured)
         motion = _completed(intervals, motion, dataset)
     report(callback, "drawing hypotheses", 0.1)
     hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
@@ -364,7 +370,10 @@ def _estimate(
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
     units = parameter_units(intervals, found.motion, result.parameters)
     lost = ~((spans < units) | (spans < np.abs(result.parameters)))
-    lost, combinations = unidentifiable(dataset.model, dataset.layout, result.parameters, result.covariance, lost)
+    measured = measured_signals(intervals) if unmeasured_states(intervals) else None
+    lost, combinations = unidentifiable(
+        dataset.model, dataset.layout, result.parameters, result.covariance, lost, measured
+    )
     covariance = result.covariance.copy()
     covariance[lost] = covariance[:, lost] = np.inf
     nonlinear = bool(dataset.model.nonlinear_parameters)

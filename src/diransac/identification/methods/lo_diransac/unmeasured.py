@@ -3,8 +3,8 @@
 Their equations are simulated over whole logs, driven by the inputs and by the smoothed motion of all other states.  An
 observer compares the other accelerations that the equations then give with the motion, ``e' = a(q, v, u, p) +
 b (v - e)``: the error ``e - v`` is that of the acceleration, low-pass filtered.  Parameters and initial values of the
-unmeasured states are found by least squares (Levenberg-Marquardt) from many random starts, which are lanes of one batch.  The
-trajectories take the place of smoothed signals until shooting estimates these states with all others.
+unmeasured states are found by least squares (Levenberg-Marquardt) from many random starts, which are lanes of one
+batch.  The trajectories take the place of smoothed signals until shooting estimates these states with all others.
 
 References
 ----------
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.model.derivation import Symbols
 
-__all__ = ["unmeasured_states", "with_unmeasured_states"]
+__all__ = ["measured_signals", "unmeasured_states", "with_unmeasured_states"]
 
 # Random starts and their steps; the number of those that go on, and their further steps.
 _N_STARTS, _N_STEPS, _N_FINALISTS, _N_FURTHER_STEPS = 256, 15, 12, 60
@@ -58,12 +58,28 @@ def unmeasured_states(intervals: ShootingIntervals) -> tuple[str, ...]:
         In the order of the model's states.
     """
     model = intervals.model
-    seen = {n for n, k in zip(model.signals, intervals.known.any(axis=0), strict=True) if k}
+    seen = set(measured_signals(intervals))
     lost = {name for chain in model.chains if seen.isdisjoint(chain) for name in chain}
     if model.kinematics is not None:
         inferred = () if seen.isdisjoint(model.coordinates) else model.velocities_of_motion
         lost -= {*model.coordinates, *inferred}
     return tuple(n for n in model.state if n in lost)
+
+
+def measured_signals(intervals: ShootingIntervals) -> tuple[str, ...]:
+    """Names of the signals with a sample.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+
+    Returns
+    -------
+    tuple of str
+        In the order of the model's signals.
+    """
+    seen = np.flatnonzero(intervals.known.any(axis=0))
+    return tuple(intervals.model.signals[i] for i in seen)
 
 
 def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Motion | None:
@@ -236,19 +252,21 @@ class _DrivenStates:
 
 def _least_squares(problem: _DrivenStates, z: FloatArray, n_steps: int) -> tuple[FloatArray, FloatArray]:
     """Unknowns (n_starts, n) and costs (n_starts,) after steps of Levenberg and Marquardt from every start."""
-    now, damping = problem.linearized(z), np.full(len(z), _DAMPING)
+    (cost, gradient, matrix), damping = problem.linearized(z), np.full(len(z), _DAMPING)
     for _ in range(n_steps):
-        cost, gradient, matrix = now
         scale = np.sqrt(np.einsum("kii->ki", matrix)) + 1e-300
         scaled = matrix / scale[:, :, None] / scale[:, None, :] + damping[:, None, None] * np.eye(z.shape[1])
         step = -np.linalg.solve(scaled, (gradient / scale)[:, :, None])[:, :, 0] / scale
         trial = problem.moved(z, step)
         then = problem.linearized(trial)
         better = then[0] < cost
-        gain = np.where(better, cost - then[0], np.inf)
+        settled = better & (cost - then[0] < _CONVERGED * cost) | (damping >= _DAMPING_BOUNDS[1])
         z = np.where(better[:, None], trial, z)
-        now = tuple(np.where(better.reshape(-1, *(1,) * (x.ndim - 1)), y, x) for x, y in zip(now, then, strict=True))
+        cost, gradient, matrix = (
+            np.where(better.reshape(-1, *(1,) * (x.ndim - 1)), y, x)
+            for x, y in zip((cost, gradient, matrix), then, strict=True)
+        )
         damping = np.clip(np.where(better, _LESS, _MORE) * damping, *_DAMPING_BOUNDS)
-        if ((gain < _CONVERGED * cost) | (damping == _DAMPING_BOUNDS[1])).all():
+        if settled.all():
             break
-    return z, now[0]
+    return z, cost
