@@ -234,10 +234,11 @@ def long_runs(mask: BoolArray, least: int) -> BoolArray:
 
 
 def _raise_missing(model: Model, log: Log, name: str) -> None:
-    derivable = name in model.velocities_of_motion or name in model.accelerations
-    hint = (
-        "pass --differentiate to estimate velocities and accelerations" if derivable else "name its column with --map"
-    )
+    hint = "name its column with --map"
+    if name in model.first_order:
+        hint = "pass --differentiate, with which lo-diransac estimates a state that nothing measures"
+    elif name in model.velocities or name in model.accelerations:
+        hint = "pass --differentiate to estimate velocities and accelerations"
     if name in log.unusable:
         raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; correct the column, or {hint}')
     found = ", ".join(("t", *log.names))

@@ -30,6 +30,7 @@ __all__ = [
     "limits_of",
     "reference_weights",
     "route_of",
+    "start_at_rest",
     "trim_at",
     "weights_of",
 ]
@@ -329,11 +330,27 @@ def trim_at(
     if given is not None:
         values = _named_values("trim", "input", given, tuple(model.inputs))
         return np.array([values.get(name, 0.0) for name in model.inputs])
+    return _rest_inputs(model, parameters, *_rest_state(model, start), limits)
+
+
+def start_at_rest(model: Model, parameters: FloatArray, start: Waypoint, trim: FloatArray) -> Waypoint:
+    """The first waypoint, and in it the states of first order that it leaves free, at rest under inputs (n_u,)."""
+    x, free = _rest_state(model, start)
+    settled = _least_acceleration(model, parameters, x, free, Limits(trim, trim))[2]
+    if not free.any() or not np.isfinite(settled).all():
+        return start
+    settled[list(start.states)] = start.values
+    fixed = np.union1d(start.states, np.flatnonzero(free)).astype(int)
+    return Waypoint(tuple(fixed.tolist()), settled[fixed])
+
+
+def _rest_state(model: Model, start: Waypoint) -> tuple[FloatArray, BoolArray]:
+    """State (n_x,) at rest at the first waypoint, and the mask (n_x,) of its states of first order that are free."""
     x, free = np.zeros(len(model.state)), np.isin(model.state, list(model.first_order))
     for j, value in zip(start.states, start.values, strict=True):
         if j < model.n_q or free[j]:
             x[j], free[j] = value, False
-    return _rest_inputs(model, parameters, x, free, limits)
+    return x, free
 
 
 # Trim ----------------------------------------------------------------------------------------------------------------
@@ -352,13 +369,13 @@ def _rest_inputs(model: Model, parameters: FloatArray, x: FloatArray, free: Bool
     """
     lower, upper = limits.lower, limits.upper
     unlimited = np.full(model.n_u, np.inf)
-    trim, residual = _least_acceleration(model, parameters, x, free, limits)
+    trim, residual, _ = _least_acceleration(model, parameters, x, free, limits)
     scale = 1.0 + np.abs(_accelerations(model, parameters, x, np.zeros(model.n_u))).max()
     if np.abs(residual).max() <= _TRIM_TOLERANCE * scale:
         return trim
     shown = [j for j, n in enumerate(model.state) if n in model.coordinates or (n in model.first_order and not free[j])]
     state_text = ", ".join(f"{model.state[j]} = {x[j]:g}" for j in shown)
-    unlimited_trim, left = _least_acceleration(model, parameters, x, free, Limits(-unlimited, unlimited))
+    unlimited_trim, left, _ = _least_acceleration(model, parameters, x, free, Limits(-unlimited, unlimited))
     if np.isfinite(left).all() and np.abs(left).max() <= _TRIM_TOLERANCE * scale:
         needs = ", ".join(
             f"{n} would have to be {v:.4g}, but may be {low:.4g} to {high:.4g}"
@@ -379,8 +396,8 @@ def _rest_inputs(model: Model, parameters: FloatArray, x: FloatArray, free: Bool
 
 def _least_acceleration(
     model: Model, parameters: FloatArray, x: FloatArray, free: BoolArray, limits: Limits
-) -> tuple[FloatArray, FloatArray]:
-    """Inputs of least squared acceleration, and this acceleration (n_v,); the free of the states x are unknown, too."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Inputs (n_u,) of least squared acceleration, this acceleration (n_v,), and the state (n_x,), free where given."""
     from scipy.optimize import lsq_linear  # slow to import
 
     x, n_free = x.copy(), int(free.sum())
@@ -392,7 +409,7 @@ def _least_acceleration(
         A, B = (np.array(J)[model.n_q :] for J in model.linearization(x, u, parameters))
         J, a = np.hstack([A[:, free], B]), _accelerations(model, parameters, x, u)
         if not (np.isfinite(J).all() and np.isfinite(a).all()):
-            return u, np.full(model.n_v, np.nan)
+            return u, np.full(model.n_v, np.nan), np.full(len(x), np.nan)
         target = J[:, open_ended] @ z[open_ended] - a
         new = z.copy()
         if open_ended.any():
@@ -403,7 +420,7 @@ def _least_acceleration(
         if converged:
             break
     x[free] = z[:n_free]
-    return z[n_free:], _accelerations(model, parameters, x, z[n_free:])
+    return z[n_free:], _accelerations(model, parameters, x, z[n_free:]), x
 
 
 def _accelerations(model: Model, parameters: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:

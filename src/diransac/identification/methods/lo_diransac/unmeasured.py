@@ -4,7 +4,8 @@ Their equations are simulated over whole logs, driven by the inputs and by the s
 observer compares the other accelerations that the equations then give with the motion, ``e' = a(q, v, u, p) +
 b (v - e)``: the error ``e - v`` is that of the acceleration, low-pass filtered.  Parameters and initial values of the
 unmeasured states are found by least squares (Levenberg-Marquardt) from many random starts, which are lanes of one
-batch.  The trajectories take the place of smoothed signals until shooting estimates these states with all others.
+batch.  The best of them simulates the shooting intervals best, by the scores of hypotheses.  Its trajectories take the
+place of smoothed signals until shooting estimates these states with all others.
 
 References
 ----------
@@ -21,6 +22,7 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
+from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.smoothing import Motion
 from diransac.identification.nonlinear import ParameterChart
 from diransac.model import Model, Parameter
@@ -36,8 +38,9 @@ __all__ = ["measured_signals", "unmeasured_states", "with_unmeasured_states"]
 _N_STARTS, _N_STEPS, _N_FINALISTS, _N_FURTHER_STEPS = 256, 15, 12, 60
 # Largest factor of a positive parameter in a step.
 _LARGEST_FACTOR = 10.0
-# Bandwidth of the observers times the duration of a shooting interval; integration steps per sample.
-_SETTLED, _SUBSTEPS = 4.0, 2
+# Memory of the observers, in shooting intervals, over which errors of the smoothed motion average out; integration
+# steps per sample.
+_MEMORY, _SUBSTEPS = 4.0, 2
 # Damping at the start, its bounds, and its factors after a step down and after one up; the least gain of a step.
 _TINY = 1e-9
 _DAMPING, _DAMPING_BOUNDS, _LESS, _MORE, _CONVERGED = 1e-2, (1e-9, 1e9), 0.2, 6.0, 1e-9
@@ -94,17 +97,25 @@ def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Moti
     Returns
     -------
     Motion or None
-        None if every simulation of the unmeasured states diverges.
+        None if every simulation diverges.
     """
     problem = _DrivenStates(intervals, motion, unmeasured_states(intervals))
     z, cost = _least_squares(problem, problem.starts(), _N_STEPS)
     z, cost = _least_squares(problem, z[np.argsort(cost, kind="stable")[:_N_FINALISTS]], _N_FURTHER_STEPS)
-    best = int(np.argmin(cost))
-    if not np.isfinite(cost[best]):
-        return None
-    signals, spread = motion.signals.copy(), motion.spread.copy()
-    for name, values in problem.trajectories(z[best]).items():
-        column = intervals.model.signals.index(name)
+    n, every = len(intervals.layout), np.arange(len(intervals))
+    completed = [_completed(problem, one) for one in z[np.isfinite(cost)]]
+    scores = [
+        robust_scores(intervals, one, p[None, :n], every)[0]
+        for one, p in zip(completed, z[np.isfinite(cost)], strict=True)
+    ]
+    return completed[int(np.argmin(scores))] if np.isfinite(scores).any() else None
+
+
+def _completed(problem: _DrivenStates, z: FloatArray) -> Motion:
+    """The motion with the unmeasured states and their derivatives that unknowns (n,) give."""
+    signals, spread = problem.motion.signals.copy(), problem.motion.spread.copy()
+    for name, values in problem.trajectories(z).items():
+        column = problem.intervals.model.signals.index(name)
         signals[:, column], spread[column] = values, values.std() + _TINY
     return Motion(signals, spread)
 
@@ -170,7 +181,7 @@ class _DrivenStates:
     @property
     def _bandwidth(self) -> float:
         """Bandwidth of the observers, 1/s."""
-        return _SETTLED / self.intervals.duration
+        return 1.0 / (_MEMORY * self.intervals.duration)
 
     @cached_property
     def _inputs(self) -> FloatArray:
