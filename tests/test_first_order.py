@@ -320,6 +320,18 @@ def test_linear_methods_refuse_an_unmeasured_state_in_a_sentence(differentiated)
         dr.identify(lagged_thrust(), log, method="ols", differentiate=differentiated)
 
 
+def test_validation_starts_from_an_estimated_state():
+    t, signals, inputs = thrust_signals()
+    plant = dr.Plant(lagged_thrust(), {n: x for n, x in THRUST.items() if n != "mass"})
+    late = {n: x[400:] for n, x in {**signals, **inputs}.items() if n != "thrust"}
+    scores = dr.validate(plant, dr.Log.from_arrays(t[400:], late), substeps=4)
+    assert scores.rmse["z"] < 1e-3 * signals["z"].std()
+    with pytest.raises(dr.LogError, match=r'"z_dot"'):
+        dr.validate(plant, dr.Log.from_arrays(t, {"z": signals["z"], **inputs}))
+    raw = dr.Log.from_arrays(t, {"z": signals["z"], **inputs})
+    assert dr.validate(plant, differentiate(raw, lagged_thrust())).fit_percent["z"] > 90.0
+
+
 # ---------------------------------------------------------------------- flight
 
 

@@ -236,7 +236,7 @@ def long_runs(mask: BoolArray, least: int) -> BoolArray:
 def _raise_missing(model: Model, log: Log, name: str) -> None:
     hint = "name its column with --map"
     if name in model.first_order:
-        hint = "pass --differentiate, with which lo-diransac estimates a state that nothing measures"
+        hint = "estimate it by lo-diransac, of all methods the only one that can, with --differentiate"
     elif name in model.velocities or name in model.accelerations:
         hint = "pass --differentiate to estimate velocities and accelerations"
     if name in log.unusable:

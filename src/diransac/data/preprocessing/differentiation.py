@@ -176,13 +176,15 @@ def _sources(log: Log, model: Model) -> dict[str, tuple[str, int]]:
     """Missing signal -> the measured signal that it is derived from, and the order of the derivative."""
     sources: dict[str, tuple[str, int]] = {}
     for chain in model.chains:
+        # A state of first order is no derivative: a log that lacks it is refused where rows of equations are needed.
+        given = chain[0] in model.first_order or chain[0] not in model.velocities
         for k, name in enumerate(chain):
             nearest = next((i for i in range(k - 1, -1, -1) if chain[i] in log), None)
-            if name in log or (name in model.coordinates and k == 0):
+            if name in log or (k == 0 and given):
                 continue
             if nearest is not None:
                 sources[name] = (chain[nearest], k - nearest)
-            elif name in model.required_signals:
+            elif name in model.required_signals and chain[0] not in model.first_order:
                 raise LogError(_underivable(log, model, name, chain[0] if k else None))
     return sources
 
@@ -191,8 +193,6 @@ def _underivable(log: Log, model: Model, name: str, source: str | None) -> str:
     found = ", ".join(("t", *log.names))
     if source is None:
         why = f'model "{model.name}" has velocities that are not derivatives of its coordinates'
-        if name in model.first_order:
-            why = "it is a state of first order, the derivative of no signal"
         return f'{log.source}: signal "{name}" is missing and cannot be derived: {why}; found {found}. Give it.'
     return f'{log.source}: signal "{name}" is missing, and so is "{source}", its source; found {found}. Give either.'
 
