@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from diransac.model import Model, Parameter
     from diransac.simulation.compiler import Map
 
-__all__ = ["NonlinearLeastSquares"]
+__all__ = ["NonlinearLeastSquares", "ParameterChart"]
 
 
 _START_DECADES = 3.0
@@ -99,7 +99,7 @@ class _BoundNonlinear:
         self._log_of_row = np.repeat(np.arange(len(parts)), [len(x) for x, _, _ in parts])
         self._scale = np.sqrt(np.square(self._accelerations).mean(axis=0))
         self._scale[self._scale == 0.0] = 1.0
-        self._chart = _Chart(self._layout.bounds)
+        self._chart = ParameterChart(self._layout.bounds)
         self._evaluate = _compiled(model, known)
         self.n_rows = len(self._state)
         self._n_p = len(self._layout)
@@ -313,7 +313,7 @@ def _usable(one: Segment, known: Sequence[int]) -> tuple[FloatArray, FloatArray,
     return np.hstack([q, v]), one.acting_inputs()[one.valid], a[:, known]
 
 
-class _Chart:
+class ParameterChart:
     """Free coordinates of bounded parameters: the logarithm where a parameter is positive, itself elsewhere."""
 
     def __init__(self, parameters: Sequence[Parameter]) -> None:
@@ -325,9 +325,11 @@ class _Chart:
             self._upper = np.where(self._log, np.minimum(np.log(np.maximum(upper, 0.0)), _LOG_BOUND), upper)
 
     def to_parameters(self, free: FloatArray) -> FloatArray:
+        """Parameters ``(..., n_p)`` of free coordinates."""
         return np.where(self._log, np.exp(np.where(self._log, free, 0.0)), free)
 
     def to_free(self, parameters: FloatArray) -> FloatArray:
+        """Free coordinates ``(..., n_p)`` of parameters."""
         return np.where(self._log, np.log(np.where(self._log, np.maximum(parameters, 1e-300), 1.0)), parameters)
 
     def slope(self, free: FloatArray) -> FloatArray:
@@ -335,6 +337,7 @@ class _Chart:
         return np.where(self._log, self.to_parameters(free), 1.0)
 
     def clip(self, free: FloatArray) -> FloatArray:
+        """Free coordinates within their bounds."""
         return np.clip(free, self._lower, self._upper)
 
     def starts(self, n: int) -> FloatArray:

@@ -169,7 +169,8 @@ def _candidates(intervals: ShootingIntervals) -> list[tuple[BoolArray, bool]]:
     """Signals and kinds of the errors that are tested: of each signal, and delays of coordinates, velocities, ..."""
     model = intervals.model
     seen = intervals.known.sum(axis=0) >= _FEWEST
-    kind = np.repeat([0, 1, 2], [model.n_q, model.n_v, model.n_v])
+    n = len(model.velocities_of_motion)
+    kind = np.repeat([0, 1, 3, 2, 3], [model.n_q, n, model.n_v - n, n, model.n_v - n])
     single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen)]
     groups = [(kind == g) & seen for g in range(3)]
     groups = [x for x in groups if 1 < x.sum() < seen.sum()]
