@@ -37,7 +37,7 @@ class Segment:
     ----------
     model : Model
     log : Log
-        The log, with its angles unwrapped.
+        The log, with continuous coordinates; see `preprocessing.continuous`.
     offset : int
         Row of the log that is row 0 of the arrays: the first that counts.
     signals : tuple of str
@@ -198,7 +198,7 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     used = [n for n in (*signals, *model.inputs) if n in log]
     log.check(used)
     _check_units(model, log, used)
-    log = preprocessing.unwrap(log, [n for n in model.coordinates if n in log and model.coordinates[n] == "rad"])
+    log = preprocessing.continuous(log, model)
     inputs, held = _held_inputs(model, log)
     measured = np.column_stack([log[n] for n in signals])
     critical = [i for i, n in enumerate(signals) if n in needed or n in also]

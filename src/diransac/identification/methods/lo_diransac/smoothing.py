@@ -199,6 +199,7 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
         rates = np.zeros((len(measured), model.n_q))
         for d in range(model.n_q):
             signals[:, [d]], rates[:, d] = smoother.smoothed(measured[:, [d]], known[:, [d]], centre[:, [d]])
+        _project(model, signals, rates, known)
         lacking = model.n_q + np.flatnonzero(~known[:, model.n_q : model.n_q + model.n_v].any(axis=0))
         if len(lacking):
             inferred = _velocities_of_rates(model, signals, rates, measured, known, lacking)
@@ -209,6 +210,20 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
         _integrate(signals, known, columns, dt)
     rows, seen = np.arange(len(signals)), np.flatnonzero(~log.gaps)
     return signals if log.gaps.all() else np.column_stack([np.interp(rows, seen, x[seen]) for x in signals.T])
+
+
+def _project(model: Model, signals: FloatArray, rates: FloatArray, known: BoolArray) -> None:
+    """Scale smoothed quaternions to unit norm, and their rates by the same factor, in place.
+
+    The error of a polynomial in the four components is of the order of the fit's along the norm, and vanishes there.
+    """
+    for four in model.quaternions:
+        columns = list(four)
+        if known[:, columns].any(axis=0).all():
+            norms = np.linalg.norm(signals[:, columns], axis=1, keepdims=True)
+            factor = 1.0 / np.where(norms > _FLOOR, norms, 1.0)
+            signals[:, columns] *= factor
+            rates[:, columns] *= factor
 
 
 def _velocities_of_rates(
