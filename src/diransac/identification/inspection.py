@@ -190,7 +190,8 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
     -------
     Inspection
     """
-    signals = {name: _signal_facts(log, name) for name in log.names}
+    continuous = preprocessing.unwrap(log) if model is None else preprocessing.continuous(log, model)
+    signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names}
     fitness = None if model is None else _fitness(log, model)
     if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
         fitness = dataclasses.replace(fitness, caveat=_caveat(signals, model))
@@ -200,14 +201,15 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
 # ---------------------------------------------------------------------- signals
 
 
-def _signal_facts(log: Log, name: str) -> SignalFacts:
+def _signal_facts(log: Log, name: str, continuous: FloatArray) -> SignalFacts:
+    """Statistics of a signal; its spikes are those of its continuous form, without wraps and changes of sign."""
     values = log[name]
     finite = values[np.isfinite(values)]
     low, high, spread = (finite.min(), finite.max(), _spread(finite)) if len(finite) else (np.nan,) * 3
     run = _longest_run(values)
     frozen = run * log.dt if run >= _FROZEN_SAMPLES else 0.0
     with np.errstate(over="ignore"):  # a bound that overflows is infinite, and nothing is beyond it
-        n_spikes = int(preprocessing.hampel(values)[0].sum())
+        n_spikes = int(preprocessing.hampel(continuous)[0].sum())
     return SignalFacts(
         log.units.get(name), float(low), float(high), float(spread), int(np.isnan(values).sum()), n_spikes, frozen
     )

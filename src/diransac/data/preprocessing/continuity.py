@@ -32,7 +32,7 @@ __all__ = ["continuous", "continuous_quaternions", "unit_quaternions", "unwrap",
 
 
 # Samples to either side of the one whose medoid is sought, at most; samples of the running medians.
-_REACH, _WINDOW, _PERSISTS = 5, 25, 5
+_REACH, _REACH_OF_ATTITUDES, _WINDOW, _PERSISTS = 5, 3, 25, 5
 # In turns: departures from the medoid that are always or never those of a good sample; deviation of a leap from one
 # turn beside the motion; the margin by which good samples leave the turn to which an angle is wrapped.
 _CLOSE, _FAR, _NEARLY, _MARGIN = 0.05, 0.25, 0.1, 0.02
@@ -42,7 +42,7 @@ _INSIDE = 0.95
 _MANY_SIGMA, _MUCH_MOTION = 8.0, 3.0
 _MAD_TO_STD = 1.4826
 # Difference of two components that counts at most, and the weight of uncapped components, which breaks ties.
-_CAP, _TIE = 0.25, 1e-9
+_CAP, _TIE = 1.0, 1e-9
 # Relative deviations of a quaternion's norm that are its own, and those that are rounding errors.
 _OWN_NORM, _ROUNDING = 0.1, 1e-9
 
@@ -72,14 +72,14 @@ def continuous(log: Log, model: Model) -> Log:
 # ---------------------------------------------------------------------- angles
 
 
-def unwrap(log: Log, names: Sequence[str]) -> Log:
+def unwrap(log: Log, names: Sequence[str] | None = None) -> Log:
     """Log with the leaps by one turn removed from wrapped angles.
 
     Parameters
     ----------
     log : Log
-    names : sequence of str
-        Angles; the turn is 360 for a signal in degrees, 2 pi otherwise.
+    names : sequence of str, optional
+        Angles; the turn is 360 for a signal in degrees, 2 pi otherwise.  None: the signals whose unit is one of angles.
 
     Raises
     ------
@@ -91,7 +91,8 @@ def unwrap(log: Log, names: Sequence[str]) -> Log:
     A leap is a wrap if it is one turn to within the motion from sample to sample and a tenth of a turn, also across
     missing samples, and if the signal lies within one turn.  Outliers keep their distance from the angle.
     """
-    return _without_wraps(log, {name: one_turn(log.units.get(name, "rad")) or 2.0 * math.pi for name in names})
+    turns = {name: one_turn(log.units.get(name, "1")) for name in (log.names if names is None else names)}
+    return _without_wraps(log, {n: x or 2.0 * math.pi for n, x in turns.items() if x or names is not None})
 
 
 def _without_wraps(log: Log, turns: Mapping[str, float]) -> Log:
@@ -117,7 +118,7 @@ def _revolutions(values: FloatArray, turn: float) -> IntArray:
     good = _agreeing(y, motion)
     middle = _middle_of_leaps(y[good], motion[good])
     inside = np.abs(y - middle) <= 0.5 + _MARGIN
-    if not good.any() or median_filter(inside[good], size=_PERSISTS, mode="nearest").mean() < _INSIDE:
+    if not good.any() or median_filter(inside[good], size=_PERSISTS, mode="mirror").mean() < _INSIDE:
         return k
     good &= inside
     angle = _continued(y[good], rows[good])
@@ -127,7 +128,7 @@ def _revolutions(values: FloatArray, turn: float) -> IntArray:
     first = int(np.median(found[:_PERSISTS]))
     k = found[_nearest(rows[good], len(values))] - first
     off = np.interp(rows, rows[good], angle) - y
-    close = inside & (np.abs(_remainder(off)) <= _CLOSE)
+    close = inside & (np.abs(_remainder(off)) <= np.minimum(_CLOSE + _MUCH_MOTION * motion, _FAR))
     k[rows[close]] = np.round(off[close]).astype(np.int64) - first
     return k
 
@@ -151,14 +152,14 @@ def _remainder(turns: FloatArray) -> FloatArray:
 def _motion(y: FloatArray, rows: IntArray) -> FloatArray:
     """Usual size ``(N,)`` of the step on the circle that leads to each sample, in turns; a gap lasts for several."""
     lasting = np.diff(rows)
-    per_row = median_filter(np.abs(_remainder(np.diff(y))) / lasting, size=_WINDOW, mode="nearest")
+    per_row = median_filter(np.abs(_remainder(np.diff(y))) / lasting, size=_WINDOW, mode="mirror")
     return np.concatenate([per_row[:1], per_row * lasting])
 
 
 def _continued(y: FloatArray, rows: IntArray) -> FloatArray:
     """Angles ``(N,)``, in turns, continued by steps that are nearest to those of the usual rate around them."""
     steps, lasting = np.diff(y), np.diff(rows)
-    expected = lasting * median_filter(_remainder(steps) / lasting, size=_WINDOW, mode="nearest")
+    expected = lasting * median_filter(_remainder(steps) / lasting, size=_WINDOW, mode="mirror")
     return np.cumsum(np.r_[y[:1], expected + _remainder(steps - expected)])
 
 
@@ -178,7 +179,7 @@ def _middle_of_leaps(y: FloatArray, motion: FloatArray) -> float:
 
 def _is_wrapped(y: FloatArray, k: IntArray, middle: float) -> bool:
     """True if revolutions ``k`` of good samples, in turns, change for good, or at the ends of a usual turn alone."""
-    usual = median_filter(k, size=_PERSISTS, mode="nearest")
+    usual = median_filter(k, size=_PERSISTS, mode="mirror")
     leaps = np.flatnonzero(np.diff(k))
     beyond = np.abs(np.abs(np.r_[y[leaps], y[leaps + 1]] - middle) - 0.5)
     at_ends = bool(len(leaps)) and middle in _USUAL_MIDDLES and bool((beyond <= _MARGIN).all())
@@ -225,7 +226,7 @@ def continuous_quaternions(q: FloatArray) -> FloatArray:
     usual_norm = float(np.median(norms)) if len(whole) else 0.0
     if not usual_norm > 0.0:
         return q
-    scaled, around = q / usual_norm, _neighbours(len(whole), _REACH)
+    scaled, around = q / usual_norm, _neighbours(len(whole), _REACH_OF_ATTITUDES)
     medoid = scaled[whole][_medoids(scaled[whole], lambda a, b: np.minimum(*_distances(a, b)), around)]
     medoid *= np.cumprod(np.r_[1.0, _signs(medoid[1:], medoid[:-1])])[:, None]
     signs = _signs(scaled, medoid[_nearest(whole, len(q))])
