@@ -11,6 +11,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.data import preprocessing
+from diransac.data.checks import rows_per_sample
 from diransac.data.log import Log
 from diransac.data.units import conversion, same_unit
 from diransac.errors import LogError, SettingsError
@@ -27,6 +28,8 @@ _ROWS_FOR_VALUE, _ROWS_FOR_SLOPE = 7, 25
 _FAR = 5.0
 # Rows that an input is held for, beyond which the motion is no longer the one that it made.
 _LONG_HOLD = 3
+# Fraction of the rows with a sample below which a signal is a slow one.
+_SLOW = 0.5
 
 
 @dataclass(frozen=True)
@@ -202,15 +205,37 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     inputs, held = _held_inputs(model, log)
     measured = np.column_stack([log[n] for n in signals])
     critical = [i for i, n in enumerate(signals) if n in needed or n in also]
-    valid = np.all(np.isfinite(np.hstack([measured[:, critical], inputs])), axis=1)
+    valid = _complete(np.isfinite(measured[:, critical]), pointwise) & np.isfinite(inputs).all(axis=1)
     if not valid.any():
         raise LogError(
             f"{log.source}: no row has a value in every signal in use ({', '.join(used)}); found NaN in each"
+            f"{_slow_signals(log, used)}"
         )
     offset = int(np.argmax(valid))
     notes = [*log.notes, *_row_notes(log, valid, held)]
     gaps = long_runs(held, _LONG_HOLD)[offset:]
     return Segment(model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], tuple(notes), gaps)
+
+
+def _complete(known: BoolArray, pointwise: bool) -> BoolArray:
+    """Rows ``(N,)`` that count, of samples ``(N, n)`` that are known.
+
+    Without equations at each row, slow signals, which have samples in fewer than half of the rows, are compared where
+    they have one; a row without a sample of any signal does not count.
+    """
+    slow = np.zeros(known.shape[1], bool) if pointwise else known.mean(axis=0) < _SLOW
+    if not slow.any():
+        return np.asarray(known.all(axis=1))
+    return np.asarray(known.any(axis=1) & (known | slow).all(axis=1))
+
+
+def _slow_signals(log: Log, names: Sequence[str]) -> str:
+    """Clause that names the signals that are sampled less often than the log, with their rates; empty without any."""
+    apart = {n: rows_per_sample(np.isfinite(log[n])) for n in names}
+    slow = [f'"{n}" is sampled at {1.0 / (x * log.dt):.4g} Hz' for n, x in apart.items() if x > 1]
+    if not slow:
+        return ""
+    return f": {', '.join(slow)}, the log at {1.0 / log.dt:.4g} Hz; use lo-diransac, which needs no complete rows"
 
 
 def long_runs(mask: BoolArray, least: int) -> BoolArray:

@@ -12,7 +12,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import LogError, SettingsError
 from diransac.identification.estimate import Evaluation, Resolution
-from diransac.simulation import Measurements, RolloutBatch, default_threads, rollouts
+from diransac.simulation import Measurements, RolloutBatch, ScoreBatch, default_threads, rollouts
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from diransac.identification.estimate import Diagnosis, Estimate
     from diransac.identification.settings import Settings
     from diransac.model import Model
-    from diransac.simulation import ScoreBatch, Simulator
+    from diransac.simulation import Simulator
 
 __all__ = [
     "Scores",
@@ -253,9 +253,11 @@ class Simulation:
         batches = []
         for i, one in enumerate(self._dataset.segments):
             lanes = RolloutBatch(self._dataset.layout.of_log(parameters, i), self.starts[i], one.inputs, one.log.dt)
-            found = self._simulator.score(
-                lanes, self._measured[i], thresholds, min_inlier_signals, threads=self._threads
-            )
+            measured = self._measured[i]
+            if np.isnan(measured.values[measured.valid]).any():
+                batches.append(_incomplete_scores(self._simulator, lanes, measured, thresholds, min_inlier_signals))
+                continue
+            found = self._simulator.score(lanes, measured, thresholds, min_inlier_signals, threads=self._threads)
             batches.append(found)
         sums, counts = batches[0].sum_squares, batches[0].inlier_count
         for batch in batches[1:]:
@@ -303,6 +305,31 @@ class Simulation:
         lanes = np.tile(parameters, (len(states), 1))
         batch = RolloutBatch(lanes, states, inputs, one.log.dt, start_rows, n_rows)
         return batch, Measurements(measured, np.ones(len(measured), bool))
+
+
+def _incomplete_scores(
+    simulator: Simulator,
+    lanes: RolloutBatch,
+    measured: Measurements,
+    thresholds: FloatArray,
+    min_inlier_signals: int,
+) -> ScoreBatch:
+    """Scores of a log with slow signals, each of which is compared where it has samples.
+
+    The mean square of a signal is that of its samples, and counts for all rows that count.  Of the signals that a row
+    lacks, none need be an inlier: a row needs the same fraction of its own.
+    """
+    known = np.isfinite(measured.values) & measured.valid[:, None]
+    errors = simulator.errors(lanes, replace(measured, values=np.nan_to_num(measured.values)))
+    weight = measured.valid.sum() / np.maximum(known.sum(axis=0), 1)
+    squares = np.where(known, np.square(np.nan_to_num(errors, nan=np.inf)), 0.0).sum(axis=1) * weight
+    judged = thresholds > 0.0
+    needed = np.ceil(min_inlier_signals * (known & judged).sum(axis=1) / max(1, judged.sum()))
+    near = (known & (np.abs(np.nan_to_num(errors, nan=np.inf)) < thresholds)).sum(axis=2)
+    inliers = (near >= np.maximum(needed, 1.0)) & measured.valid
+    diverged = ~np.isfinite(squares).all(axis=1)
+    bits = np.packbits(inliers, axis=0, bitorder="little")
+    return ScoreBatch(lanes, squares, inliers.sum(axis=1), diverged, bits)
 
 
 def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: Settings) -> Evaluation:

@@ -16,6 +16,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
+from diransac.data.checks import rows_per_sample
 from diransac.data.segment import long_runs
 from diransac.errors import IdentificationError, LogError, ModelError
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
@@ -60,6 +61,8 @@ __all__ = ["LoDiransac", "configured"]
 _FEWEST_INTERVALS = 4
 # Rows without any sample that are a gap, at least.
 _FEWEST_UNMEASURED = 8
+# Samples that are missing in such a gap where no sensor is sampled in every row.
+_UNMEASURED_SAMPLES = 3
 _OUTLIER = 0.5
 # Fraction of a signal's spread from which on its noise leaves nothing to explain.
 _ALL_OF_IT = 0.8
@@ -330,7 +333,11 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
     if n_leaps:
         notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median replaces them")
     centre = running_median(measured, known, odd_window(settings.median_window, dt, _MOST_SAMPLES))
-    unmeasured = long_runs(~known.any(axis=1), max(_FEWEST_UNMEASURED, round(settings.smoothing_half_width / dt)))
+    seen = known.any(axis=1)
+    least = max(
+        _FEWEST_UNMEASURED, round(settings.smoothing_half_width / dt), _UNMEASURED_SAMPLES * rows_per_sample(seen)
+    )
+    unmeasured = long_runs(~seen, least)
     return Samples(measured, known, centre, one.gaps | unmeasured), inputs, notes
 
 
