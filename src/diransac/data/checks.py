@@ -30,6 +30,8 @@ __all__ = [
 # In mean intervals: the jitter that is not reported, and the one that is an error; in median intervals: a gap.
 _SILENT_JITTER, _TOLERATED_JITTER, _GAP = 1e-3, 0.2, 1.5
 _ROUNDING = 1e-6
+# Samples of a signal from which its rate is taken.
+_FEWEST_SAMPLES = 5
 
 # Likely seconds from row to row, and the most that are accepted.  Clocks that explain longer ones: their tick in
 # seconds, and the number of ticks from row to row above which it is this clock rather than the next.
@@ -86,7 +88,7 @@ def check_names(names: Iterable[object], source: str) -> None:
 def rows_per_sample(known: npt.NDArray[np.bool_]) -> int:
     """Median number of rows from one sample of a signal to the next; 1 for a signal with a sample in most rows."""
     rows = np.flatnonzero(known)
-    return int(np.median(np.diff(rows))) if len(rows) > 1 else 1
+    return int(np.median(np.diff(rows))) if len(rows) >= _FEWEST_SAMPLES else 1
 
 
 def describe_gaps(time: FloatArray, signals: Mapping[str, FloatArray]) -> list[str]:

@@ -205,14 +205,15 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     inputs, held = _held_inputs(model, log)
     measured = np.column_stack([log[n] for n in signals])
     critical = [i for i, n in enumerate(signals) if n in needed or n in also]
-    valid = _complete(np.isfinite(measured[:, critical]), pointwise) & np.isfinite(inputs).all(axis=1)
+    known = np.isfinite(measured[:, critical])
+    valid = _complete(known, pointwise) & np.isfinite(inputs).all(axis=1)
     if not valid.any():
         raise LogError(
             f"{log.source}: no row has a value in every signal in use ({', '.join(used)}); found NaN in each"
             f"{_slow_signals(log, used)}"
         )
     offset = int(np.argmax(valid))
-    notes = [*log.notes, *_row_notes(log, valid, held)]
+    notes = [*log.notes, *_row_notes(log, valid, held, sampled=np.asarray(known.any(axis=1)))]
     gaps = long_runs(held, _LONG_HOLD)[offset:]
     return Segment(model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], tuple(notes), gaps)
 
@@ -291,9 +292,9 @@ def _held_inputs(model: Model, log: Log) -> tuple[FloatArray, BoolArray]:
     return np.column_stack(columns) if columns else np.zeros((len(log), 0)), held
 
 
-def _row_notes(log: Log, valid: BoolArray, held: BoolArray) -> list[str]:
+def _row_notes(log: Log, valid: BoolArray, held: BoolArray, sampled: BoolArray) -> list[str]:
     notes = []
-    skipped = int((~valid).sum())
+    skipped = int((~valid & sampled).sum())
     if skipped:
         notes.append(f"{skipped} of {len(valid)} rows were skipped: a signal in use is NaN there")
     if held.any():
