@@ -13,7 +13,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.segment import runs
 from diransac.errors import LogError, SettingsError
 from diransac.identification.estimate import Evaluation, Resolution
-from diransac.simulation import Measurements, RolloutBatch, default_threads, rollouts
+from diransac.simulation import Measurements, RolloutBatch, ScoreBatch, default_threads, rollouts
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from diransac.identification.estimate import Diagnosis, Estimate
     from diransac.identification.settings import Settings
     from diransac.model import Model
-    from diransac.simulation import ScoreBatch, Simulator
+    from diransac.simulation import Simulator
 
 __all__ = [
     "Scores",
@@ -331,13 +331,20 @@ class Simulation:
             for rows, state in self.starts[i]:
                 lanes = RolloutBatch(own, state, self._inputs[i][rows], one.log.dt)
                 known = Measurements(measured.values[rows], measured.valid[rows])
-                batch = self._simulator.score(lanes, known, thresholds, min_inlier_signals, threads=self._threads)
-                found.append((rows, batch))
+                found.append((rows, self._score(lanes, known, thresholds, min_inlier_signals)))
             logs.append(LogScores(len(one), tuple(found)))
         sums, counts = logs[0].sum_squares, logs[0].inlier_count
         for other in logs[1:]:
             sums, counts = sums + other.sum_squares, counts + other.inlier_count
         return Scores(sums, counts, tuple(logs))
+
+    def _score(
+        self, lanes: RolloutBatch, measured: Measurements, thresholds: FloatArray, min_inlier_signals: int
+    ) -> ScoreBatch:
+        """Scores of a stretch."""
+        if np.isnan(measured.values[measured.valid]).any():
+            return _incomplete_scores(self._simulator, lanes, measured, thresholds, min_inlier_signals)
+        return self._simulator.score(lanes, measured, thresholds, min_inlier_signals, threads=self._threads)
 
     def errors(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
@@ -380,6 +387,31 @@ class Simulation:
         lanes = np.tile(parameters, (len(states), 1))
         batch = RolloutBatch(lanes, states, inputs, one.log.dt, start_rows, n_rows)
         return batch, Measurements(measured, np.ones(len(measured), bool))
+
+
+def _incomplete_scores(
+    simulator: Simulator,
+    lanes: RolloutBatch,
+    measured: Measurements,
+    thresholds: FloatArray,
+    min_inlier_signals: int,
+) -> ScoreBatch:
+    """Scores of a log with slow signals, each of which is compared where it has samples.
+
+    The mean square of a signal is that of its samples, and counts for all rows that count.  Of the signals that a row
+    lacks, none need be an inlier: a row needs the same fraction of its own.
+    """
+    known = np.isfinite(measured.values) & measured.valid[:, None]
+    errors = simulator.errors(lanes, replace(measured, values=np.nan_to_num(measured.values)))
+    weight = measured.valid.sum() / np.maximum(known.sum(axis=0), 1)
+    squares = np.where(known, np.square(np.nan_to_num(errors, nan=np.inf)), 0.0).sum(axis=1) * weight
+    judged = thresholds > 0.0
+    needed = np.ceil(min_inlier_signals * (known & judged).sum(axis=1) / max(1, judged.sum()))
+    near = (known & (np.abs(np.nan_to_num(errors, nan=np.inf)) < thresholds)).sum(axis=2)
+    inliers = (near >= np.maximum(needed, 1.0)) & measured.valid
+    diverged = ~np.isfinite(squares).all(axis=1)
+    bits = np.packbits(inliers, axis=0, bitorder="little")
+    return ScoreBatch(lanes, squares, inliers.sum(axis=1), diverged, bits)
 
 
 def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: Settings) -> Evaluation:
