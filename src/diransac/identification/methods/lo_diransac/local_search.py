@@ -23,7 +23,7 @@ from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import estimate_parameters
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
-from diransac.identification.methods.lo_diransac.sensors import clearest_error, error_of_sensor, with_error
+from diransac.identification.methods.lo_diransac.sensors import clear_errors, error_of_sensor, with_error
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -174,10 +174,9 @@ class LocalSearch:
         kinds = {"delays": self.settings.sensor_delays is None, "biases": self.settings.sensor_biases is None}
         for k in range(self.settings.max_sensor_errors if not best.exact else 0):
             report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
-            error = clearest_error(best.intervals, best.refinement.fit, **kinds)
-            if error is None:
-                break
-            other = self._refitted(best, with_error(best.intervals, best.refinement.fit, error))
+            errors = clear_errors(best.intervals, best.refinement.fit, **kinds)
+            others = [self._refitted(best, with_error(best.intervals, best.refinement.fit, x)) for x in errors]
+            other = min(others, key=lambda x: x.cost, default=best)
             if other.cost > best.cost - _WORTH:
                 break
             best = other

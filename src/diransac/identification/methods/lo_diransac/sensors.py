@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["SensorError", "clearest_error", "error_of_sensor", "with_error"]
+__all__ = ["SensorError", "clear_errors", "error_of_sensor", "with_error"]
 
 # Standard errors from which on an error of a sensor is tried, and its least delay, samples.
 _CLEAR, _LEAST_DELAY = 3.0, 0.1
@@ -55,8 +55,8 @@ class SensorError:
     ratio: float
 
 
-def clearest_error(intervals: ShootingIntervals, fit: Fit, *, delays: bool, biases: bool) -> SensorError | None:
-    """The error of the sensors that the residuals show most clearly.
+def clear_errors(intervals: ShootingIntervals, fit: Fit, *, delays: bool, biases: bool) -> list[SensorError]:
+    """Errors of the sensors that the residuals show most clearly: one of a single signal, and one of a group.
 
     Parameters
     ----------
@@ -68,13 +68,14 @@ def clearest_error(intervals: ShootingIntervals, fit: Fit, *, delays: bool, bias
 
     Returns
     -------
-    SensorError or None
-        None if no error is clear.
+    list of SensorError
+        Empty if no error is clear.
     """
     tested = [x for x in _candidates(intervals) if (delays if x[1] else biases)]
     found = _score_tests(intervals, fit, tested) if tested else []
     clear = [x for x in found if x.ratio > _CLEAR and (not x.is_delay or abs(x.size) > _LEAST_DELAY)]
-    return max(clear, key=lambda x: x.ratio, default=None)
+    kinds = [[x for x in clear if (x.signals.sum() > 1) == of_group] for of_group in (False, True)]
+    return [max(kind, key=lambda x: x.ratio) for kind in kinds if kind]
 
 
 def error_of_sensor(intervals: ShootingIntervals, fit: Fit, name: str, *, is_delay: bool) -> SensorError | None:
@@ -114,9 +115,12 @@ def _score_tests(intervals: ShootingIntervals, fit: Fit, candidates: list[tuple[
         information = float((weights * np.square(sensitivity)).sum() - (of_z * z).sum() - of_s @ s)
         rows = (weights * sensitivity * fit.residuals).sum(axis=1)
         scores = rows.reshape(len(intervals), -1).sum(axis=1) + (at.data_z * z).sum(axis=1) + at.data_s @ s
+        score = float(rows.sum())
+        # An error that is there has a score of one sign in each batch; only the rest of the scores scatters.
+        share = (weights * np.square(sensitivity)).sum(axis=1).reshape(len(intervals), -1).sum(axis=1)
+        scores = scores - score * share / max(share.sum(), 1e-300)
         variance = max(information, float(np.square(np.add.reduceat(scores, batch)).sum()))
         if information > 0.0:
-            score = float(rows.sum())
             found.append(SensorError(signals, is_delay, -score / information, abs(score) / np.sqrt(variance)))
     return found
 
