@@ -6,13 +6,15 @@ A second-order plant has coordinates ``q``, velocities ``v``, accelerations ``a`
 * the regressor ``W p = b`` with ``W = dr/dp`` and ``b = W p - r`` (Dimmig et al. 2023, eqs. (1) and (5)),
 * the forward dynamics ``a = -M^-1 r(a=0)`` with ``M = dr/da``,
 * the linearisation of the state equation, with ``M da = -dr``.
+
+Sensors are further outputs ``y = h(q, v, a, u, p)``: the measurement equation of an accelerometer, an encoder, ...
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -24,6 +26,7 @@ from diransac.errors import ModelError, ResultError
 from diransac.model import derivation
 from diransac.model.derivation import Probe, Symbols
 from diransac.model.parameter import Parameter
+from diransac.model.sensors import Sensor, with_parameters_of
 
 __all__ = ["Model"]
 
@@ -54,6 +57,9 @@ class Model:
     kinematics : callable, optional
         ``kinematics(q, v)`` returns the derivative of every coordinate. Four consecutive coordinates whose norm it
         conserves are a unit quaternion: it is normalised after every integration step, and errors ignore its sign.
+    sensors : mapping from name to Sensor, optional
+        Measurement equations of further columns of a log: an accelerometer, an encoder, ...; see `diransac.sensors`.
+        Parameters that come with a sensor follow the model's own; one that the model declares itself is the model's.
     description : str
         One line for lists of models.
 
@@ -61,8 +67,8 @@ class Model:
     ------
     ModelError
         A name is unknown or repeated, the number of residuals is wrong, a constant is NaN (such as ``math.sin`` of a
-        symbol), Python code branches on a symbol, the residuals are not affine in the accelerations, or the mass matrix
-        is singular.
+        symbol), Python code branches on a symbol, the residuals are not affine in the accelerations, the mass matrix
+        is singular, or a sensor returns anything but one value.
 
     Notes
     -----
@@ -79,9 +85,12 @@ class Model:
         *,
         velocities: Mapping[str, str] | None = None,
         kinematics: Kinematics | None = None,
+        sensors: Mapping[str, Sensor] | None = None,
         description: str = "",
     ) -> None:
-        self._name_signals(name, coordinates, inputs, parameters, velocities, description)
+        parameters = with_parameters_of(f'model "{name}"', sensors, parameters)
+        units = {n: x.unit for n, x in (sensors or {}).items()}
+        self._name_signals(name, coordinates, inputs, parameters, velocities, description, units)
         if (velocities is None) != (kinematics is None):
             given, missing = ("velocities", "kinematics") if kinematics is None else ("kinematics", "velocities")
             raise ModelError(f'model "{name}": {given} without {missing}; give both, or neither')
@@ -92,6 +101,11 @@ class Model:
         if kinematics is not None:
             rates = derivation.call_user(self._label, "kinematics", kinematics, *self.named(q, v))
             self.kinematics = ca.Function("kinematics", [q, v], [rates], list("qv"), ["q_dot"])
+        named = self.named(q, v, a, u, p)
+        outputs = [derivation.call_sensor(self._label, n, x.equation, *named) for n, x in (sensors or {}).items()]
+        self.measurement: ca.Function | None = None
+        if outputs:
+            self.measurement = ca.Function("measurement", [q, v, a, u, p], [ca.vertcat(*outputs)], list("qvaup"), ["y"])
         self._check()
 
     # ------------------------------------------------------------------ names and sizes
@@ -104,9 +118,10 @@ class Model:
         parameters: Mapping[str, Parameter],
         velocities: Mapping[str, str] | None,
         description: str,
+        sensors: Mapping[str, str],
     ) -> None:
-        self.name, self.description = name, description
-        units = {"coordinates": coordinates, "inputs": inputs, "velocities": velocities or {}}
+        self.name, self.description, self.sensors = name, description, dict(sensors)
+        units = {"coordinates": coordinates, "inputs": inputs, "velocities": velocities or {}, "sensors": sensors}
         derivation.check_groups(self._label, units, parameters)
         self.coordinates, self.inputs, self.parameters = dict(coordinates), dict(inputs), dict(parameters)
         if velocities is None:
@@ -115,7 +130,7 @@ class Model:
         else:
             self.velocities = dict(velocities)
             self.accelerations = {f"{v}_dot": _per_second(unit) for v, unit in velocities.items()}
-        groups = (self.coordinates, self.velocities, self.accelerations, self.inputs, self.parameters)
+        groups = (self.coordinates, self.velocities, self.accelerations, self.inputs, self.parameters, self.sensors)
         derivation.check_names(self._label, groups)
 
     @property
@@ -149,13 +164,13 @@ class Model:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Names of the simulated signals: coordinates, velocities, accelerations."""
-        return (*self.state, *self.accelerations)
+        """Names of the simulated signals: coordinates, velocities, accelerations, sensors."""
+        return (*self.state, *self.accelerations, *self.sensors)
 
     @property
     def units(self) -> dict[str, str]:
         """Unit of every signal and input by name."""
-        return {**self.coordinates, **self.velocities, **self.accelerations, **self.inputs}
+        return {**self.coordinates, **self.velocities, **self.accelerations, **self.sensors, **self.inputs}
 
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
         groups = (self.coordinates, self.velocities, self.accelerations, self.inputs, self.parameters)
@@ -191,9 +206,15 @@ class Model:
         derivation.check_residual(self._label, self.residual, tuple(self.accelerations))
         if self.kinematics is not None:
             derivation.check_kinematics(self._label, self.kinematics)
-        self._probe = Probe(self.residual, tuple(self.parameters.values()))
+        self._probe = Probe(self.residual, self._bounds)
         self._mass_matrix, self._bias = derivation.affine_in_acceleration(self._label, self._probe, self.accelerations)
         self._definite = derivation.mass_matrix_sign(self._label, self._probe, self._mass_matrix, self.accelerations)
+        if self.measurement is not None:
+            derivation.check_sensors(self._label, Probe(self.measurement, self._bounds), tuple(self.sensors))
+
+    @property
+    def _bounds(self) -> tuple[Parameter, ...]:
+        return tuple(self.parameters.values())
 
     @property
     def force_sign(self) -> int:
@@ -208,9 +229,15 @@ class Model:
     @cached_property
     def required_signals(self) -> tuple[str, ...]:
         """Names of the signals and inputs that the residuals depend on, which a pointwise estimator requires."""
-        names = (*self.signals, *self.inputs)
-        q, v, a, u, p = self._symbols()
-        depends = ca.which_depends(self.residual(q, v, a, u, p), ca.vertcat(q, v, a, u), 1, False)
+        used = self._names_in(self.residual)
+        return tuple(n for n in (*self.state, *self.accelerations, *self.inputs) if n in used)
+
+    def _names_in(self, function: ca.Function, output: int | None = None) -> tuple[str, ...]:
+        """Names of the states, accelerations, inputs and parameters that a result, or one element of it, depends on."""
+        names = (*self.state, *self.accelerations, *self.inputs, *self.parameters)
+        symbols = self._symbols()
+        result = function(*symbols)
+        depends = ca.which_depends(result if output is None else result[output], ca.vertcat(*symbols), 1, False)
         return tuple(n for n, d in zip(names, depends, strict=True) if d)
 
     def states_behind(self, signals: Iterable[str]) -> tuple[str, ...]:
@@ -218,7 +245,8 @@ class Model:
         x = ca.vertcat(*(ca.SX.sym(n) for n in self.state))
         u, p = ca.SX.sym("u", self.n_u), ca.SX.sym("p", self.n_p)
         rates, accelerations = self.dynamics(x, u, p)
-        feeds = np.array(ca.DM(ca.jacobian_sparsity(ca.vertcat(x, accelerations), x), 1), dtype=bool)
+        outputs = ca.vertcat(x, accelerations, self.readings(x, accelerations, u, p))
+        feeds = np.array(ca.DM(ca.jacobian_sparsity(outputs, x), 1), dtype=bool)
         wanted = set(signals)
         matter = np.any(feeds[[n in wanted for n in self.signals]], axis=0)
         flows = np.array(ca.DM(ca.jacobian_sparsity(rates, x), 1), dtype=bool)
@@ -230,6 +258,85 @@ class Model:
     def quaternions(self) -> tuple[tuple[int, int, int, int], ...]:
         """Indices of the coordinates that form unit quaternions, found by the norm that ``kinematics`` conserves."""
         return () if self.kinematics is None else derivation.find_quaternions(self.kinematics)
+
+    # ------------------------------------------------------------------ sensors
+
+    @cached_property
+    def sensor_arguments(self) -> dict[str, tuple[str, ...]]:
+        """Names of the states, accelerations, inputs and parameters that each sensor depends on."""
+        if self.measurement is None:
+            return {}
+        return {name: self._names_in(self.measurement, k) for k, name in enumerate(self.sensors)}
+
+    @cached_property
+    def biased_sensors(self) -> tuple[str, ...]:
+        """Names of the sensors with a parameter that adds a constant to them."""
+        if self.measurement is None:
+            return ()
+        symbols = self._symbols()
+        slopes = ca.jacobian(self.measurement(*symbols), symbols[4])
+        return tuple(n for k, n in enumerate(self.sensors) if any(map(_is_constant, ca.horzsplit(slopes[k, :]))))
+
+    @cached_property
+    def affine_sensors(self) -> tuple[str, ...]:
+        """Names of the sensors that are affine in the parameters."""
+        return tuple(n for n in self.sensors if self._probe_of_sensors((n,)).is_affine_in_parameters())
+
+    @cached_property
+    def sensor_regressor(self) -> ca.Function:
+        """Function ``(q, v, a, u) -> (S (n_y, n_p), c (n_y))`` with ``y = S p + c`` for the sensors affine in p.
+
+        Rows of the others are zero.
+        """
+        q, v, a, u, p = self._symbols()
+        S, c = ca.SX(len(self.sensors), self.n_p), ca.SX(len(self.sensors), 1)
+        for k, name in enumerate(self.sensors):
+            if name in self.affine_sensors:
+                S[k, :], c[k] = self._probe_of_sensors((name,)).affine_parts("p", (q, v, a, u, p))
+        return ca.Function("sensor_regressor", [q, v, a, u], [ca.densify(S), ca.densify(c)], list("qvau"), ["S", "c"])
+
+    @cached_property
+    def readings(self) -> ca.Function:
+        """Function ``(x, a, u, p) -> y``: the sensors, by the state and the accelerations that belong to it."""
+        q, v, a, u, p = self._symbols()
+        y = ca.SX(0, 1) if self.measurement is None else self.measurement(q, v, a, u, p)
+        return ca.Function("readings", [ca.vertcat(q, v), a, u, p], [ca.densify(y)], ["x", "a", "u", "p"], ["y"])
+
+    def with_sensors(self, names: Collection[str]) -> Model:
+        """The model with some of its sensors, and without the parameters that only the others depend on.
+
+        The model itself where it has no others.
+        """
+        kept = [n for n in self.sensors if n in names]
+        if len(kept) == len(self.sensors):
+            return self
+        left = {n for name, used in self.sensor_arguments.items() if name not in kept for n in used}
+        needed = {*self._names_in(self.residual), *(n for name in kept for n in self.sensor_arguments[name])}
+        parameters = {n: x for n, x in self.parameters.items() if n in needed or n not in left}
+        model = Model.__new__(Model)
+        velocities = None if self.kinematics is None else self.velocities
+        units = {n: self.sensors[n] for n in kept}
+        model._name_signals(
+            self.name, self.coordinates, self.inputs, parameters, velocities, self.description, units
+        )
+        q, v, a, u, p = model._symbols()
+        values = dict(zip(parameters, ca.vertsplit(p), strict=True))
+        arguments = [q, v, a, u, ca.vertcat(*(values.get(n, ca.SX(0)) for n in self.parameters))]
+        model.residual = ca.Function("residual", [q, v, a, u, p], [self.residual(*arguments)], list("qvaup"), ["r"])
+        model.kinematics, model.measurement = self.kinematics, None
+        if kept and self.measurement is not None:
+            places = [list(self.sensors).index(n) for n in kept]
+            y = self.measurement(*arguments)[places]
+            model.measurement = ca.Function("measurement", [q, v, a, u, p], [y], list("qvaup"), ["y"])
+        model._check()
+        return model
+
+    def _probe_of_sensors(self, names: Collection[str]) -> Probe:
+        """Probe of some of the measurement equations."""
+        assert self.measurement is not None
+        symbols = self._symbols()
+        y = self.measurement(*symbols)[[k for k, n in enumerate(self.sensors) if n in names]]
+        return Probe(ca.Function("sensors", list(symbols), [y]), self._bounds)
 
     # ------------------------------------------------------------------ derived functions
 
@@ -310,8 +417,13 @@ class Model:
         return self._definite * ca.ldl_solve(ca.densify(rhs), D, LT, order)
 
     def equations_text(self) -> tuple[str, ...]:
-        """Every residual as readable text, ``0 = ...``, in the signals' names."""
-        return tuple(f"0 = {r}" for r in ca.vertsplit(self.residual(*self._symbols())))
+        """Every residual as readable text, ``0 = ...``, in the signals' names, and every sensor, ``name = ...``."""
+        symbols = self._symbols()
+        residuals = tuple(f"0 = {r}" for r in ca.vertsplit(self.residual(*symbols)))
+        if self.measurement is None:
+            return residuals
+        outputs = zip(self.sensors, ca.vertsplit(self.measurement(*symbols)), strict=True)
+        return (*residuals, *(f"{name} = {y}" for name, y in outputs))
 
     def parameter_vector(self, parameters: Mapping[str, float]) -> FloatArray:
         """Values ``(n_p,)`` in the model's order.
@@ -358,6 +470,8 @@ class Model:
             "residual": self.residual.serialize(),
             "kinematics": None if self.kinematics is None else self.kinematics.serialize(),
         }
+        if self.measurement is not None:
+            data |= {"sensors": self.sensors, "measurement": self.measurement.serialize()}
         return {**data, "checksum": _checksum(data)}
 
     @classmethod
@@ -383,13 +497,24 @@ class Model:
             raise ResultError("the stored model is damaged: its checksum does not match; identify again")
         parameters = {n: _parameter_from_dict(x) for n, x in data["parameters"].items()}
         model._name_signals(
-            data["name"], data["coordinates"], data["inputs"], parameters, data["velocities"], data["description"]
+            data["name"],
+            data["coordinates"],
+            data["inputs"],
+            parameters,
+            data["velocities"],
+            data["description"],
+            data.get("sensors", {}),
         )
         model.residual = derivation.deserialize(data["residual"])
         stored = data["kinematics"]
         model.kinematics = None if stored is None else derivation.deserialize(stored)
-        sizes = [model.residual.size1_in(i) for i in range(model.residual.n_in())]
-        if sizes != [model.n_q, model.n_v, model.n_v, model.n_u, model.n_p]:
+        stored = data.get("measurement")
+        model.measurement = None if stored is None else derivation.deserialize(stored)
+        wanted = [model.n_q, model.n_v, model.n_v, model.n_u, model.n_p]
+        functions = [model.residual, *([] if model.measurement is None else [model.measurement])]
+        sizes = [[function.size1_in(i) for i in range(function.n_in())] for function in functions]
+        n_sensors = 0 if model.measurement is None else model.measurement.numel_out(0)
+        if any(found != wanted for found in sizes) or n_sensors != len(model.sensors):
             raise ResultError("the stored model is damaged: its names do not fit its equations; identify again")
         model._check()
         return model
@@ -399,6 +524,11 @@ class Model:
 
     def __repr__(self) -> str:
         return f"Model({self.name!r}, coordinates={list(self.coordinates)}, parameters={list(self.parameters)})"
+
+
+def _is_constant(slope: ca.SX) -> bool:
+    """True for an expression without symbols that is not zero."""
+    return bool(slope.is_constant() and float(slope) != 0.0)
 
 
 def _per_second(unit: str, order: int = 1) -> str:
