@@ -18,7 +18,7 @@ from diransac.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from diransac.model import Model, Parameter
 
-__all__ = ["Dataset", "ParameterLayout", "as_logs", "distinct_logs"]
+__all__ = ["Dataset", "ParameterLayout", "as_logs", "distinct_logs", "observed_model"]
 
 
 # Relative difference of two sampling times below which they are one rate with another jitter.
@@ -149,6 +149,52 @@ def distinct_logs(logs: Log | Iterable[Log]) -> tuple[Log, ...]:
             found = f"{one.source} is given twice" if one.source == other.source else same
             raise LogError(f"{found}; give each log once: repeated samples are no further evidence")
     return several
+
+
+def observed_model(model: Model, logs: Sequence[Log], *, regression: bool) -> tuple[Model, tuple[str, ...]]:
+    """The model without sensors that cannot be used, and without the parameters that only these depend on.
+
+    Parameters
+    ----------
+    model : Model
+    logs : sequence of Log
+    regression : bool
+        Whether sensors are used as rows of ``W p = b``: affine in the parameters, of measured signals.  Other sensors
+        remain where they have no parameters of their own, because simulations are compared with them.
+
+    Returns
+    -------
+    Model
+    tuple of str
+        Notes, a sentence each.
+    """
+    absent = [n for n in model.sensors if not any(n in log for log in logs)]
+    reasons = dict.fromkeys(absent, "no log has it")
+    if regression:
+        reasons |= {n: reason for n in model.sensors if n not in absent and (reason := _unusable(model, n, logs))}
+    own = model.with_sensors([n for n in model.sensors if n not in reasons]).parameters
+    needs = {n: [x for x in model.sensor_arguments[n] if x in model.parameters and x not in own] for n in reasons}
+    kept = [n for n in model.sensors if n not in absent and not needs.get(n)]
+    notes = [
+        f"sensor {n} is not used: {reason}{_without(needs[n])}"
+        for n, reason in reasons.items()
+        if n not in absent or needs[n]
+    ]
+    return model.with_sensors(kept), tuple(notes)
+
+
+def _unusable(model: Model, sensor: str, logs: Sequence[Log]) -> str:
+    """Reason why a sensor gives no rows of a regression; empty if it does."""
+    if sensor not in model.affine_sensors:
+        return "it is not affine in the parameters, as a regression needs"
+    needed = [n for n in model.sensor_arguments[sensor] if n in model.signals]
+    having = [log for log in logs if sensor in log]
+    missing = [[n for n in needed if n not in log] for log in having]
+    return f"{', '.join(missing[0])}, which it depends on, is not measured" if all(missing) else ""
+
+
+def _without(parameters: Sequence[str]) -> str:
+    return f"; {', '.join(parameters)}, of which nothing else depends, is left out" if parameters else ""
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,17 @@ class Segment:
         for name in self.present:
             full[:, self.model.signals.index(name)] = self.column(name)
         n_q, n_v = self.model.n_q, self.model.n_v
-        return full[:, :n_q], full[:, n_q : n_q + n_v], full[:, n_q + n_v :]
+        return full[:, :n_q], full[:, n_q : n_q + n_v], full[:, n_q + n_v : n_q + 2 * n_v]
+
+    def sensor_samples(self) -> FloatArray:
+        """Measured sensors ``(N, n_y)`` of the model; NaN where one, or a signal in it, is missing."""
+        model, samples = self.model, np.full((len(self), len(self.model.sensors)), np.nan)
+        for k, name in enumerate(model.sensors):
+            needed = [name, *(n for n in model.sensor_arguments[name] if n in model.signals)]
+            if set(needed) <= set(self.present):
+                usable = np.all([np.isfinite(self.column(n)) for n in needed], axis=0)
+                samples[usable, k] = self.column(name)[usable]
+        return samples
 
     def acting_inputs(self) -> FloatArray:
         """Inputs ``(N, n_u)`` that belong to each row's accelerations; see `preprocessing.acting_inputs`."""

@@ -37,6 +37,8 @@ __all__ = [
 
 _THRESHOLD_IN_SPREADS = 0.2
 _ACCELERATION_WEIGHT = 0.1
+# Fraction of the rows of every log in which a sensor is measured that is scored by default.
+_MOSTLY_MEASURED = 0.9
 _DEFAULT_RESOLUTION = Resolution()
 
 
@@ -79,7 +81,8 @@ def judged_signals(model: Model, logs: Sequence[Log], settings: Settings) -> tup
     logs : sequence of Log
     settings : Settings
         Weights and thresholds; where either is None, the default signals are compared: velocities and accelerations,
-        and coordinates whose velocity is not measured, as far as every log has them.
+        coordinates whose velocity is not measured, as far as every log has them, and sensors that are measured in
+        nearly all rows: the other rows do not count.
 
     Returns
     -------
@@ -88,12 +91,18 @@ def judged_signals(model: Model, logs: Sequence[Log], settings: Settings) -> tup
     named = {**(settings.error_weights or {}), **(settings.inlier_thresholds or {})}
     chosen = {n for n, x in named.items() if x > 0.0}
     if settings.error_weights is None or settings.inlier_thresholds is None:
-        chosen.update(_judged_by_default(model, [n for n in model.signals if all(n in log for log in logs)]))
+        measured = [n for n in model.signals if all(n in log for log in logs)]
+        sparse = [
+            n
+            for n in model.sensors
+            if n in measured and any(np.isfinite(log[n]).mean() < _MOSTLY_MEASURED for log in logs)
+        ]
+        chosen.update(_judged_by_default(model, [n for n in measured if n not in sparse]))
     return tuple(n for n in model.signals if n in chosen)
 
 
 def _judged_by_default(model: Model, measured: Sequence[str]) -> tuple[str, ...]:
-    rates = [n for n in (*model.velocities, *model.accelerations) if n in measured]
+    rates = [n for n in (*model.velocities, *model.accelerations, *model.sensors) if n in measured]
     if model.kinematics is not None:
         bare = [] if any(n in measured for n in model.velocities) else [q for q in model.coordinates if q in measured]
     else:
@@ -121,7 +130,8 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     LogError
         Every signal is constant.
     """
-    by_default = _judged_by_default(dataset.model, dataset.common_signals)
+    sparse = [n for n in dataset.model.sensors if n in dataset.signals and not _is_complete(dataset, n)]
+    by_default = _judged_by_default(dataset.model, [n for n in dataset.common_signals if n not in sparse])
     if not by_default and (settings.error_weights is None or settings.inlier_thresholds is None):
         raise LogError(
             f"{dataset.source}: no signal that could be scored is in every log; give one that all logs "
@@ -130,13 +140,15 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     scales = {n: dataset.scales[n] for n in by_default}
     constant = [n for n, scale in scales.items() if scale == 0.0]
     weights, thresholds = settings.error_weights, settings.inlier_thresholds
+    notes = [f"{n} is constant and is not compared" for n in constant]
     if weights is None or thresholds is None:
+        notes += [f"{n} is measured in a part of the rows and is not compared" for n in sparse]
         if len(constant) == len(scales):
             raise LogError(
                 f"{dataset.source}: {', '.join(scales)} are constant; nothing moves in this log. Record a motion"
             )
         moving = {n: scale for n, scale in scales.items() if scale > 0.0}
-        slow = dataset.model.accelerations
+        slow = _with_accelerations(dataset.model)
         if weights is None:
             weights = {n: (_ACCELERATION_WEIGHT if n in slow else 1.0) / x for n, x in moving.items()}
         if thresholds is None:
@@ -152,9 +164,19 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
             "thresholds"
         )
     compared = ", ".join(n for n, x in zip(dataset.signals, eps, strict=True) if x > 0.0)
-    notes = [f"{n} is constant and is not compared" for n in constant]
     notes.append(f"a row is an inlier if {needed} of {n_signals} signals are within their thresholds: {compared}")
     return Scoring(w, eps, needed, tuple(notes))
+
+
+def _is_complete(dataset: Dataset, name: str) -> bool:
+    """True if a signal is measured in every row that counts."""
+    return all(bool(np.isfinite(one.column(name)[one.valid]).all()) for one in dataset.segments)
+
+
+def _with_accelerations(model: Model) -> tuple[str, ...]:
+    """Names of the accelerations, and of the sensors that depend on them."""
+    sensors = [n for n, used in model.sensor_arguments.items() if not set(used).isdisjoint(model.accelerations)]
+    return (*model.accelerations, *sensors)
 
 
 # ---------------------------------------------------------------------- simulation

@@ -178,7 +178,7 @@ def _random_parameters(bounds: Sequence[Parameter], rng: np.random.Generator) ->
 
 
 def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Rows ``(n, n_p)`` of ``dr/dp`` at random motions that satisfy the equations, each of unit size."""
+    """Rows ``(n, n_p)`` of ``dr/dp`` and ``dy/dp`` at random motions that satisfy the equations, each of unit size."""
     n = max(_N_MOTIONS, _PER_PARAMETER * model.n_p)
     q, v, u = (_random_numbers((size, n), rng) for size in (model.n_q, model.n_v, model.n_u))
     for four in model.quaternions:
@@ -186,8 +186,11 @@ def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator) -> F
     repeated = np.repeat(p[:, None], n, axis=1)
     a = np.array(model.dynamics(np.vstack([q, v]), u, repeated)[1])
     symbols = [ca.SX.sym(name, model.residual.size1_in(i)) for i, name in enumerate("qvaup")]
-    slope = ca.Function("slope", symbols, [ca.densify(ca.jacobian(model.residual(*symbols), symbols[4]))])
-    J = np.array(slope(q, v, a, u, repeated)).reshape(model.n_v, n, model.n_p).reshape(-1, model.n_p)
+    outputs = model.residual(*symbols)
+    if model.measurement is not None:
+        outputs = ca.vertcat(outputs, model.measurement(*symbols))
+    slope = ca.Function("slope", symbols, [ca.densify(ca.jacobian(outputs, symbols[4]))])
+    J = np.array(slope(q, v, a, u, repeated)).reshape(outputs.numel(), n, model.n_p).reshape(-1, model.n_p)
     size = np.abs(J).max(axis=1)
     usable = np.isfinite(size) & (size > 0.0) & (size < 1e100)
     return np.asarray(J[usable] / size[usable, None])

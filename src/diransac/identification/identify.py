@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diransac.data import preprocessing
-from diransac.data.dataset import Dataset, distinct_logs
+from diransac.data.dataset import Dataset, distinct_logs, observed_model
 from diransac.data.log import Log
 from diransac.errors import DiransacError, SettingsError
 from diransac.identification.agreement import disagreements
@@ -177,9 +177,10 @@ class _Task:
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
         """Identify from prepared logs."""
         criteria = self.method.criteria
-        judged = judged_signals(self.model, logs, criteria)
+        model, unused = observed_model(self.model, logs, regression=self.method.regresses(self.model))
+        judged = judged_signals(model, logs, criteria)
         dataset = Dataset.of(
-            self.model, logs, judged, pointwise=self.pointwise, given=self.given, input_hold=self.input_hold
+            model, logs, judged, pointwise=self.pointwise, given=self.given, input_hold=self.input_hold
         )
         check_motion(dataset)
         fitted = 0.5 if self.compares else 0.95
@@ -192,7 +193,7 @@ class _Task:
             remarks, incomparable = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
         report(progress, "done", 1.0)
         return Result(
-            model=self.model,
+            model=model,
             method=self.method.name,
             seed=self.seed,
             settings=criteria,
@@ -202,7 +203,7 @@ class _Task:
             logs=_summaries(
                 dataset, evaluation, remarks, predictions(estimate, evaluation, dataset, scoring, criteria)
             ),
-            notes=(*dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x), *incomparable),
+            notes=(*unused, *dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x), *incomparable),
         )
 
     def with_suggestions(self, progress: Callback | None) -> Result:
@@ -211,7 +212,7 @@ class _Task:
         note = "no terms were suggested; the model is the given one"
         if found.suggestions:
             note = f"terms were added to the model as suggested: {'; '.join(x.text for x in found.suggestions)}"
-            extended = dataclasses.replace(self, model=with_terms(self.model, found.suggestions))
+            extended = dataclasses.replace(self, model=with_terms(found.model, found.suggestions))
             found = extended.run(self.given, within(progress, 0.5, 1.0, "with suggested terms: "))
         return dataclasses.replace(found, notes=(note, *found.notes))
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import ModelError, ResultError
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def check_sensors(label: str, probe: Probe, names: Sequence[str]) -> None:
     """Raises ModelError: a NaN constant in a sensor's equation, or one that is finite at no random point."""
     for i, _ in _nan_outputs(probe.residual):
         raise ModelError(f"{label}: sensor {names[i]!r} contains NaN; use casadi's functions, not Python's math")
-    finite = np.isfinite(np.array(probe.residual(*probe.points))).any(axis=1)
+    finite: BoolArray = np.asarray(np.isfinite(np.array(probe.residual(*probe.points))).any(axis=1))
     for name in (n for n, x in zip(names, finite, strict=True) if not x):
         raise ModelError(
             f"{label}: sensor {name!r} is not finite at any of {_N_POINTS} random points; check roots and logarithms"

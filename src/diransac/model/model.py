@@ -282,6 +282,11 @@ class Model:
         """Names of the sensors that are affine in the parameters."""
         return tuple(n for n in self.sensors if self._probe_of_sensors((n,)).is_affine_in_parameters())
 
+    @property
+    def is_affine(self) -> bool:
+        """True if the residuals and all sensors are affine in the parameters."""
+        return not self.nonlinear_parameters and len(self.affine_sensors) == len(self.sensors)
+
     @cached_property
     def sensor_regressor(self) -> ca.Function:
         """Function ``(q, v, a, u) -> (S (n_y, n_p), c (n_y))`` with ``y = S p + c`` for the sensors affine in p.
@@ -316,9 +321,7 @@ class Model:
         model = Model.__new__(Model)
         velocities = None if self.kinematics is None else self.velocities
         units = {n: self.sensors[n] for n in kept}
-        model._name_signals(
-            self.name, self.coordinates, self.inputs, parameters, velocities, self.description, units
-        )
+        model._name_signals(self.name, self.coordinates, self.inputs, parameters, velocities, self.description, units)
         q, v, a, u, p = model._symbols()
         values = dict(zip(parameters, ca.vertsplit(p), strict=True))
         arguments = [q, v, a, u, ca.vertcat(*(values.get(n, ca.SX(0)) for n in self.parameters))]
@@ -330,6 +333,16 @@ class Model:
             model.measurement = ca.Function("measurement", [q, v, a, u, p], [y], list("qvaup"), ["y"])
         model._check()
         return model
+
+    def sensors_of(self, arguments: Callable[..., Sequence[ca.SX]]) -> dict[str, Sensor]:
+        """The sensors for another model, of whose symbols ``arguments(q, v, a, u, p)`` returns this model's vectors."""
+
+        def output(k: int) -> Callable[..., ca.SX]:
+            assert self.measurement is not None
+            h = self.measurement
+            return lambda *symbols: h(*arguments(*symbols))[k]
+
+        return {name: Sensor(unit, output(k)) for k, (name, unit) in enumerate(self.sensors.items())}
 
     def _probe_of_sensors(self, names: Collection[str]) -> Probe:
         """Probe of some of the measurement equations."""

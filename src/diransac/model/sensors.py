@@ -20,12 +20,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import pi
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
 
+from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.parameter import Parameter
 
@@ -64,9 +66,7 @@ class Sensor:
             raise ModelError(f'the unit of a sensor is {self.unit!r}; give a text, such as "m/s^2"')
         if not callable(self.equation):
             raise ModelError(f"the equation of a sensor is {self.equation!r}; give a function of (q, v, a, u, p)")
-        if not isinstance(self.parameters, Mapping) or not all(
-            isinstance(x, Parameter) for x in self.parameters.values()
-        ):
+        if not all(isinstance(x, Parameter) for x in dict(self.parameters).values()):
             raise ModelError(f"the parameters of a sensor are {self.parameters!r}; map names to dr.Parameter")
 
 
@@ -142,24 +142,19 @@ def accelerometer(
             else 'accelerometer: a lever arm needs the angular velocities; give rates=("wx", "wy", "wz")'
         )
 
-    def force(q: Any, v: Any, a: Any, p: Any) -> ca.SX:
-        f = _rotation(attitude, q, p, n).T @ (ca.vertcat(*(a[x] for x in position)) - g)
+    def force(at: _Arguments) -> ca.SX:
+        f = _rotation(attitude, at, n).T @ (_column(at.a, position) - g)
         if arm is None:
             return f
-        r = _values(arm, p)
+        r = _values(arm, at.p)
         if n == 2:
-            w, alpha = v[attitude], a[attitude]
-            return f + alpha * ca.vertcat(-r[1], r[0]) - w**2 * r
+            w, alpha = at.v[attitude], at.a[attitude]
+            return ca.SX(f + alpha * ca.vertcat(-r[1], r[0]) - w**2 * r)
         assert rates is not None
-        w, alpha = (ca.vertcat(*(x[one] for one in rates)) for x in (v, a))
+        w, alpha = _column(at.v, rates), _column(at.a, rates)
         return f + ca.cross(alpha, r) + ca.cross(w, ca.cross(w, r))
 
-    return {
-        f"{name}_{axis}": _calibrated(
-            "m/s^2", lambda q, v, a, u, p, i=i: force(q, v, a, p)[i], name, f"_{axis}", bias, scale, arms
-        )
-        for i, axis in enumerate(position)
-    }
+    return _triad(name, position, "m/s^2", force, bias, scale, arms)
 
 
 def gyroscope(
@@ -189,20 +184,15 @@ def gyroscope(
     dict of str to Sensor
     """
     if isinstance(rates, str):
-        return {name: _calibrated("rad/s", lambda q, v, a, u, p: v[rates], name, "", bias, scale)}
+        return {name: _calibrated("rad/s", lambda at: at.v[rates], name, "", bias, scale)}
     if len(rates) != 3:
         raise ModelError(f"gyroscope: rates = {rates!r}; give the name of a planar angle, or three angular velocities")
 
-    def turned(q: Any, v: Any, p: Any) -> ca.SX:
-        w = ca.vertcat(*(v[x] for x in rates))
-        return w if attitude is None else _rotation(attitude, q, p, 3).T @ w
+    def turned(at: _Arguments) -> ca.SX:
+        w = _column(at.v, rates)
+        return w if attitude is None else _rotation(attitude, at, 3).T @ w
 
-    return {
-        f"{name}_{axis}": _calibrated(
-            "rad/s", lambda q, v, a, u, p, i=i: turned(q, v, p)[i], name, f"_{axis}", bias, scale
-        )
-        for i, axis in enumerate(rates)
-    }
+    return _triad(name, rates, "rad/s", turned, bias, scale)
 
 
 def encoder(
@@ -242,7 +232,7 @@ def encoder(
     column = name or f"{coordinate}_encoder"
     factor = ratio if counts is None else ratio * counts / (2.0 * pi)
     shown = unit if counts is None else "1"
-    return {column: _calibrated(shown, lambda q, v, a, u, p: factor * q[coordinate], column, "", bias, scale)}
+    return {column: _calibrated(shown, lambda at: factor * at.q[coordinate], column, "", bias, scale)}
 
 
 def magnetometer(
@@ -280,18 +270,11 @@ def magnetometer(
     B, fields = _estimated(field, [f"{name}_field_{x}" for x in axes], unit, "field")
     if B is None:
         raise ModelError('magnetometer: field = None; give its components, or "estimated"')
-    return {
-        f"{name}_{axis}": _calibrated(
-            unit,
-            lambda q, v, a, u, p, i=i: (_rotation(attitude, q, p, n).T @ _values(B, p))[i],
-            name,
-            f"_{axis}",
-            bias,
-            scale,
-            fields,
-        )
-        for i, axis in enumerate(axes)
-    }
+
+    def turned(at: _Arguments) -> ca.SX:
+        return _rotation(attitude, at, n).T @ _values(B, at.p)
+
+    return _triad(name, axes, unit, turned, bias, scale, fields)
 
 
 def range_to(
@@ -326,8 +309,8 @@ def range_to(
     if aim is None:
         raise ModelError('range_to: point = None; give its coordinates, or "estimated"')
 
-    def distance(q: Any, v: Any, a: Any, u: Any, p: Any) -> ca.SX:
-        return ca.norm_2(ca.vertcat(*(q[x] for x in position)) - _values(aim, p))
+    def distance(at: _Arguments) -> ca.SX:
+        return ca.norm_2(_column(at.q, position) - _values(aim, at.p))
 
     return {name: _calibrated(unit, distance, name, "", bias, scale, points)}
 
@@ -335,23 +318,53 @@ def range_to(
 # ---------------------------------------------------------------------- parts
 
 
+class _Arguments(NamedTuple):
+    """Arguments of a measurement equation, with components by name."""
+
+    q: Any
+    v: Any
+    a: Any
+    u: Any
+    p: Any
+
+
+def _triad(
+    name: str,
+    axes: Sequence[str],
+    unit: str,
+    ideal: Callable[[_Arguments], ca.SX],
+    bias: bool,
+    scale: bool,
+    parameters: Mapping[str, Parameter] | None = None,
+) -> dict[str, Sensor]:
+    """A sensor for each axis of a vector, each with its own bias and scale."""
+    return {
+        f"{name}_{axis}": _calibrated(unit, partial(_component, ideal, i), name, f"_{axis}", bias, scale, parameters)
+        for i, axis in enumerate(axes)
+    }
+
+
+def _component(ideal: Callable[[_Arguments], ca.SX], i: int, at: _Arguments) -> ca.SX:
+    return ca.SX(ideal(at)[i])
+
+
 def _calibrated(
     unit: str,
-    ideal: Callable[..., Any],
+    ideal: Callable[[_Arguments], Any],
     name: str,
     axis: str,
     bias: bool,
     scale: bool,
-    more: Mapping[str, Parameter] | None = None,
+    parameters: Mapping[str, Parameter] | None = None,
 ) -> Sensor:
     """A sensor that shows ``scale * ideal + bias``."""
     zero, factor = f"{name}_bias{axis}", f"{name}_scale{axis}"
-    own = {**(more or {})}
+    own = {**(parameters or {})}
     own |= {zero: Parameter(unit)} if bias else {}
     own |= {factor: Parameter("1", positive=True)} if scale else {}
 
     def equation(q: Any, v: Any, a: Any, u: Any, p: Any) -> Any:
-        value = ideal(q, v, a, u, p)
+        value = ideal(_Arguments(q, v, a, u, p))
         value = p[factor] * value if scale else value
         return value + p[zero] if bias else value
 
@@ -373,10 +386,10 @@ def _estimated(
 
 def _values(vector: Sequence[float] | Sequence[str], p: Any) -> ca.SX:
     """A vector of numbers, or of parameters by name."""
-    return ca.vertcat(*(p[x] if isinstance(x, str) else x for x in vector))
+    return ca.SX(ca.vertcat(*(p[x] if isinstance(x, str) else x for x in vector)))
 
 
-def _vector(what: str, values: Sequence[float], n: int) -> np.ndarray:
+def _vector(what: str, values: Sequence[float], n: int) -> FloatArray:
     """Finite numbers ``(n,)``."""
     try:
         found = np.asarray(values, dtype=float)
@@ -394,23 +407,29 @@ def _dimension(what: str, names: Sequence[str]) -> int:
     return len(names)
 
 
-def _rotation(attitude: Attitude, q: Any, p: Any, n: int) -> ca.SX:
+def _column(symbols: Any, names: Sequence[str]) -> ca.SX:
+    """Components by name as a column."""
+    return ca.SX(ca.vertcat(*(symbols[name] for name in names)))
+
+
+def _rotation(attitude: Attitude, at: _Arguments, n: int) -> ca.SX:
     """Rotation matrix ``(n, n)`` from the body to the world frame."""
     if callable(attitude):
-        R = ca.SX(attitude(q, p))
+        R = ca.SX(attitude(at.q, at.p))
         if R.shape != (n, n):
             raise ValueError(f"attitude returns a matrix {R.shape}, not {(n, n)}")
         return R
     if isinstance(attitude, str):
         if n != 2:
             raise ValueError(f"attitude {attitude!r} is a planar angle, but there are {n} axes")
-        s, c = ca.sin(q[attitude]), ca.cos(q[attitude])
-        return ca.vertcat(ca.horzcat(c, -s), ca.horzcat(s, c))
+        s, c = ca.sin(at.q[attitude]), ca.cos(at.q[attitude])
+        return ca.SX(ca.vertcat(ca.horzcat(c, -s), ca.horzcat(s, c)))
     if len(attitude) != 4 or n != 3:
         raise ValueError(f"attitude {tuple(attitude)!r} is not a unit quaternion (w first) of three axes")
-    w, x, y, z = (q[name] for name in attitude)
-    return ca.vertcat(
+    w, x, y, z = (at.q[name] for name in attitude)
+    rows = (
         ca.horzcat(1 - 2 * (y**2 + z**2), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         ca.horzcat(2 * (x * y + w * z), 1 - 2 * (x**2 + z**2), 2 * (y * z - w * x)),
         ca.horzcat(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)),
     )
+    return ca.SX(ca.vertcat(*rows))

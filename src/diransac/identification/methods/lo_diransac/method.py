@@ -253,10 +253,9 @@ def _checks(
 
 def _rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRows]:
     """Rows of the smoothed motion of each log."""
-    n_q, n_v = intervals.model.n_q, intervals.model.n_v
     logged = [np.arange(x.start, x.stop)[intervals.is_logged[x]] for x in intervals.rows_of_logs]
-    parts = [np.split(motion.signals[rows], [n_q, n_q + n_v], axis=1) for rows in logged]
-    return [MotionRows(q, v, a, intervals.inputs[rows]) for (q, v, a), rows in zip(parts, logged, strict=True)]
+    parts = [motion.parts(intervals.model, rows) for rows in logged]
+    return [MotionRows(q, v, a, intervals.inputs[rows], y) for (q, v, a, y), rows in zip(parts, logged, strict=True)]
 
 
 def _unmeasured(intervals: ShootingIntervals) -> list[str]:

@@ -135,12 +135,16 @@ def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
 
 
 def _candidates(intervals: ShootingIntervals) -> list[tuple[BoolArray, bool]]:
-    """Signals and kinds of the errors that are tested: of each signal, and delays of coordinates, velocities, ..."""
+    """Signals and kinds of the errors that are tested: of each signal, and delays of coordinates, velocities, ...
+
+    The bias of a sensor that has one as a parameter is not tested.
+    """
     model = intervals.model
     seen = intervals.known.sum(axis=0) >= _FEWEST
-    kind = np.repeat([0, 1, 2], [model.n_q, model.n_v, model.n_v])
+    kind = np.repeat([0, 1, 2, 3], [model.n_q, model.n_v, model.n_v, len(model.sensors)])
     single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen)]
-    groups = [(kind == g) & seen for g in range(3)]
+    groups = [(kind == g) & seen for g in range(4)]
     groups = [x for x in groups if 1 < x.sum() < seen.sum()]
     delays = [(x, True) for x in [*groups, *single] if not (x == seen).all()]
-    return [*delays, *((x, False) for x in single)]
+    biased = np.array([n in model.biased_sensors for n in model.signals])
+    return [*delays, *((x, False) for x in single if not biased[x].any())]
