@@ -169,32 +169,30 @@ def observed_model(model: Model, logs: Sequence[Log], *, regression: bool) -> tu
         Notes, a sentence each.
     """
     absent = [n for n in model.sensors if not any(n in log for log in logs)]
-    reasons = dict.fromkeys(absent, "no log has it")
+    reasons = dict.fromkeys(absent, "no log has such a signal")
     if regression:
         reasons |= {n: reason for n in model.sensors if n not in absent and (reason := _unusable(model, n, logs))}
     own = model.with_sensors([n for n in model.sensors if n not in reasons]).parameters
     needs = {n: [x for x in model.sensor_arguments[n] if x in model.parameters and x not in own] for n in reasons}
     kept = [n for n in model.sensors if n not in absent and not needs.get(n)]
-    notes = [
-        f"sensor {n} is not used: {reason}{_without(needs[n])}"
-        for n, reason in reasons.items()
-        if n not in absent or needs[n]
-    ]
+    notes = []
+    for reason in dict.fromkeys(reasons.values()):
+        alike = [n for n, x in reasons.items() if x == reason]
+        lost = dict.fromkeys(x for n in alike for x in needs[n])
+        if lost or alike[0] not in absent:
+            with_parameters = f" with {', '.join(lost)}, which only sensors depend on" if lost else ""
+            notes.append(f"the fit leaves {', '.join(alike)} out{with_parameters}: {reason}")
     return model.with_sensors(kept), tuple(notes)
 
 
 def _unusable(model: Model, sensor: str, logs: Sequence[Log]) -> str:
     """Reason why a sensor gives no rows of a regression; empty if it does."""
     if sensor not in model.affine_sensors:
-        return "it is not affine in the parameters, as a regression needs"
+        return "a regression needs sensors that are affine in the parameters"
     needed = [n for n in model.sensor_arguments[sensor] if n in model.signals]
     having = [log for log in logs if sensor in log]
     missing = [[n for n in needed if n not in log] for log in having]
-    return f"{', '.join(missing[0])}, which it depends on, is not measured" if all(missing) else ""
-
-
-def _without(parameters: Sequence[str]) -> str:
-    return f"; {', '.join(parameters)}, of which nothing else depends, is left out" if parameters else ""
+    return f"{', '.join(missing[0])} in the measurement equation is not measured" if all(missing) else ""
 
 
 @dataclass(frozen=True)

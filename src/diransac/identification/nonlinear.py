@@ -243,8 +243,10 @@ class _SelectedRows:
 def _usable(one: Segment, known: Sequence[int], shown: Sequence[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """States, inputs, and known accelerations and sensors of one log's usable rows; sensors may be NaN."""
     q, v, a = (x[one.valid] for x in one.state_arrays())
-    y = one.sensor_samples()[one.valid]
-    return np.hstack([q, v]), one.acting_inputs()[one.valid], np.hstack([a[:, known], y[:, shown]])
+    measured = a[:, known]
+    if shown:
+        measured = np.hstack([measured, one.sensor_samples()[one.valid][:, shown]])
+    return np.hstack([q, v]), one.acting_inputs()[one.valid], measured
 
 
 def _spreads(sensors: FloatArray) -> list[float]:

@@ -139,10 +139,17 @@ class LocalSearch:
         return self._with_sensors(best)
 
     def _with_sensors(self, best: Explanation) -> Explanation:
-        """The explanation with errors of the sensors, one after the other, as long as they make it likelier."""
-        for k in range(self.settings.max_sensor_errors if not best.exact else 0):
+        """The explanation with errors of the sensors, one after the other, as long as they make it likelier.
+
+        Where the model is exact, only the signals of its measurement equations are tested: nothing else depends on
+        them, so that the motion is as likely whatever their delay.
+        """
+        model = best.intervals.model
+        tested = np.full(len(model.signals), not best.exact)
+        tested[len(model.signals) - len(model.sensors) :] = True
+        for k in range(self.settings.max_sensor_errors if tested.any() else 0):
             report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
-            error = clearest_error(best.intervals, best.refinement.fit)
+            error = clearest_error(best.intervals, best.refinement.fit, tested)
             if error is None:
                 break
             other = self._refitted(best, with_error(best.intervals, best.refinement.fit, error))

@@ -55,7 +55,7 @@ class SensorError:
     ratio: float
 
 
-def clearest_error(intervals: ShootingIntervals, fit: Fit) -> SensorError | None:
+def clearest_error(intervals: ShootingIntervals, fit: Fit, tested: BoolArray) -> SensorError | None:
     """The error of the sensors that the residuals show most clearly.
 
     Parameters
@@ -63,6 +63,8 @@ def clearest_error(intervals: ShootingIntervals, fit: Fit) -> SensorError | None
     intervals : ShootingIntervals
     fit : Fit
         At its optimum.
+    tested : (n_s,) bool array
+        Signals whose errors are tested.
 
     Returns
     -------
@@ -73,7 +75,8 @@ def clearest_error(intervals: ShootingIntervals, fit: Fit) -> SensorError | None
     at = linearize(intervals, fit, weights)
     batch = np.arange(0, len(intervals), max(1, round(np.sqrt(len(intervals)))))
     found: list[SensorError] = []
-    for signals, is_delay in _candidates(intervals):
+    n_motion = len(intervals.model.signals) - len(intervals.model.sensors)
+    for signals, is_delay in _candidates(intervals, tested):
         sensitivity = np.where(signals, -rates if is_delay else 1.0, 0.0)
         # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
         moved = linearize(replace(intervals, measured=intervals.measured - sensitivity), fit, weights)
@@ -82,9 +85,13 @@ def clearest_error(intervals: ShootingIntervals, fit: Fit) -> SensorError | None
         information = float((weights * np.square(sensitivity)).sum() - (of_z * z).sum() - of_s @ s)
         rows = (weights * sensitivity * fit.residuals).sum(axis=1)
         scores = rows.reshape(len(intervals), -1).sum(axis=1) + (at.data_z * z).sum(axis=1) + at.data_s @ s
+        score = float(rows.sum())
+        if signals[n_motion:].any():
+            # An error that is there has a score of one sign in each batch; only the rest of the scores scatters.
+            share = (weights * np.square(sensitivity)).sum(axis=1).reshape(len(intervals), -1).sum(axis=1)
+            scores = scores - score * share / max(share.sum(), 1e-300)
         variance = max(information, float(np.square(np.add.reduceat(scores, batch)).sum()))
         if information > 0.0:
-            score = float(rows.sum())
             found.append(SensorError(signals, is_delay, -score / information, abs(score) / np.sqrt(variance)))
     clear = [x for x in found if x.ratio > _CLEAR and (not x.is_delay or abs(x.size) > _LEAST_DELAY)]
     return max(clear, key=lambda x: x.ratio, default=None)
@@ -134,7 +141,7 @@ def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return np.nan_to_num(rates, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _candidates(intervals: ShootingIntervals) -> list[tuple[BoolArray, bool]]:
+def _candidates(intervals: ShootingIntervals, tested: BoolArray) -> list[tuple[BoolArray, bool]]:
     """Signals and kinds of the errors that are tested: of each signal, and delays of coordinates, velocities, ...
 
     The bias of a sensor that has one as a parameter is not tested.
@@ -142,8 +149,8 @@ def _candidates(intervals: ShootingIntervals) -> list[tuple[BoolArray, bool]]:
     model = intervals.model
     seen = intervals.known.sum(axis=0) >= _FEWEST
     kind = np.repeat([0, 1, 2, 3], [model.n_q, model.n_v, model.n_v, len(model.sensors)])
-    single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen)]
-    groups = [(kind == g) & seen for g in range(4)]
+    single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen & tested)]
+    groups = [(kind == g) & seen & tested for g in range(4)]
     groups = [x for x in groups if 1 < x.sum() < seen.sum()]
     delays = [(x, True) for x in [*groups, *single] if not (x == seen).all()]
     biased = np.array([n in model.biased_sensors for n in model.signals])
