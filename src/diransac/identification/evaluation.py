@@ -130,7 +130,7 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     LogError
         Every signal is constant.
     """
-    sparse = [n for n in dataset.model.sensors if n in dataset.signals and not _is_complete(dataset, n)]
+    sparse = [n for n in dataset.model.sensors if n in dataset.common_signals and not _is_complete(dataset, n)]
     by_default = _judged_by_default(dataset.model, [n for n in dataset.common_signals if n not in sparse])
     if not by_default and (settings.error_weights is None or settings.inlier_thresholds is None):
         raise LogError(
