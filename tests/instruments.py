@@ -12,8 +12,13 @@ from scipy.integrate import solve_ivp
 GRAVITY, ARM = 9.81, 0.177
 TRUTH = {"mass": 0.25, "inertia": 0.0041, "drag": 0.012}
 INSTRUMENTS = {
-    "acc_arm_x": 0.06, "acc_arm_z": -0.04, "acc_bias_x": 0.35, "acc_bias_z": -0.22, "gyro_bias": 0.08, "gyro_scale": 1.06,
-}  # fmt: skip
+    "acc_arm_x": 0.06,
+    "acc_arm_z": -0.04,
+    "acc_bias_x": 0.35,
+    "acc_bias_z": -0.22,
+    "gyro_bias": 0.08,
+    "gyro_scale": 1.06,
+}
 POSE_NOISE, ACC_NOISE, GYRO_NOISE = 0.002, 0.15, 0.01
 
 
@@ -68,9 +73,14 @@ def readings(of: Mapping[str, np.ndarray], p: Mapping[str, float]) -> dict[str, 
 def recorded(
     columns: Mapping[str, np.ndarray], seed: int = 0, outliers: float = 0.0, signals: tuple[str, ...] = ()
 ) -> dict[str, np.ndarray]:
-    """Pose and readings with noise; outliers, of 10 m/s^2 and 3 rad/s, in the readings.  Further signals as they are."""
+    """Pose and readings with noise; outliers, of 10 m/s^2 and 3 rad/s, in the readings; further signals as they are."""
     rng, n = np.random.default_rng([seed, 1]), len(columns["t"])
-    noise = {**dict.fromkeys(("x", "z", "theta"), POSE_NOISE), "acc_x": ACC_NOISE, "acc_z": ACC_NOISE, "gyro": GYRO_NOISE}
+    noise = {
+        **dict.fromkeys(("x", "z", "theta"), POSE_NOISE),
+        "acc_x": ACC_NOISE,
+        "acc_z": ACC_NOISE,
+        "gyro": GYRO_NOISE,
+    }
     log = {name: columns[name] for name in ("t", "thrust", "moment", *signals)}
     log |= {name: columns[name] + rng.normal(0.0, std, n) for name, std in noise.items()}
     for name in ("acc_x", "acc_z", "gyro"):
