@@ -399,6 +399,13 @@ def test_the_delay_of_an_imu_is_estimated(model, columns):
     assert within_intervals(result, TRUE) == []
 
 
+def test_a_log_without_a_sensor_is_identified_with_one_that_has_it(model, columns):
+    other = {n: x for n, x in recorded(flight(5), 5).items() if n not in ("acc_x", "acc_z", "gyro")}
+    result = dr.identify(model, [as_log(recorded(columns, 0)), as_log(other)], differentiate=True)
+    assert within_intervals(result, TRUE) == []
+    assert [x.remark for x in result.logs] == ["", ""]
+
+
 def test_a_parameter_that_only_a_sensor_shows_is_identified_from_it():
     """The motion of a cart with its payload shows only their sum; a load cell between them shows the payload."""
     cart = dr.Model(

@@ -269,6 +269,13 @@ class Model:
         return {name: self._names_in(self.measurement, k) for k, name in enumerate(self.sensors)}
 
     @cached_property
+    def sensor_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that sensors depend on, and no residual."""
+        of_sensors = {n for used in self.sensor_arguments.values() for n in used}
+        of_motion = set(self._names_in(self.residual))
+        return tuple(n for n in self.parameters if n in of_sensors and n not in of_motion)
+
+    @cached_property
     def biased_sensors(self) -> tuple[str, ...]:
         """Names of the sensors with a parameter that adds a constant to them."""
         if self.measurement is None:
@@ -315,9 +322,8 @@ class Model:
         kept = [n for n in self.sensors if n in names]
         if len(kept) == len(self.sensors):
             return self
-        left = {n for name, used in self.sensor_arguments.items() if name not in kept for n in used}
-        needed = {*self._names_in(self.residual), *(n for name in kept for n in self.sensor_arguments[name])}
-        parameters = {n: x for n, x in self.parameters.items() if n in needed or n not in left}
+        needed = {n for name in kept for n in self.sensor_arguments[name]}
+        parameters = {n: x for n, x in self.parameters.items() if n in needed or n not in self.sensor_parameters}
         model = Model.__new__(Model)
         velocities = None if self.kinematics is None else self.velocities
         units = {n: self.sensors[n] for n in kept}

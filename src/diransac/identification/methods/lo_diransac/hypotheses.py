@@ -76,14 +76,17 @@ def _linear(
 ) -> FloatArray:
     """Finalists of a model that is affine in its parameters: the best of least squares of random averages.
 
-    Parameters that only sensors depend on, but not as affine functions, are those of nonlinear least squares.
+    Parameters that only sensors depend on, but not as affine functions, are those of nonlinear least squares.  Where
+    no log has such a sensor, they are 1 if positive and 0 otherwise, and their variance will be infinite.
     """
-    weak = weak_form(intervals, motion)
+    weak, layout = weak_form(intervals, motion), dataset.layout
     n = len(intervals)
     few = np.unique(np.linspace(0, n - 1, min(settings.n_screening_intervals, n)).astype(int))
     samples = weak.solve(_samples(settings, weak, seed))
-    if not dataset.model.is_affine:
-        missing = ~weak.W.any(axis=(0, 1))
+    missing = _in_sensors_alone(dataset) & ~weak.W.any(axis=(0, 1))
+    if missing.any() and dataset.model.is_affine:
+        samples[:, missing] = [1.0 if x.positive else 0.0 for x, m in zip(layout.bounds, missing, strict=True) if m]
+    elif missing.any():
         bound = NonlinearLeastSquares().bind(_smoothed_dataset(intervals, motion, dataset))
         samples[:, missing] = bound.select([np.arange(bound.n_rows)]).fit()[0][missing]
     samples = _admitted(intervals, samples)
@@ -91,6 +94,12 @@ def _linear(
         return samples
     order = np.argsort(robust_scores(intervals, motion, samples, few), kind="stable")
     return samples[order[: settings.n_finalists]]
+
+
+def _in_sensors_alone(dataset: Dataset) -> BoolArray:
+    """Mask ``(n,)`` of the parameters that no equation of motion depends on."""
+    alone = dataset.model.sensor_parameters
+    return np.array([name.partition("[")[0] in alone for name in dataset.layout.names], bool)
 
 
 def _nonlinear(

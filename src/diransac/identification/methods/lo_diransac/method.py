@@ -103,7 +103,8 @@ class LoDiransac(LoDiransacSettings):
     max_delay_shifts : int, optional
         Rounds in which other delays, a lag and another hold of the inputs are tried after the first optimisations.
     max_sensor_errors : int, optional
-        Largest number of delays and biases of sensors that are estimated where the model is not exact.
+        Largest number of delays and biases of sensors that are estimated; where the model is exact, only of those with
+        a measurement equation.
     substeps : int, optional
         Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
         samples or links are light.

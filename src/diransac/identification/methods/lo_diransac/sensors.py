@@ -1,5 +1,7 @@
 """Systematic errors of the sensors: a delay of each signal or group of signals, and a bias.
 
+A sensor is here whatever measures a signal, with a measurement equation or without.
+
 An error of a sensor that no parameter and no discrepancy explains is in the residuals: a delay in
 proportion to the signal's rate, a bias a constant.  A score test finds the most significant error, given all
 else that is estimated; it costs a call of the simulator, and no fit.  The error is then estimated jointly with all
