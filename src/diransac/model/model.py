@@ -323,22 +323,20 @@ class Model:
         if len(kept) == len(self.sensors):
             return self
         needed = {n for name in kept for n in self.sensor_arguments[name]}
-        parameters = {n: x for n, x in self.parameters.items() if n in needed or n not in self.sensor_parameters}
-        model = Model.__new__(Model)
-        velocities = None if self.kinematics is None else self.velocities
-        units = {n: self.sensors[n] for n in kept}
-        model._name_signals(self.name, self.coordinates, self.inputs, parameters, velocities, self.description, units)
-        q, v, a, u, p = model._symbols()
-        values = dict(zip(parameters, ca.vertsplit(p), strict=True))
-        arguments = [q, v, a, u, ca.vertcat(*(values.get(n, ca.SX(0)) for n in self.parameters))]
-        model.residual = ca.Function("residual", [q, v, a, u, p], [self.residual(*arguments)], list("qvaup"), ["r"])
-        model.kinematics, model.measurement = self.kinematics, None
+        parameters = [n for n in self.parameters if n in needed or n not in self.sensor_parameters]
+        q, v, a, u, p = self._symbols()
+        own = [symbol for n, symbol in zip(self.parameters, ca.vertsplit(p), strict=True) if n in parameters]
+        symbols = [q, v, a, u, ca.vertcat(*own)]
+        data = {k: x for k, x in self.to_dict().items() if k not in ("checksum", "sensors", "measurement")}
+        data["parameters"] = {n: data["parameters"][n] for n in parameters}
+        data["residual"] = ca.Function(
+            "residual", symbols, [self.residual(q, v, a, u, p)], list("qvaup"), ["r"]
+        ).serialize()
         if kept and self.measurement is not None:
-            places = [list(self.sensors).index(n) for n in kept]
-            y = self.measurement(*arguments)[places]
-            model.measurement = ca.Function("measurement", [q, v, a, u, p], [y], list("qvaup"), ["y"])
-        model._check()
-        return model
+            y = self.measurement(q, v, a, u, p)[[list(self.sensors).index(n) for n in kept]]
+            data["sensors"] = {n: self.sensors[n] for n in kept}
+            data["measurement"] = ca.Function("measurement", symbols, [y], list("qvaup"), ["y"]).serialize()
+        return Model.from_dict({**data, "checksum": _checksum(data)})
 
     def sensors_of(self, arguments: Callable[..., Sequence[ca.SX]]) -> dict[str, Sensor]:
         """The sensors for another model, of whose symbols ``arguments(q, v, a, u, p)`` returns this model's vectors."""
