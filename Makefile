@@ -2,6 +2,8 @@
 PYTHON ?= $(firstword $(foreach p,python3 python python3.14 python3.13 python3.12 python3.11,\
 	$(shell $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(p))))
 BIN := .venv/bin
+# A file runs in one worker; in the order of their names, because few tests of a file may take as long as many.
+PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
 ENVIRONMENT := .venv/.installed
 
 .PHONY: demo test quick lint bench docs coverage lock clean
@@ -10,10 +12,10 @@ demo: $(ENVIRONMENT)  ## fly, identify, fly what was identified; writes out/demo
 	$(BIN)/python examples/demo.py
 
 test: lint docs  ## everything that must hold
-	$(BIN)/pytest -q -n auto --dist loadfile
+	$(BIN)/pytest -q $(PARALLEL)
 
 quick: $(ENVIRONMENT)  ## tests without the slow ones
-	$(BIN)/pytest -q -n auto --dist loadfile -m "not slow"
+	$(BIN)/pytest -q $(PARALLEL) -m "not slow"
 
 lint: $(ENVIRONMENT)
 	$(BIN)/ruff check .

@@ -105,7 +105,7 @@ LEFT_OUT = {
     "unmodelled accelerations": dr.LoDiransac(model_error=False),
     "prior of a thousandth": dr.LoDiransac(prior_model_error=1e-5),
     "input gain and bias discrepancy": dr.LoDiransac(prior_discrepancy=1e-6, initial_discrepancy=1e-6),
-    "delay": dr.LoDiransac(prior_delay=1e-8, delay_range=(0.0, 0.0), max_delay_shifts=0),
+    "delay": dr.LoDiransac(input_delay=False, input_lag=False, max_delay_shifts=0),
     "delay by whole samples first": dr.LoDiransac(delay_range=(0.0, 0.0)),
     "robust initial scale": dr.LoDiransac(robust_model_error=False),
     "slow continuity schedule": dr.LoDiransac(gradual_continuity=False),

@@ -65,15 +65,32 @@ def test_nan_of_an_input_is_held_from_the_last_good_sample_and_counted():
     assert any("held" in note and "2 rows" in note for note in segment.notes)
 
 
-def test_gap_in_the_inputs_is_said_with_what_it_spoils():
+def test_gap_in_the_inputs_ends_a_stretch_and_its_rows_do_not_count():
     """A few samples are bridged; where more are missing, what is simulated is no longer what flew."""
     two, ten = tuple(range(5, 7)), tuple(range(30, 40))
-    notes = bind_log(MODEL, plane_log({(two, "thrust"): np.nan, (ten, "moment"): np.nan})).notes
-    assert notes[-2] == "inputs were held from the last good sample in 12 rows, where they are NaN"
-    assert notes[-1].startswith(
-        "inputs are unknown in 1 gap, the longest 0.22 s after t = 0.58 s: a simulation through it"
+    segment = bind_log(MODEL, plane_log({(two, "thrust"): np.nan, (ten, "moment"): np.nan, (40, "x_ddot"): np.nan}))
+    assert segment.notes[-2] == "inputs were held from the last good sample in 2 rows, where they are NaN"
+    assert segment.notes[-1] == (
+        "inputs or all sensors are unknown in 1 gap, the longest 0.22 s after t = 0.58 s: simulations end there and "
+        "begin again after it"
     )
+    assert segment.stretches == (slice(0, 30), slice(41, len(segment)))
+    assert not segment.valid[30:41].any()
+    assert segment.valid[[*range(30), *range(41, len(segment))]].all()
     assert not any("gap" in note for note in bind_log(MODEL, plane_log({(two, "thrust"): np.nan})).notes)
+
+
+@pytest.mark.parametrize(("n_rows", "is_gap"), [(11, False), (12, True)])
+def test_silence_of_all_sensors_for_a_quarter_of_a_second_is_a_gap(n_rows, is_gap):
+    rows = tuple(range(30, 30 + n_rows))
+    segment = bind_log(MODEL, plane_log({(rows, name): np.nan for name in MODEL.signals}))
+    assert len(segment.stretches) == 1 + is_gap
+
+
+def test_rare_samples_are_no_gaps():
+    silent = tuple(k for k in range(1, N) if k % 20)
+    segment = bind_log(MODEL, plane_log({(silent, name): np.nan for name in MODEL.signals}), pointwise=False)
+    assert not segment.gaps.any()
 
 
 def test_input_unknown_from_the_start_is_not_held():

@@ -46,7 +46,9 @@ def test_velocities_that_are_not_logged_follow_from_the_kinematics():
 def test_a_lag_of_the_actuators_is_estimated_and_named():
     found = judged("rotor motor lag 50 ms")
     assert found.worst < 0.2
-    assert any("first-order lag of 4" in x or "first-order lag of 5" in x for x in found.findings)
+    lags = [x for x in found.findings if "after a first-order lag of the actuators" in x]
+    assert len(lags) == 1
+    assert float(lags[0].split()[2]) == pytest.approx(50.0, abs=5.0)
 
 
 def test_late_sensors_are_named():

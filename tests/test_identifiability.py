@@ -248,3 +248,17 @@ def test_a_motion_with_outliers_and_noise_is_a_motion(noise):
     hit = lambda x: np.where(rng.random(N) < 0.3, rng.uniform(-50.0, 50.0, N), x)  # noqa: E731
     log = slide(noise, s=lambda x: hit(x["s"]), s_dot=lambda x: hit(x["s_dot"]))
     assert dr.identify(sledge(), log).parameters["mass"] == pytest.approx(MASS, rel=0.2)
+
+
+def test_a_coordinate_at_rest_says_nothing_of_the_others():
+    """A sledge that never leaves its track: the second equation is 0 = 0 on the log."""
+    track = dr.Model(
+        "tracked sledge",
+        {"s": "m", "y": "m"},
+        {"force": "N"},
+        {"mass": POSITIVE, "drag": NOT_NEGATIVE},
+        lambda q, v, a, u, p: [p.mass * a.s + p.drag * v.s - u.force, p.mass * a.y + p.drag * v.y],
+    )
+    columns = {name: slide()[name] for name in ("s", "s_dot", "force")} | {"y": np.zeros(N), "y_dot": np.zeros(N)}
+    found = dr.identify(track, dr.Log.from_arrays(DT * np.arange(N), columns), differentiate=True)
+    assert found.parameters == pytest.approx({"mass": MASS, "drag": DRAG}, rel=0.02)

@@ -325,7 +325,7 @@ LEFT_OUT = [
     {"model_error": False},
     {"prior_model_error": 1e-5},
     {"prior_discrepancy": 1e-6, "initial_discrepancy": 1e-6},
-    {"prior_delay": 1e-8, "max_delay_shifts": 0, "delay_range": (0, 0)},
+    {"input_delay": False, "input_lag": False, "max_delay_shifts": 0},
     {"robust_model_error": False},
     {"gradual_continuity": False},
     {"projection": False},

@@ -253,8 +253,8 @@ def perturbed_fit(intervals, signals, seed=9):
     n = intervals.n_shared
     shared = np.append(TRUTH, np.zeros(n - 3)) * 1.05 + np.r_[0, 0, 0, 1e-3 * rng.normal(size=n - 3)]
     noise = Mixture(np.full(9, 0.1), np.full(9, 0.1), np.full(9, 10.0), np.full(9, 1e-6))
-    prior = np.r_[np.full(3, np.inf), np.full(n - 3, 0.01)]
-    sizes = (np.full(3, 0.1), np.array([0.0, 0.4, 0.9]), np.full(6, 0.02), prior)
+    prior, mean = np.r_[0.02, np.inf, 0.003, np.full(n - 3, 0.01)], np.r_[0.3, 0.0, 0.02, np.zeros(n - 3)]
+    sizes = (np.full(3, 0.1), np.array([0.0, 0.4, 0.9]), np.full(6, 0.02), prior, mean)
     return with_residuals(intervals, Fit(shared, x, d, np.zeros_like(signals), noise, *sizes))
 
 
@@ -290,7 +290,8 @@ def test_a_gauss_newton_step_solves_a_linear_problem_at_once():
     intervals = intervals_over(measured, inputs, model, dt, 20)
     noise = Mixture(np.ones(3), np.full(3, 0.1), np.full(3, 10.0), np.full(3, 1e-6))
     shared = np.zeros(intervals.n_shared)
-    sizes = (np.array([0.3]), np.array([0.6]), np.array([0.1, 0.1]), np.r_[np.inf, 0.1, 0.1, 1e-9])
+    prior = (np.r_[np.inf, 0.1, 0.1, 1e-9], np.zeros(4))
+    sizes = (np.array([0.3]), np.array([0.6]), np.array([0.1, 0.1]), *prior)
     fit = with_residuals(intervals, Fit(shared, np.zeros((5, 2)), np.zeros((5, 1)), measured, noise, *sizes))
     weights = rng.uniform(0.5, 2.0, (n, 3))
     first = linearize(intervals, fit, weights)

@@ -17,7 +17,18 @@ from diransac.identification.settings import Settings, nearest_names
 from diransac.model import Model
 from diransac.user_files import definitions, file_and_name
 
-__all__ = ["load_methods", "load_model", "load_settings", "model_file", "names", "numbers", "pairs", "toml_value"]
+__all__ = [
+    "fixed_parameters",
+    "load_methods",
+    "load_model",
+    "load_settings",
+    "model_file",
+    "names",
+    "numbers",
+    "pairs",
+    "prior_pairs",
+    "toml_value",
+]
 
 
 # ---------------------------------------------------------------------- lists of pairs
@@ -91,6 +102,67 @@ def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
         return {name: float(value) for name, value in found.items()}
     except ValueError as error:
         raise typer.BadParameter(f"{option}: {error}; give name=number pairs") from error
+
+
+def fixed_parameters(option: str, texts: Sequence[str]) -> dict[str, float | None]:
+    """``["mass=0.25,gravity"]`` as values by name; None for a name alone.
+
+    Parameters
+    ----------
+    option : str
+        Name of the option in messages.
+    texts : sequence of str
+        Items, separated by commas.
+
+    Returns
+    -------
+    dict of str to float or None
+
+    Raises
+    ------
+    typer.BadParameter
+        As `numbers`.
+    """
+    items = [item for text in texts for item in names(text)]
+    alone = [item for item in items if "=" not in item]
+    found: dict[str, float | None] = {**numbers(option, [item for item in items if "=" in item])}
+    for name in alone:
+        if name in found:
+            raise typer.BadParameter(f"{option}: {name} is given twice")
+        found[name] = None
+    return found
+
+
+def prior_pairs(option: str, texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """``["inertia=0.004,0.001"]`` as a mean and a standard deviation by name.
+
+    Parameters
+    ----------
+    option : str
+        Name of the option in messages.
+    texts : sequence of str
+        A prior each.
+
+    Returns
+    -------
+    dict of str to (float, float)
+
+    Raises
+    ------
+    typer.BadParameter
+        A text is not ``name=mean,deviation``, or a name is given twice.
+    """
+    found: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        name, _, values = (part.strip() for part in text.partition("="))
+        try:
+            mean, std = (float(x) for x in values.split(","))
+        except ValueError as error:
+            raise typer.BadParameter(f"{option}: {text!r} is not name=mean,standard deviation") from error
+        if name in found:
+            raise typer.BadParameter(f"{option}: {name} is given twice")
+        found[name] = (mean, std)
+    return found
 
 
 # ---------------------------------------------------------------------- settings

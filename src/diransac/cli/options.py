@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from diransac.cli.arguments import load_methods, load_settings, names, numbers, pairs
+from diransac.cli.arguments import fixed_parameters, load_methods, load_settings, names, numbers, pairs, prior_pairs
 from diransac.data import preprocessing
 from diransac.data.log import Log
 from diransac.data.readers import read_log
@@ -115,7 +115,7 @@ def _option(*names: str, **about: Any) -> Any:
 
 @dataclass(frozen=True)
 class Search:
-    """Options of the method: seed, settings and hold of the inputs."""
+    """Options of the identification: seed, settings, hold of the inputs, and parameters that are known."""
 
     seed: Annotated[int, typer.Option(help="The same seed gives the same answer.")] = 0
     settings: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Settings by name.")] = None
@@ -134,9 +134,22 @@ class Search:
         ),
     ] = None
 
+    fixed: Annotated[
+        list[str] | None,
+        typer.Option("--fix", metavar="NAME[=VALUE],...", help="Parameters that are known: mass=0.25, or by name."),
+    ] = None
+    priors: Annotated[
+        list[str] | None,
+        typer.Option("--prior", metavar="NAME=MEAN,SD", help="A Gaussian prior of a parameter; repeatable."),
+    ] = None
+
     def arguments(self) -> dict[str, Any]:
-        """Arguments of `diransac.identify`, without the method."""
-        return {"seed": self.seed, "input_hold": self.input_hold}
+        """Arguments of `diransac.identify`, without the method.  Raises typer.BadParameter: they cannot be read."""
+        known = {
+            "fixed": fixed_parameters("--fix", self.fixed or ()),
+            "priors": prior_pairs("--prior", self.priors or ()),
+        }
+        return {"seed": self.seed, "input_hold": self.input_hold, **known}
 
     def methods(self, names: Sequence[str]) -> list[Method]:
         """The methods with these settings.  Raises SettingsError: a setting has no meaning."""

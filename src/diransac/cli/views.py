@@ -82,9 +82,8 @@ class Comparison:
         errors = result.standard_errors
         outside = {n: "!" if n in result.violations else "" for n in result.parameters}
         unknown = result.unidentifiable
-        estimates = [
-            "?" if n in unknown else f"{x:.5g} ± {errors[n]:.2g}{outside[n]}" for n, x in result.parameters.items()
-        ]
+        spreads = {n: "fixed" if n in result.fixed else f"± {error:.2g}" for n, error in errors.items()}
+        estimates = ["?" if n in unknown else f"{x:.5g} {spreads[n]}{outside[n]}" for n, x in result.parameters.items()]
         inliers = f"{100.0 * result.inlier_fraction:.1f} %"
         return [
             name,

@@ -18,7 +18,7 @@ from diransac.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from diransac.model import Model, Parameter
 
-__all__ = ["Dataset", "ParameterLayout", "as_logs", "distinct_logs", "observed_model"]
+__all__ = ["Dataset", "ParameterLayout", "as_logs", "distinct_logs", "usable_sensors"]
 
 
 # Relative difference of two sampling times below which they are one rate with another jitter.
@@ -34,6 +34,8 @@ class ParameterLayout:
         Parameters of the model by name.
     n_logs : int, optional
         Number of logs that are identified together.
+    priors : mapping of str to (float, float), optional
+        Mean and standard deviation of the Gaussian prior of a parameter, in its unit; for a per-log one, of each value.
 
     Attributes
     ----------
@@ -43,10 +45,17 @@ class ParameterLayout:
         Unit and bounds of each of the n.
     index : (n_logs, n_p) int array
         Positions of each log's parameters in the vector.
+    prior_mean, prior_std : (n,) array
+        Mean and standard deviation of the prior of each of the n; 0 and infinite without one.
     """
 
-    def __init__(self, parameters: Mapping[str, Parameter], n_logs: int = 1) -> None:
-        self.parameters, self.n_logs = dict(parameters), n_logs
+    def __init__(
+        self,
+        parameters: Mapping[str, Parameter],
+        n_logs: int = 1,
+        priors: Mapping[str, tuple[float, float]] | None = None,
+    ) -> None:
+        self.parameters, self.n_logs, self.priors = dict(parameters), n_logs, dict(priors or {})
         names: list[str] = []
         columns: list[list[int]] = []
         for name, parameter in parameters.items():
@@ -56,9 +65,16 @@ class ParameterLayout:
         self.names = tuple(names)
         self.bounds = tuple(self.parameters[name.partition("[")[0]] for name in names)
         self.index: IntArray = np.array(columns, np.int64).reshape(len(columns), n_logs).T
+        beforehand = np.array([self.priors.get(name.partition("[")[0], (0.0, np.inf)) for name in names])
+        self.prior_mean, self.prior_std = beforehand.T
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @cached_property
+    def with_prior(self) -> IntArray:
+        """Positions of the parameters that have a prior."""
+        return np.flatnonzero(np.isfinite(self.prior_std))
 
     @property
     def is_shared(self) -> bool:
@@ -151,8 +167,8 @@ def distinct_logs(logs: Log | Iterable[Log]) -> tuple[Log, ...]:
     return several
 
 
-def observed_model(model: Model, logs: Sequence[Log], *, regression: bool) -> tuple[Model, tuple[str, ...]]:
-    """The model without sensors that cannot be used, and without the parameters that only these depend on.
+def usable_sensors(model: Model, logs: Sequence[Log], *, regression: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Sensors of a model that can be used.
 
     Parameters
     ----------
@@ -164,25 +180,25 @@ def observed_model(model: Model, logs: Sequence[Log], *, regression: bool) -> tu
 
     Returns
     -------
-    Model
-    tuple of str
-        Notes, a sentence each.
+    sensors : tuple of str
+    notes : tuple of str
+        Reasons for those that are left out, a sentence each.
     """
     absent = [n for n in model.sensors if not any(n in log for log in logs)]
     reasons = dict.fromkeys(absent, "no log has such a signal")
     if regression:
         reasons |= {n: reason for n in model.sensors if n not in absent and (reason := _unusable(model, n, logs))}
-    own = model.with_sensors([n for n in model.sensors if n not in reasons]).parameters
-    needs = {n: [x for x in model.sensor_arguments[n] if x in model.parameters and x not in own] for n in reasons}
-    kept = [n for n in model.sensors if n not in absent and not needs.get(n)]
+    left = {x for n in model.sensors if n not in reasons for x in model.sensor_arguments[n]}
+    own = {n: [x for x in model.sensor_arguments[n] if x in model.sensor_parameters and x not in left] for n in reasons}
     notes = []
     for reason in dict.fromkeys(reasons.values()):
         alike = [n for n, x in reasons.items() if x == reason]
-        lost = dict.fromkeys(x for n in alike for x in needs[n])
+        lost = dict.fromkeys(x for n in alike for x in own[n])
         if lost or alike[0] not in absent:
             with_parameters = f" with {', '.join(lost)}, which only sensors depend on" if lost else ""
             notes.append(f"the fit leaves {', '.join(alike)} out{with_parameters}: {reason}")
-    return model.with_sensors(kept), tuple(notes)
+    used = tuple(n for n in model.sensors if n not in absent and not own.get(n))
+    return used, tuple(notes)
 
 
 def _unusable(model: Model, sensor: str, logs: Sequence[Log]) -> str:
@@ -229,6 +245,7 @@ class Dataset:
         pointwise: bool = True,
         given: Sequence[Log] | None = None,
         input_hold: str | None = None,
+        priors: Mapping[str, tuple[float, float]] | None = None,
     ) -> Dataset:
         """The dataset of one log or several.
 
@@ -244,6 +261,8 @@ class Dataset:
             Logs as the user gave them, where ``logs`` were derived from them.
         input_hold : str, optional
             Requested hold of the inputs.
+        priors : mapping of str to (float, float), optional
+            Mean and standard deviation of the Gaussian prior of a parameter.
 
         Returns
         -------
@@ -258,7 +277,7 @@ class Dataset:
         segments = [bind_log(model, log, also, pointwise=pointwise) for log in several]
         found = {name for one in segments for name in one.signals}
         signals = tuple(name for name in model.signals if name in found)
-        layout = ParameterLayout(model.parameters, len(several))
+        layout = ParameterLayout(model.parameters, len(several), priors)
         own = several if given is None else tuple(given)
         return cls(model, own, tuple(x.with_signals(signals) for x in segments), layout, input_hold)
 
@@ -363,7 +382,8 @@ class Dataset:
         signals = tuple(n for n in self.signals if n in found)
         narrowed = tuple(one.with_signals(signals) for one in segments)
         given = tuple(self.given[i] for i in logs)
-        return replace(self, given=given, segments=narrowed, layout=ParameterLayout(self.model.parameters, len(logs)))
+        layout = ParameterLayout(self.model.parameters, len(logs), self.layout.priors)
+        return replace(self, given=given, segments=narrowed, layout=layout)
 
     def on_given_logs(self, masks: Sequence[BoolArray]) -> BoolArray:
         """Mask over the rows of all given logs, log after log, from one mask per segment."""

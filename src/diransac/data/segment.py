@@ -27,6 +27,8 @@ _ROWS_FOR_VALUE, _ROWS_FOR_SLOPE = 7, 25
 _FAR = 5.0
 # Rows that an input is held for, beyond which the motion is no longer the one that it made.
 _LONG_HOLD = 3
+# Time, rows, and usual intervals between samples, without a sample of any signal: then the motion is found anew.
+_LONG_SILENCE, _FEWEST_SILENT, _SILENT_INTERVALS = 0.25, 8, 4
 
 
 @dataclass(frozen=True)
@@ -47,11 +49,11 @@ class Segment:
     inputs : (N, n_u) array
         Inputs, each in its unit; NaN is replaced by the last good sample.
     valid : (N,) bool array
-        Rows in which every signal in use is finite.
+        Rows in which every signal in use is finite, outside of gaps.
     notes : tuple of str
         Findings and changes, a sentence each.
     gaps : (N,) bool array
-        Rows of gaps of several samples in an input.
+        Rows of gaps of several samples in an input, or of 0.25 s in all sensors: no simulation passes through them.
     """
 
     model: Model
@@ -71,6 +73,19 @@ class Segment:
     def n_rows(self) -> int:
         """Rows that count."""
         return int(self.valid.sum())
+
+    @cached_property
+    def stretches(self) -> tuple[slice, ...]:
+        """Rows from each gap to the next, from the first one that counts; the whole log where there is no gap."""
+        parts = [
+            slice(x.start + int(np.argmax(self.valid[x])), x.stop) for x in runs(~self.gaps) if self.valid[x].any()
+        ]
+        return tuple(parts)
+
+    def part(self, rows: slice) -> Segment:
+        """The segment of some of the rows alone."""
+        arrays = {name: getattr(self, name)[rows] for name in ("measured", "inputs", "valid", "gaps")}
+        return replace(self, offset=self.offset + rows.start, **arrays)
 
     def first_row_in(self, given: Log) -> int:
         """Row of the log as it was given that is row 0 here."""
@@ -211,16 +226,33 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     log = preprocessing.unwrap(log, [n for n in model.coordinates if n in log and model.coordinates[n] == "rad"])
     inputs, held = _held_inputs(model, log)
     measured = np.column_stack([log[n] for n in signals])
+    gaps = long_runs(held, _LONG_HOLD) | silent_rows(np.isfinite(measured), log.dt)
     critical = [i for i, n in enumerate(signals) if n in needed or n in also]
-    valid = np.all(np.isfinite(np.hstack([measured[:, critical], inputs])), axis=1)
+    valid = np.all(np.isfinite(np.hstack([measured[:, critical], inputs])), axis=1) & ~gaps
     if not valid.any():
         raise LogError(
             f"{log.source}: no row has a value in every signal in use ({', '.join(used)}); found NaN in each"
         )
     offset = int(np.argmax(valid))
-    notes = [*log.notes, *_row_notes(log, valid, held)]
-    gaps = long_runs(held, _LONG_HOLD)[offset:]
-    return Segment(model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], tuple(notes), gaps)
+    notes = (*log.notes, *_row_notes(valid, held & ~gaps), *_gap_notes(log, gaps, offset))
+    return Segment(
+        model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], notes, gaps[offset:]
+    )
+
+
+def runs(mask: BoolArray) -> list[slice]:
+    """Runs of the elements of a mask ``(N,)`` that are True.
+
+    Parameters
+    ----------
+    mask : (N,) bool array
+
+    Returns
+    -------
+    list of slice
+    """
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def long_runs(mask: BoolArray, least: int) -> BoolArray:
@@ -235,11 +267,29 @@ def long_runs(mask: BoolArray, least: int) -> BoolArray:
     -------
     (N,) bool array
     """
-    edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
     kept = np.zeros(len(mask), bool)
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        kept[begin:end] = end - begin >= least
+    for rows in runs(mask):
+        kept[rows] = rows.stop - rows.start >= least
     return kept
+
+
+def silent_rows(known: BoolArray, dt: float) -> BoolArray:
+    """Rows of gaps in all sensors: 0.25 s, eight rows and four usual intervals or more without a sample.
+
+    Parameters
+    ----------
+    known : (N, n_s) bool array
+        Samples that there are.
+    dt : float
+        Sampling time, s.
+
+    Returns
+    -------
+    (N,) bool array
+    """
+    some: BoolArray = np.asarray(known.any(axis=1))
+    usual = np.median(np.diff(np.flatnonzero(some))) if some.sum() > 1 else 1.0
+    return long_runs(~some, max(_FEWEST_SILENT, round(_LONG_SILENCE / dt), round(_SILENT_INTERVALS * usual)))
 
 
 def _raise_missing(model: Model, log: Log, name: str) -> None:
@@ -276,26 +326,24 @@ def _held_inputs(model: Model, log: Log) -> tuple[FloatArray, BoolArray]:
     return np.column_stack(columns) if columns else np.zeros((len(log), 0)), held
 
 
-def _row_notes(log: Log, valid: BoolArray, held: BoolArray) -> list[str]:
+def _row_notes(valid: BoolArray, held: BoolArray) -> list[str]:
     notes = []
     skipped = int((~valid).sum())
     if skipped:
         notes.append(f"{skipped} of {len(valid)} rows were skipped: a signal in use is NaN there")
     if held.any():
         notes.append(f"inputs were held from the last good sample in {held.sum()} rows, where they are NaN")
-    return [*notes, *_gap_notes(log, held)]
+    return notes
 
 
-def _gap_notes(log: Log, held: BoolArray) -> list[str]:
-    """A note on the gaps over which inputs were held for 3 rows or more; none without gaps."""
-    edges = np.flatnonzero(np.diff(np.r_[False, held, False]))
-    first, length = edges[::2], edges[1::2] - edges[::2]
-    n_gaps = int((length >= _LONG_HOLD).sum())
-    if not n_gaps:
+def _gap_notes(log: Log, gaps: BoolArray, first_row: int) -> list[str]:
+    """A note on the gaps between rows that count; none without gaps."""
+    found = [rows for rows in runs(gaps) if rows.start > first_row]
+    if not found:
         return []
-    longest = int(length.argmax())
+    longest = max(found, key=lambda rows: rows.stop - rows.start)
+    seconds = (longest.stop - longest.start + 1) * log.dt
     return [
-        f"inputs are unknown in {n_gaps} gap{'s' * (n_gaps > 1)}, the longest {(length[longest] + 1) * log.dt:.4g} s "
-        f"after t = {log.time[first[longest] - 1]:.6g} s: a simulation through it drifts, which affects fit error "
-        "and inliers; split the log there to avoid it"
+        f"inputs or all sensors are unknown in {len(found)} gap{'s' * (len(found) > 1)}, the longest {seconds:.4g} s "
+        f"after t = {log.time[longest.start - 1]:.6g} s: simulations end there and begin again after it"
     ]

@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.input_timing import InputTiming
 from diransac.identification.serialization import (
     Mask,
     Masks,
@@ -85,7 +86,7 @@ class Finding(str):
 
 @dataclass(frozen=True)
 class Resolution:
-    """Resolution of a simulation.
+    """Integration and inputs of a simulation.
 
     Parameters
     ----------
@@ -95,11 +96,14 @@ class Resolution:
         Integration steps per sample.
     hold : str, optional
         Inputs between samples: "zero-order", held, or "linear", interpolated.
+    timing : InputTiming, optional
+        Delay and lag after which recorded inputs act.
     """
 
     integrator: str = "rk4"
     substeps: int = 1
     hold: str = "zero-order"
+    timing: InputTiming = field(default_factory=InputTiming)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +135,7 @@ class Diagnosis:
     smoothed_states : mapping of str to (W,) array
         Most probable value of each state at those times, measured or not.
     input_delay, input_delay_error : float
-        Delay of the inputs with respect to the log, and its standard error, s.
+        Delay of the inputs with respect to the log, lag included, and its standard error, s.
     input_delay_significant : bool
         Whether the delay exceeds three standard errors and a quarter of a sample.
     unidentifiable : tuple of str
@@ -246,7 +250,7 @@ class Estimate:
     rejected : mapping of str to int, optional
         Number of rejected hypotheses by reason.
     resolution : Resolution, optional
-        Resolution of the simulation in the fit; `evaluate` simulates with the same.
+        Integration and inputs of the simulation in the fit; `evaluate` simulates with the same.
     squared_error : bool, optional
         Whether the fit error is DIRANSAC's mean square rather than eq. (2).
     notes : tuple of str, optional

@@ -3,11 +3,18 @@
 An estimator tests whether a set of rows is well-defined, and fits it.  Where a fit needs sums alone, each
 observation's block of ``[W b]^T [W b]`` is formed once, and a sample or a set of inliers is a sum of blocks, taken in
 the order of its rows: no result depends on how many hypotheses are fitted at a time.
+
+A Gaussian prior ``p_j = m +- s`` is a further row ``(sigma / s) p_j = (sigma / s) m`` of every fit, where sigma is the
+standard deviation of the residuals of that fit without priors, so that a prior that contradicts the rows does not make
+them noisy.  Residuals of a machine are correlated, and rows then say less than their number: sigma^2 is multiplied by
+the ratio of the variance of sums of scores over blocks of time to that of white residuals, where that exceeds one.
+With known sigma this is the exact posterior mean of the linear-Gaussian model (Gelman et al. 2013, section 14.8).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
 import numpy as np
@@ -18,11 +25,12 @@ from diransac.data import preprocessing
 from diransac.errors import IdentificationError, SettingsError
 from diransac.identification.identifiability import NullSpace, null_space
 from diransac.identification.regression import regression_rows
+from diransac.identification.uncertainty import score_inflation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from diransac.data.dataset import Dataset
+    from diransac.data.dataset import Dataset, ParameterLayout
     from diransac.data.segment import Segment
 
 __all__ = [
@@ -39,6 +47,8 @@ __all__ = [
 
 
 _MIN_EIGENVALUE = 1e-6
+# Noise of a fit with priors at least, over the RMS of b; ridge that makes the sums of a set of rows definite.
+_LEAST_NOISE, _RIDGE = 1e-5, 1e-10
 
 
 class Selection(Protocol):
@@ -73,6 +83,9 @@ class BoundEstimator(Protocol):
         -------
         (n_groups, n) array
         """
+
+    def prior_shifts(self, rows: IntArray) -> FloatArray:
+        """Change ``(n_priors, n)`` of the parameters from rows by a shift of each prior by its standard deviation."""
 
     def null_space(self) -> NullSpace:
         """Directions of the parameters that the whole dataset does not determine."""
@@ -143,13 +156,13 @@ class _SumsEstimator:
 
     def bind(self, dataset: Dataset) -> BoundEstimator:
         """The estimator over the usable rows of a dataset."""
-        return self._bind(*regression(dataset))
+        return self._bind(*regression(dataset), dataset.layout)
 
-    def _bind(self, W: FloatArray, b: FloatArray) -> _BoundSums:
-        return _BoundSums(self, W, b)
+    def _bind(self, W: FloatArray, b: FloatArray, layout: ParameterLayout | None = None) -> _BoundSums:
+        return _BoundSums(self, W, b, layout)
 
-    def solve(self, gram: FloatArray) -> FloatArray:
-        """Parameters ``(..., n_p)`` from sums ``(..., n_p + 1, n_p + 1)`` with columns of unit RMS."""
+    def solve(self, gram: FloatArray, prior: _PriorSums | None = None) -> FloatArray:
+        """Parameters ``(..., n_p)`` from sums ``(..., n_p + 1, n_p + 1)`` with columns of unit RMS, and of priors."""
         raise NotImplementedError
 
 
@@ -168,9 +181,9 @@ class OrdinaryLeastSquares(_SumsEstimator):
     Dimmig et al. 2023, section III.C (whose printed formula lacks the transpose).
     """
 
-    def solve(self, gram: FloatArray) -> FloatArray:
+    def solve(self, gram: FloatArray, prior: _PriorSums | None = None) -> FloatArray:
         """Normal equations by LDL^T."""
-        return solve_definite(gram[..., :-1, :-1], gram[..., :-1, -1])
+        return _solved(gram[..., :-1, :-1], gram[..., :-1, -1], prior)
 
 
 @dataclass(frozen=True)
@@ -189,53 +202,131 @@ class TotalLeastSquares(_SumsEstimator):
     Golub and Van Loan 1980, "An analysis of the total least squares problem".
     """
 
-    def solve(self, gram: FloatArray) -> FloatArray:
-        """Eigenvector of the smallest eigenvalue of ``[W b]^T [W b]``."""
+    def solve(self, gram: FloatArray, prior: _PriorSums | None = None) -> FloatArray:
+        """Eigenvector of the smallest eigenvalue of ``[W b]^T [W b]``.
+
+        It solves ``(W^T W - l) p = W^T b`` with that eigenvalue l, the normal equations to which a prior adds its sums.
+        """
         finite = np.all(np.isfinite(gram), axis=(-2, -1), keepdims=True)
-        _, vectors = np.linalg.eigh(np.where(finite, gram, np.eye(gram.shape[-1])))
+        values, vectors = np.linalg.eigh(np.where(finite, gram, np.eye(gram.shape[-1])))
+        if prior is not None:
+            least = values[..., :1, None] * np.eye(gram.shape[-1] - 1)
+            return _solved(gram[..., :-1, :-1] - least, gram[..., :-1, -1], prior)
         smallest = np.where(finite[..., 0], vectors[..., :, 0], np.nan)
         last = smallest[..., -1:]
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(np.abs(last) > np.finfo(float).eps, -smallest[..., :-1] / last, np.nan)
 
 
+@dataclass(frozen=True)
+class _PriorSums:
+    """Sums that priors add to those of sets of rows, in columns of unit RMS.
+
+    Parameters
+    ----------
+    weight : (..., n) array
+        Variance of the noise over that of the prior; 0 for a parameter without one.
+    mean : (n,) array
+        Means of the priors.
+    """
+
+    weight: FloatArray
+    mean: FloatArray
+
+
+def _solved(A: FloatArray, g: FloatArray, prior: _PriorSums | None) -> FloatArray:
+    """``A^-1 g``, with the sums of priors."""
+    if prior is None:
+        return solve_definite(A, g)
+    return solve_definite(A + prior.weight[..., None] * np.eye(A.shape[-1]), g + prior.weight * prior.mean)
+
+
 class _BoundSums:
     """Blocks of ``[W b]^T [W b]`` in columns of unit RMS, the upper triangle of each observation's in a row."""
 
-    def __init__(self, estimator: _SumsEstimator, W: FloatArray, b: FloatArray) -> None:
+    def __init__(
+        self, estimator: _SumsEstimator, W: FloatArray, b: FloatArray, layout: ParameterLayout | None = None
+    ) -> None:
         self._estimator = estimator
-        self.n_rows, _, self._n_p = W.shape
+        self.n_rows, self._n_equations, self._n_p = W.shape
         columns = np.concatenate([W, b[:, :, None]], axis=2)
-        self._scale = column_scale(columns)
-        columns = columns / np.where(self._scale > 0.0, self._scale, 1.0)
+        scale = column_scale(columns)
+        self._scale = np.where(scale > 0.0, scale, 1.0)
+        columns = columns / self._scale
         self._upper = np.triu_indices(self._n_p + 1)
         i, j = self._upper
         self._blocks = np.zeros((self.n_rows, len(i)))
         for row in range(W.shape[1]):
             self._blocks += columns[:, row, i] * columns[:, row, j]
+        per_unit = self._scale[:-1] / self._scale[-1]
+        self._prior_std = np.full(self._n_p, np.inf) if layout is None else layout.prior_std * per_unit
+        self._prior_mean = np.zeros(self._n_p) if layout is None else layout.prior_mean * per_unit
+        self._has_prior = np.isfinite(self._prior_std)
 
     def select(self, row_sets: Sequence[IntArray]) -> _SelectedSums:
-        return _SelectedSums(self, self._gram(row_sets))
+        return _SelectedSums(self, self._gram(row_sets), np.array([len(rows) for rows in row_sets]))
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        return self.solve(self._gram([rows]) - self._gram(groups))
+        left = len(rows) - np.array([len(group) for group in groups])
+        return self.solve(self._gram([rows]) - self._gram(groups), left)
+
+    def prior_shifts(self, rows: IntArray) -> FloatArray:
+        gram, n = self._gram([rows]), np.array([len(rows)])
+        shifted = [self.solve(gram, n, shift)[0] for shift in self.unit_shifts()]
+        return np.array(shifted).reshape(-1, self._n_p) - self.solve(gram, n)
+
+    def unit_shifts(self) -> FloatArray:
+        """Shifts ``(n_priors, n)`` of the means of the priors, each by its standard deviation alone."""
+        return np.asarray(np.diag(np.where(self._has_prior, self._prior_std, 0.0))[self._has_prior])
 
     def null_space(self) -> NullSpace:
-        gram = self._gram([np.arange(self.n_rows)])[0, :-1, :-1]
+        gram = self.counting_priors(self._gram([np.arange(self.n_rows)])[0, :-1, :-1])
         return null_space(gram, self._scale[:-1], self.min_eigenvalue)
 
     def correlations(self) -> FloatArray:
-        return correlations(self._gram([np.arange(self.n_rows)])[0, :-1, :-1])
+        gram = self._gram([np.arange(self.n_rows)])
+        prior = self.prior_sums(gram, np.array([self.n_rows]))
+        own = gram[0, :-1, :-1]
+        return correlations(own if prior is None else own + np.diag(prior.weight[0]))
 
     @property
     def min_eigenvalue(self) -> float:
         """Threshold of a well-defined set of rows."""
         return self._estimator.min_eigenvalue
 
-    def solve(self, gram: FloatArray) -> FloatArray:
-        """Parameters in their units from sums in columns of unit RMS."""
+    def counting_priors(self, gram: FloatArray) -> FloatArray:
+        """Sums ``(..., n, n)`` of ``W^T W`` in which each prior is a row of unit size, for tests of their rank."""
+        return gram + np.diag(self._has_prior.astype(float)) if self._has_prior.any() else gram
+
+    def solve(self, gram: FloatArray, n_rows: IntArray, shift: FloatArray | None = None) -> FloatArray:
+        """Parameters in their units from sums, over as many rows, in columns of unit RMS; priors may be shifted."""
+        prior = self.prior_sums(gram, n_rows, shift)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(self._estimator.solve(gram) * self._scale[-1] / self._scale[:-1])
+            return np.asarray(self._estimator.solve(gram, prior) * self._scale[-1] / self._scale[:-1])
+
+    def prior_sums(self, gram: FloatArray, n_rows: IntArray, shift: FloatArray | None = None) -> _PriorSums | None:
+        """What priors add to the sums of sets of as many rows; None without priors."""
+        if not self._has_prior.any():
+            return None
+        noise = self._inflation * self._residual_variance(gram, n_rows)[0]
+        mean = self._prior_mean if shift is None else self._prior_mean + shift
+        return _PriorSums(np.maximum(noise, _LEAST_NOISE**2)[:, None] / np.square(self._prior_std), mean)
+
+    def _residual_variance(self, gram: FloatArray, n_rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Variance ``(n_sets,)`` of the residuals of ordinary least squares without priors, and its solutions."""
+        G, h = gram[:, :-1, :-1], gram[:, :-1, -1]
+        p = solve_definite(G + _RIDGE * n_rows[:, None, None] * np.eye(self._n_p), h)
+        left = gram[:, -1, -1] - (h * p).sum(axis=1)
+        return left / np.maximum(1, n_rows * self._n_equations - self._n_p), p
+
+    @cached_property
+    def _inflation(self) -> float:
+        """Variance of sums of scores over blocks of time, over that of white residuals; one at least."""
+        gram = self._gram([np.arange(self.n_rows)])
+        (variance,), (p,) = self._residual_variance(gram, np.array([self.n_rows]))
+        parts = self._gram(list(np.arange(self.n_rows)[:, None]))
+        scores = parts[:, :-1, -1] - parts[:, :-1, :-1] @ p
+        return score_inflation(scores, gram[0, :-1, :-1], max(float(variance), _LEAST_NOISE**2))
 
     def _gram(self, row_sets: Sequence[IntArray]) -> FloatArray:
         """Sums ``(n_sets, n + 1, n + 1)``, each in the order of its rows."""
@@ -253,16 +344,22 @@ class _BoundSums:
 
 @dataclass(frozen=True)
 class _SelectedSums:
-    """Sums of ``[W b]^T [W b]`` over each set of rows, ``(n_sets, n + 1, n + 1)``."""
+    """Sums of ``[W b]^T [W b]`` over each set of rows, ``(n_sets, n + 1, n + 1)``, and the number of rows."""
 
     bound: _BoundSums
     gram: FloatArray
+    n_rows: IntArray
 
     def well_defined(self) -> BoolArray:
-        return np.asarray(smallest_eigenvalue(self.gram[:, :-1, :-1]) > self.bound.min_eigenvalue)
+        gram = self.bound.counting_priors(self.gram[:, :-1, :-1])
+        return np.asarray(smallest_eigenvalue(gram) > self.bound.min_eigenvalue)
 
     def fit(self) -> FloatArray:
-        return self.bound.solve(self.gram)
+        return self.bound.solve(self.gram, self.n_rows)
+
+    def prior_sums(self, shift: FloatArray | None = None) -> _PriorSums | None:
+        """What priors add to the sums."""
+        return self.bound.prior_sums(self.gram, self.n_rows, shift)
 
 
 class LinearRegressor(Protocol):
@@ -303,15 +400,15 @@ class ScikitLearnEstimator:
 
     def bind(self, dataset: Dataset) -> BoundEstimator:
         """The estimator over the usable rows of a dataset."""
-        return _BoundScikitLearn(self, *regression(dataset))
+        return _BoundScikitLearn(self, *regression(dataset), dataset.layout)
 
 
 class _BoundScikitLearn:
     """Rows of ``W`` and ``b`` for a scikit-learn regressor; their sums decide whether a set is well-defined."""
 
-    def __init__(self, estimator: ScikitLearnEstimator, W: FloatArray, b: FloatArray) -> None:
+    def __init__(self, estimator: ScikitLearnEstimator, W: FloatArray, b: FloatArray, layout: ParameterLayout) -> None:
         self._regressor = estimator.regressor
-        self._sums = _BoundSums(OrdinaryLeastSquares(estimator.min_eigenvalue), W, b)
+        self._sums = _BoundSums(OrdinaryLeastSquares(estimator.min_eigenvalue), W, b, layout)
         self.n_rows = len(W)
         scale = column_scale(np.concatenate([W, b[:, :, None]], axis=2))
         self._scale = np.where(scale > 0.0, scale, 1.0)
@@ -329,17 +426,27 @@ class _BoundScikitLearn:
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
         return self.fit([np.setdiff1d(rows, group) for group in groups])
 
-    def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
-        """Parameters ``(n_sets, n)`` in their units."""
-        fits = np.array([self._fit_one(rows) for rows in row_sets]).reshape(len(row_sets), -1)
-        return np.asarray(fits * self._scale[-1] / self._scale[:-1])
+    def prior_shifts(self, rows: IntArray) -> FloatArray:
+        shifted = [self.fit([rows], shift)[0] for shift in self._sums.unit_shifts()]
+        return np.array(shifted).reshape(-1, self._W.shape[2]) - self.fit([rows])
 
-    def _fit_one(self, rows: IntArray) -> FloatArray:
+    def fit(self, row_sets: Sequence[IntArray], shift: FloatArray | None = None) -> FloatArray:
+        """Parameters ``(n_sets, n)`` in their units; priors may be shifted."""
+        prior = self._sums.select(row_sets).prior_sums(shift)
+        roots = np.zeros((len(row_sets), self._W.shape[2])) if prior is None else np.sqrt(prior.weight)
+        mean = np.zeros(self._W.shape[2]) if prior is None else prior.mean
+        fits = np.array([self._fit_one(rows, root, mean) for rows, root in zip(row_sets, roots, strict=True)])
+        return np.asarray(fits.reshape(len(row_sets), -1) * self._scale[-1] / self._scale[:-1])
+
+    def _fit_one(self, rows: IntArray, root: FloatArray, mean: FloatArray) -> FloatArray:
+        """Parameters from rows, and from one row for each prior, by the square root of its weight."""
         from sklearn.base import clone
 
-        n_p = self._W.shape[2]
+        n_p, of_priors = self._W.shape[2], root > 0.0
+        W = np.concatenate([self._W[rows].reshape(-1, n_p), np.diag(root)[of_priors]])
+        b = np.concatenate([self._b[rows].reshape(-1), (root * mean)[of_priors]])
         try:
-            fitted = clone(self._regressor).fit(self._W[rows].reshape(-1, n_p), self._b[rows].reshape(-1))
+            fitted = clone(self._regressor).fit(W, b)
         except ValueError:
             return np.full(n_p, np.nan)
         holder = getattr(fitted, "estimator_", fitted)

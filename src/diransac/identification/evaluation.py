@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.segment import runs
 from diransac.errors import LogError, SettingsError
 from diransac.identification.estimate import Evaluation, Resolution
 from diransac.simulation import Measurements, RolloutBatch, default_threads, rollouts
@@ -27,12 +28,14 @@ __all__ = [
     "Scores",
     "Scoring",
     "Simulation",
+    "Stretch",
     "as_estimated",
     "choose_scoring",
     "evaluate",
     "judged_signals",
     "mean_squared_error",
     "rms_error",
+    "stretches_of",
 ]
 
 _THRESHOLD_IN_SPREADS = 0.2
@@ -192,21 +195,92 @@ class Scores:
         Squared errors summed over the rows that count, each signal's unit squared; infinite where a rollout diverged.
     inlier_count : (n_lanes,) int array
         Number of inliers.
-    batches : tuple of ScoreBatch
+    logs : tuple of LogScores
         Scores of each log.
     """
 
     sum_squares: FloatArray
     inlier_count: IntArray
-    batches: tuple[ScoreBatch, ...]
+    logs: tuple[LogScores, ...]
 
     def inlier_masks(self, lane: int) -> list[BoolArray]:
         """Inliers ``(N,)`` of one hypothesis over all rows of each log; False in rows that do not count."""
-        return [batch.inliers(lane) for batch in self.batches]
+        return [one.inliers(lane) for one in self.logs]
+
+
+@dataclass(frozen=True)
+class LogScores:
+    """Agreement of hypotheses with one log.
+
+    Parameters
+    ----------
+    n_rows : int
+        Number of rows of the log.
+    stretches : tuple of (slice, ScoreBatch)
+        Rows of each simulation, and its scores.
+    """
+
+    n_rows: int
+    stretches: tuple[tuple[slice, ScoreBatch], ...]
+
+    @property
+    def sum_squares(self) -> FloatArray:
+        """Squared errors summed over the rows that count, (n_lanes, n_s)."""
+        first, *others = (batch.sum_squares for _, batch in self.stretches)
+        return sum(others, first)
+
+    @property
+    def inlier_count(self) -> IntArray:
+        """Number of inliers, (n_lanes,)."""
+        first, *others = (batch.inlier_count for _, batch in self.stretches)
+        return sum(others, first)
+
+    def inliers(self, lane: int) -> BoolArray:
+        """Inliers ``(n_rows,)`` of one hypothesis."""
+        found = np.zeros(self.n_rows, bool)
+        for rows, batch in self.stretches:
+            found[rows] = batch.inliers(lane)
+        return found
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Rows of a log that one simulation covers.
+
+    Parameters
+    ----------
+    rows : slice
+        Rows without a gap.
+    rule : str or mapping of str to float
+        Rule of the initial state, as ``Settings.initial_state``.
+    """
+
+    rows: slice
+    rule: str | Mapping[str, float]
+
+
+def stretches_of(one: Segment, rule: str | Mapping[str, float]) -> tuple[Stretch, ...]:
+    """Stretches of a log between its gaps.
+
+    Parameters
+    ----------
+    one : Segment
+    rule : str or mapping of str to float
+        Of the first row.  After a gap, where given values do not hold, it is "robust" in their place.
+
+    Returns
+    -------
+    tuple of Stretch
+    """
+    first, *others = one.stretches
+    later = rule if isinstance(rule, str) else "robust"
+    return (Stretch(first, rule), *(Stretch(rows, later) for rows in others))
 
 
 class Simulation:
     """Simulations of the logs of a dataset, driven by their inputs.
+
+    No simulation passes through a gap: it ends there, and another one begins after it.
 
     Parameters
     ----------
@@ -214,9 +288,9 @@ class Simulation:
     signals : (n_s,) bool array, optional
         Signals of the dataset that are compared with the measured ones; None: all.
     resolution : Resolution, optional
-        Integrator, steps per sample, and hold of the inputs.
-    rules : sequence of str or mapping of str to float, optional
-        Rule of each log's initial state in `score`, as ``Settings.initial_state``; None: the first samples.
+        Integrator, steps per sample, hold and timing of the inputs.
+    stretches : sequence of tuple of Stretch, optional
+        Simulations of each log in `score`; None: from the first samples, and those after each gap.
     threads : int, optional
         Number of threads; None: one per core.
     """
@@ -226,13 +300,13 @@ class Simulation:
         dataset: Dataset,
         signals: BoolArray | None = None,
         resolution: Resolution = _DEFAULT_RESOLUTION,
-        rules: Sequence[str | Mapping[str, float]] | None = None,
+        stretches: Sequence[tuple[Stretch, ...]] | None = None,
         threads: int | None = None,
     ) -> None:
         compared = np.ones(len(dataset.signals), bool) if signals is None else signals
         names = [n for n, j in zip(dataset.signals, compared, strict=True) if j]
         self._dataset, self._compared = dataset, compared
-        self._rules = ["first"] * len(dataset.segments) if rules is None else list(rules)
+        self._stretches = [stretches_of(one, "first") for one in dataset.segments] if stretches is None else stretches
         self._threads = threads or default_threads()
         self._simulator: Simulator = rollouts(
             dataset.model,
@@ -244,17 +318,19 @@ class Simulation:
         self._measured = [
             Measurements(np.ascontiguousarray(one.measured[:, compared]), one.valid) for one in dataset.segments
         ]
+        self._inputs = [resolution.timing.acting(one.inputs, one.log.dt) for one in dataset.segments]
 
     @cached_property
-    def starts(self) -> list[FloatArray]:
-        """Initial state ``(n_x,)`` of each log.
+    def starts(self) -> list[list[tuple[slice, FloatArray]]]:
+        """Rows of each simulation of each log, and its initial state ``(n_x,)``.
 
         Raises
         ------
         LogError
             A log lacks a state on which a measured signal depends.
         """
-        return [one.initial_state(rule) for one, rule in zip(self._dataset.segments, self._rules, strict=True)]
+        pairs = zip(self._dataset.segments, self._stretches, strict=True)
+        return [[(x.rows, one.part(x.rows).initial_state(x.rule)) for x in stretches] for one, stretches in pairs]
 
     def score(self, parameters: FloatArray, thresholds: FloatArray, min_inlier_signals: int) -> Scores:
         """Sums of squared errors and inliers of every hypothesis over all logs.
@@ -272,17 +348,19 @@ class Simulation:
         -------
         Scores
         """
-        batches = []
+        logs = []
         for i, one in enumerate(self._dataset.segments):
-            lanes = RolloutBatch(self._dataset.layout.of_log(parameters, i), self.starts[i], one.inputs, one.log.dt)
-            found = self._simulator.score(
-                lanes, self._measured[i], thresholds, min_inlier_signals, threads=self._threads
-            )
-            batches.append(found)
-        sums, counts = batches[0].sum_squares, batches[0].inlier_count
-        for batch in batches[1:]:
-            sums, counts = sums + batch.sum_squares, counts + batch.inlier_count
-        return Scores(sums, counts, tuple(batches))
+            own, measured, found = self._dataset.layout.of_log(parameters, i), self._measured[i], []
+            for rows, state in self.starts[i]:
+                lanes = RolloutBatch(own, state, self._inputs[i][rows], one.log.dt)
+                known = Measurements(measured.values[rows], measured.valid[rows])
+                batch = self._simulator.score(lanes, known, thresholds, min_inlier_signals, threads=self._threads)
+                found.append((rows, batch))
+            logs.append(LogScores(len(one), tuple(found)))
+        sums, counts = logs[0].sum_squares, logs[0].inlier_count
+        for other in logs[1:]:
+            sums, counts = sums + other.sum_squares, counts + other.inlier_count
+        return Scores(sums, counts, tuple(logs))
 
     def errors(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
@@ -321,7 +399,7 @@ class Simulation:
     ) -> tuple[RolloutBatch, Measurements]:
         one, measured = self._dataset.segments[log], np.nan_to_num(self._measured[log].values)
         more = ((0, max(0, int(start_rows.max()) + n_rows - len(one))), (0, 0))
-        inputs, measured = (np.pad(x, more, mode="edge") for x in (one.inputs, measured))
+        inputs, measured = (np.pad(x, more, mode="edge") for x in (self._inputs[log], measured))
         lanes = np.tile(parameters, (len(states), 1))
         batch = RolloutBatch(lanes, states, inputs, one.log.dt, start_rows, n_rows)
         return batch, Measurements(measured, np.ones(len(measured), bool))
@@ -330,7 +408,7 @@ class Simulation:
 def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: Settings) -> Evaluation:
     """Evaluation of an estimate on the logs that it was made from.
 
-    The simulation has the resolution, input delay and initial states of the fit.
+    The simulation has the resolution, timing of the inputs and initial states of the fit.  Rows of gaps do not count.
 
     Parameters
     ----------
@@ -346,10 +424,10 @@ def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: S
     Evaluation
         The fit error is NaN, and there are no inliers, where a log lacks its initial state.
     """
-    acting, rules = as_estimated(dataset, estimate.diagnosis, settings)
+    acting, stretches = as_estimated(dataset, estimate.diagnosis, settings)
     judged, weights = scoring.judged, scoring.weights[scoring.judged]
     thresholds = {n: float(x) for n, x in zip(dataset.signals, scoring.thresholds, strict=True) if x > 0.0}
-    simulation = Simulation(acting, judged, estimate.resolution, rules, settings.threads)
+    simulation = Simulation(acting, judged, estimate.resolution, stretches, settings.threads)
     try:
         simulation.starts  # noqa: B018  refuses a log without an initial state
     except LogError:
@@ -359,57 +437,72 @@ def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: S
     scores = simulation.score(estimate.values[None], scoring.thresholds[judged], scoring.min_inlier_signals)
     error_of = mean_squared_error if estimate.squared_error else rms_error
     counts = [one.n_rows for one in acting.segments]
-    parts = list(zip(scores.batches, counts, strict=True))
+    parts = list(zip(scores.logs, counts, strict=True))
     return Evaluation(
         fit_error=float(error_of(scores.sum_squares, acting.n_rows, weights)[0]),
         inlier_fraction=float(scores.inlier_count[0] / acting.n_rows),
         inliers=acting.on_given_logs(scores.inlier_masks(0)),
-        fit_errors=np.array([error_of(batch.sum_squares, n, weights)[0] for batch, n in parts]),
-        inlier_fractions=np.array([batch.inlier_count[0] / n for batch, n in parts]),
+        fit_errors=np.array([error_of(one.sum_squares, n, weights)[0] for one, n in parts]),
+        inlier_fractions=np.array([one.inlier_count[0] / n for one, n in parts]),
         thresholds=thresholds,
     )
 
 
 def as_estimated(
     dataset: Dataset, found: Diagnosis | None, settings: Settings
-) -> tuple[Dataset, list[str | Mapping[str, float]]]:
-    """The dataset with the input delay of a diagnosis, and the rule of each log's initial state.
+) -> tuple[Dataset, list[tuple[Stretch, ...]]]:
+    """The dataset with the rows that an estimate simulates, and the simulations of each log.
 
     Parameters
     ----------
     dataset : Dataset
     found : Diagnosis, optional
-        Input delay, outliers and smoothed states; None: the dataset is returned unchanged.
+        Outliers and smoothed states; None: simulations start from measured states.
     settings : Settings
         Rule of the initial states.
 
     Returns
     -------
     dataset : Dataset
-    rules : list of str or mapping of str to float
-        With a diagnosis and ``initial_state="first"``: the first sample, replaced by the smoothed state where it is
-        missing or an outlier.
+        The rows that no simulation covers count as gaps.
+    stretches : list of tuple of Stretch
+        With a diagnosis, after a gap: from the first smoothed state.  With ``initial_state="first"``, at the first row:
+        the first sample, replaced by the smoothed state where it is missing or an outlier.
     """
-    rule = settings.initial_state
-    if found is None:
-        return dataset, [rule] * len(dataset.segments)
-    delay = found.input_delay if found.input_delay_significant else 0.0
-    segments = tuple(_delayed(one, delay) for one in dataset.segments)
-    if rule == "robust":
-        return replace(dataset, segments=segments), [rule] * len(segments)
     begins = np.cumsum([0, *(len(log) for log in dataset.given)])
-    rules = [_first_state(one, i, int(begins[i]) + one.offset, found) for i, one in enumerate(segments)]
-    given = rule if isinstance(rule, Mapping) else {}
-    return replace(dataset, segments=segments), [{**start, **given} for start in rules]
+    stretches = []
+    for i, one in enumerate(dataset.segments):
+        first, *others = stretches_of(one, settings.initial_state)
+        if found is not None:
+            others = _resumed(one, i, found)
+            if first.rule != "robust":
+                given = first.rule if isinstance(first.rule, Mapping) else {}
+                start = _first_state(one, i, int(begins[i]) + one.offset, found)
+                first = Stretch(first.rows, {**start, **given})
+        stretches.append((first, *others))
+    segments = tuple(_covered(one, own) for one, own in zip(dataset.segments, stretches, strict=True))
+    return replace(dataset, segments=segments), stretches
 
 
-def _delayed(one: Segment, delay: float) -> Segment:
-    """The segment with its inputs acting ``delay`` seconds later, interpolated linearly."""
-    if not delay:
-        return one
-    time = one.log.dt * np.arange(len(one))
-    columns = [np.interp(time - delay, time, column) for column in one.inputs.T]
-    return replace(one, inputs=np.column_stack(columns))
+def _resumed(one: Segment, log: int, found: Diagnosis) -> list[Stretch]:
+    """Simulations after each gap of a log, from the first smoothed state there."""
+    windows = found.windows_of(log)
+    at = np.round((found.smoothed_time[windows] - one.log.time[one.offset]) / one.log.dt).astype(int)
+    stretches = []
+    for rows in runs(~one.gaps)[1:]:
+        inside = np.flatnonzero((at >= rows.start) & (at < rows.stop))
+        if len(inside):
+            state = {name: float(x[windows[inside[0]]]) for name, x in found.smoothed_states.items()}
+            stretches.append(Stretch(slice(int(at[inside[0]]), rows.stop), state))
+    return stretches
+
+
+def _covered(one: Segment, stretches: tuple[Stretch, ...]) -> Segment:
+    """The segment, in which the rows of no stretch are those of a gap."""
+    gaps = np.ones(len(one), bool)
+    for x in stretches:
+        gaps[x.rows] = False
+    return replace(one, gaps=gaps, valid=one.valid & ~gaps)
 
 
 def _first_state(one: Segment, log: int, row: int, found: Diagnosis) -> dict[str, float]:

@@ -25,6 +25,8 @@ _MOST, _HALF, _FEW = 0.7, 0.5, 0.01
 _BREAKDOWN = 2.0 / 3.0
 """Fraction of outliers beyond which the estimate of lo-diransac is arbitrary."""
 _UNCERTAIN = 0.5
+_CONTRADICTION = 3.0
+"""Distance of an estimate from the mean of its prior, in standard deviations of that, which needs care."""
 _STEADY, _UNSTEADY = 0.05, 0.2
 """Relative changes of a parameter with the filter's bandwidth that are good, and that need care."""
 
@@ -42,6 +44,7 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
     return by_seriousness(
         (
             *_bounds(result),
+            *_known(result),
             *_simulation(result.logs, restarts=result.diagnosis is not None),
             *_inliers(result.logs, result.inlier_fraction, restarted=result.diagnosis is not None),
             *_diagnosis(result),
@@ -123,8 +126,27 @@ def _bounds(result: Result) -> Iterator[Finding]:
             f"{name} = {value} is on its bound, where the fit was stopped: its interval is unknown; check the bound, "
             "or take the parameter out of the model.",
         )
-    if not (result.violations or result.on_bounds) and any(bounds_text(x) for x in parameters.values()):
+    bounded = any(bounds_text(x) for n, x in parameters.items() if n not in result.fixed)
+    if bounded and not (result.violations or result.on_bounds):
         yield Finding("note", "Every parameter is within its bounds.")
+
+
+def _known(result: Result) -> Iterator[Finding]:
+    """Fixed parameters, priors, and priors that the logs contradict."""
+    for name in result.fixed:
+        value = f"{number(result.parameters[name])} {result.units[name]}".rstrip()
+        yield Finding("note", f"{name} is fixed at {value}, not identified.")
+    for name, x in result.estimate.parameters.items():
+        mean, std = result.priors.get(name.partition("[")[0], (np.nan, np.nan))
+        away = abs(x - mean) / std
+        if away > _CONTRADICTION:
+            text = (
+                f"{_these(result.logs)} {'contradict' if len(result.logs) > 1 else 'contradicts'} the prior of {name}"
+            )
+            far = f"{number(x)} lies {number(away, 2)} prior standard deviations from its mean {number(mean)}"
+            yield Finding("care", f"{text[0].upper()}{text[1:]}: the estimate {far}; check the prior, and the model.")
+        elif np.isfinite(away):
+            yield Finding("note", f"The estimate of {name} uses the prior {number(mean)} ± {number(std, 2)}.")
 
 
 def bounds_text(parameter: Parameter) -> str:
@@ -247,11 +269,11 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
     for suggestion in result.suggestions:
         yield Finding("care", f"The model seems to lack a term. {suggestion.text}.")
     if found.input_delay_significant:
-        sense = "later" if found.input_delay > 0.0 else "earlier"
-        delay = f"Inputs act {number(1e3 * abs(found.input_delay), 3)} ms {sense} than recorded"
-        yield Finding(
-            "care", f"{delay}: the estimate includes this delay; simulations of the model must include it, too."
-        )
+        sense, lag = "later" if found.input_delay > 0.0 else "earlier", result.estimate.resolution.timing.lag
+        late = f"Inputs act {number(1e3 * abs(found.input_delay), 3)} ms {sense} than recorded"
+        how, what = (", after a first-order lag of the actuators", "lag") if lag else ("", "delay")
+        included = f"the estimate includes this {what}, as do its evaluation and validation"
+        yield Finding("care", f"{late}{how}: {included}; other simulations of the model must include it, too.")
     yield from _unidentifiable(result, found)
 
 
@@ -270,7 +292,7 @@ def _unexplained(logs: Sequence[LogSummary]) -> Iterator[Finding]:
 
 
 def _unidentifiable(result: Result, found: Diagnosis) -> Iterator[Finding]:
-    if len(result.unidentifiable) == len(result.parameters):
+    if len(result.unidentifiable) == len(result.parameters) - len(result.fixed):
         yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}.")
     yield from (Finding("care", f"{sentence}.") for sentence in found.unidentifiable_sentences())
 
@@ -282,7 +304,7 @@ def _these(logs: Sequence[LogSummary]) -> str:
 def _uncertainty(result: Result) -> Iterator[Finding]:
     """Widths of the confidence intervals."""
     widths: dict[str, float] = {}
-    intervals = result.intervals()
+    intervals = {n: x for n, x in result.intervals().items() if n not in result.fixed}
     unknown = [name for name, (low, high) in intervals.items() if not np.isfinite(high - low)]
     stuck = {name.partition("[")[0] for name in result.on_bounds}
     lost = [name for name in unknown if name not in stuck]

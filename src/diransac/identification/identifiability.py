@@ -36,6 +36,7 @@ __all__ = [
     "null_space",
     "of_log",
     "structural",
+    "structural_slopes",
     "unidentifiable",
     "vague_parameters",
 ]
@@ -94,14 +95,19 @@ class Ambiguity:
         reason = f", {self.reason}" if self.reason else ""
         n_free = len(self.names) - self.n_determined
         which = f"one, for example {self.names[0]}," if n_free == 1 else f"{n_free} of them"
-        return f"{self.determined()}{reason}; no motion helps: fix {which} at a known value in the model"
+        return f"{self.determined()}{reason}; no motion helps: fix {which} at a known value, {self.remedy()}"
 
     def of_motion(self) -> str:
         """Clause about an ambiguity of a log: what is determined, and what to do."""
         if not self.n_determined:
             them = "it" if len(self.names) == 1 else "them"
-            return f"the motion does not excite {them}; record a livelier motion, or fix {them} in the model"
-        return f"{self.determined()} by this motion; record a livelier motion, or fix one of them in the model"
+            return f"the motion does not excite {them}; record a livelier motion, or fix {them}, {self.remedy()}"
+        return f"{self.determined()} by this motion; record a livelier motion, or fix one of them, {self.remedy()}"
+
+    def remedy(self) -> str:
+        """Argument and option that fix the first parameter, for example."""
+        name = self.names[0].partition("[")[0]
+        return f'by fixed={{"{name}": ...}} or --fix {name}=...'
 
     def sentence(self, clause: str, logs: str = "") -> str:
         """The names, ``is not identifiable``, and a clause."""
@@ -164,6 +170,28 @@ def check_structure(model: Model, source: str, allow: int = 0) -> None:
     found = structural(model)
     if sum(len(x.names) for x in found) > allow:
         raise IdentificationError(f"{source}: {'; '.join(x.sentence(x.of_equations()) for x in found)}")
+
+
+def structural_slopes(model: Model, parameters: FloatArray, given: IntArray) -> FloatArray:
+    """Changes of the parameters that leave every motion as it is, per change of some of them.
+
+    Parameters
+    ----------
+    model : Model
+        Whose equations do not determine all parameters.
+    parameters : (n_p,) array
+        Each in its unit.
+    given : (k,) int array
+        Positions of parameters which, if they were known, would make the others identifiable.
+
+    Returns
+    -------
+    (n_p, k) array
+        1 and 0 in the rows of the given ones.
+    """
+    space = _null_space(_random_jacobian(model, parameters, np.random.default_rng(20240607)))
+    directions = space.directions / space.scale
+    return np.asarray((np.linalg.pinv(directions[:, given]) @ directions).T)
 
 
 def _random_parameters(bounds: Sequence[Parameter], rng: np.random.Generator) -> FloatArray:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from diransac.data import preprocessing
-from diransac.data.dataset import Dataset, distinct_logs, observed_model
+from diransac.data.dataset import Dataset, distinct_logs, usable_sensors
 from diransac.data.log import Log
 from diransac.errors import DiransacError, SettingsError
 from diransac.identification.agreement import disagreements
 from diransac.identification.estimate import Evaluation, LogSummary, Prediction
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
+from diransac.identification.known_parameters import KnownParameters
 from diransac.identification.method import Callback, Method, fit, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, factory
 from diransac.identification.prediction import predictions
@@ -39,6 +40,8 @@ def identify(
     differentiate: bool = False,
     bandwidth: float | None = None,
     input_hold: str | None = None,
+    fixed: Mapping[str, float | None] | Iterable[str] | None = None,
+    priors: Mapping[str, tuple[float, float]] | None = None,
     compare_logs: bool = True,
     with_suggestions: bool = False,
     progress: Callback | None = None,
@@ -73,6 +76,12 @@ def identify(
         Inputs between samples in every simulation: "zero-order", held, as those of a digital controller are; "linear",
         interpolated, for continuous inputs such as those of a sensor.  None: "zero-order"; lo-diransac chooses the
         likelier one.
+    fixed : mapping of str to float, or iterable of str, optional
+        Value of each parameter that is not to be identified, in its unit; None, or a name alone, for its nominal
+        value (``Parameter.value``).  The result has it, with a standard error of zero, and names it in ``fixed``.
+    priors : mapping of str to (float, float), optional
+        Mean and standard deviation of a Gaussian prior of a parameter, in its unit; for a per-log parameter, of the
+        value in each log.  A prior has the weight that the noise of the log gives it: see `docs/method.md`.
     compare_logs : bool, optional
         Whether each of several logs is also identified alone, so that logs that disagree with the others are named;
         that takes about as long again.
@@ -114,7 +123,8 @@ def identify(
     if with_suggestions and not getattr(chosen, "suggestions", False):
         raise SettingsError(f"with_suggestions=True needs suggestions, which method {chosen.name} does not give")
     pointwise = chosen.needs_all_signals or not differentiate
-    task = _Task(model, given, chosen, int(seed), pointwise, hold, compares=compare_logs and len(given) > 1)
+    known = KnownParameters.of(model, fixed, priors)
+    task = _Task(known, given, chosen, int(seed), pointwise, hold, compares=compare_logs and len(given) > 1)
     if with_suggestions:
         return task.with_suggestions(progress)
     if not filtered:
@@ -166,7 +176,7 @@ def _check_arguments(model: object, seed: object) -> None:
 class _Task:
     """One identification, apart from the preparation of its logs."""
 
-    model: Model
+    known: KnownParameters
     given: tuple[Log, ...]
     method: Method
     seed: int
@@ -176,11 +186,17 @@ class _Task:
 
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
         """Identify from prepared logs."""
-        criteria = self.method.criteria
-        model, unused = observed_model(self.model, logs, regression=self.method.regresses(self.model))
+        known, unused = self._observed(logs)
+        criteria, model = self.method.criteria, known.free()
         judged = judged_signals(model, logs, criteria)
         dataset = Dataset.of(
-            model, logs, judged, pointwise=self.pointwise, given=self.given, input_hold=self.input_hold
+            model,
+            logs,
+            judged,
+            pointwise=self.pointwise,
+            given=self.given,
+            input_hold=self.input_hold,
+            priors=known.priors_of_fit,
         )
         check_motion(dataset)
         fitted = 0.5 if self.compares else 0.95
@@ -193,18 +209,26 @@ class _Task:
             remarks, incomparable = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
         report(progress, "done", 1.0)
         return Result(
-            model=model,
+            model=known.model,
             method=self.method.name,
             seed=self.seed,
             settings=criteria,
             options=dict(self.method.options()),
-            estimate=estimate,
+            estimate=known.completed(estimate, len(logs)),
             evaluation=evaluation,
             logs=_summaries(
                 dataset, evaluation, remarks, predictions(estimate, evaluation, dataset, scoring, criteria)
             ),
             notes=(*unused, *dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x), *incomparable),
+            fixed=tuple(n for n in known.model.parameters if n in known.fixed),
+            priors=dict(known.priors),
         )
+
+    def _observed(self, logs: Sequence[Log]) -> tuple[KnownParameters, tuple[str, ...]]:
+        """The known parameters of the model with the sensors that the method can use, and notes on the others."""
+        free = self.known.free()
+        used, notes = usable_sensors(free, logs, regression=self.method.regresses(free))
+        return self.known.of_model(self.known.model.with_sensors(used)), notes
 
     def with_suggestions(self, progress: Callback | None) -> Result:
         """The result of the model with the terms that a first identification suggests; its notes name them."""
@@ -212,8 +236,9 @@ class _Task:
         note = "no terms were suggested; the model is the given one"
         if found.suggestions:
             note = f"terms were added to the model as suggested: {'; '.join(x.text for x in found.suggestions)}"
-            extended = dataclasses.replace(self, model=with_terms(found.model, found.suggestions))
-            found = extended.run(self.given, within(progress, 0.5, 1.0, "with suggested terms: "))
+            extended = with_terms(found.model, found.suggestions)
+            task = dataclasses.replace(self, known=self.known.of_model(extended))
+            found = task.run(self.given, within(progress, 0.5, 1.0, "with suggested terms: "))
         return dataclasses.replace(found, notes=(note, *found.notes))
 
     def with_sensitivity(self, result: Result, derived: Sequence[Log], progress: Callback | None) -> Result:
@@ -224,7 +249,7 @@ class _Task:
             part = within(progress, 0.4 + 0.3 * k, 0.7 + 0.3 * k, f"{factor:g} x bandwidth: ")
             changes.append(self._change(result, [factor * x for x in chosen], part))
         report(progress, "done", 1.0)
-        pairs = {n: (changes[0][n], changes[1][n]) for n in result.parameters}
+        pairs = {n: (changes[0][n], changes[1][n]) for n in result.parameters if n not in result.fixed}
         return dataclasses.replace(result, bandwidth_sensitivity=pairs)
 
     def _change(self, result: Result, bandwidths: Sequence[float], progress: Callback | None) -> dict[str, float]:
@@ -232,7 +257,7 @@ class _Task:
         alone = dataclasses.replace(self, compares=False)
         try:
             pairs = zip(self.given, bandwidths, strict=True)
-            derived = [preprocessing.differentiate(log, self.model, x) for log, x in pairs]
+            derived = [preprocessing.differentiate(log, self.known.model, x) for log, x in pairs]
             other = alone.run(derived, progress).parameters
         except DiransacError:
             return dict.fromkeys(result.parameters, np.nan)

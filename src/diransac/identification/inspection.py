@@ -11,7 +11,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data import preprocessing
-from diransac.data.dataset import Dataset, observed_model
+from diransac.data.dataset import Dataset, usable_sensors
 from diransac.errors import IdentificationError, LogError
 from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.evaluation import choose_scoring
@@ -247,7 +247,7 @@ def _fitness(log: Log, model: Model) -> Fitness:
             model.name, missing, derivable, {}, f"not affine in {names}: excitation is known only after identification"
         )
     try:
-        model, _ = observed_model(model, [derived], regression=True)
+        model = model.with_sensors(usable_sensors(model, [derived], regression=True)[0])
         dataset = Dataset.of(model, derived)
         check_motion(dataset)
         ambiguous = structural(model)

@@ -3,11 +3,14 @@
 The error is that of the predicted acceleration, not that of the equation: an equation can be multiplied by any function
 of the parameters, and its error vanishes with that function; the error of an acceleration does not.  Sensors are
 predicted from the predicted accelerations.
+
+A Gaussian prior ``p_j = m +- s`` is a further error ``(sigma / s) (p_j - m)`` of each fit, with sigma as in
+`estimators`: from the errors of that fit without priors, and their correlation in time.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -23,6 +26,7 @@ from diransac.identification.estimators import (
     solve_definite,
 )
 from diransac.identification.identifiability import NullSpace, null_space
+from diransac.identification.uncertainty import score_inflation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,6 +49,8 @@ _CONVERGED = 1e-14
 _HUGE = 1e140
 # Marquardt's damping at the start, and its bounds.
 _DAMPING = (1e-3, 1e-12, 1e12)
+# Standard deviation of the errors at least, over the RMS of the accelerations, where priors are weighed against them.
+_LEAST_NOISE = 1e-5
 # Bounds of the logarithm of a positive parameter that has none of its own: 1e-12 to 1e12.
 _LOG_BOUND = 27.6
 
@@ -108,28 +114,45 @@ class _BoundNonlinear:
         if not (model.is_affine or model.nonlinear_parameters):
             determined, values = _solution_of_affine_part(dataset)
             self._starts[:, determined] = self._chart.clip(self._chart.to_free(values[None]))[:, determined]
+        self._inflation = 1.0
         everything = np.arange(self.n_rows)[None]
         whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // _ROWS_FOR_WHOLE)]))
         self._starts = np.vstack([whole, self._starts])
-        J = self._errors(everything, whole)[1].reshape(self.n_rows, len(self._scale), -1)
+        errors, J = self._errors(everything, whole)
+        errors, J = errors.reshape(self.n_rows, len(self._scale)), J.reshape(self.n_rows, len(self._scale), -1)
         scale = np.sqrt(np.square(J).mean(axis=(0, 1)))
         J = J / np.where(scale > 0.0, scale, 1.0)
         self._blocks = np.einsum("nri,nrj->nij", J, J)
         self._column_scale = scale / self._chart.slope(whole)[0]
+        if len(self._layout.with_prior):
+            scores = np.einsum("nri,nr->ni", J, np.nan_to_num(errors))
+            self._inflation = score_inflation(scores, self._blocks.sum(axis=0), float(np.square(errors).mean()))
 
     def select(self, row_sets: Sequence[IntArray]) -> _SelectedRows:
         return _SelectedRows(self, row_sets)
 
     def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
         """Mask of the sets of rows in which the Jacobian at the fit of all rows has full rank."""
-        gram = np.array([self._blocks[rows].sum(axis=0) for rows in row_sets])
+        gram = np.array([self._blocks[rows].sum(axis=0) for rows in row_sets]) + self._counted_priors()
         return np.asarray(smallest_eigenvalue(gram) > self._settings.min_eigenvalue)
 
     def null_space(self) -> NullSpace:
-        return null_space(self._blocks.sum(axis=0), self._column_scale, self._settings.min_eigenvalue)
+        gram = self._blocks.sum(axis=0) + self._counted_priors()
+        return null_space(gram, self._column_scale, self._settings.min_eigenvalue)
 
     def correlations(self) -> FloatArray:
-        return correlations(self._blocks.sum(axis=0))
+        return correlations(self._blocks.sum(axis=0) + self._counted_priors())
+
+    def _counted_priors(self) -> FloatArray:
+        """Each prior as a row of unit size, ``(n, n)``."""
+        return np.diag(np.isfinite(self._layout.prior_std).astype(float))
+
+    def prior_shifts(self, rows: IntArray) -> FloatArray:
+        here = self._fit_equal(rows[None])
+        start = self._chart.to_free(here)[:, None]
+        shifts = np.diag(self._layout.prior_std)[self._layout.with_prior]
+        shifted = [self._likeliest(rows[None], start, np.where(np.isfinite(x), x, 0.0))[0] for x in shifts]
+        return np.array(shifted).reshape(-1, self._n_p) - here
 
     def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
         """Parameters ``(n_sets, n)``."""
@@ -143,9 +166,8 @@ class _BoundNonlinear:
         return fits
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        start = self._chart.to_free(self._fit_equal(rows[None]))
-        kept = [np.setdiff1d(rows, group)[None] for group in groups]
-        return np.array([self._chart.to_parameters(self._descend(x, start)[0][0]) for x in kept])
+        start = self._chart.to_free(self._fit_equal(rows[None]))[:, None]
+        return np.array([self._likeliest(np.setdiff1d(rows, group)[None], start)[0] for group in groups])
 
     def _fit_equal(self, rows: IntArray) -> FloatArray:
         """Parameters ``(B, n_p)`` from row sets ``(B, n)``: each from the best of its followed starts."""
@@ -158,14 +180,38 @@ class _BoundNonlinear:
         if self._linear is not None:
             solved = self._chart.clip(self._chart.to_free(self._linear.select(list(rows)).fit()))
             followed = np.concatenate([solved[:, None], followed], axis=1)
-        free, costs = self._descend(np.repeat(rows, followed.shape[1], axis=0), followed.reshape(-1, self._n_p))
+        return self._likeliest(rows, followed)
+
+    def _likeliest(self, rows: IntArray, starts: FloatArray, shift: FloatArray | None = None) -> FloatArray:
+        """Parameters ``(B, n_p)`` from row sets ``(B, n)``, each from the best of its starts ``(B, n_starts, n_p)``.
+
+        The means of priors may be shifted ``(n_p,)``.
+        """
+        n_sets, n_starts = starts.shape[:2]
+        every = np.repeat(rows, n_starts, axis=0)
+        free, costs = self._descend(every, starts.reshape(-1, self._n_p))
+        if len(self._layout.with_prior):
+            least = costs.reshape(n_sets, -1).min(axis=1)
+            prior = self._prior_errors(least / max(1, rows.shape[1] * len(self._scale) - self._n_p), shift)
+            free, costs = self._descend(every, free, prior.of(np.repeat(np.arange(n_sets), n_starts)))
         winner = np.argmin(costs.reshape(n_sets, -1), axis=1)
         return self._chart.to_parameters(free.reshape(n_sets, -1, self._n_p)[np.arange(n_sets), winner])
 
-    def _descend(self, rows: IntArray, free: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _prior_errors(self, variance: FloatArray, shift: FloatArray | None) -> _PriorErrors:
+        """Errors of the priors where the errors of the rows have a variance ``(n_sets,)``."""
+        layout = self._layout
+        sigma = np.sqrt(np.maximum(self._inflation * np.nan_to_num(variance), _LEAST_NOISE**2))
+        mean = layout.prior_mean if shift is None else layout.prior_mean + shift
+        return _PriorErrors(
+            layout.with_prior, mean[layout.with_prior], sigma[:, None] / layout.prior_std[layout.with_prior]
+        )
+
+    def _descend(
+        self, rows: IntArray, free: FloatArray, prior: _PriorErrors | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Levenberg-Marquardt on every lane until convergence: free coordinates and sums of squares."""
         free, damping, active = free.copy(), np.full(len(free), _DAMPING[0]), np.arange(len(free))
-        errors, J = self._errors(rows, free)
+        errors, J = self._errors(rows, free, prior)
         costs = np.square(errors).sum(axis=1)
         for _ in range(self._settings.max_steps):
             H = np.einsum("bni,bnj->bij", J[active], J[active])
@@ -173,7 +219,7 @@ class _BoundNonlinear:
             diagonal = np.einsum("bii->bi", H)
             H = H + (damping[active, None] * (diagonal + 1e-12))[:, :, None] * np.eye(self._n_p)
             trial = self._chart.clip(free[active] - np.nan_to_num(solve_definite(H, slope)))
-            trial_errors, trial_J = self._errors(rows[active], trial)
+            trial_errors, trial_J = self._errors(rows[active], trial, None if prior is None else prior.of(active))
             trial_costs = np.square(trial_errors).sum(axis=1)
             with np.errstate(invalid="ignore"):
                 gain = costs[active] - trial_costs
@@ -191,8 +237,10 @@ class _BoundNonlinear:
         """Sum of squares ``(B,)``, infinite where it is not finite."""
         return np.asarray(np.square(self._errors(rows, free)[0]).sum(axis=1))
 
-    def _errors(self, rows: IntArray, free: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Scaled errors ``(B, n r)`` and their Jacobian ``(B, n r, n_p)`` in the free coordinates."""
+    def _errors(
+        self, rows: IntArray, free: FloatArray, prior: _PriorErrors | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Scaled errors ``(B, n r)`` and their Jacobian ``(B, n r, n_p)`` in free coordinates; those of priors last."""
         n_lanes = len(rows)
         p, slope = self._chart.to_parameters(free), self._chart.slope(free)
         flat = rows.reshape(-1)
@@ -207,7 +255,10 @@ class _BoundNonlinear:
             errors[missing], J[missing] = 0.0, 0.0
         bad = ~(np.all(np.abs(errors) < _HUGE, axis=1) & np.all(np.abs(J) < _HUGE, axis=(1, 2)))
         errors[bad], J[bad] = np.inf, 0.0
-        return errors, J
+        if prior is None:
+            return errors, J
+        of_prior, slopes = prior.errors(p, slope)
+        return np.hstack([errors, of_prior]), np.concatenate([J, slopes], axis=1)
 
     def _own(self, p: FloatArray, rows: IntArray) -> FloatArray:
         """Parameters of the model ``(B n, n_p)`` at each row of ``(B, n)``, from vectors ``(B, n_all)``."""
@@ -224,6 +275,34 @@ class _BoundNonlinear:
         index = np.broadcast_to(self._layout.index[self._log_of_row[rows]][:, None, :], J.shape)
         np.put_along_axis(full, index, J, axis=2)
         return full
+
+
+@dataclass(frozen=True)
+class _PriorErrors:
+    """Errors of k priors in each of B lanes.
+
+    Parameters
+    ----------
+    places : (k,) int array
+        Positions of their parameters.
+    mean : (k,) array
+    weight : (B, k) array
+        Standard deviation of the errors of the rows over that of the prior.
+    """
+
+    places: IntArray
+    mean: FloatArray
+    weight: FloatArray
+
+    def of(self, lanes: IntArray) -> _PriorErrors:
+        """The errors of some of the lanes."""
+        return replace(self, weight=self.weight[lanes])
+
+    def errors(self, p: FloatArray, slope: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Errors ``(B, k)`` at parameters ``(B, n)``, and their Jacobian ``(B, k, n)`` with ``slope = dp / d free``."""
+        J = np.zeros((*self.weight.shape, p.shape[1]))
+        J[:, np.arange(len(self.places)), self.places] = self.weight * slope[:, self.places]
+        return self.weight * (p[:, self.places] - self.mean), J
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.segment import runs
 from diransac.errors import LogError
 from diransac.identification.estimate import Prediction
 from diransac.identification.evaluation import Simulation, as_estimated
@@ -27,6 +28,7 @@ __all__ = [
     "bulk_range",
     "diagnosed_parts",
     "predictions",
+    "restart_rows",
     "restarts_of",
     "simulated_parts",
     "simulated_rows",
@@ -47,36 +49,64 @@ _MOVING = 0.01
 
 @dataclass(frozen=True)
 class Restarts:
-    """Equidistant states of a log from which its simulation starts.
+    """States of a log from which its simulation starts: equidistant ones, and those after gaps.
 
     Parameters
     ----------
+    rows : (K,) int array
+        Row of each state, ascending.
     states : (K, n_x) array
-        State at row ``0, n_rows, 2 n_rows, ...``.
+        States.
     n_rows : int
-        Number of rows between two states.
+        Number of rows between two states without a gap.
     """
 
+    rows: IntArray
     states: FloatArray
     n_rows: int
 
 
+def restart_rows(observations: Segment, n_rows: int, known: IntArray) -> IntArray:
+    """Rows from which the simulation of a log restarts.
+
+    Parameters
+    ----------
+    observations : Segment
+    n_rows : int
+        Number of rows between two of them without a gap.
+    known : (n,) int array
+        Rows whose state is known, ascending.
+
+    Returns
+    -------
+    (K,) int array
+        Every ``n_rows``-th row of the log outside of its gaps, and the first one of ``known`` after each gap.
+    """
+    parts = []
+    for x in runs(~observations.gaps):
+        after = known[np.searchsorted(known, x.start) :]
+        begin = int(after[0]) if x.start and len(after) else x.start
+        parts += [np.arange(begin, min(begin + 1, x.stop)), np.arange(begin - begin % -n_rows, x.stop, n_rows)]
+    return np.unique(np.concatenate(parts))
+
+
 def restarts_of(diagnosis: Diagnosis, observations: Segment) -> Restarts | None:
-    """About twelve smoothed states of a log; None where the diagnosis of this log lacks a state of the model."""
+    """About twelve smoothed states of a log, and one after each gap; None where the diagnosis lacks a state."""
     time, names = diagnosis.smoothed_time, observations.model.state
     if not set(names) <= set(diagnosis.smoothed_states):
         return None
     every = max(1, round(len(time) / _N_RESTARTS))
     dt, start = observations.log.dt, observations.log.time[observations.offset]
     n_rows = max(1, every * round(float(time[1] - time[0]) / dt)) if len(time) > 1 else len(observations)
-    at = start + dt * np.arange(0, len(observations), n_rows)
-    return Restarts(np.column_stack([np.interp(at, time, diagnosis.smoothed_states[n]) for n in names]), n_rows)
+    rows = restart_rows(observations, n_rows, np.round((time - start) / dt).astype(int))
+    at = start + dt * rows
+    return Restarts(rows, np.column_stack([np.interp(at, time, diagnosis.smoothed_states[n]) for n in names]), n_rows)
 
 
 def simulated_rows(
     simulation: Simulation, log: int, parameters: FloatArray, observations: Segment, restarts: Restarts | None = None
 ) -> FloatArray:
-    """All signals of the model ``(N, n_signals)``, simulated over one log.
+    """All signals of the model ``(N, n_signals)``, simulated over one log; NaN in gaps.
 
     Parameters
     ----------
@@ -88,18 +118,24 @@ def simulated_rows(
     observations : Segment
         The log.
     restarts : Restarts, optional
-        States to start from; None: the initial state of the log alone.
+        States to start from; None: the initial state of the log, and those after gaps.
 
     Raises
     ------
     LogError
         The log lacks its initial state, and no other is given.
     """
-    n = len(observations)
-    begin = Restarts(simulation.starts[log][None], n) if restarts is None else restarts
-    starts = begin.n_rows * np.arange(len(begin.states))
-    series = simulation.trajectories(log, parameters, begin.states, starts, begin.n_rows)
-    return series.reshape(-1, series.shape[2])[:n]
+    if restarts is None:
+        begins = [(rows.start, state) for rows, state in simulation.starts[log]]
+    else:
+        begins = list(zip(restarts.rows.tolist(), restarts.states, strict=True))
+    outside = np.flatnonzero(np.append(observations.gaps, True))
+    series = np.full((len(observations), len(observations.model.signals)), np.nan)
+    for k, (row, state) in enumerate(begins):
+        end = min([int(outside[np.searchsorted(outside, row)]), *(other for other, _ in begins[k + 1 : k + 2])])
+        found = simulation.trajectories(log, parameters, state[None], np.array([row]), end - row)
+        series[row:end] = found[0]
+    return series
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,9 +147,9 @@ class SimulatedLog:
     observations : Segment
         The model over the log, N rows.
     simulated : (N, n_s) array
-        The observations' signals as simulated; NaN after a divergence.
+        The observations' signals as simulated; NaN in gaps, and after a divergence.
     accelerations : mapping of str to (N,) array
-        Simulated accelerations, measured or not.
+        Simulated accelerations, measured or not; NaN in gaps.
     restart_period : float
         Time after which the simulation restarts, s; infinite: never.
     thresholds : (n_s,) array
@@ -147,13 +183,13 @@ class SimulatedLog:
 
     @property
     def n_excluded(self) -> int:
-        """Number of rows in which a required signal is missing."""
+        """Number of rows in which a required signal is missing, or that no simulation covers."""
         return len(self.observations) - self.observations.n_rows + self.observations.offset
 
     @property
     def divergence(self) -> float:
         """Time of the log at which the simulation becomes infinite, s; infinite if it does not."""
-        lost = ~np.isfinite(self.simulated).all(axis=1)
+        lost = ~np.isfinite(self.simulated).all(axis=1) & ~self.observations.gaps
         return float(self._time(int(np.argmax(lost)))) if lost.any() else np.inf
 
     @cached_property
@@ -301,8 +337,8 @@ def predictions(
     settings : Settings
         Rule of the initial states, and threads.
     """
-    acting, rules = as_estimated(dataset, estimate.diagnosis, settings)
-    simulation = Simulation(acting, scoring.judged, estimate.resolution, rules, settings.threads)
+    acting, stretches = as_estimated(dataset, estimate.diagnosis, settings)
+    simulation = Simulation(acting, scoring.judged, estimate.resolution, stretches, settings.threads)
     ends = np.cumsum([0, *map(len, dataset.given)])
     found: list[Prediction | None] = []
     for i, one in enumerate(acting.segments):
@@ -340,11 +376,20 @@ def simulated_parts(observations: Segment, series: FloatArray, restarts: Restart
     """
     model = observations.model
     return {
-        "observations": observations,
+        "observations": observations if restarts is None else _restarted(observations, restarts),
         "simulated": series[:, [model.signals.index(name) for name in observations.signals]],
         "accelerations": {name: series[:, model.signals.index(name)] for name in model.accelerations},
         "restart_period": np.inf if restarts is None else restarts.n_rows * observations.log.dt,
     }
+
+
+def _restarted(observations: Segment, restarts: Restarts) -> Segment:
+    """The observations, in which rows between a gap and the next restart are those of the gap."""
+    gaps = observations.gaps.copy()
+    for x in runs(~gaps):
+        later = restarts.rows[np.searchsorted(restarts.rows, x.start) :]
+        gaps[x.start : min(x.stop, int(later[0]) if len(later) else x.stop)] = True
+    return replace(observations, gaps=gaps, valid=observations.valid & ~gaps)
 
 
 def diagnosed_parts(observations: Segment, diagnosis: Diagnosis | None, first_row: int) -> dict[str, Any]:

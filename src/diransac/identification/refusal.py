@@ -202,7 +202,8 @@ def _no_known_terms(model: Model, layout: ParameterLayout, logs: Sequence[Motion
     zero = [name for i, name in enumerate(model.inputs) if not any(one.u[:, i].any() for one in logs)]
     verb = "is" if len(zero) == 1 else "are"
     cause = f"{', '.join(zero)} {verb} zero throughout" if zero else "each known term is zero throughout"
-    return every.sentence(f"b = 0 in each row of W p = b, since {cause}: {every.determined()}; record known forces")
+    advice = f"record known forces, or fix one, {every.remedy()}"
+    return every.sentence(f"b = 0 in each row of W p = b, since {cause}: {every.determined()}; {advice}")
 
 
 def check_signs(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows], source: str) -> None:

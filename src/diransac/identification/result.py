@@ -26,7 +26,7 @@ from diransac.text_table import aligned, telling_digits
 
 __all__ = ["MARKS", "Result"]
 
-_FORMAT = 5
+_FORMAT = 6
 _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
 MARKS = {"bad": "!", "care": "·"}
@@ -43,6 +43,8 @@ class _Provenance:
     notes: tuple[str, ...]
     options: Mapping[str, Any]
     bandwidth_sensitivity: NumberPairs | None
+    fixed: tuple[str, ...]
+    priors: NumberPairs
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,10 @@ class Result:
         The method's own settings.
     bandwidth_sensitivity : mapping of str to (float, float), optional
         Relative change of each parameter at half and at twice the differentiating filter's bandwidth; None without one.
+    fixed : tuple of str, optional
+        Names of the parameters that were not identified but given; their standard errors are zero.
+    priors : mapping of str to (float, float), optional
+        Mean and standard deviation of the Gaussian prior of each parameter that had one, in its unit.
     """
 
     model: Model
@@ -107,6 +113,8 @@ class Result:
     notes: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
     bandwidth_sensitivity: Mapping[str, tuple[float, float]] | None = None
+    fixed: tuple[str, ...] = ()
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     # ------------------------------------------------------------------ parameters
 
@@ -124,10 +132,8 @@ class Result:
 
     @property
     def per_log(self) -> dict[str, tuple[float, ...]]:
-        """Values of each per-log parameter, one per log."""
-        values = self.estimate.values
-        pairs = zip(self.model.parameters.items(), self.layout.index.T, strict=True)
-        return {name: tuple(values[own].tolist()) for (name, x), own in pairs if x.per_log}
+        """Values of each per-log parameter that was identified, one per log."""
+        return self._by_log(self.estimate.values)
 
     def parameters_in(self, log: Log) -> dict[str, float]:
         """Parameters that hold in a log: per-log ones of that log if it was identified from, else their mean."""
@@ -140,9 +146,11 @@ class Result:
     @property
     def per_log_standard_errors(self) -> dict[str, tuple[float, ...]]:
         """Standard errors of `per_log`."""
-        errors = np.sqrt(np.diag(self.estimate.covariance))
+        return self._by_log(np.sqrt(np.diag(self.estimate.covariance)))
+
+    def _by_log(self, values: FloatArray) -> dict[str, tuple[float, ...]]:
         pairs = zip(self.model.parameters.items(), self.layout.index.T, strict=True)
-        return {name: tuple(errors[own].tolist()) for (name, x), own in pairs if x.per_log}
+        return {n: tuple(values[own].tolist()) for (n, x), own in pairs if x.per_log and n not in self.fixed}
 
     @property
     def covariance(self) -> FloatArray:
@@ -195,8 +203,8 @@ class Result:
     @property
     def on_bounds(self) -> tuple[str, ...]:
         """Names of the parameters on one of their bounds, where the estimator stopped: their intervals are unknown."""
-        stuck = self.layout.on_bounds(self.estimate.values)
-        return tuple(n for n, on_bound in zip(self.layout.names, stuck, strict=True) if on_bound)
+        stuck = zip(self.layout.names, self.layout.on_bounds(self.estimate.values), strict=True)
+        return tuple(n for n, on_bound in stuck if on_bound and n.partition("[")[0] not in self.fixed)
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
@@ -413,7 +421,8 @@ class Result:
         return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
 
     def __str__(self) -> str:
-        return "\n".join([self._headline(), *self._table(), self._summary(), *self._diagnosed(), *self._assessed()])
+        parts = (self._headline(), *self._table(), *self._prior_lines(), self._summary())
+        return "\n".join([*parts, *self._diagnosed(), *self._assessed()])
 
     def _headline(self) -> str:
         many = len(self.logs) > 1
@@ -428,10 +437,17 @@ class Result:
         for name, (low, high) in self.intervals().items():
             digits = telling_digits(low, high)
             interval = f"{low:.{digits}g} .. {high:.{digits}g}" if np.isfinite(high - low) else "unknown"
+            interval = "fixed" if name in self.fixed else interval
             estimate = "?" if name in self.unidentifiable else f"{self.parameters[name]:.6g}"
-            averaged = not self.layout.is_shared and self.model.parameters[name].per_log
+            varies = not self.layout.is_shared and self.model.parameters[name].per_log
+            averaged = varies and name not in self.fixed
             rows.append((f"{name} (mean of logs)" if averaged else name, estimate, interval, self.units[name]))
         return aligned(rows)
+
+    def _prior_lines(self) -> list[str]:
+        """The priors, in a line; none without them."""
+        texts = [f"{n} = {mean:.6g} ± {std:.2g} {self.units[n]}" for n, (mean, std) in self.priors.items()]
+        return [f"prior of {'; '.join(texts)}"] if texts else []
 
     def _summary(self) -> str:
         whole = "" if self.diagnosis is None else "in one simulation of the whole log: "

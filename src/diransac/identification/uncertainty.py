@@ -13,12 +13,14 @@ if TYPE_CHECKING:
 
     from diransac.identification.estimators import BoundEstimator
 
-__all__ = ["N_BLOCKS", "jackknife_covariance"]
+__all__ = ["N_BLOCKS", "combined", "jackknife_covariance", "score_inflation"]
 
 
 # Few and long: intervals have their nominal coverage while residuals are correlated over up to an eighth of a stretch
 # (tests/test_uncertainty.py), 0.3 s of a log of 25 s; with 30 stretches it would be 0.1 s.
 N_BLOCKS = 10
+# Ridge that makes the information of an undetermined parameter definite, over the number of rows.
+_RIDGE = 1e-10
 
 
 def jackknife_covariance(
@@ -60,3 +62,66 @@ def jackknife_covariance(
     deviations = fits - fits.mean(axis=0)
     covariance: FloatArray = np.einsum("ni,nj->ij", deviations, deviations) * (n - 1) / n
     return covariance
+
+
+def score_inflation(scores: FloatArray, information: FloatArray, variance: float) -> float:
+    """Variance of sums of scores over 10 stretches of time, over that of white residuals; one at least.
+
+    Rows with correlated residuals determine the parameters as so many times fewer rows with white ones would.
+
+    Parameters
+    ----------
+    scores : (N, n) array
+        Product of the regressors and the residuals of each row, at the least squares of all.
+    information : (n, n) array
+        Sum of the products of the regressors.
+    variance : float
+        Of the residuals.
+
+    Returns
+    -------
+    float
+        Mean over the directions of the parameters.
+
+    References
+    ----------
+    White 1982 (the sandwich); Kish 1965 (design effect).
+    """
+    n_blocks, n = min(N_BLOCKS, len(scores)), scores.shape[1]
+    sums = np.add.reduceat(scores, np.linspace(0, len(scores), n_blocks, endpoint=False).astype(int))
+    definite = information + _RIDGE * len(scores) * np.eye(n)
+    observed = (sums * np.linalg.solve(definite, sums.T).T).sum() * n_blocks / max(1, n_blocks - 1)
+    ratio = observed / (n * variance) if variance > 0.0 else 1.0
+    return max(1.0, float(ratio)) if np.isfinite(ratio) else 1.0
+
+
+def combined(
+    p: FloatArray, covariance: FloatArray, places: IntArray, mean: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Gaussian estimate combined with independent Gaussian knowledge of some parameters.
+
+    ``p + K (m - H p)`` and ``C - K H C`` with ``K = C H' (H C H' + S)^-1``, where H selects the parameters.
+
+    Parameters
+    ----------
+    p : (n,) array
+    covariance : (n, n) array
+        C; parameters of infinite variance are left as they are.
+    places : (k,) int array
+        Positions of the parameters that are known.
+    mean, variance : (k,) array
+        m and the diagonal of S.
+
+    Returns
+    -------
+    (n,) array, (n, n) array
+    """
+    finite = np.isfinite(np.diag(covariance))
+    among = finite[places]
+    places, mean, variance = places[among], mean[among], variance[among]
+    C = np.where(np.outer(finite, finite), covariance, 0.0)
+    scale = np.sqrt(np.diag(C)[places] + variance)
+    inner = (C[np.ix_(places, places)] + np.diag(variance)) / np.outer(scale, scale)
+    K = np.linalg.solve(inner, C[places] / scale[:, None]).T / scale
+    less = C - K @ C[places]
+    return p + K @ (mean - p[places]), np.where(np.outer(finite, finite), 0.5 * (less + less.T), covariance)

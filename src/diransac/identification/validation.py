@@ -12,7 +12,7 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, as_logs, distinct_logs
 from diransac.data.log import Log
-from diransac.data.segment import Segment
+from diransac.data.segment import Segment, runs
 from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.identification.estimate import Resolution
 from diransac.identification.evaluation import Simulation
@@ -138,11 +138,13 @@ def validate(
         was identified from, and the mean of these in others.
     horizon : float, optional
         Time after which the simulation restarts from the measured state, s.  None: two that suit the length of the
-        logs.  The whole of each log from its first complete state on is always scored, too.
+        logs.  The whole of each log from its first complete state on is always scored, too.  No window passes through a
+        gap: windows end there, and begin again at the next complete state.
     integrator : str, optional
     substeps : int, optional
     input_hold : str, optional
         As in `Settings` and `identify`; None: those of the identification of a result, else "rk4", 1 and "zero-order".
+        A result's inputs act after the delay or lag that was identified.
 
     Returns
     -------
@@ -162,7 +164,10 @@ def validate(
     known = as_plant(plant)
     fitted = plant.estimate.resolution if isinstance(plant, Result) else Resolution()
     resolution = Resolution(
-        integrator or fitted.integrator, substeps or fitted.substeps, checked_hold(input_hold) or fitted.hold
+        integrator or fitted.integrator,
+        substeps or fitted.substeps,
+        checked_hold(input_hold) or fitted.hold,
+        fitted.timing,
     )
     dataset = Dataset.of(known.model, several, pointwise=False)
     own = [plant.parameters_in(log) if isinstance(plant, Result) else known.parameters for log in several]
@@ -188,30 +193,44 @@ class _OpenLoop:
         self._parameters = dataset.model.parameter_vector(parameters)
         self._states = _states(self._segment)
         self._complete: BoolArray = np.asarray(np.isfinite(self._states).all(axis=1))
-        self._n_steps = len(self._states) - 1 - int(np.argmax(self._complete))
+        stretches = [x for x in runs(~self._segment.gaps) if self._complete[x.start : x.stop - 1].any()]
+        self._stretches = [slice(x.start + int(np.argmax(self._complete[x])), x.stop) for x in stretches]
+        if not stretches:
+            needed = ", ".join(dataset.model.states_behind(self._segment.present))
+            raise LogError(f"{self._segment.log.source}: no row has a complete state ({needed}) to start from")
 
     @property
     def duration(self) -> float:
-        """From the first complete state to the end, s."""
-        return self._n_steps * self._segment.log.dt
+        """From the first complete state to the end, or to a gap, the longest, s."""
+        return max(self._steps(x, np.inf) for x in self._stretches) * self._segment.log.dt
+
+    def _steps(self, rows: slice, horizon: float) -> int:
+        """Samples of a horizon; 0 where the stretch is not longer than that."""
+        longest = int(rows.stop - rows.start) - 1
+        if np.isinf(horizon):
+            return longest
+        return round(horizon / self._segment.log.dt) if horizon < longest * self._segment.log.dt else 0
 
     def steps(self, horizon: float) -> int:
-        """Samples of a horizon; 0 where the log is not longer than that."""
-        if np.isinf(horizon):
-            return self._n_steps
-        return round(horizon / self._segment.log.dt) if horizon < self.duration else 0
+        """Samples of a horizon; 0 where no stretch of the log is longer than that."""
+        return max(self._steps(x, horizon) for x in self._stretches)
 
     def sums(self, horizon: float) -> _Sums:
-        """Sums over windows of one horizon, one after another; one that starts at an incomplete state is left out."""
-        steps = self.steps(horizon)
-        starts = np.arange(int(np.argmax(self._complete)), len(self._states) - steps, steps) if steps else np.arange(0)
+        """Sums over the windows of one horizon in all stretches between gaps."""
+        first, *others = (self._sums(rows, self._steps(rows, horizon)) for rows in self._stretches)
+        for other in others:
+            first = first.with_those_of(other)
+        return first
+
+    def _sums(self, rows: slice, steps: int) -> _Sums:
+        """Sums over windows, one after another; one that starts at an incomplete state is left out."""
+        starts = np.arange(rows.start, rows.stop - steps, steps) if steps else np.arange(0)
         starts = starts[self._complete[starts]]
         if not len(starts):
             nothing = np.zeros(self._segment.measured.shape[1])
             return _Sums(0, 0, nothing, nothing, np.empty((0, len(nothing))))
         errors = self._simulation.errors(self._log, self._parameters, self._states[starts], starts, steps + 1)[:, 1:]
-        rows = starts[:, None] + np.arange(1, steps + 1)
-        measured = self._segment.measured[rows]
+        measured = self._segment.measured[starts[:, None] + np.arange(1, steps + 1)]
         present = np.isfinite(measured)
         diverged = (~np.isfinite(errors) & present).any(axis=(1, 2))
         with np.errstate(over="ignore"):
@@ -231,6 +250,16 @@ class _Sums:
     squared: FloatArray
     count: FloatArray
     measured: FloatArray
+
+    def with_those_of(self, other: _Sums) -> _Sums:
+        """The sums over the windows of both."""
+        return _Sums(
+            self.windows + other.windows,
+            self.diverged + other.diverged,
+            self.squared + other.squared,
+            self.count + other.count,
+            np.concatenate([self.measured, other.measured]),
+        )
 
 
 def _pooled(signals: Sequence[str], horizon: float, predictions: Sequence[_OpenLoop]) -> HorizonScores:
@@ -254,7 +283,7 @@ def _spread(measured: FloatArray) -> FloatArray:
 def _states(segment: Segment) -> FloatArray:
     """The measured state ``(N, n_x)`` at every row, NaN where it is incomplete; 0 where nothing measured depends on it.
 
-    Raises LogError: no row has a complete state.
+    Raises LogError: the log lacks a state on which a measured signal depends.
     """
     model = segment.model
     states = np.tile(segment.initial_state("first"), (len(segment), 1))
@@ -262,9 +291,6 @@ def _states(segment: Segment) -> FloatArray:
     for i, name in enumerate(model.state):
         if name in segment.present and name in matter:
             states[:, i] = segment.column(name)
-    complete: BoolArray = np.asarray(np.isfinite(states).all(axis=1))
-    if not complete[:-1].any():
-        raise LogError(f"{segment.log.source}: no row has a complete state ({', '.join(matter)}) to start from")
     return states
 
 

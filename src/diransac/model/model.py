@@ -425,6 +425,46 @@ class Model:
         a = self._definite * self._solve_mass(q, v, u, p, f)
         return ca.Function("force_response", [q, v, u, p, f], [ca.densify(a)], list("qvupf"), ["a"])
 
+    def with_fixed(self, values: Mapping[str, float]) -> Model:
+        """The model with some of its parameters replaced by constants in the equations.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Value of each of these parameters in its unit.
+
+        Raises
+        ------
+        ModelError
+            No parameter is left, or the equations with these constants are not those of a model.
+        """
+        if not values:
+            return self
+
+        def arguments(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[ca.SX]:
+            own = ca.vertcat(*(values[n] if n in values else p[n] for n in self.parameters))
+            return [*(ca.SX(ca.vertcat(*x)) for x in (q, v, a, u)), own]
+
+        def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[Any]:
+            return [self.residual(*arguments(q, v, a, u, p))]
+
+        def kinematics(q: Symbols, v: Symbols) -> list[Any]:
+            assert self.kinematics is not None
+            return [self.kinematics(ca.vertcat(*q), ca.vertcat(*v))]
+
+        has_kinematics = self.kinematics is not None
+        return Model(
+            self.name,
+            self.coordinates,
+            self.inputs,
+            {n: x for n, x in self.parameters.items() if n not in values},
+            equations,
+            velocities=self.velocities if has_kinematics else None,
+            kinematics=kinematics if has_kinematics else None,
+            sensors=self.sensors_of(arguments),
+            description=self.description,
+        )
+
     def _solve_mass(self, q: ca.SX, v: ca.SX, u: ca.SX, p: ca.SX, rhs: ca.SX) -> ca.SX:
         """``M^-1 rhs``: LDL^T where the probe found ``M`` symmetric and definite, CasADi's solve elsewhere."""
         M = self._mass_matrix(q, v, u, p)
@@ -567,13 +607,16 @@ def _parameter_to_dict(parameter: Parameter) -> dict[str, Any]:
 
     lower, upper = finite(parameter.lower), finite(parameter.upper)
     stored = {"unit": parameter.unit, "lower": lower, "upper": upper, "positive": parameter.positive}
-    return {**stored, "per_log": True} if parameter.per_log else stored
+    own_values = {"per_log": True} if parameter.per_log else {}
+    nominal = {} if parameter.value is None else {"value": float(parameter.value)}
+    return {**stored, **own_values, **nominal}
 
 
 def _parameter_from_dict(data: Mapping[str, Any]) -> Parameter:
     lower = -np.inf if data["lower"] is None else data["lower"]
     upper = np.inf if data["upper"] is None else data["upper"]
-    return Parameter(data["unit"], lower, upper, data["positive"], bool(data.get("per_log", False)))
+    own_values, nominal = bool(data.get("per_log", False)), data.get("value")
+    return Parameter(data["unit"], lower, upper, data["positive"], own_values, nominal)
 
 
 def _checksum(data: Mapping[str, Any]) -> str:

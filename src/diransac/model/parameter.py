@@ -26,11 +26,13 @@ class Parameter:
         Adds a strict lower bound of zero, for a mass and the like.
     per_log : bool
         One value per log (the bias of a sensor, a payload) where several logs are identified together.
+    value : float, optional
+        Nominal value in that unit, at which ``identify(..., fixed=["mass"])`` fixes the parameter.
 
     Raises
     ------
     ModelError
-        No value is within the bounds, or one is NaN.
+        No value is within the bounds, one is NaN, or the nominal value is outside of them.
     """
 
     unit: str = "1"
@@ -38,12 +40,18 @@ class Parameter:
     upper: float = np.inf
     positive: bool = False
     per_log: bool = False
+    value: float | None = None
 
     def __post_init__(self) -> None:
         if not self.lower <= self.upper or (self.positive and self.upper <= 0.0):
             raise ModelError(
                 f"parameter bounds leave no room: lower {self.lower}, upper {self.upper}, positive {self.positive}; "
                 "give lower <= upper"
+            )
+        if self.value is not None and not self.admits(self.value):
+            raise ModelError(
+                f"nominal value {self.value} of a parameter is outside its bounds: lower {self.lower}, upper "
+                f"{self.upper}, positive {self.positive}; give a finite value within them"
             )
 
     def admits(self, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:

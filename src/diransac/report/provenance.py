@@ -57,6 +57,10 @@ def _facts(entry: Entry) -> dict[str, tuple[str, bool]]:
         "rejected hypotheses": ", ".join(f"{n:,} {reason}" for reason, n in result.rejected.items()) or "none",
         "stop reason": result.stop_reason,
     }
+    if result.fixed:
+        facts["fixed"] = ", ".join(f"{n} = {number(result.parameters[n], 6)}" for n in result.fixed)
+    if result.priors:
+        facts["priors"] = ", ".join(f"{n} = {number(m, 6)} ± {number(s, 2)}" for n, (m, s) in result.priors.items())
     chosen = {key: (_value(x), x != default[key]) for key, x in result.settings.to_dict().items()}
     own = {key: (_value(x), x != defaults.get(key)) for key, x in result.options.items()}
     return {key: (text, False) for key, text in facts.items()} | chosen | {"input hold": (hold, hold != _HOLD)} | own
@@ -145,6 +149,11 @@ def _call(entry: Entry) -> str:
         arguments.append(f"differentiate=True, bandwidth={steps[-1]['bandwidth']!r}")
     if result.estimate.resolution.hold != _HOLD:
         arguments.append(f"input_hold={result.estimate.resolution.hold!r}")
+    if result.fixed:
+        values = {n: result.parameters[n] for n in result.fixed}
+        arguments.append(f"fixed={values!r}")
+    if result.priors:
+        arguments.append(f"priors={dict(result.priors)!r}")
     return f"result = dr.identify(model, log, {', '.join(arguments)})"
 
 

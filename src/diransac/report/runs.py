@@ -20,6 +20,7 @@ from diransac.identification.prediction import (
     Restarts,
     SimulatedLog,
     diagnosed_parts,
+    restart_rows,
     restarts_of,
     simulated_parts,
     simulated_rows,
@@ -27,7 +28,6 @@ from diransac.identification.prediction import (
 )
 from diransac.identification.result import Result
 from diransac.identification.validation import Validation, validate
-from diransac.model import Plant
 from diransac.report.rendering import numbered
 from diransac.simulation import inlier_mask
 
@@ -220,8 +220,8 @@ def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | 
     log = _prepared(result, view, given)
     dataset = _dataset(result, log, given)
     scoring = choose_scoring(dataset, result.settings)
-    dataset, rules = as_estimated(dataset, view.diagnosis, result.settings)
-    simulation = Simulation(dataset, scoring.judged, result.estimate.resolution, rules, threads=1)
+    dataset, stretches = as_estimated(dataset, view.diagnosis, result.settings)
+    simulation = Simulation(dataset, scoring.judged, result.estimate.resolution, stretches, threads=1)
     observations, parameters = dataset.segments[0], result.model.parameter_vector(view.parameters)
     first_row = observations.first_row_in(given)
     whole = simulated_rows(simulation, 0, parameters, observations)
@@ -242,7 +242,7 @@ def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | 
         first_row=first_row,
         diagnosis=diagnosis,
         open_loop=open_loop,
-        validation=_validation(result, view, log),
+        validation=_validation(result, log),
     )
     return replace(run, inliers=_inliers(run, scoring))
 
@@ -261,8 +261,9 @@ def _restarts(result: Result, view: LogView, observations: Segment, diagnosis: D
     n_rows, names = max(1, round(min(periods) / observations.log.dt)), observations.model.state
     if not set(names) <= set(observations.signals):
         return None
-    states = np.column_stack([observations.column(name) for name in names])[::n_rows]
-    return Restarts(states, n_rows) if np.isfinite(states).all() else None
+    rows = restart_rows(observations, n_rows, np.arange(len(observations)))
+    states = np.column_stack([observations.column(name)[rows] for name in names])
+    return Restarts(rows, states, n_rows) if np.isfinite(states).all() else None
 
 
 def _inliers(run: Run, scoring: Scoring) -> BoolArray:
@@ -300,11 +301,9 @@ def _dataset(result: Result, log: Log, given: Log) -> Dataset:
         return Dataset.of(result.model, log, pointwise=False, given=[given])
 
 
-def _validation(result: Result, view: LogView, log: Log) -> Validation | str:
+def _validation(result: Result, log: Log) -> Validation | str:
     """Open-loop scores, or the reason why there are none."""
-    fitted = result.estimate.resolution
     try:
-        plant = Plant(result.model, view.parameters)
-        return validate(plant, log, integrator=fitted.integrator, substeps=fitted.substeps, input_hold=fitted.hold)
+        return validate(result, log)
     except (LogError, SettingsError) as error:
         return str(error)

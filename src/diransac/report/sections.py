@@ -219,7 +219,7 @@ def _parameter_scale(name: str, entries: Sequence[Entry]) -> Scale:
     intervals = np.array([entry.result.intervals()[name] for entry in entries])
     estimates = np.array([entry.result.parameters[name] for entry in entries])
     widths = intervals[:, 1] - intervals[:, 0]
-    sharpest = int(np.argmin(np.where(np.isfinite(widths), widths, np.inf)))
+    sharpest = int(np.argmin(np.where(widths > 0.0, widths, np.inf)))  # a fixed value has no interval
     core = np.append(estimates, intervals[sharpest][np.isfinite(intervals[sharpest])])
     low, high = float(core.min()), float(core.max())
     reach = _WIDEST * (high - low)
@@ -234,6 +234,9 @@ def _estimate(name: str, entry: Entry, look: str, scale: Scale) -> Estimate:
     if not entry.identifies(name):
         return Estimate(entry.label, look)
     value, (low, high) = result.parameters[name], result.intervals()[name]
+    if name in result.fixed:
+        at = _whisker(name, entry, look, scale)
+        return Estimate(entry.label, look, number(value, 6), "fixed", "–", whisker=at)
     known = np.isfinite(high - low)
     digits = telling_digits(low, high)
     width = "includes 0" if low <= 0.0 <= high else percent(0.5 * (high - low) / abs(value))
@@ -326,7 +329,8 @@ def _delay(entry: Entry) -> str:
     if not found.input_delay_significant:
         return ""
     delay, error = number(1e3 * found.input_delay, 3), number(1e3 * found.input_delay_error, 2)
-    return f"Input delay: {delay} ± {error} ms (standard error). The estimate and the simulations shown include it."
+    kind = "lag" if entry.result.estimate.resolution.timing.lag else "delay"
+    return f"Input {kind}: {delay} ± {error} ms (standard error). The estimate and the simulations shown include it."
 
 
 def short_term_scores(runs: Sequence[Run]) -> Table | None:

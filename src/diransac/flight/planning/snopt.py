@@ -139,6 +139,6 @@ def _value(
         if np.ndim(found := value(at)) == 0:
             return AutoDiffXd(found, derivative(at))
         return InitializeAutoDiff(found, derivative(at)).ravel()
-    except BaseException as error:
+    except BaseException as error:  # an interrupt too: Drake may hide what is raised in it
         stopped.append(error)
         raise

@@ -213,7 +213,7 @@ class _Solver:
             values = np.asarray(_COMPUTE[name](self._program, x, objective_factor, multipliers))
             if self._name == "fatrop" and not np.abs(values).max(initial=0.0) < _FATROP_LARGEST:
                 raise _Stopped("a number is too large")
-        except BaseException as error:
+        except BaseException as error:  # an interrupt too: solvers print or hide what is raised in them
             self._stopped = error
             raise
         return values

@@ -158,7 +158,7 @@ def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
 
 
 def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows: np.ndarray, **about: Any) -> Estimate:
-    """Estimate of fitted parameters, with its jackknife covariance.
+    """Estimate of fitted parameters, with its jackknife covariance and, where there are priors, that of their means.
 
     A parameter on one of its bounds stays there whichever rows are left out: its variance is unknown, and infinite
     here, not zero.
@@ -179,7 +179,8 @@ def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows
     Estimate
     """
     log_sizes = None if dataset.layout.is_shared else [one.n_rows for one in dataset.segments]
-    covariance = jackknife_covariance(bound, rows, log_sizes)
+    shifts = bound.prior_shifts(rows)
+    covariance = jackknife_covariance(bound, rows, log_sizes) + shifts.T @ shifts
     stuck = dataset.layout.on_bounds(parameters)
     covariance[stuck] = covariance[:, stuck] = np.inf
     vague = vague_parameters(dataset.layout.names, parameters, covariance, bound.correlations())

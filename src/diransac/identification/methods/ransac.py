@@ -26,6 +26,7 @@ from diransac.identification.evaluation import (
     choose_scoring,
     mean_squared_error,
     rms_error,
+    stretches_of,
 )
 from diransac.identification.method import report
 from diransac.identification.methods.least_squares import bound_to, fitted
@@ -320,8 +321,8 @@ class Evaluator:
         self._min_inlier_signals = scoring.min_inlier_signals
         self._valid = [one.valid for one in dataset.segments]
         resolution = Resolution(settings.integrator, settings.substeps, dataset.hold)
-        rules = [settings.initial_state] * len(self._valid)
-        self._simulation = Simulation(dataset, judged, resolution, rules, settings.threads)
+        stretches = [stretches_of(one, settings.initial_state) for one in dataset.segments]
+        self._simulation = Simulation(dataset, judged, resolution, stretches, settings.threads)
         self._simulation.starts  # noqa: B018  refuses a log without an initial state
 
     def admits(self, parameters: FloatArray) -> BoolArray:

@@ -24,6 +24,9 @@ from diransac.arrays import FloatArray
 
 __all__ = ["Arrowhead", "Factored"]
 
+# Below what rounding leaves of a diagonal of one; keeps what no measurement shows (a heading that nothing depends on).
+_RIDGE = 1e-13
+
 
 @dataclass(frozen=True)
 class Factored:
@@ -70,12 +73,15 @@ class Arrowhead:
         B.
     corner : (m, m) array
         C.
+    ridge : float, optional
+        Addition to a diagonal of one.
     """
 
     diagonal: FloatArray
     below: FloatArray
     border: FloatArray
     corner: FloatArray
+    ridge: float = _RIDGE
 
     def solve(self, right_z: FloatArray, right_p: FloatArray, damping: float = 0.0) -> Factored:
         """Solution for one right-hand side.
@@ -116,10 +122,10 @@ class Arrowhead:
         """
         sz, sp = _scale(np.einsum("wii->wi", self.diagonal)), _scale(np.diag(self.corner))
         k, m = self.border.shape[1:]
-        D = self.diagonal * sz[:, :, None] * sz[:, None, :] + (damping + _RIDGE) * np.eye(k)
+        D = self.diagonal * sz[:, :, None] * sz[:, None, :] + (damping + self.ridge) * np.eye(k)
         E = self.below * sz[1:, :, None] * sz[:-1, None, :]
         B = self.border * sz[:, :, None] * sp
-        C = self.corner * sp[:, None] * sp + (damping + _RIDGE) * np.eye(m)
+        C = self.corner * sp[:, None] * sp + (damping + self.ridge) * np.eye(m)
         solved, var, below, log_det = _reduce(D, E, np.concatenate([B, right_z * sz[:, :, None]], axis=2))
         gain, alone = solved[:, :, :m], solved[:, :, m:]
         left = C - np.einsum("wki,wkj->ij", B, gain)
@@ -137,10 +143,6 @@ class Arrowhead:
             gain * sz[:, :, None] / sp,
             float(log_det + _log_det(left) - 2.0 * (np.log(sz).sum() + np.log(sp).sum())),
         )
-
-
-# Below what rounding leaves of a diagonal of one; keeps what no measurement shows (a heading that nothing depends on).
-_RIDGE = 1e-13
 
 
 def _scale(diagonal: FloatArray) -> FloatArray:

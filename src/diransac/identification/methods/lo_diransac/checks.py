@@ -1,4 +1,4 @@
-"""Findings of a fit on itself: errors of sensors and actuators, parameters that change, methods that disagree."""
+"""Findings of a fit on itself: errors of sensors, parameters that change, methods that disagree."""
 
 from __future__ import annotations
 
@@ -48,23 +48,12 @@ def findings_of_fit(found: Explanation, motion: Motion, result: ProjectedEstimat
     -------
     iterator of Finding
     """
-    yield from _of_actuators(found.intervals)
+    if found.intervals.hold == "linear" and not found.intervals.lag:
+        yield Finding("note", "Inputs that vary linearly between samples explain this log better than held ones.")
     yield from _of_sensors(found.intervals)
     if not found.exact:
         yield from _of_halves(found, result)
         yield from _of_plain_least_squares(found.intervals, motion, result)
-
-
-def _of_actuators(intervals: ShootingIntervals) -> Iterator[Finding]:
-    """A first-order lag of the actuators."""
-    if intervals.lag:
-        lag = number(1e3 * intervals.lag * intervals.dt, 3)
-        text = (
-            f"The actuators follow the recorded inputs with a first-order lag of {lag} ms, which the estimate includes"
-        )
-        yield Finding("care", f"{text}: simulations of the model must include it, too.")
-    if intervals.hold == "linear" and not intervals.lag:
-        yield Finding("note", "Inputs that vary linearly between samples explain this log better than held ones.")
 
 
 def _of_sensors(intervals: ShootingIntervals) -> Iterator[Finding]:

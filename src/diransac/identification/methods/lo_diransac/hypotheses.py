@@ -26,7 +26,7 @@ from diransac.identification.sampling import sample_rows
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset
+    from diransac.data.dataset import Dataset, ParameterLayout
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
@@ -82,8 +82,8 @@ def _linear(
     weak, layout = weak_form(intervals, motion), dataset.layout
     n = len(intervals)
     few = np.unique(np.linspace(0, n - 1, min(settings.n_screening_intervals, n)).astype(int))
-    samples = weak.solve(_samples(settings, weak, seed))
-    missing = _in_sensors_alone(dataset) & ~weak.W.any(axis=(0, 1))
+    samples = weak.solve(_samples(settings, weak, seed), layout)
+    missing = _in_sensors_alone(dataset) & ~weak.W.any(axis=(0, 1)) & np.isinf(layout.prior_std)
     if missing.any() and dataset.model.is_affine:
         samples[:, missing] = [1.0 if x.positive else 0.0 for x, m in zip(layout.bounds, missing, strict=True) if m]
     elif missing.any():
@@ -142,12 +142,18 @@ class WeakForm:
     W: FloatArray
     b: FloatArray
 
-    def solve(self, chosen: BoolArray) -> FloatArray:
-        """Parameters ``(n_sets, n_p)`` by least squares of each set of rows ``(n_sets, n, r)``."""
+    def solve(self, chosen: BoolArray, layout: ParameterLayout | None = None) -> FloatArray:
+        """Parameters ``(n_sets, n_p)`` by least squares of each set of rows ``(n_sets, n, r)``.
+
+        Rows have residuals of order one; the priors of a layout are further rows.
+        """
         n, r, n_p = self.W.shape
         masks = chosen.reshape(len(chosen), -1).astype(np.float64)
         G = (masks @ np.einsum("nri,nrj->nrij", self.W, self.W).reshape(n * r, -1)).reshape(-1, n_p, n_p)
         h = masks @ (self.W * self.b[:, :, None]).reshape(n * r, -1)
+        if layout is not None:
+            precision = 1.0 / np.square(layout.prior_std)
+            G, h = G + np.diag(precision), h + precision * layout.prior_mean
         d = np.sqrt(np.einsum("kii->ki", G)) + 1e-300
         G = G / d[:, :, None] / d[:, None, :] + 1e-10 * np.eye(n_p)
         return np.asarray(np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d)

@@ -23,7 +23,7 @@ from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import estimate_parameters
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
-from diransac.identification.methods.lo_diransac.sensors import clearest_error, with_error
+from diransac.identification.methods.lo_diransac.sensors import clearest_error, error_of_sensor, with_error
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,13 +34,18 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["Explanation", "LocalSearch", "fewest_parts"]
+__all__ = ["LEAST_LAG", "Explanation", "LocalSearch", "fewest_parts"]
+
+LEAST_LAG = 0.1
+"""Shortest lag of the inputs, samples."""
 
 # Difference of two fits' evidence, nats, below which both are as likely.
 _AS_LIKELY = 5.0
 _OUTLIER = 0.5
 # Delays that are tried at a time, before they are refined to a sample.
 _DELAYS_AT_A_TIME = 12
+# Lags that are tried where one is required.
+_LAGS = 9
 # Shortest interval, samples.
 _SHORTEST = 3
 # A delay that is worth an explanation: so many standard errors, and so many samples.
@@ -55,6 +60,8 @@ _EXPLAINS, _FIXED = float(np.log(1.25)), 1e-6
 _SMALL_GAIN = 0.03
 # Gain of evidence, nats, that an error of a sensor is worth.
 _WORTH = 20.0
+# Refinements of an error of a sensor that is estimated in any case; its change in standard errors that ends them.
+_REFINEMENTS, _REFINED = 3, 1.0
 # Inputs that vary linearly between samples act half a sample before held ones.
 _LINEAR = (-0.9, -0.1)
 
@@ -127,16 +134,40 @@ class LocalSearch:
         delay = self._likeliest_delay(intervals)
         shifted = [intervals, *([replace(intervals, delay=delay)] if delay else [])]
         best, *others = [self._from_hypotheses(x, k) for k, x in enumerate(shifted)]
-        best = self._better(best, others)
-        for k in range(self.settings.max_delay_shifts):
+        best = self._with_timing(self._better(best, others), free_hold=free_hold)
+        return self._with_sensors(self._with_named_sensors(best))
+
+    def _with_timing(self, best: Explanation, *, free_hold: bool) -> Explanation:
+        """The explanation with another timing of the inputs, where that makes it likelier or is required."""
+        settings = self.settings
+        forced = bool(settings.input_delay or settings.input_lag)
+        for k in range(max(settings.max_delay_shifts, forced)):
             report(self.callback, "timing of the inputs", 0.6 + 0.1 * k)
-            trial = best if best.exact or k else self._refitted(best, best.intervals)
-            timings = self._timings(trial, free_hold=free_hold)
-            likelier = self._better(best, [trial, *(self._refitted(trial, timing) for timing in timings)])
-            if likelier is best:
+            # A free delay suggests the others, even where no delay is admitted.
+            is_free = k > 0 or (best.exact and settings.input_delay is not False)
+            trial = best if is_free else self._refitted(best, best.intervals, self.prior)
+            others = [self._refitted(trial, x) for x in self._timings(trial, free_hold=free_hold)]
+            if settings.input_delay is not False and not (settings.input_lag and k == 0):
+                others.insert(0, trial)
+            required = forced and k == 0
+            likelier = min(others, key=lambda x: x.cost) if required else self._better(best, others)
+            if likelier is best and not required:
                 break
             best = likelier
-        return self._with_sensors(best)
+        return best
+
+    def _with_named_sensors(self, best: Explanation) -> Explanation:
+        """The explanation with the errors of the sensors that the settings name."""
+        named = [(name, True) for name in self.settings.sensor_delays or ()]
+        named += [(name, False) for name in self.settings.sensor_biases or ()]
+        for name, is_delay in named:
+            report(self.callback, "errors of the sensors", 0.8)
+            for k in range(_REFINEMENTS):
+                error = error_of_sensor(best.intervals, best.refinement.fit, name, is_delay=is_delay)
+                if error is None or (k and error.ratio < _REFINED):
+                    break
+                best = self._refitted(best, with_error(best.intervals, best.refinement.fit, error))
+        return best
 
     def _with_sensors(self, best: Explanation) -> Explanation:
         """The explanation with errors of the sensors, one after the other, as long as they make it likelier.
@@ -147,9 +178,10 @@ class LocalSearch:
         model = best.intervals.model
         tested = np.full(len(model.signals), not best.exact)
         tested[len(model.signals) - len(model.sensors) :] = True
+        kinds = {"delays": self.settings.sensor_delays is None, "biases": self.settings.sensor_biases is None}
         for k in range(self.settings.max_sensor_errors if tested.any() else 0):
             report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
-            error = clearest_error(best.intervals, best.refinement.fit, tested)
+            error = clearest_error(best.intervals, best.refinement.fit, tested, **kinds)
             if error is None:
                 break
             other = self._refitted(best, with_error(best.intervals, best.refinement.fit, error))
@@ -173,9 +205,18 @@ class LocalSearch:
 
     def _from_hypotheses(self, intervals: ShootingIntervals, k: int) -> Explanation:
         """The likeliest explanation with this timing of the inputs."""
-        part = within(self.callback, 0.1 + 0.25 * k, 0.35 + 0.25 * k)
-        undelayed = replace(self.prior, delay=_FIXED * self.prior.delay)
-        return self._simplest(Explanation(intervals, self.best(intervals, undelayed, part), undelayed, exact=False))
+        part, undelayed = within(self.callback, 0.1 + 0.25 * k, 0.35 + 0.25 * k), self._undelayed
+        flexible = Explanation(intervals, self.best(intervals, undelayed, part), undelayed, exact=False)
+        return self._simplest(flexible, self._prior_of(intervals))
+
+    @property
+    def _undelayed(self) -> Prior:
+        """The prior of a fit without a delay."""
+        return replace(self.prior, delay=_FIXED * self.prior.delay)
+
+    def _prior_of(self, intervals: ShootingIntervals) -> Prior:
+        """The prior of a fit whose delay or lag is free, as far as the settings admit it."""
+        return self._undelayed if self.settings.input_delay is False and not intervals.lag else self.prior
 
     def best(self, intervals: ShootingIntervals, prior: Prior, callback: Callback | None = None) -> Refinement:
         """Local optimisation from the best hypothesis; where it is doubtful, from others; the likeliest of these.
@@ -208,16 +249,19 @@ class LocalSearch:
                 waiting.insert(0, found[-1].fit.shared[: intervals.n_p])
         return min(found, key=lambda x: x.cost)
 
-    def _simplest(self, flexible: Explanation) -> Explanation:
-        """The exact model, if it is as likely; otherwise unmodelled accelerations that vary as fast as is likely."""
+    def _simplest(self, flexible: Explanation, prior: Prior) -> Explanation:
+        """The exact model, if it is as likely; otherwise unmodelled accelerations that vary as fast as is likely.
+
+        The prior is that of the exact model.
+        """
         intervals, fit = flexible.intervals, flexible.refinement.fit
         projected = estimate_parameters(intervals, fit, 1.0).parameters
         starts = np.array([projected, self.hypotheses[0]])
         starts = starts[: 1 + bool((np.abs(starts[1] - starts[0]) > _APART * np.abs(starts[0])).any())]
         for p in starts[intervals.layout.admits(starts)]:
             begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
-            refined = refine_exact(self.settings, intervals, begin, self.prior, flexible.cost)
-            exact = Explanation(intervals, refined, self.prior, exact=True)
+            refined = refine_exact(self.settings, intervals, begin, prior, flexible.cost)
+            exact = Explanation(intervals, refined, prior, exact=True)
             if exact.cost < flexible.cost:
                 return exact
         while self.settings.model_error and (parts := fewest_parts(flexible.intervals.length)):
@@ -240,38 +284,55 @@ class LocalSearch:
 
     def _timings(self, now: Explanation, *, free_hold: bool) -> list[ShootingIntervals]:
         """Other timings of the inputs that the fit suggests: whole samples of delay, a lag, or another hold."""
+        settings = self.settings
         intervals, fit = now.intervals, now.refinement.fit
         local, error = fit.shared[-1], estimate_parameters(intervals, fit, 1.0).delay_error
         late = intervals.delay + intervals.lag + local
+        if settings.input_lag and not intervals.lag:
+            hold = "linear" if free_hold else intervals.hold
+            return [self._with_likeliest_lag(replace(intervals, delay=0, hold=hold))]
         if abs(local) < max(_SIGNIFICANT * error, _SMALL_DELAY) and late == local:
             return []
         timings = []
         if intervals.lag:
-            return [replace(intervals, lag=max(late, 0.1))]
-        if abs(local) >= _WHOLE_SAMPLE:
+            return [replace(intervals, lag=max(late, LEAST_LAG))]
+        if abs(local) >= _WHOLE_SAMPLE and settings.input_delay is not False:
             timings.append(replace(intervals, delay=intervals.delay + round(local)))
         if free_hold and intervals.hold == "zero-order":
-            if late > _WHOLE_SAMPLE:
+            if late > _WHOLE_SAMPLE and settings.input_lag is not False and not settings.input_delay:
                 timings.append(replace(intervals, delay=0, lag=float(late), hold="linear"))
             if _LINEAR[0] < late < _LINEAR[1]:
                 timings.append(replace(intervals, delay=0, hold="linear"))
         return timings
 
-    def _refitted(self, now: Explanation, intervals: ShootingIntervals) -> Explanation:
-        """The likeliest explanation with another timing, from the fit of this one."""
+    def _refitted(self, now: Explanation, intervals: ShootingIntervals, free: Prior | None = None) -> Explanation:
+        """The likeliest explanation with another timing, from the fit of this one.
+
+        The free prior is that of another timing; None: as the settings admit it.
+        """
+        free = free or self._prior_of(intervals)
         fit, old = now.refinement.fit, now.intervals
         left = old.delay + old.lag + fit.shared[-1] - intervals.delay - intervals.lag
         if intervals.hold != old.hold:
             left = 0.0
-        prior = now.prior if intervals.sensors is not old.sensors else self.prior
+        prior = now.prior if intervals.sensors is not old.sensors else free
         # A wide prior that the evidence narrows: a narrow one would never widen where nothing moves.
-        sizes = np.append(fit.prior[:-1], prior.delay if prior is now.prior else max(prior.delay, _WHOLE_SAMPLE))
+        is_wide = prior is self.prior and prior is not now.prior
+        sizes = np.append(fit.prior[:-1], max(prior.delay, _WHOLE_SAMPLE) if is_wide else prior.delay)
+        left = left if free is self.prior else 0.0
         begin = with_residuals(intervals, replace(fit, shared=np.append(fit.shared[:-1], left), prior=sizes))
         if now.exact:
-            refined = refine_exact(self.settings, intervals, begin, self.prior, now.cost)
-            return Explanation(intervals, refined, self.prior, exact=True)
+            refined = refine_exact(self.settings, intervals, begin, free, now.cost)
+            return Explanation(intervals, refined, free, exact=True)
         refined = refine(self.settings, intervals, begin, prior, settled=True)
-        return self._simplest(Explanation(intervals, refined, prior, exact=False))
+        return self._simplest(Explanation(intervals, refined, prior, exact=False), free)
+
+    def _with_likeliest_lag(self, intervals: ShootingIntervals) -> ShootingIntervals:
+        """The lag, from half a sample to the latest delay, with which simulations by the best hypothesis agree best."""
+        longest, every = self.settings.delay_range[1] / intervals.dt, np.arange(len(intervals))
+        lags = np.geomspace(_WHOLE_SAMPLE, max(_WHOLE_SAMPLE, longest), _LAGS)
+        tried = [replace(intervals, lag=float(x)) for x in lags]
+        return min(tried, key=lambda x: float(robust_scores(x, self.motion, self.hypotheses[:1], every)[0]))
 
     def _likeliest_delay(self, intervals: ShootingIntervals) -> int:
         """Delay in samples with which simulations by the best hypothesis agree best with the log.
@@ -288,7 +349,7 @@ class LocalSearch:
                 scores[rows] = float(robust_scores(delayed, self.motion, self.hypotheses[:1], every)[0])
             return scores[rows]
 
-        if low == high:
+        if low == high or self.settings.input_delay is False:
             return 0
         step = max(1, (high - low) // (_DELAYS_AT_A_TIME - 1))
         tried = range(-(-low // step) * step, high + 1, step)

@@ -16,14 +16,15 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
-from diransac.data.segment import long_runs
-from diransac.errors import IdentificationError, LogError, ModelError
+from diransac.data.input_timing import InputTiming
+from diransac.data.segment import long_runs, silent_rows
+from diransac.errors import IdentificationError, LogError, ModelError, SettingsError
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
-from diransac.identification.methods.lo_diransac.local_search import LocalSearch
+from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
 from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
@@ -58,8 +59,6 @@ if TYPE_CHECKING:
 __all__ = ["LoDiransac", "configured"]
 
 _FEWEST_INTERVALS = 4
-# Rows without any sample that are a gap, at least.
-_FEWEST_UNMEASURED = 8
 _OUTLIER = 0.5
 # Fraction of a signal's spread from which on its noise leaves nothing to explain.
 _ALL_OF_IT = 0.8
@@ -100,11 +99,17 @@ class LoDiransac(LoDiransacSettings):
         Number of intervals on which all hypotheses are scored; number of hypotheses that are scored on all intervals.
     delay_range : (float, float), optional
         Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation.
+    input_delay, input_lag : bool, optional
+        Whether inputs act after a delay, or after a first-order lag of the actuators: True, always; False, never; None,
+        where that is the likelier explanation of the log.
     max_delay_shifts : int, optional
         Rounds in which other delays, a lag and another hold of the inputs are tried after the first optimisations.
+    sensor_delays, sensor_biases : sequence of str, optional
+        Signals whose delay, or bias, is estimated in any case; that of no other is.  None: those that the residuals
+        show clearly.
     max_sensor_errors : int, optional
-        Largest number of delays and biases of sensors that are estimated; where the model is exact, only of those with
-        a measurement equation.
+        Largest number of delays and biases of unnamed sensors that are estimated; where the model is exact, only of
+        those with a measurement equation.
     substeps : int, optional
         Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
         samples or links are light.
@@ -164,6 +169,8 @@ class LoDiransac(LoDiransacSettings):
         ------
         LogError
             The logs are too short, or sampled at different rates.
+        SettingsError
+            A sensor is named that the logs lack.
         IdentificationError
             No sample gives parameters within their bounds.
         """
@@ -190,6 +197,7 @@ def configured(settings: Settings, **options: Any) -> LoDiransac:
 
 def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
     """Parameters of the dataset's model, step by step."""
+    _check_sensors(settings, dataset)
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
     report(callback, "smoothing", 0.0)
     intervals, motion, notes = _prepared(settings, dataset)
@@ -217,13 +225,21 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         *_checks(settings, intervals, motion, refined),
         *findings_of_fit(likeliest, motion, result),
     )
-    late = float(intervals.delay + intervals.lag + refined.fit.shared[-1])
-    found = _Found(dataset, intervals, motion, refined.fit, result, late)
+    found = _Found(dataset, intervals, motion, refined.fit, result, bool(settings.input_delay or settings.input_lag))
     estimate = _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
     if likeliest.exact or not settings.suggestions:
         return estimate
     terms = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
     return replace(estimate, suggestions=terms)
+
+
+def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:
+    """Raises SettingsError: a sensor is named that the logs lack."""
+    for setting in ("sensor_delays", "sensor_biases"):
+        unknown = [name for name in getattr(settings, setting) or () if name not in dataset.signals]
+        if unknown:
+            has = ", ".join(dataset.signals)
+            raise SettingsError(f'{setting} names "{unknown[0]}", which {dataset.source} lacks; it has {has}')
 
 
 def _hypotheses(
@@ -330,8 +346,7 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
     if n_leaps:
         notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median replaces them")
     centre = running_median(measured, known, odd_window(settings.median_window, dt, _MOST_SAMPLES))
-    unmeasured = long_runs(~known.any(axis=1), max(_FEWEST_UNMEASURED, round(settings.smoothing_half_width / dt)))
-    return Samples(measured, known, centre, one.gaps | unmeasured), inputs, notes
+    return Samples(measured, known, centre, one.gaps | silent_rows(known, dt)), inputs, notes
 
 
 # ---------------------------------------------------------------------- the estimate
@@ -339,14 +354,33 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
 
 @dataclass(frozen=True)
 class _Found:
-    """Parts of an estimate; the delay is in samples."""
+    """Parts of an estimate; a forced delay or lag of the inputs need not be significant."""
 
     dataset: Dataset
     intervals: ShootingIntervals
     motion: Motion
     fit: Fit
     result: ProjectedEstimate
-    delay: float
+    forced: bool
+
+    @property
+    def late(self) -> float:
+        """Delay of the inputs, lag included, samples."""
+        return float(self.intervals.delay + self.intervals.lag + self.fit.shared[-1])
+
+    @property
+    def is_late(self) -> bool:
+        """True for a significant delay."""
+        return abs(self.late) > max(_SIGNIFICANT * self.result.delay_error, _SMALL_DELAY)
+
+    @property
+    def timing(self) -> InputTiming:
+        """Delay or lag of the inputs where it is significant, or forced."""
+        if not (self.is_late or self.forced):
+            return InputTiming()
+        if self.intervals.lag:
+            return InputTiming(lag=max(self.late, LEAST_LAG) * self.intervals.dt)
+        return InputTiming(delay=self.late * self.intervals.dt)
 
 
 def _estimate(
@@ -375,7 +409,7 @@ def _estimate(
         iterations=settings.n_nonlinear_samples if nonlinear else settings.n_samples,
         n_hypotheses=n_hypotheses,
         stop_reason="converged" if converged else "limit of steps",
-        resolution=Resolution("rk4", settings.substeps, intervals.hold),
+        resolution=Resolution("rk4", settings.substeps, intervals.hold, found.timing),
         notes=notes,
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),
         checks=checks,
@@ -409,9 +443,9 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
         unmodelled_forces={} if forces is None else per_equation(forces),
         smoothed_time=begins + dt * place.astype(float),
         smoothed_states=dict(zip(model.state, fit.x[shown].T.copy(), strict=True)),
-        input_delay=float(found.delay * dt),
+        input_delay=found.late * dt,
         input_delay_error=result.delay_error * dt,
-        input_delay_significant=abs(found.delay) > max(_SIGNIFICANT * result.delay_error, _SMALL_DELAY),
+        input_delay_significant=found.is_late,
         unidentifiable=lost,
         combinations=combinations,
     )

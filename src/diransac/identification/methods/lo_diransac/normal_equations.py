@@ -1,10 +1,12 @@
 """The quadratic model of all intervals together: measurements, continuity, and priors.
 
 Unknowns are those that all intervals share (parameters, discrepancies, delay), and at the start of each interval w the
-state x_w and an unmodelled acceleration d_w that acts over the interval.  With ``F`` the rollout of an interval and
-``kappa`` the standard deviation of continuity, twice the cost is
+state x_w and an unmodelled acceleration d_w that acts over the interval.  With ``F`` the rollout of an interval,
+``kappa`` the standard deviation of continuity and m the prior means of the shared unknowns (zero for discrepancies and
+delay), twice the cost is
 
-    sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / kappa^2 + sum |e_w|^2 / tau^2 + |s|^2 / prior^2
+    sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / kappa^2 + sum |e_w|^2 / tau^2
+        + |s - m|^2 / prior^2
 
 The second sum is over neighbours within one log.  Unmodelled accelerations are a first-order Gauss-Markov process:
 ``e_w`` is ``(d_w - rho d_{w-1}) / sqrt(1 - rho^2)``, and ``d_w`` where a log begins.
@@ -39,6 +41,9 @@ __all__ = [
     "with_residuals",
 ]
 
+# A prior may alone determine a parameter, with less than the ridge's part of the precision of continuity.
+_FINE_RIDGE = 1e-15
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -63,7 +68,9 @@ class Fit:
     continuity_std : (n_x,) array
         Size of the jumps from interval to interval.
     prior : (n_s,) array
-        Size of the discrepancies and of the delay; infinite for the parameters.
+        Size of the discrepancies and of the delay; prior standard deviation of the parameters, infinite without one.
+    prior_mean : (n_s,) array
+        Prior means of the parameters; zero for the others.
     """
 
     shared: FloatArray
@@ -75,6 +82,7 @@ class Fit:
     rho: FloatArray
     continuity_std: FloatArray
     prior: FloatArray
+    prior_mean: FloatArray
 
 
 @dataclass(frozen=True)
@@ -157,8 +165,9 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     g[:-1, n_x:k] += rho * deviation[1:]
     beforehand = 1.0 / np.square(fit.prior)
     border, corner, right = _shared_blocks(intervals, H[:, :k, k:], H[:, k:, k:], g[:, k:])
-    system = Arrowhead(H[:, :k, :k], E, border, corner + np.diag(beforehand))
-    return NormalEquations(system, g[:, :k], right - beforehand * fit.shared, data_z, data_s)
+    blocks = (H[:, :k, :k], E, border, corner + np.diag(beforehand))
+    system = Arrowhead(*blocks, _FINE_RIDGE) if len(intervals.layout.with_prior) else Arrowhead(*blocks)
+    return NormalEquations(system, g[:, :k], right - beforehand * (fit.shared - fit.prior_mean), data_z, data_s)
 
 
 def _in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
@@ -264,7 +273,7 @@ def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
         (weights * np.square(fit.residuals)).sum(),
         np.square((fit.x[1:] - ends) / fit.continuity_std).sum(),
         np.square(innovations(intervals, fit)).sum(),
-        np.square(fit.shared / fit.prior).sum(),
+        np.square((fit.shared - fit.prior_mean) / fit.prior).sum(),
     )
     total = float(sum(terms))
     return total if np.isfinite(total) else np.inf

@@ -9,9 +9,16 @@ Inputs are no instruments: a controller answers disturbances, and its inputs are
 1999).  Nor are any needed: the fitted accelerations are posterior means, whose errors are uncorrelated with themselves,
 so that they do not bias the slopes of a regression on them (Berkson 1950).
 
-The covariance has three parts: that of the fit, propagated through the projection; that of the unmodelled forces
-outside the regressor's column space, as a sample of forces that differ from log to log; and the change under a tenfold
-wider prior on model error, because a constant deviation from the model is not averaged out.
+The covariance has four parts: that of the fit, propagated through the projection; that of the unmodelled forces
+outside the regressor's column space, as a sample of forces that differ from log to log; and, because a constant
+deviation from the model is not averaged out, the changes under a tenfold wider prior on model error and under least
+squares without a robust loss.
+
+A Gaussian prior of a parameter is a term of the fit, so that the parameters of an exact model have it already.  The
+projection is a regression on the motion, which leaves priors out: its result and covariance are combined with them as
+two independent Gaussian estimates, which is exact where the model is affine in its parameters and the errors are
+Gaussian.  So that no prior counts twice, the covariance of the fit is taken with priors that are a hundred times as
+wide, and the combination has what is left of their precision.
 
 References
 ----------
@@ -32,6 +39,7 @@ from diransac.identification.methods.lo_diransac.hypotheses import WeakForm, equ
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.methods.lo_diransac.smoothing import split_signals
+from diransac.identification.uncertainty import combined
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
@@ -57,6 +65,8 @@ __all__ = [
 
 
 _TINY, _UPPER = 1e-300, 0.975
+# Factor of the standard deviations of priors in the covariance that is combined with them.
+_WIDER = 100.0
 # Steps of reweighting, the width of Cauchy's loss in standard deviations, and what is rounding of an equation's scale.
 _REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
 
@@ -99,9 +109,11 @@ def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation:
     ProjectedEstimate
         Within the inclusive bounds; parameters on them have an infinite variance.
     """
-    found = _solution(intervals, fit)
-    change = _solution(intervals, _inflated_prior(intervals, fit, prior_inflation)).parameters - found.parameters
-    return replace(found, covariance=found.covariance + np.outer(change, change))
+    wide = _with_wide_priors(intervals, fit)
+    found = _solution(intervals, wide)
+    change = _solution(intervals, _inflated_prior(intervals, wide, prior_inflation)).parameters - found.parameters
+    found = replace(found, covariance=found.covariance + np.outer(change, change))
+    return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
 
 
 def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -129,6 +141,21 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     return ProjectedEstimate(p, s[:n_p] * np.outer(more, more), unexplained(intervals, fit, p), float(np.sqrt(delay)))
 
 
+def _with_wide_priors(intervals: ShootingIntervals, fit: Fit) -> Fit:
+    """The fit with priors of the parameters that hardly count, but keep its equations definite."""
+    factor = np.where(np.arange(len(fit.prior)) < intervals.n_p, _WIDER, 1.0)
+    return replace(fit, prior=factor * fit.prior)
+
+
+def _combined_with_priors(intervals: ShootingIntervals, fit: Fit, found: ProjectedEstimate) -> ProjectedEstimate:
+    """The estimate combined with what its covariance lacks of the priors.  Parameters on a bound stay there."""
+    layout = intervals.layout
+    variance = np.square(layout.prior_std[layout.with_prior]) / (1.0 - _WIDER**-2)
+    mean = layout.prior_mean[layout.with_prior]
+    p, covariance = combined(found.parameters, found.covariance, layout.with_prior, mean, variance)
+    return replace(found, parameters=p, covariance=covariance, unexplained=unexplained(intervals, fit, p))
+
+
 def _inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fit:
     """The fit after one step with ``tau`` larger by a factor."""
     inflated, n_x = replace(fit, tau=factor * fit.tau), fit.x.shape[1]
@@ -154,7 +181,8 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     M = means_of_intervals(intervals, M)
     latent = np.einsum("wij,wj->wi", M, fit.d)
     means = means_of_intervals(intervals, W)
-    p, gains, stuck = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent))
+    p, gains, stuck = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent), _REWEIGHTED)
+    plain = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent), 0)[0]
     by_rows, by_means = gains
     of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + n_v, n_p))
     level = np.hstack([np.ones((len(push), 1)), intervals.inputs])
@@ -168,7 +196,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     unpushed = push - W @ np.einsum("pni,ni->p", by_rows, push)
     of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)
     sums = batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
-    covariance = covariance + sums.T @ sums
+    covariance = covariance + sums.T @ sums + np.outer(plain - p, plain - p)
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
     delay = at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
@@ -180,10 +208,12 @@ def _bounded_projection(
     now: FloatArray,
     rows: tuple[FloatArray, FloatArray],
     means: tuple[FloatArray, FloatArray],
+    reweighted: int,
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], BoolArray]:
     """Parameters within inclusive bounds, gains of rows (n, N, n_v) and of means (n, W, n_v), and those on a bound.
 
-    Arguments are the parameters of the fit, and regressors with residuals of rows and of interval means.
+    Arguments are the parameters of the fit, regressors with residuals of rows and of interval means, and the number of
+    steps of reweighting.
     """
     lower = np.array([-np.inf if x.positive else x.lower for x in intervals.layout.bounds])
     upper = np.array([x.upper for x in intervals.layout.bounds])
@@ -192,7 +222,7 @@ def _bounded_projection(
         free = ~stuck
         left = means[1] + means[0][:, :, stuck] @ (p - now)[stuck]
         known = means[0][:, :, free] @ now[free] - left - means_of_intervals(intervals, rows[1])
-        weights = _robust_weights(intervals, WeakForm(means[0][:, :, free], known))
+        weights = _robust_weights(intervals, WeakForm(means[0][:, :, free], known), reweighted)
         gains = tuple(np.zeros((len(now), *x.shape[:2])) for x, _ in (rows, means))
         for gain, (W, _), one in zip(
             gains, (rows, means), (np.repeat(weights, intervals.length, axis=0), weights), strict=True
@@ -207,13 +237,13 @@ def _bounded_projection(
     return p, (gains[0], gains[1]), stuck
 
 
-def _robust_weights(intervals: ShootingIntervals, rows: WeakForm) -> FloatArray:
+def _robust_weights(intervals: ShootingIntervals, rows: WeakForm, steps: int) -> FloatArray:
     """Square roots of the weights ``(W, n_v)``: of the equations by their scales, and of intervals by Cauchy's loss.
 
     A gust of a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.
     """
     scale, loss = equation_scales(rows), np.ones(rows.b.shape)
-    for _ in range(_REWEIGHTED):
+    for _ in range(steps):
         gains = least_squares_gains(rows.W, loss / scale)
         left = rows.b - rows.W @ np.einsum("pwi,wi->p", gains, rows.b)
         spread = 1.4826 * np.median(np.abs(left[intervals.occupied]), axis=0)
@@ -329,6 +359,7 @@ def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArra
         Infinite for parameters; 1 sample for the delay.
     """
     force = inertial_forces(intervals, motion, p)
+    force[force == 0.0] = 1.0  # nor do discrepancies of what is at rest
     level = np.append(1.0, np.sqrt(np.square(intervals.inputs).mean(axis=0)))
     level[level == 0.0] = 1.0  # the gain of an input that never acts stays at its prior
     return np.concatenate([np.full(intervals.n_p, np.inf), (force[:, None] / level).ravel(), [1.0]])

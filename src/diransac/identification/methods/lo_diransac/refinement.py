@@ -177,9 +177,11 @@ def start(
     fraction = np.full(len(sigma), 0.3 if settings.outliers else 0.0)
     noise = Mixture(sigma, fraction, np.where(high > low, high - low, 1.0), floor)
     sizes = prior.unit * np.r_[np.full(len(shared) - 1, prior.guarded), prior.delay]
+    sizes[: len(p)] = intervals.layout.prior_std
+    mean = np.concatenate([intervals.layout.prior_mean, np.zeros(len(shared) - len(p))])
     tau = _TAU_START * _accelerations(intervals.model, motion)
     continuity = motion.spread[:n_x].copy() if settings.gradual_continuity else _continuity(intervals, tau)
-    fit = Fit(shared, x, d, residuals, noise, tau, np.zeros(n_v), continuity, sizes)
+    fit = Fit(shared, x, d, residuals, noise, tau, np.zeros(n_v), continuity, sizes, mean)
     return _anchored(intervals, fit) if settings.neighbouring_starts else fit
 
 

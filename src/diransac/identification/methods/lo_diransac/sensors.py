@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["SensorError", "clearest_error", "with_error"]
+__all__ = ["SensorError", "clearest_error", "error_of_sensor", "with_error"]
 
 # Standard errors from which on an error of a sensor is tried, and its least delay, samples.
 _CLEAR, _LEAST_DELAY = 3.0, 0.1
@@ -57,7 +57,9 @@ class SensorError:
     ratio: float
 
 
-def clearest_error(intervals: ShootingIntervals, fit: Fit, tested: BoolArray) -> SensorError | None:
+def clearest_error(
+    intervals: ShootingIntervals, fit: Fit, among: BoolArray, *, delays: bool, biases: bool
+) -> SensorError | None:
     """The error of the sensors that the residuals show most clearly.
 
     Parameters
@@ -65,20 +67,52 @@ def clearest_error(intervals: ShootingIntervals, fit: Fit, tested: BoolArray) ->
     intervals : ShootingIntervals
     fit : Fit
         At its optimum.
-    tested : (n_s,) bool array
+    among : (n_s,) bool array
         Signals whose errors are tested.
+    delays, biases : bool
+        Kinds of errors that are tested.
 
     Returns
     -------
     SensorError or None
         None if no error is clear.
     """
+    tested = [x for x in _candidates(intervals, among) if (delays if x[1] else biases)]
+    found = _score_tests(intervals, fit, tested) if tested else []
+    clear = [x for x in found if x.ratio > _CLEAR and (not x.is_delay or abs(x.size) > _LEAST_DELAY)]
+    return max(clear, key=lambda x: x.ratio, default=None)
+
+
+def error_of_sensor(intervals: ShootingIntervals, fit: Fit, name: str, *, is_delay: bool) -> SensorError | None:
+    """The error of one signal, clear or not.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        At its optimum.
+    name : str
+        Signal of the model.
+    is_delay : bool
+        A delay, or a bias.
+
+    Returns
+    -------
+    SensorError or None
+        None if the log does not determine it.
+    """
+    signal = np.array([x == name for x in intervals.model.signals])
+    return next(iter(_score_tests(intervals, fit, [(signal, is_delay)])), None)
+
+
+def _score_tests(intervals: ShootingIntervals, fit: Fit, candidates: list[tuple[BoolArray, bool]]) -> list[SensorError]:
+    """Estimates of errors of the sensors, each given all else that is estimated."""
     weights, rates = weights_of(intervals, fit), signal_rates(intervals, fit)
     at = linearize(intervals, fit, weights)
     batch = np.arange(0, len(intervals), max(1, round(np.sqrt(len(intervals)))))
     found: list[SensorError] = []
     n_motion = len(intervals.model.signals) - len(intervals.model.sensors)
-    for signals, is_delay in _candidates(intervals, tested):
+    for signals, is_delay in candidates:
         sensitivity = np.where(signals, -rates if is_delay else 1.0, 0.0)
         # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
         moved = linearize(replace(intervals, measured=intervals.measured - sensitivity), fit, weights)
@@ -95,8 +129,7 @@ def clearest_error(intervals: ShootingIntervals, fit: Fit, tested: BoolArray) ->
         variance = max(information, float(np.square(np.add.reduceat(scores, batch)).sum()))
         if information > 0.0:
             found.append(SensorError(signals, is_delay, -score / information, abs(score) / np.sqrt(variance)))
-    clear = [x for x in found if x.ratio > _CLEAR and (not x.is_delay or abs(x.size) > _LEAST_DELAY)]
-    return max(clear, key=lambda x: x.ratio, default=None)
+    return found
 
 
 def with_error(intervals: ShootingIntervals, fit: Fit, error: SensorError) -> ShootingIntervals:
@@ -143,7 +176,7 @@ def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return np.nan_to_num(rates, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _candidates(intervals: ShootingIntervals, tested: BoolArray) -> list[tuple[BoolArray, bool]]:
+def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[tuple[BoolArray, bool]]:
     """Signals and kinds of the errors that are tested: of each signal, and delays of coordinates, velocities, ...
 
     The bias of a sensor that has one as a parameter is not tested.
@@ -151,8 +184,8 @@ def _candidates(intervals: ShootingIntervals, tested: BoolArray) -> list[tuple[B
     model = intervals.model
     seen = intervals.known.sum(axis=0) >= _FEWEST
     kind = np.repeat([0, 1, 2, 3], [model.n_q, model.n_v, model.n_v, len(model.sensors)])
-    single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen & tested)]
-    groups = [(kind == g) & seen & tested for g in range(4)]
+    single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen & among)]
+    groups = [(kind == g) & seen & among for g in range(4)]
     groups = [x for x in groups if 1 < x.sum() < seen.sum()]
     delays = [(x, True) for x in [*groups, *single] if not (x == seen).all()]
     biased = np.array([n in model.biased_sensors for n in model.signals])

@@ -35,7 +35,11 @@ class LoDiransacSettings:
     n_screening_intervals: int = 12
     n_finalists: int = 12
     delay_range: tuple[float, float] = (-0.03, 0.08)
+    input_delay: bool | None = None
+    input_lag: bool | None = None
     max_delay_shifts: int = 3
+    sensor_delays: tuple[str, ...] | None = None
+    sensor_biases: tuple[str, ...] | None = None
     max_sensor_errors: int = 8
     substeps: int = 5
     max_starts: int = 5
@@ -63,13 +67,19 @@ class LoDiransacSettings:
         check_used(self.criteria, self.uses, self.name)
         for f in dataclasses.fields(self):
             value = getattr(self, f.name)
-            if f.name not in _NOT_NUMBERS:
+            if f.name in _SWITCHES and not (value is None or isinstance(value, bool)):
+                raise SettingsError(f"{f.name} is {value!r}; give True, False, or None for the choice by evidence")
+            if f.name in _SENSORS:
+                object.__setattr__(self, f.name, _checked_names(f.name, value))
+            elif f.name not in (*_OBJECTS, *_SWITCHES):
                 object.__setattr__(self, f.name, _checked(f.name, value, f.default))
         if self.candidate_terms is not None and not callable(self.candidate_terms):
             raise SettingsError(
                 f"candidate_terms is {self.candidate_terms!r}; give a function of (q, v, u) that returns expressions "
                 "by name"
             )
+        if self.input_delay and self.input_lag:
+            raise SettingsError("input_delay and input_lag are both True; inputs act after a delay or after a lag")
         if not -np.inf < self.delay_range[0] <= 0.0 <= self.delay_range[1] < np.inf:
             raise SettingsError(f"delay_range is {self.delay_range}; give (earliest, latest) in s, with 0 between them")
 
@@ -79,11 +89,13 @@ class LoDiransacSettings:
 
     def options(self) -> Mapping[str, Any]:
         """All settings but the criteria and the user's candidate terms."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _NOT_NUMBERS}
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _OBJECTS}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
 
 
-_NOT_NUMBERS = ("criteria", "candidate_terms")
+_OBJECTS = ("criteria", "candidate_terms")
+_SWITCHES = ("input_delay", "input_lag")
+_SENSORS = ("sensor_delays", "sensor_biases")
 _MAY_BE_ZERO = (
     "n_samples",
     "max_delay_shifts",
@@ -113,3 +125,13 @@ def _checked(name: str, value: Any, default: Any) -> Any:
     if value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
         raise SettingsError(f"{name} is {value!r}; give a number {least}")
     return type(default)(value)
+
+
+def _checked_names(name: str, value: Any) -> tuple[str, ...] | None:
+    """Names of signals; one name stands for itself.  Raises SettingsError: a value is no name."""
+    names = (value,) if isinstance(value, str) else value
+    if names is None:
+        return None
+    if not isinstance(names, list | tuple) or not all(isinstance(x, str) for x in names):
+        raise SettingsError(f"{name} is {value!r}; give names of signals, () for none, or None for the clear ones")
+    return tuple(names)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.input_timing import acting_inputs
 from diransac.identification.methods.lo_diransac.augmented_model import AugmentedModel, augmented_model
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
@@ -232,15 +233,8 @@ class ShootingIntervals:
         return np.hstack([self.inputs, -later])
 
     def _acting(self, lag: float) -> FloatArray:
-        """Recorded inputs after the delay and a lag, in samples; an actuator is at rest when a log begins."""
-        at = [np.clip(np.arange(r.start, r.stop) - self.delay, r.start, r.stop - 1) for r in self.rows_of_logs]
-        delayed = [self.recorded[rows] for rows in at]
-        if lag:
-            from scipy.signal import lfilter
-
-            decay = np.exp(-1.0 / lag)
-            delayed = [lfilter([0.0, 1.0 - decay], [1.0, -decay], u, axis=0, zi=u[:1])[0] for u in delayed]
-        return np.concatenate(delayed)
+        """Recorded inputs of each log after the delay and a lag, in samples."""
+        return np.concatenate([acting_inputs(self.recorded[rows], self.delay, lag) for rows in self.rows_of_logs])
 
     @cached_property
     def rows_of_logs(self) -> list[slice]:

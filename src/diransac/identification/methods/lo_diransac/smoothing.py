@@ -195,14 +195,15 @@ def smooth(model: Model, logs: Sequence[Samples], dt: float, half: int) -> list[
     Returns
     -------
     list of Motion
-        The spread of each signal is that over all logs.
+        The spread of each signal is that over all logs; its unit for one that is at rest.
     """
     signals = [_smoothed(model, log, dt, half) for log in logs]
     middle = _joined(
         model, [np.where(log.known.any(axis=0), log.centre, x) for log, x in zip(logs, signals, strict=True)]
     )
     n = _n_motion(model)
-    spread = np.concatenate([_spread(middle[:, :n]), *map(_spread_of_known, middle[:, n:].T)]) + 1e-9
+    spread = np.concatenate([_spread(middle[:, :n]), *map(_spread_of_known, middle[:, n:].T)])
+    spread = np.where(spread > 0.0, spread + 1e-9, 1.0)
     return [Motion(x, spread) for x in signals]
 
 

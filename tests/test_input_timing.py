@@ -1,0 +1,257 @@
+"""Inputs that act late or after a lag, gaps, and settings that force or forbid what explains a log.
+
+The machine is a pendulum under a held command, simulated by small steps of its own: the command reaches it after a
+delay or a first-order lag, which are exact at a tenth of a sample.
+"""
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import diransac as dr
+from diransac.data.dataset import Dataset
+from diransac.data.input_timing import InputTiming, acting_inputs
+from diransac.errors import SettingsError
+
+DT, FINE = 0.01, 10
+TRUE = {"inertia": 0.5, "damping": 0.4, "weight": 4.0}
+NOISE = {"angle": 1e-3, "angle_dot": 5e-3, "angle_ddot": 5e-2}
+MODEL = dr.Model(
+    "pendulum",
+    {"angle": "rad"},
+    {"torque": "N m"},
+    {
+        "inertia": dr.Parameter("kg m^2", positive=True),
+        "damping": dr.Parameter("N m s"),
+        "weight": dr.Parameter("N m"),
+    },
+    lambda q, v, a, u, p: [p.inertia * a.angle + p.damping * v.angle + p.weight * ca.sin(q.angle) - u.torque],
+)
+
+
+def commands(n_rows, seed=0):
+    """Sines of a digital controller."""
+    time, rng = DT * np.arange(n_rows), np.random.default_rng(seed)
+    return sum(1.2 * np.sin(w * time + phase) for w, phase in zip((2.0, 5.1, 11.3), rng.uniform(0, 6, 3), strict=True))
+
+
+def pendulum_log(delay=0.0, lag=0.0, n_rows=1500, seed=0, biases=None, gaps=()):
+    """A log of the pendulum; gaps are (first row, last row, signals)."""
+    recorded, h = commands(n_rows, seed), DT / FINE
+    torque = np.repeat(recorded, FINE)
+    shift = round(delay / h)
+    torque = np.r_[np.full(shift, torque[0]), torque[: len(torque) - shift]]
+    if lag:
+        decay = np.exp(-h / lag)
+        torque = lfilter([0.0, 1.0 - decay], [1.0, -decay], torque, zi=torque[:1])[0]
+
+    def acceleration(angle, rate, u):
+        return (u - TRUE["damping"] * rate - TRUE["weight"] * np.sin(angle)) / TRUE["inertia"]
+
+    angle, rate, states = 0.2, 0.0, []
+    for u in torque:  # the midpoint rule
+        a = acceleration(angle, rate, u)
+        states.append((angle, rate, a))
+        middle = angle + 0.5 * h * rate, rate + 0.5 * h * a
+        angle, rate = angle + h * middle[1], rate + h * acceleration(*middle, u)
+    rng = np.random.default_rng(seed + 100)
+    columns = {
+        name: x + NOISE[name] * rng.standard_normal(n_rows) + (biases or {}).get(name, 0.0)
+        for name, x in zip(NOISE, np.array(states)[::FINE].T, strict=True)
+    }
+    columns["torque"] = recorded
+    for first, last, names in gaps:
+        for name in names:
+            columns[name][first:last] = np.nan
+    return dr.Log.from_arrays(DT * np.arange(n_rows), columns, source=f"seed {seed}")
+
+
+# ---------------------------------------------------------------------- acting inputs
+
+
+def test_inputs_without_delay_and_lag_are_the_recorded_ones():
+    recorded = np.random.default_rng(0).standard_normal((50, 2))
+    assert InputTiming().acting(recorded, DT) is recorded
+
+
+@pytest.mark.parametrize("delay", [-7, -1, 3, 60])
+def test_whole_samples_of_delay_shift_the_inputs_whose_ends_continue(delay):
+    recorded = np.random.default_rng(0).standard_normal((50, 2))
+    rows = np.clip(np.arange(50) - delay, 0, 49)
+    np.testing.assert_array_equal(acting_inputs(recorded, delay, 0.0), recorded[rows])
+
+
+@pytest.mark.parametrize("delay", [0.3, 2.7, -1.6])
+def test_a_fraction_of_delay_is_the_mean_of_the_held_signal_over_each_sample(delay):
+    recorded, fine = np.random.default_rng(0).standard_normal((40, 1)), 10
+    held = np.repeat(recorded, fine, axis=0)
+    late = held[np.clip(np.arange(len(held)) - round(delay * fine), 0, len(held) - 1)]
+    mean = late.reshape(40, fine, 1).mean(axis=1)
+    np.testing.assert_allclose(acting_inputs(recorded, delay, 0.0)[4:-4], mean[4:-4], rtol=1e-12, atol=1e-14)
+
+
+def test_a_ramp_is_delayed_exactly():
+    ramp = np.arange(30.0)[:, None]
+    np.testing.assert_allclose(InputTiming(0.0123).acting(ramp, DT)[2:], ramp[2:] - 1.23, rtol=1e-12)
+
+
+def test_a_lag_answers_a_step_with_an_exponential():
+    step = np.r_[np.zeros(10), np.ones(90)][:, None]
+    time = DT * np.maximum(np.arange(100) - 10, 0)
+    np.testing.assert_allclose(InputTiming(lag=0.07).acting(step, DT)[:, 0], 1.0 - np.exp(-time / 0.07), atol=1e-12)
+
+
+# ---------------------------------------------------------------------- delay and lag in evaluation and validation
+
+
+@pytest.fixture(scope="module")
+def late():
+    """Results of a log whose inputs act late, by what makes them late."""
+    return {
+        "delay": dr.identify(MODEL, pendulum_log(delay=0.04), differentiate=True),
+        "lag": dr.identify(MODEL, pendulum_log(lag=0.04), differentiate=True),
+    }
+
+
+@pytest.mark.parametrize("what", ["delay", "lag"])
+def test_the_timing_of_a_result_is_that_of_its_machine(late, what):
+    timing = late[what].estimate.resolution.timing
+    other = "lag" if what == "delay" else "delay"
+    assert getattr(timing, what) == pytest.approx(0.04, abs=0.002)
+    assert getattr(timing, other) == 0.0
+
+
+@pytest.mark.parametrize("what", ["delay", "lag"])
+def test_evaluation_and_validation_of_late_inputs_leave_the_noise_alone(late, what, tmp_path):
+    result = late[what]
+    assert result.inlier_fraction > 0.99
+    late[what].save(tmp_path / "model.json")
+    loaded = dr.Result.load(tmp_path / "model.json")
+    assert loaded == result
+    other = pendulum_log(**{what: 0.04}, seed=5)
+    errors = dr.validate(loaded, other).rmse
+    assert errors["angle"] < 2.0 * NOISE["angle"]
+    assert errors["angle_dot"] < 2.0 * NOISE["angle_dot"]
+    as_recorded = dr.validate(dr.Plant(MODEL, result.parameters), other)
+    assert as_recorded.rmse["angle_dot"] > 5.0 * errors["angle_dot"]
+
+
+def test_print_and_page_say_once_that_inputs_act_late(late, tmp_path):
+    for what, words in (("delay", "Inputs act 40"), ("lag", "after a first-order lag of the actuators")):
+        text = str(late[what])
+        assert text.count("later than recorded") == 1
+        assert words.removesuffix("40") in text
+        page = tmp_path / f"{what}.html"
+        dr.write_report({"lo": late[what]}, [pendulum_log(**{what: 0.04})], page)
+        assert f"Input {what}: " in page.read_text()
+        assert page.read_text().count("later than recorded") == 1
+
+
+# ---------------------------------------------------------------------- gaps
+
+
+@pytest.mark.parametrize("method", ["ols", "i-diransac", "lo-diransac"])
+@pytest.mark.parametrize("lost", [("torque",), tuple(NOISE)], ids=["inputs", "sensors"])
+def test_no_simulation_passes_through_a_gap(method, lost):
+    log = pendulum_log(gaps=[(500, 640, lost)])
+    result = dr.identify(MODEL, log, method)
+    assert not result.inliers[500:640].any()
+    assert result.inlier_fraction > 0.99
+    assert result.inliers[680:].mean() > 0.99
+    assert dr.validate(result, log).horizons[-1].windows == 2
+    errors = dr.validate(result, log).rmse
+    assert errors["angle_dot"] < 6.0 * NOISE["angle_dot"]
+    assert result.logs[0].prediction.divergence == np.inf
+
+
+def test_a_page_of_a_log_with_gaps_is_written(tmp_path):
+    log = pendulum_log(gaps=[(500, 640, ("torque",))])
+    results = {method: dr.identify(MODEL, log, method) for method in ("lo-diransac", "i-diransac")}
+    dr.write_report(results, [log, pendulum_log(seed=3, gaps=[(200, 300, ("torque",))])], tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    assert "1 gap" in text
+    assert "diverge" not in text
+
+
+def test_windows_of_a_validation_restart_after_a_gap_and_do_not_score_it():
+    plant, rows = dr.Plant(MODEL, TRUE), (700, 800)
+    whole = dr.validate(plant, pendulum_log(), 0.5)
+    gapped = dr.validate(plant, pendulum_log(gaps=[(*rows, ("torque",))]), 0.5)
+    assert whole.horizons[0].windows == 29
+    assert gapped.horizons[0].windows == 26  # 13 before row 700, 13 from row 800 on
+
+
+# ---------------------------------------------------------------------- settings
+
+
+def estimate(log, **options):
+    return dr.LoDiransac(suggestions=False, **options).fit(Dataset.of(MODEL, log, pointwise=False), 0)
+
+
+@pytest.mark.parametrize(("kind", "time"), [("delay", 0.04), ("lag", 0.0), ("delay", 0.0), ("lag", 0.04)])
+def test_a_forbidden_delay_or_lag_is_not_estimated(kind, time):
+    found = estimate(pendulum_log(**{kind: time}), input_delay=False, input_lag=False).resolution.timing
+    assert found == InputTiming()
+
+
+def test_without_a_lag_a_lagging_machine_has_a_delay_and_the_reverse():
+    log = pendulum_log(lag=0.04)
+    delayed, lagging = estimate(log, input_lag=False), estimate(log, input_delay=False)
+    assert delayed.resolution.timing.lag == 0.0
+    assert 0.02 < delayed.resolution.timing.delay < 0.06
+    assert lagging.resolution.timing.delay == 0.0
+    assert lagging.resolution.timing.lag == pytest.approx(0.04, abs=0.002)
+
+
+def test_a_required_delay_is_estimated_though_no_evidence_asks_for_it():
+    found = estimate(pendulum_log(), input_delay=True)
+    assert found.resolution.timing.delay != 0.0
+    assert found.resolution.timing.delay == pytest.approx(0.0, abs=0.001)
+
+
+def test_a_required_lag_is_estimated_where_a_delay_is_likelier():
+    timing = estimate(pendulum_log(delay=0.04), input_lag=True).resolution.timing
+    assert timing.delay == 0.0
+    assert 0.02 < timing.lag < 0.06
+
+
+def test_a_named_bias_is_estimated_and_no_other():
+    log = pendulum_log(biases={"angle_dot": 0.05, "angle_ddot": 0.5})
+    found = estimate(log, sensor_biases="angle_dot", sensor_delays=())
+    said = [x for x in found.checks if "sensor" in x]
+    assert len(said) == 1
+    assert said[0].startswith("angle_dot has a sensor bias of 0.05")
+
+
+def test_errors_of_sensors_can_be_forbidden():
+    log = pendulum_log(biases={"angle_dot": 0.05})
+    found = estimate(log, sensor_biases=(), sensor_delays=())
+    assert not any("sensor" in x for x in found.checks)
+
+
+def test_a_required_delay_of_a_sensor_is_estimated():
+    log = pendulum_log()
+    columns = {name: np.array(log[name]) for name in log.names}
+    columns["angle"][3:] = columns["angle"][:-3].copy()
+    found = estimate(dr.Log.from_arrays(log.time, columns), sensor_delays=["angle"])
+    said = next(x for x in found.checks if x.startswith("angle is recorded"))
+    assert float(said.split()[3]) == pytest.approx(30.0, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"input_delay": True, "input_lag": True}, "both True"),
+        ({"input_lag": "yes"}, "input_lag is 'yes'; give True, False, or None"),
+        ({"sensor_biases": 3}, "sensor_biases is 3; give names"),
+    ],
+)
+def test_switches_without_meaning_are_refused(options, says):
+    with pytest.raises(SettingsError, match=says):
+        dr.LoDiransac(**options)
+
+
+def test_a_sensor_that_the_log_lacks_is_refused_by_name():
+    with pytest.raises(SettingsError, match=r'sensor_biases names "x", which .* lacks; it has angle, angle_dot'):
+        estimate(pendulum_log(), sensor_biases=("x",))
