@@ -303,6 +303,17 @@ def test_a_sensor_that_a_regression_cannot_use_is_left_out_and_named(columns):
     assert [exact[n] for n in ("range_point_x", "range_point_z", "range_bias")] == pytest.approx([2.0, -1.0, 0.3], 1e-4)
 
 
+def test_a_sensor_is_affine_once_the_others_of_its_parameters_are_fixed(columns):
+    model = rotorcraft(imu(scale=True))
+    fixed = {"acc_scale_x": 1.0, "acc_scale_z": 1.0, "gyro_scale": 1.06}
+    result = dr.identify(model, as_log(columns), "ols", fixed=fixed)
+    assert set(result.fixed) == set(fixed)
+    assert result.parameters["acc_arm_x"] == pytest.approx(0.06, rel=1e-6)
+    assert result.parameters["acc_scale_x"] == 1.0
+    without = as_log({n: x for n, x in columns.items() if not n.startswith("acc")})
+    assert set(dr.identify(model, without, "ols", fixed=fixed).fixed) == {"gyro_scale"}
+
+
 def test_a_sensor_whose_argument_is_missing_is_left_out_and_named(columns):
     tank = dr.Model(
         "slide",
