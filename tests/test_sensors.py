@@ -482,7 +482,11 @@ def test_sensors_that_are_not_affine_are_fitted_too():
     assert within_intervals(result, {"mass": 2.0, "friction": 0.5, "along": 0.4, "beside": 0.7}) == []
 
 
-def test_a_coordinate_that_only_a_sensor_shows_is_refused_in_one_sentence(model, columns):
+def test_an_attitude_that_only_sensors_show_is_estimated(model, columns):
     log = {n: x for n, x in recorded(columns, 0).items() if n != "theta"}
-    with pytest.raises(dr.IdentificationError, match="nothing measures theta"):
-        dr.identify(model, as_log(log), differentiate=True)
+    result = dr.identify(model, as_log(log), differentiate=True)
+    assert within_intervals(result, TRUE) == []
+    angles = np.interp(result.diagnosis.smoothed_time, columns["t"], columns["theta"])
+    assert np.abs(result.diagnosis.smoothed_states["theta"] - angles).max() < 0.02
+    with pytest.raises(dr.LogError, match="theta"):
+        dr.identify(model, as_log(log), "ols", differentiate=True)

@@ -146,7 +146,8 @@ class ModelList:
         rows = [["model", "coordinates", "inputs", "parameters"]]
         for name, make in BUILTIN.items():
             model = make()
-            rows.append([name, *(", ".join(group) for group in (model.coordinates, model.inputs, model.parameters))])
+            states = (*model.coordinates, *model.first_order)
+            rows.append([name, *(", ".join(group) for group in (states, model.inputs, model.parameters))])
         return "\n".join(aligned(rows))
 
 

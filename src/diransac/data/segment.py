@@ -155,9 +155,10 @@ class Segment:
         coordinate = name.removesuffix("_dot")
         if rule == "robust" and self.model.kinematics is None and coordinate in self.present:
             return self._line(coordinate, _ROWS_FOR_SLOPE)[1]
+        hint = "" if name in self.model.first_order else "pass --differentiate, or "
         raise LogError(
-            f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; pass '
-            f"--differentiate, or give initial_state = {{{name} = ...}}"
+            f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; {hint}give '
+            f"initial_state = {{{name} = ...}}"
         )
 
     def _first(self, name: str) -> float:
@@ -293,10 +294,11 @@ def silent_rows(known: BoolArray, dt: float) -> BoolArray:
 
 
 def _raise_missing(model: Model, log: Log, name: str) -> None:
-    derivable = name in model.velocities or name in model.accelerations
-    hint = (
-        "pass --differentiate to estimate velocities and accelerations" if derivable else "name its column with --map"
-    )
+    hint = "name its column with --map"
+    if name in model.first_order:
+        hint = "estimate it by lo-diransac, of all methods the only one that can, with --differentiate"
+    elif name in model.velocities or name in model.accelerations:
+        hint = "pass --differentiate to estimate velocities and accelerations"
     if name in log.unusable:
         raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; correct the column, or {hint}')
     found = ", ".join(("t", *log.names))

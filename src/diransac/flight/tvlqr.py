@@ -203,7 +203,8 @@ def tvlqr(
     -----
     The default weights follow Bryson's rule and are not tuned: an error of 0.5 in a coordinate (m, rad) or of 1 in a
     velocity (m/s, rad/s) costs as much as full use of an input, which is half the range of its limits, or 1 without
-    limits. ``Qf`` is ``Q`` times 1 s by default.
+    limits. A state of first order has no weight where the model has coordinates, whose motion it serves, and that of a
+    velocity otherwise. ``Qf`` is ``Q`` times 1 s by default.
 
     The controller is optimal at its own rate and converges to the continuous one for dt to 0; the last row counts as
     lasting dt. The four numbers of a quaternion are treated as coordinates: errors along its norm, which no input
@@ -318,8 +319,10 @@ class _CostMatrices:
     """Matrices Q, Qf and R."""
 
     def __init__(self, model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None) -> None:
-        errors = np.repeat([COORDINATE_ERROR, VELOCITY_ERROR], [model.n_q, model.n_v])
-        self.Q = _matrix("Q", errors**-2.0 if Q is None else Q, model.state)
+        weights = np.repeat([COORDINATE_ERROR**-2.0, VELOCITY_ERROR**-2.0], [model.n_q, model.n_v])
+        if model.n_q:
+            weights[len(weights) - len(model.first_order) :] = 0.0
+        self.Q = _matrix("Q", weights if Q is None else Q, model.state)
         self.Qf = FINAL_SECONDS * self.Q if Qf is None else _matrix("Qf", Qf, model.state)
         self._R = None if R is None else _matrix("R", R, tuple(model.inputs))
         if self._R is not None and np.linalg.eigvalsh(self._R).min(initial=np.inf) <= 0:

@@ -181,9 +181,12 @@ class _Maker:
 
     def of_equation(self, i: int) -> Iterator[CandidateTerm]:
         """Candidates in one equation, the simplest first."""
-        if self.speeds[i] > 0.0:
+        first_order = self.model.rate_names[i] in self.model.first_order
+        if first_order:
+            yield from self._of_own_state(i)
+        elif self.speeds[i] > 0.0:
             yield from self._of_own_speed(i)
-        yield self._term("constant force", i, "bias", "", "", ca.SX(1), "")
+        yield self._term("constant term" if first_order else "constant force", i, "bias", "", "", ca.SX(1), "")
         yield from self._of_positions(i)
         yield from self._of_other_speeds(i)
 
@@ -208,6 +211,12 @@ class _Maker:
                 sign * ca.exp(-((v / slow) ** 2)),
                 "",
             )
+
+    def _of_own_state(self, i: int) -> Iterator[CandidateTerm]:
+        s, name = self.symbols[1][i], self.model.rate_names[i]
+        unit = self.model.first_order[name]
+        yield self._term("linear term", i, "linear", name, f"v.{name}", s, unit)
+        yield self._term("quadratic term", i, "quadratic", f"{name}^2", f"v.{name} ** 2", s**2, f"({unit})^2")
 
     def _of_positions(self, i: int) -> Iterator[CandidateTerm]:
         derived = self.model.kinematics is None
@@ -277,8 +286,8 @@ class _Maker:
         residuals[i] = sign * value
         factor = f" * {code}" if code else ""
         line = f"{'-' if sign < 0 else '+'} p.{parameter}{factor}"
-        coordinates = list(self.model.coordinates.values())
-        force = _FORCES.get(coordinates[i], "") if self.model.kinematics is None and self.model.force_sign else ""
+        known = self.model.kinematics is None and self.model.force_sign
+        force = _FORCES.get(self.model.coordinates.get(place, ""), "") if known else ""
         whole = "" if unit is None or not force else _over(force, unit)
         return CandidateTerm(kind, i, place, formula, line, parameter, whole, residuals)
 

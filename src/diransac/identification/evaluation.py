@@ -109,8 +109,7 @@ def _judged_by_default(model: Model, measured: Sequence[str]) -> tuple[str, ...]
     if model.kinematics is not None:
         bare = [] if any(n in measured for n in model.velocities) else [q for q in model.coordinates if q in measured]
     else:
-        pairs = zip(model.coordinates, model.velocities, strict=True)
-        bare = [q for q, v in pairs if q in measured and v not in measured]
+        bare = [q for q, v, *_ in model.chains if q in model.coordinates and q in measured and v not in measured]
     return (*bare, *rates)
 
 

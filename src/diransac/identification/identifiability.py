@@ -6,8 +6,8 @@ but this motion does not.
 
 References
 ----------
-Bellman and Astrom 1970 (structural identifiability); Gautier and Khalil 1990 (base parameters); Belsley, Kuh and Welsch
-1980 (collinearity of scaled columns).
+Bellman and Astrom 1970 (structural identifiability); Gautier and Khalil 1990 (base parameters); Stigter and Molenaar
+2015 (rank of sensitivities); Belsley, Kuh and Welsch 1980 (collinearity of scaled columns).
 """
 
 from __future__ import annotations
@@ -44,14 +44,18 @@ __all__ = [
 # Parameter vectors at which dr/dp is evaluated; random motions for each, at least and per parameter; their decades.
 _N_VECTORS, _N_MOTIONS, _PER_PARAMETER = 3, 60, 4
 _DECADES = (-2.0, 1.0)
-# Singular value over the largest below which it is zero; entry of a null vector that is not zero; equal projectors.
-_RANK, _PART, _SAME = 1e-9, 1e-5, 1e-5
+# Random motions of which some signals are measured, their steps per unknown, and a step over the fastest time constant.
+_N_TRAJECTORIES, _STEPS_PER_UNKNOWN, _STEP = 4, 2, 0.2
+# Singular value over the largest below which it is zero, of dr/dp and of sensitivities, whose sizes differ by decades;
+# entry of a null vector that is not zero; equal projectors.
+_RANK, _RANK_OF_OUTPUTS, _PART, _SAME = 1e-9, 1e-12, 1e-5, 1e-5
 # Entry from which on a parameter takes part in a null vector of a log.
 _PART_OF_LOG = 0.1
 # Eigenvalue of a correlation matrix below which parameters are collinear, and entry that takes part.
 _COLLINEAR, _PART_OF_CORRELATION = 0.05, 0.2
 # Standard errors of a 95 % interval to either side.
 _TWO_SIDED = 1.96
+_UNMEASURED = "since not all states are measured"
 _HOMOGENEOUS = "since each term has one of them as a factor (b = 0 in W p = b)"
 
 
@@ -119,8 +123,11 @@ class Ambiguity:
 
 
 @lru_cache(maxsize=64)
-def structural(model: Model) -> tuple[Ambiguity, ...]:
+def structural(model: Model, measured: tuple[str, ...] | None = None) -> tuple[Ambiguity, ...]:
     """Parameters that no log determines one by one, from the null space of ``dr/dp`` at random motions.
+
+    Where states are not measured, it is the null space of the sensitivities of the measured signals, for any initial
+    state, in short random motions.
 
     Accelerations satisfy the equations, so that the scale of homogeneous equations is in the null space.  A null space
     that does not depend on the parameters leaves sums, one of ``dp/p`` that does not leaves products and ratios.  A
@@ -129,21 +136,26 @@ def structural(model: Model) -> tuple[Ambiguity, ...]:
     Parameters
     ----------
     model : Model
+    measured : tuple of str, optional
+        Signals that are measured; None: all.
 
     Returns
     -------
     tuple of Ambiguity
-        Empty where each parameter is identifiable from all signals, random motions give no finite equations, or the
+        Empty where each parameter is identifiable from these signals, random motions give no finite equations, or the
         number of ambiguities depends on the parameters.
     """
     rng = np.random.default_rng(20240607)
     bounds = list(model.parameters.values())
     free = np.flatnonzero([x.lower < x.upper for x in bounds])
     vectors = [_random_parameters(bounds, rng) for _ in range(_N_VECTORS)]
-    jacobians = [_random_jacobian(model, p, rng)[:, free] for p in vectors]
+    jacobians = [
+        (_random_jacobian(model, p, rng) if measured is None else _output_jacobian(model, p, rng, measured))[:, free]
+        for p in vectors
+    ]
     if not len(free) or min(map(len, jacobians)) < len(free):
         return ()
-    spaces = [_null_space(J) for J in jacobians]
+    spaces = [_null_space(J, _RANK if measured is None else _RANK_OF_OUTPUTS) for J in jacobians]
     if len({len(x.directions) for x in spaces}) > 1:
         return ()
     names = np.array(list(model.parameters))[free]
@@ -151,12 +163,14 @@ def structural(model: Model) -> tuple[Ambiguity, ...]:
     for group in _components(spaces[0].directions, _PART):
         parts = [x.of(group) for x in spaces]
         found.append(_ambiguity(names[group].tolist(), parts, [p[free][group] for p in vectors]))
-    if not model.nonlinear_parameters:
+    if measured is not None:
+        found = [replace(x, reason=_UNMEASURED) for x in found]
+    elif not model.nonlinear_parameters:
         found = [replace(x, reason=_HOMOGENEOUS) if x.noun == "ratio" else x for x in found]
     return _joined(found)
 
 
-def check_structure(model: Model, source: str, allow: int = 0) -> None:
+def check_structure(model: Model, source: str, allow: int = 0, measured: tuple[str, ...] | None = None) -> None:
     """Raise IdentificationError for parameters that the equations do not determine, whatever the motion.
 
     Parameters
@@ -166,8 +180,10 @@ def check_structure(model: Model, source: str, allow: int = 0) -> None:
         Name of the logs in the message.
     allow : int, optional
         Number of such parameters that the caller can do with.
+    measured : tuple of str, optional
+        Signals that are measured; None: all.
     """
-    found = structural(model)
+    found = structural(model, measured)
     if sum(len(x.names) for x in found) > allow:
         raise IdentificationError(f"{source}: {'; '.join(x.sentence(x.of_equations()) for x in found)}")
 
@@ -189,7 +205,7 @@ def structural_slopes(model: Model, parameters: FloatArray, given: IntArray) -> 
     (n_p, k) array
         1 and 0 in the rows of the given ones.
     """
-    space = _null_space(_random_jacobian(model, parameters, np.random.default_rng(20240607)))
+    space = _null_space(_random_jacobian(model, parameters, np.random.default_rng(20240607)), _RANK)
     directions = space.directions / space.scale
     return np.asarray((np.linalg.pinv(directions[:, given]) @ directions).T)
 
@@ -222,6 +238,45 @@ def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator) -> F
     size = np.abs(J).max(axis=1)
     usable = np.isfinite(size) & (size > 0.0) & (size < 1e100)
     return np.asarray(J[usable] / size[usable, None])
+
+
+def _output_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, measured: Sequence[str]) -> FloatArray:
+    """Derivatives ``(n, n_p)`` of measured signals in random motions, without what initial states can explain.
+
+    Motions are sequences of Euler's steps, which have the symmetries of the equations.
+    """
+    n_x, n_q, sensor_slopes = len(model.state), model.n_q, _sensor_slopes(model)
+    rows, blocks = [model.signals.index(n) for n in measured], []
+    for _ in range(_N_TRAJECTORIES):
+        x, step = rng.normal(size=n_x), 0.0
+        of_x, of_p, seen_x, seen_p = np.eye(n_x), np.zeros((n_x, model.n_p)), list[FloatArray](), list[FloatArray]()
+        for _ in range(_STEPS_PER_UNKNOWN * (n_x + model.n_p)):
+            for four in model.quaternions:
+                x[list(four)] /= np.linalg.norm(x[list(four)])
+            u = rng.normal(size=model.n_u)
+            A, _, P = (np.array(ca.DM(J)) for J in model.rate_jacobians(x, u, p))
+            step = step or _STEP / max(1.0, float(np.linalg.norm(A)))
+            moved_x, moved_p = A @ of_x, A @ of_p + P
+            x_dot, a = (np.array(value).ravel() for value in model.dynamics(x, u, p))
+            C, D, S = (np.array(ca.DM(J)) for J in sensor_slopes(x, a, u, p))
+            seen_x.append(np.vstack([of_x, moved_x[n_q:], C @ of_x + D @ moved_x[n_q:]])[rows])
+            seen_p.append(np.vstack([of_p, moved_p[n_q:], C @ of_p + D @ moved_p[n_q:] + S])[rows])
+            x = x + step * x_dot
+            of_x, of_p = of_x + step * moved_x, of_p + step * moved_p
+        J_x, J_p = np.concatenate(seen_x), np.concatenate(seen_p)
+        if np.isfinite(J_x).all() and np.isfinite(J_p).all():
+            U, sizes, _ = np.linalg.svd(J_x, full_matrices=False)
+            U = U[:, sizes > _RANK_OF_OUTPUTS * sizes[0]]
+            blocks.append(J_p - U @ (U.T @ J_p))
+    return np.concatenate(blocks) if blocks else np.zeros((0, model.n_p))
+
+
+def _sensor_slopes(model: Model) -> ca.Function:
+    """Function ``(x, a, u, p) -> dy/d(x, a, p)`` of the sensors, three matrices."""
+    sizes = {"x": len(model.state), "a": model.n_v, "u": model.n_u, "p": model.n_p}
+    x, a, u, p = (ca.SX.sym(name, n) for name, n in sizes.items())
+    y = model.readings(x, a, u, p)
+    return ca.Function("sensor_slopes", [x, a, u, p], [ca.jacobian(y, z) for z in (x, a, p)])
 
 
 def _random_numbers(shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:
@@ -260,12 +315,12 @@ class NullSpace:
         return np.asarray(rows.T @ rows)
 
 
-def _null_space(J: FloatArray) -> NullSpace:
-    """Null space of the rows of J, with columns of unit norm."""
+def _null_space(J: FloatArray, rank: float) -> NullSpace:
+    """Null space of the rows of J, with columns of unit norm; singular values below ``rank`` are zero."""
     norms = np.linalg.norm(J, axis=0)
     scale = np.where(norms > 0.0, norms, 1.0)
     _, sizes, rows = np.linalg.svd(J / scale, full_matrices=False)
-    return NullSpace(rows[sizes <= _RANK * sizes.max(initial=0.0)], scale)
+    return NullSpace(rows[sizes <= rank * sizes.max(initial=0.0)], scale)
 
 
 def _joined(found: Sequence[Ambiguity]) -> tuple[Ambiguity, ...]:
@@ -489,7 +544,12 @@ def vague_parameters(
 
 
 def unidentifiable(
-    model: Model, layout: ParameterLayout, values: FloatArray, covariance: FloatArray, uncertain: BoolArray
+    model: Model,
+    layout: ParameterLayout,
+    values: FloatArray,
+    covariance: FloatArray,
+    uncertain: BoolArray,
+    measured: tuple[str, ...] | None = None,
 ) -> tuple[BoolArray, tuple[str, ...]]:
     """Parameters of an estimate that are not identifiable, by the equations or from the log.
 
@@ -503,6 +563,8 @@ def unidentifiable(
     covariance : (n, n) array
     uncertain : (n,) bool array
         Parameters whose error is too large for the estimate to be of use.
+    measured : tuple of str, optional
+        Signals that are measured; None: all.
 
     Returns
     -------
@@ -511,7 +573,7 @@ def unidentifiable(
     sentences : tuple of str
         The names, the combinations that are determined, and what to do.
     """
-    of_model = structural(model)
+    of_model = structural(model, measured)
     ambiguous = {name for x in of_model for name in x.names}
     by_equations = np.array([name.partition("[")[0] in ambiguous for name in layout.names])
     from_log = collinear(layout.names, values, covariance, uncertain & ~by_equations)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from diransac.model import Model, Parameter
     from diransac.simulation.compiler import Map
 
-__all__ = ["NonlinearLeastSquares"]
+__all__ = ["NonlinearLeastSquares", "ParameterChart"]
 
 
 _START_DECADES = 3.0
@@ -105,7 +105,7 @@ class _BoundNonlinear:
         self._scale = np.sqrt(np.square(self._measured[:, : len(known)]).mean(axis=0))
         self._scale = np.append(self._scale, _spreads(self._measured[:, len(known) :]))
         self._scale[self._scale == 0.0] = 1.0
-        self._chart = _Chart(self._layout.bounds)
+        self._chart = ParameterChart(self._layout.bounds)
         self._evaluate = _compiled(model, known, shown)
         self.n_rows = len(self._state)
         self._n_p = len(self._layout)
@@ -343,7 +343,7 @@ def _solution_of_affine_part(dataset: Dataset) -> tuple[BoolArray, FloatArray]:
     return scale > 0.0, solved / np.where(scale > 0.0, scale, 1.0)
 
 
-class _Chart:
+class ParameterChart:
     """Free coordinates of bounded parameters: the logarithm where a parameter is positive, itself elsewhere."""
 
     def __init__(self, parameters: Sequence[Parameter]) -> None:
@@ -355,9 +355,11 @@ class _Chart:
             self._upper = np.where(self._log, np.minimum(np.log(np.maximum(upper, 0.0)), _LOG_BOUND), upper)
 
     def to_parameters(self, free: FloatArray) -> FloatArray:
+        """Parameters ``(..., n_p)`` of free coordinates."""
         return np.where(self._log, np.exp(np.where(self._log, free, 0.0)), free)
 
     def to_free(self, parameters: FloatArray) -> FloatArray:
+        """Free coordinates ``(..., n_p)`` of parameters."""
         return np.where(self._log, np.log(np.where(self._log, np.maximum(parameters, 1e-300), 1.0)), parameters)
 
     def slope(self, free: FloatArray) -> FloatArray:
@@ -365,6 +367,7 @@ class _Chart:
         return np.where(self._log, self.to_parameters(free), 1.0)
 
     def clip(self, free: FloatArray) -> FloatArray:
+        """Free coordinates within their bounds."""
         return np.clip(free, self._lower, self._upper)
 
     def starts(self, n: int) -> FloatArray:

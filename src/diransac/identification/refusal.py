@@ -8,7 +8,7 @@ Ljung and Box 1978 (serial correlation); Holland and Welsch 1977 (iteratively re
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -124,11 +124,10 @@ class MotionRows:
     y: FloatArray
 
     def scaled(self, model: Model, factors: Mapping[str, float]) -> MotionRows:
-        """The rows with inputs, and coordinates with their derivatives, multiplied by factors by name."""
-        of_q, of_u = (np.array([factors.get(n, 1.0) for n in names]) for names in (model.coordinates, model.inputs))
-        if model.kinematics is not None:
-            return replace(self, u=self.u * of_u)
-        return MotionRows(self.q * of_q, self.v * of_q, self.a * of_q, self.u * of_u, self.y)
+        """The rows with inputs, coordinates and states of first order, and their derivatives, multiplied by factors."""
+        names = (model.coordinates, model.rate_names, model.inputs)
+        of_q, of_v, of_u = (np.array([factors.get(n, 1.0) for n in group]) for group in names)
+        return MotionRows(self.q * of_q, self.v * of_v, self.a * of_v, self.u * of_u, self.y)
 
 
 def motion_rows(dataset: Dataset) -> list[MotionRows]:
@@ -241,7 +240,7 @@ class _Alternatives:
 
     def signs(self) -> str:
         """Clause about signals whose signs are reversed; empty where no reversal explains the logs."""
-        signals = [*self.model.inputs, *self._coordinates()]
+        signals = [*self.model.inputs, *self._coordinates(), *self.model.first_order]
         single = [name for name in signals if self._explain({name: -1.0})]
         if single:
             return f"with the sign of {' or '.join(single)} reversed, {_WITHIN}: check it"

@@ -145,8 +145,9 @@ def with_terms(model: Model, suggestions: Sequence[Suggestion]) -> Model:
         model.inputs,
         {**model.parameters, **new},
         equations,
-        velocities=None if derived else model.velocities,
+        velocities=None if derived else model.velocities_of_motion,
         kinematics=None if derived else kinematics,
+        first_order=model.first_order,
         sensors=model.sensors_of(arguments),
         description=model.description,
     )

@@ -10,10 +10,11 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.data import preprocessing
-from diransac.data.dataset import Dataset, as_logs, distinct_logs
+from diransac.data.dataset import Dataset, ParameterLayout, as_logs, distinct_logs
 from diransac.data.log import Log
 from diransac.data.segment import Segment, runs
 from diransac.errors import DiransacError, LogError, SettingsError
+from diransac.identification.driven_states import DrivenStates, least_squares
 from diransac.identification.estimate import Resolution
 from diransac.identification.evaluation import Simulation
 from diransac.identification.identify import checked_hold, identify
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 __all__ = ["CrossValidation", "HorizonScores", "Validation", "cross_validate", "validate"]
 
 _NICE = (1.0, 2.0, 5.0)
+# Memory of the observers that find unmeasured initial states, over the duration of the log; steps of their search.
+_MEMORY, _N_STEPS = 0.05, 20
 
 
 @dataclass(frozen=True)
@@ -191,7 +194,7 @@ class _OpenLoop:
         self._log, self._segment = log, dataset.segments[log]
         self._simulation = Simulation(dataset, resolution=resolution)
         self._parameters = dataset.model.parameter_vector(parameters)
-        self._states = _states(self._segment)
+        self._states = _states(self._segment, dataset.layout, self._parameters)
         self._complete: BoolArray = np.asarray(np.isfinite(self._states).all(axis=1))
         stretches = [x for x in runs(~self._segment.gaps) if self._complete[x.start : x.stop - 1].any()]
         self._stretches = [slice(x.start + int(np.argmax(self._complete[x])), x.stop) for x in stretches]
@@ -280,18 +283,40 @@ def _spread(measured: FloatArray) -> FloatArray:
     return np.asarray(np.where(present, np.square(measured - mean), 0.0).sum(axis=0))
 
 
-def _states(segment: Segment) -> FloatArray:
+def _states(segment: Segment, layout: ParameterLayout, parameters: FloatArray) -> FloatArray:
     """The measured state ``(N, n_x)`` at every row, NaN where it is incomplete; 0 where nothing measured depends on it.
 
-    Raises LogError: the log lacks a state on which a measured signal depends.
+    States of first order that the log lacks are simulated, driven by the others.
+
+    Raises LogError: the log lacks another state on which a measured signal depends.
     """
-    model = segment.model
-    states = np.tile(segment.initial_state("first"), (len(segment), 1))
-    matter = model.states_behind(segment.present)
+    model, matter = segment.model, segment.model.states_behind(segment.present)
+    hidden = tuple(n for n in model.first_order if n in matter and n not in segment.present)
+    states = np.tile(segment.initial_state(dict.fromkeys(hidden, 0.0) or "first"), (len(segment), 1))
     for i, name in enumerate(model.state):
         if name in segment.present and name in matter:
             states[:, i] = segment.column(name)
+    if hidden:
+        states[:, [model.state.index(n) for n in hidden]] = _unmeasured(segment, layout, parameters, states, hidden)
     return states
+
+
+def _unmeasured(
+    segment: Segment, layout: ParameterLayout, parameters: FloatArray, states: FloatArray, hidden: tuple[str, ...]
+) -> FloatArray:
+    """States ``(N, n)`` that the log lacks, from the initial values that agree best with the other velocities."""
+    model, rows = segment.model, np.arange(len(segment))
+    known = np.column_stack([np.interp(rows, rows[np.isfinite(x)], x[np.isfinite(x)]) for x in states.T])
+    observed = [i for i, n in enumerate(model.state) if n in model.velocities and n not in hidden]
+    spread = known[:, observed].std(axis=0)
+    weights = np.where(np.isfinite(states[:, observed]), 1.0 / np.square(np.where(spread > 0.0, spread, 1.0)), 0.0)
+    bandwidth = 1.0 / (_MEMORY * len(segment) * segment.log.dt)
+    whole, alone = [slice(0, len(segment))], ParameterLayout(layout.parameters)
+    problem = DrivenStates(
+        model, alone, hidden, known, segment.inputs, weights, whole, segment.log.dt, bandwidth, parameters
+    )
+    found = problem.trajectories(least_squares(problem, problem.starts(), _N_STEPS)[0][0])
+    return np.column_stack([found[n] for n in hidden])
 
 
 def _nice(seconds: float) -> float:

@@ -112,9 +112,9 @@ def check_groups(label: str, units: Mapping[str, object], parameters: object) ->
 
 
 def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
-    """Check names of coordinates, velocities, accelerations, inputs, parameters and others, in that order.
+    """Check names of coordinates, velocities, states of first order, derivatives, inputs, parameters and sensors.
 
-    Raises ModelError: a name is not an identifier or is used twice, or there are no coordinates or parameters.
+    Raises ModelError: a name is not an identifier or is used twice, or there are no states or parameters.
     """
     names = [n for group in groups for n in group]
     for name in names:
@@ -126,7 +126,7 @@ def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
             raise ModelError(f'{label}: the name "t" is reserved for time; choose another')
         if names.count(name) > 1:
             raise ModelError(f"{label}: the name {name!r} is used twice; signals and parameters need different names")
-    for kind, group in (("coordinates", groups[0]), ("parameters", groups[4])):
+    for kind, group in (("coordinates or first_order states", [*groups[0], *groups[2]]), ("parameters", groups[-2])):
         if not group:
             raise ModelError(f"{label}: there are no {kind}; give at least one")
 

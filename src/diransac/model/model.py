@@ -1,7 +1,9 @@
-"""Second-order models, given by their equations of motion.
+"""Dynamical models, given by their equations of motion.
 
-A second-order plant has coordinates ``q``, velocities ``v``, accelerations ``a``, inputs ``u`` and constant parameters
-``p``.  The user writes residuals ``r(q, v, a, u, p) = 0``, one per acceleration.  From them come
+A plant has coordinates ``q``, velocities ``v``, accelerations ``a``, inputs ``u`` and constant parameters ``p``.  A
+state of first order, such as a temperature or the speed of a motor, is a velocity without a coordinate: the state is in
+``v``, its derivative in ``a``.  The user writes residuals ``r(q, v, a, u, p) = 0``, one per acceleration.  From them
+come
 
 * the regressor ``W p = b`` with ``W = dr/dp`` and ``b = W p - r`` (Dimmig et al. 2023, eqs. (1) and (5)),
 * the forward dynamics ``a = -M^-1 r(a=0)`` with ``M = dr/da``,
@@ -35,14 +37,14 @@ Kinematics = Callable[[Symbols, Symbols], Sequence[Any]]
 
 
 class Model:
-    """A second-order dynamical model with named, unit-carrying signals and parameters.
+    """A dynamical model with named, unit-carrying signals and parameters.
 
     Parameters
     ----------
     name : str
         Name in messages and files.
     coordinates : mapping from name to unit
-        A coordinate ``x`` has velocity ``x_dot`` and acceleration ``x_ddot``.
+        A coordinate ``x`` has velocity ``x_dot`` and acceleration ``x_ddot``. Empty for a model of first order.
     inputs : mapping from name to unit
         Known signals that act on the plant.
     parameters : mapping from name to Parameter
@@ -57,6 +59,9 @@ class Model:
     kinematics : callable, optional
         ``kinematics(q, v)`` returns the derivative of every coordinate. Four consecutive coordinates whose norm it
         conserves are a unit quaternion: it is normalised after every integration step, and errors ignore its sign.
+    first_order : mapping from name to unit, optional
+        States with a first derivative only: in the equations ``v.motor`` is the state and ``a.motor`` its derivative;
+        the signals are ``motor`` and ``motor_dot``.
     sensors : mapping from name to Sensor, optional
         Measurement equations of further columns of a log: an accelerometer, an encoder, ...; see `diransac.sensors`.
         Parameters that come with a sensor follow the model's own; one that the model declares itself is the model's.
@@ -85,12 +90,14 @@ class Model:
         *,
         velocities: Mapping[str, str] | None = None,
         kinematics: Kinematics | None = None,
+        first_order: Mapping[str, str] | None = None,
         sensors: Mapping[str, Sensor] | None = None,
         description: str = "",
     ) -> None:
         parameters = with_parameters_of(f'model "{name}"', sensors, parameters)
         units = {n: x.unit for n, x in (sensors or {}).items()}
-        self._name_signals(name, coordinates, inputs, parameters, velocities, description, units)
+        groups = (coordinates, inputs, parameters, velocities, first_order or {})
+        self._name_signals(name, *groups, description, units)
         if (velocities is None) != (kinematics is None):
             given, missing = ("velocities", "kinematics") if kinematics is None else ("kinematics", "velocities")
             raise ModelError(f'model "{name}": {given} without {missing}; give both, or neither')
@@ -117,21 +124,25 @@ class Model:
         inputs: Mapping[str, str],
         parameters: Mapping[str, Parameter],
         velocities: Mapping[str, str] | None,
+        first_order: Mapping[str, str],
         description: str,
         sensors: Mapping[str, str],
     ) -> None:
         self.name, self.description, self.sensors = name, description, dict(sensors)
-        units = {"coordinates": coordinates, "inputs": inputs, "velocities": velocities or {}, "sensors": sensors}
-        derivation.check_groups(self._label, units, parameters)
+        units = {"coordinates": coordinates, "inputs": inputs, "velocities": velocities or {}}
+        derivation.check_groups(self._label, {**units, "first_order": first_order, "sensors": sensors}, parameters)
         self.coordinates, self.inputs, self.parameters = dict(coordinates), dict(inputs), dict(parameters)
+        self.first_order = dict(first_order)
         if velocities is None:
-            self.velocities = {f"{q}_dot": _per_second(unit) for q, unit in coordinates.items()}
-            self.accelerations = {f"{q}_ddot": _per_second(unit, 2) for q, unit in coordinates.items()}
+            of_motion = {f"{q}_dot": _per_second(unit) for q, unit in coordinates.items()}
+            accelerations = {f"{q}_ddot": _per_second(unit, 2) for q, unit in coordinates.items()}
         else:
-            self.velocities = dict(velocities)
-            self.accelerations = {f"{v}_dot": _per_second(unit) for v, unit in velocities.items()}
-        groups = (self.coordinates, self.velocities, self.accelerations, self.inputs, self.parameters, self.sensors)
+            of_motion = dict(velocities)
+            accelerations = {f"{v}_dot": _per_second(unit) for v, unit in velocities.items()}
+        rates = {f"{s}_dot": _per_second(unit) for s, unit in first_order.items()}
+        groups = (coordinates, of_motion, first_order, accelerations, rates, inputs, parameters, sensors)
         derivation.check_names(self._label, groups)
+        self.velocities, self.accelerations = {**of_motion, **self.first_order}, {**accelerations, **rates}
 
     @property
     def _label(self) -> str:
@@ -144,7 +155,7 @@ class Model:
 
     @property
     def n_v(self) -> int:
-        """Number of velocities, and of accelerations."""
+        """Number of velocities, states of first order included, and of accelerations."""
         return len(self.velocities)
 
     @property
@@ -180,7 +191,25 @@ class Model:
     @property
     def rate_names(self) -> tuple[str, ...]:
         """Names of velocities and accelerations in the equations: ``theta``, not ``theta_dot``."""
-        return tuple(self.coordinates if self._velocities_are_derivatives else self.velocities)
+        of_motion = self.coordinates if self._velocities_are_derivatives else self.velocities_of_motion
+        return (*of_motion, *self.first_order)
+
+    @property
+    def velocities_of_motion(self) -> dict[str, str]:
+        """Velocities by name, without the states of first order, which follow them."""
+        return {name: unit for name, unit in self.velocities.items() if name not in self.first_order}
+
+    @property
+    def chains(self) -> tuple[tuple[str, ...], ...]:
+        """Signals of which each is the derivative of the one before, ordered by the last: ``(x, x_dot, x_ddot)``.
+
+        Coordinates of a model with kinematics, whose derivatives are no signals, come first, alone.
+        """
+        pairs = tuple(zip(self.velocities, self.accelerations, strict=True))
+        if self.kinematics is not None:
+            return (*((q,) for q in self.coordinates), *pairs)
+        n = self.n_q
+        return (*((q, *pair) for q, pair in zip(self.coordinates, pairs[:n], strict=True)), *pairs[n:])
 
     def named(self, *vectors: ca.SX) -> tuple[Symbols, ...]:
         """The arguments of the equations: the vectors q, v, a, u and p, or the first few, with named components."""
@@ -198,7 +227,7 @@ class Model:
 
     @property
     def _velocities_are_derivatives(self) -> bool:
-        return list(self.velocities) == [f"{q}_dot" for q in self.coordinates]
+        return list(self.velocities_of_motion) == [f"{q}_dot" for q in self.coordinates]
 
     # ------------------------------------------------------------------ checks
 
@@ -380,7 +409,7 @@ class Model:
         """Function ``(x, u, p) -> (x_dot (n_x), a (n_v))`` with ``x = [q; v]``."""
         q, v, _, u, p = self._symbols()
         a = -self._solve_mass(q, v, u, p, self._bias(q, v, u, p))
-        q_dot = v if self.kinematics is None else self.kinematics(q, v)
+        q_dot = self._coordinate_rates(q, v)
         x = ca.vertcat(q, v)
         outputs = [ca.densify(ca.vertcat(q_dot, a)), ca.densify(a)]
         return ca.Function("dynamics", [x, u, p], ca.cse(outputs), ["x", "u", "p"], ["x_dot", "a"])
@@ -398,7 +427,7 @@ class Model:
         q, v, a, u, p = self._symbols()
         x = ca.vertcat(q, v)
         r = self.residual(q, v, a, u, p)
-        q_dot = v if self.kinematics is None else self.kinematics(q, v)
+        q_dot = self._coordinate_rates(q, v)
         solved = -self._solve_mass(q, v, u, p, ca.jacobian(r, ca.vertcat(x, u, p)))
         solved = ca.sparsify(ca.substitute(solved, a, self.dynamics(x, u, p)[1]))
         both = ca.vertcat(ca.jacobian(q_dot, ca.vertcat(x, u, p)), solved)
@@ -459,11 +488,16 @@ class Model:
             self.inputs,
             {n: x for n, x in self.parameters.items() if n not in values},
             equations,
-            velocities=self.velocities if has_kinematics else None,
+            velocities=self.velocities_of_motion if has_kinematics else None,
             kinematics=kinematics if has_kinematics else None,
+            first_order=self.first_order,
             sensors=self.sensors_of(arguments),
             description=self.description,
         )
+
+    def _coordinate_rates(self, q: ca.SX, v: ca.SX) -> ca.SX:
+        """Derivatives of the coordinates."""
+        return v[: self.n_q, 0] if self.kinematics is None else self.kinematics(q, v)
 
     def _solve_mass(self, q: ca.SX, v: ca.SX, u: ca.SX, p: ca.SX, rhs: ca.SX) -> ca.SX:
         """``M^-1 rhs``: LDL^T where the probe found ``M`` symmetric and definite, CasADi's solve elsewhere."""
@@ -521,11 +555,12 @@ class Model:
             "name": self.name,
             "description": self.description,
             "coordinates": self.coordinates,
-            "velocities": None if self.kinematics is None else self.velocities,
+            "velocities": None if self.kinematics is None else self.velocities_of_motion,
             "inputs": self.inputs,
             "parameters": {n: _parameter_to_dict(x) for n, x in self.parameters.items()},
             "residual": self.residual.serialize(),
             "kinematics": None if self.kinematics is None else self.kinematics.serialize(),
+            **({"first_order": self.first_order} if self.first_order else {}),
         }
         if self.measurement is not None:
             data |= {"sensors": self.sensors, "measurement": self.measurement.serialize()}
@@ -553,15 +588,8 @@ class Model:
         if data["checksum"] != _checksum({k: x for k, x in data.items() if k != "checksum"}):
             raise ResultError("the stored model is damaged: its checksum does not match; identify again")
         parameters = {n: _parameter_from_dict(x) for n, x in data["parameters"].items()}
-        model._name_signals(
-            data["name"],
-            data["coordinates"],
-            data["inputs"],
-            parameters,
-            data["velocities"],
-            data["description"],
-            data.get("sensors", {}),
-        )
+        units = (data["coordinates"], data["inputs"], parameters, data["velocities"], data.get("first_order", {}))
+        model._name_signals(data["name"], *units, data["description"], data.get("sensors", {}))
         model.residual = derivation.deserialize(data["residual"])
         stored = data["kinematics"]
         model.kinematics = None if stored is None else derivation.deserialize(stored)
@@ -580,7 +608,9 @@ class Model:
         return (Model.from_dict, (self.to_dict(),))
 
     def __repr__(self) -> str:
-        return f"Model({self.name!r}, coordinates={list(self.coordinates)}, parameters={list(self.parameters)})"
+        first_order = f", first_order={list(self.first_order)}" if self.first_order else ""
+        names = f"coordinates={list(self.coordinates)}{first_order}, parameters={list(self.parameters)}"
+        return f"Model({self.name!r}, {names})"
 
 
 def _is_constant(slope: ca.SX) -> bool:

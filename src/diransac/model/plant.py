@@ -250,17 +250,17 @@ class DisturbedModel:
         """Function ``(x, u, p) -> (x_dot, a (n_v of the model))``."""
         x, u, p = (ca.SX.sym(n, size) for n, size in (("x", len(self.state)), ("u", self.n_u), ("p", self.n_p)))
         model, n_x = self.model, len(self.model.state)
-        q, v = x[: model.n_q], x[model.n_q : n_x]
+        q, v = x[: model.n_q, 0], x[model.n_q : n_x, 0]
         known, acceleration = model.dynamics(x[:n_x], u, p[: model.n_p])
         forces, rates = ca.SX(model.n_v, 1), []
-        for effect in self._effects(q, v, x[n_x:], u, p):
+        for effect in self._effects(q, v, x[n_x:, 0], u, p):
             forces += effect[0]
             acceleration += effect[1]
             rates.append(effect[2])
         if forces.nnz():
             acceleration += model.force_response(q, v, u, p[: model.n_p], forces)
         clock = ca.SX.ones(int("t" in self.own_states))
-        x_dot = ca.vertcat(known[: model.n_q], acceleration, *rates, clock)
+        x_dot = ca.vertcat(known[: model.n_q, 0], acceleration, *rates, clock)
         outputs = ca.cse([ca.densify(x_dot), ca.densify(acceleration)])
         return ca.Function("dynamics", [x, u, p], outputs, ["x", "u", "p"], ["x_dot", "a"])
 

@@ -257,6 +257,8 @@ def _unmodelled_figure(run: Run, name: str, values: FloatArray, found: Diagnosis
     unit = _FORCES.get(model.units[name], "") if found.unmodelled_forces else model.units[name]
     coordinate = model.rate_names[list(model.accelerations).index(name)]
     what = f"force on {coordinate}" if found.unmodelled_forces else name
+    if found.unmodelled_forces and coordinate in model.first_order:
+        what, unit = f"term of {coordinate}", ""
     rms, fraction = float(np.sqrt(np.mean(np.square(values)))), run.unexplained.get(name)
     relative = "no motion" if fraction is None else f"{percent(fraction)} of the acceleration"
     least = _VISIBLE * rms / fraction if fraction else 0.0

@@ -30,7 +30,12 @@ def unique_models(entries: Sequence[Entry]) -> list[Model]:
 
 def model_text(model: Model) -> tuple[str, str, str]:
     """Name, variables and equations of a model."""
-    groups = (("coordinates", model.coordinates), ("velocities", model.velocities), ("inputs", model.inputs))
+    groups = (
+        ("coordinates", model.coordinates),
+        ("velocities", model.velocities_of_motion),
+        ("states of first order", model.first_order),
+        ("inputs", model.inputs),
+    )
     named = (f"{kind} " + ", ".join(f"{n} ({u})" for n, u in units.items()) for kind, units in groups if units)
     return model.name, "; ".join(named), "\n".join(model.equations_text())
 

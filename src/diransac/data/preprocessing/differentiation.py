@@ -175,16 +175,17 @@ def acting_inputs(specification: FilterSpecification | None, inputs: FloatArray)
 def _sources(log: Log, model: Model) -> dict[str, tuple[str, int]]:
     """Missing signal -> the measured signal that it is derived from, and the order of the derivative."""
     sources: dict[str, tuple[str, int]] = {}
-    for i, (v, a) in enumerate(zip(model.velocities, model.accelerations, strict=True)):
-        q = list(model.coordinates)[i] if model.kinematics is None else None
-        available = [(name, order) for name, order in ((v, 1), (q, 2)) if name is not None and name in log]
-        if v not in log and q is not None and q in log:
-            sources[v] = (q, 1)
-        if a not in log and available:
-            sources[a] = available[0]
-        for name in (v, a):
-            if name not in log and name not in sources and name in model.required_signals:
-                raise LogError(_underivable(log, model, name, v if name == a and q is None else q))
+    for chain in model.chains:
+        # A state of first order is no derivative: a log that lacks it is refused where rows of equations are needed.
+        given = chain[0] in model.first_order or chain[0] not in model.velocities
+        for k, name in enumerate(chain):
+            nearest = next((i for i in range(k - 1, -1, -1) if chain[i] in log), None)
+            if name in log or (k == 0 and given):
+                continue
+            if nearest is not None:
+                sources[name] = (chain[nearest], k - nearest)
+            elif name in model.required_signals and chain[0] not in model.first_order:
+                raise LogError(_underivable(log, model, name, chain[0] if k else None))
     return sources
 
 
@@ -204,9 +205,8 @@ def _filtered(model: Model) -> Iterable[str]:
 
 def _motions(log: Log, model: Model) -> list[tuple[str, int]]:
     """The lowest measured derivative of every degree of freedom, and the order from it to the acceleration."""
-    coordinates = list(model.coordinates) if model.kinematics is None else [""] * len(model.velocities)
-    chains = zip(coordinates, model.velocities, model.accelerations, strict=True)
-    measured = [[(n, order) for n, order in zip(chain, (2, 1, 0), strict=True) if n in log] for chain in chains]
+    chains = [chain for chain in model.chains if chain[-1] in model.accelerations]
+    measured = [[(n, len(chain) - 1 - k) for k, n in enumerate(chain) if n in log] for chain in chains]
     return [chain[0] for chain in measured if chain]
 
 

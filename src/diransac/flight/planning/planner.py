@@ -32,6 +32,7 @@ from diransac.flight.planning.request import (
     limits_of,
     reference_weights,
     route_of,
+    start_at_rest,
     trim_at,
     weights_of,
 )
@@ -106,7 +107,8 @@ def plan(
     trim : mapping of str to float, optional
         Inputs of zero cost, 0 where not named. By default those that hold the plant at rest at the start.
     start_end_at_rest : bool
-        Whether states that the first and last waypoint do not name are zero there. False: they are free.
+        Whether states that the first and last waypoint do not name are zero there; states of first order are at rest
+        under the inputs of zero cost in the first, and free in the last. False: they are all free.
     guess : Trajectory, optional
         Starting point of the search, of the same model.
     solver : {"ipopt", "fatrop", "snopt"}
@@ -147,6 +149,9 @@ def plan(
     check_search(time_weight, max_iterations, time_limit)
     parameters = model.parameter_vector(plant.parameters)
     trim_inputs = trim_at(model, parameters, route.waypoints[0], limits, trim)
+    if start_end_at_rest and model.first_order:
+        begin = start_at_rest(model, parameters, route.waypoints[0], trim_inputs)
+        route = replace(route, waypoints=(begin, *route.waypoints[1:]))
     states = limits_of("state", state_limits, model.state)
     check_within(model, route.waypoints, states)
     task = Task(

@@ -166,7 +166,7 @@ def straight_guess(task: Task, durations: FloatArray) -> InitialGuess:
         states[:, j] = samples
     if task.model.kinematics is None:
         slopes = np.gradient(states[:, : task.model.n_q], time, axis=0)
-        for j in set(range(task.model.n_q, states.shape[1])) - set(followed):
+        for j in set(range(task.model.n_q, 2 * task.model.n_q)) - set(followed):
             states[:, j] = slopes[:, j - task.model.n_q]
             states[np.searchsorted(time, fixed[j][0]), j] = fixed[j][1]
     for four in task.model.quaternions:

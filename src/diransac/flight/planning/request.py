@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import PlanningError, SettingsError
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ __all__ = [
     "limits_of",
     "reference_weights",
     "route_of",
+    "start_at_rest",
     "trim_at",
     "weights_of",
 ]
@@ -138,7 +139,7 @@ def _waypoints_of(
         values = _named_values(f"waypoint {k}", "state", waypoint, model.state)
         _check_quaternions(model, k, values, start_end_at_rest and at_end)
         if start_end_at_rest and at_end:
-            values = dict.fromkeys(model.state, 0.0) | values
+            values = dict.fromkeys((*model.coordinates, *model.velocities_of_motion), 0.0) | values
         states = tuple(j for j, name in enumerate(model.state) if name in values)
         found.append(Waypoint(states, _normalised(model, states, values)))
     return tuple(found)
@@ -329,11 +330,27 @@ def trim_at(
     if given is not None:
         values = _named_values("trim", "input", given, tuple(model.inputs))
         return np.array([values.get(name, 0.0) for name in model.inputs])
-    coordinates = np.zeros(model.n_q)
+    return _rest_inputs(model, parameters, *_rest_state(model, start), limits)
+
+
+def start_at_rest(model: Model, parameters: FloatArray, start: Waypoint, trim: FloatArray) -> Waypoint:
+    """The first waypoint, and in it the states of first order that it leaves free, at rest under inputs (n_u,)."""
+    x, free = _rest_state(model, start)
+    settled = _least_acceleration(model, parameters, x, free, Limits(trim, trim))[2]
+    if not free.any() or not np.isfinite(settled).all():
+        return start
+    settled[list(start.states)] = start.values
+    fixed = np.union1d(start.states, np.flatnonzero(free)).astype(int)
+    return Waypoint(tuple(fixed.tolist()), settled[fixed])
+
+
+def _rest_state(model: Model, start: Waypoint) -> tuple[FloatArray, BoolArray]:
+    """State (n_x,) at rest at the first waypoint, and the mask (n_x,) of its states of first order that are free."""
+    x, free = np.zeros(len(model.state)), np.isin(model.state, list(model.first_order))
     for j, value in zip(start.states, start.values, strict=True):
-        if j < model.n_q:
-            coordinates[j] = value
-    return _rest_inputs(model, parameters, coordinates, limits.lower, limits.upper)
+        if j < model.n_q or free[j]:
+            x[j], free[j] = value, False
+    return x, free
 
 
 # Trim ----------------------------------------------------------------------------------------------------------------
@@ -342,24 +359,23 @@ _TRIM_ITERATIONS = 30
 _TRIM_TOLERANCE = 1e-6
 
 
-def _rest_inputs(
-    model: Model, parameters: FloatArray, coordinates: FloatArray, lower: FloatArray, upper: FloatArray
-) -> FloatArray:
-    """Inputs (n_u,) within their limits of zero acceleration at rest at these coordinates (n_q,).
+def _rest_inputs(model: Model, parameters: FloatArray, x: FloatArray, free: BoolArray, limits: Limits) -> FloatArray:
+    """Inputs (n_u,) within their limits of zero acceleration in a state of rest (n_x,), of which some are free.
 
     Gauss-Newton on the accelerations, each step a bounded linear least-squares problem; exact for a model that is
-    affine in its inputs.
+    affine in its inputs and free states.
 
     Raises PlanningError: there are none within the limits, or none at all.
     """
-    x = np.concatenate([coordinates, np.zeros(model.n_v)])
+    lower, upper = limits.lower, limits.upper
     unlimited = np.full(model.n_u, np.inf)
-    trim, residual = _least_acceleration(model, parameters, x, lower, upper)
+    trim, residual, _ = _least_acceleration(model, parameters, x, free, limits)
     scale = 1.0 + np.abs(_accelerations(model, parameters, x, np.zeros(model.n_u))).max()
     if np.abs(residual).max() <= _TRIM_TOLERANCE * scale:
         return trim
-    coordinates_text = ", ".join(f"{n} = {v:g}" for n, v in zip(model.coordinates, coordinates, strict=True))
-    unlimited_trim, left = _least_acceleration(model, parameters, x, -unlimited, unlimited)
+    shown = [j for j, n in enumerate(model.state) if n in model.coordinates or (n in model.first_order and not free[j])]
+    state_text = ", ".join(f"{model.state[j]} = {x[j]:g}" for j in shown)
+    unlimited_trim, left, _ = _least_acceleration(model, parameters, x, free, Limits(-unlimited, unlimited))
     if np.isfinite(left).all() and np.abs(left).max() <= _TRIM_TOLERANCE * scale:
         needs = ", ".join(
             f"{n} would have to be {v:.4g}, but may be {low:.4g} to {high:.4g}"
@@ -367,39 +383,44 @@ def _rest_inputs(
             if not low <= v <= high
         )
         raise PlanningError(
-            f'model "{model.name}" cannot rest at {coordinates_text} with these parameters: {needs}; '
+            f'model "{model.name}" cannot rest at {state_text} with these parameters: {needs}; '
             "raise the input limits, or check the parameters"
         )
     worst = int(np.argmax(np.abs(np.nan_to_num(left, nan=np.inf))))
     name = list(model.accelerations)[worst]
     raise PlanningError(
-        f'model "{model.name}" cannot rest at {coordinates_text}: no inputs make {name} zero; '
+        f'model "{model.name}" cannot rest at {state_text}: no inputs make {name} zero; '
         "start elsewhere, or give the inputs of zero cost with trim="
     )
 
 
 def _least_acceleration(
-    model: Model, parameters: FloatArray, x: FloatArray, lower: FloatArray, upper: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Inputs of least squared acceleration, and this acceleration (n_v,)."""
+    model: Model, parameters: FloatArray, x: FloatArray, free: BoolArray, limits: Limits
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Inputs (n_u,) of least squared acceleration, this acceleration (n_v,), and the state (n_x,), free where given."""
     from scipy.optimize import lsq_linear  # slow to import
 
-    u = np.clip(np.zeros(model.n_u), lower, upper)
-    free = upper > lower
+    x, n_free = x.copy(), int(free.sum())
+    lower = np.concatenate([np.full(n_free, -np.inf), limits.lower])
+    upper = np.concatenate([np.full(n_free, np.inf), limits.upper])
+    z, open_ended = np.clip(np.concatenate([x[free], np.zeros(model.n_u)]), lower, upper), upper > lower
     for _ in range(_TRIM_ITERATIONS):
-        B = np.array(model.linearization(x, u, parameters)[1])[model.n_q :]
-        a = _accelerations(model, parameters, x, u)
-        if not (np.isfinite(B).all() and np.isfinite(a).all()):
-            return u, np.full(model.n_v, np.nan)
-        target = B[:, free] @ u[free] - a
-        new = u.copy()
-        if free.any():
-            new[free] = lsq_linear(B[:, free], target, (lower[free], upper[free]), method="bvls").x
-        converged = np.allclose(new, u, rtol=1e-13, atol=1e-13)
-        u = new
+        x[free], u = z[:n_free], z[n_free:]
+        A, B = (np.array(J)[model.n_q :] for J in model.linearization(x, u, parameters))
+        J, a = np.hstack([A[:, free], B]), _accelerations(model, parameters, x, u)
+        if not (np.isfinite(J).all() and np.isfinite(a).all()):
+            return u, np.full(model.n_v, np.nan), np.full(len(x), np.nan)
+        target = J[:, open_ended] @ z[open_ended] - a
+        new = z.copy()
+        if open_ended.any():
+            within = lower[open_ended], upper[open_ended]
+            new[open_ended] = lsq_linear(J[:, open_ended], target, within, method="bvls").x
+        converged = np.allclose(new, z, rtol=1e-13, atol=1e-13)
+        z = new
         if converged:
             break
-    return u, _accelerations(model, parameters, x, u)
+    x[free] = z[:n_free]
+    return z[n_free:], _accelerations(model, parameters, x, z[n_free:]), x
 
 
 def _accelerations(model: Model, parameters: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:

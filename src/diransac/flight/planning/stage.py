@@ -179,7 +179,7 @@ def _stepped(model: Model, s: ca.SX, u: ca.SX, p: ca.SX, c: ca.SX, free_time: bo
     for four in model.quaternions:
         rows = list(four)
         after[rows] = after[rows] / ca.norm_2(after[rows])
-    return ca.vertcat(after, s[n_x:])
+    return ca.vertcat(after, s[n_x:, 0])
 
 
 def _cost_of(n_x: int, s: ca.SX, u: ca.SX, free_time: bool) -> tuple[list[ca.SX], list[ca.SX]]:

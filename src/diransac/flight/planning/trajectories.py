@@ -376,7 +376,7 @@ def _inverse_dynamics(model: Model) -> ca.Function:
     q, v, a, u, p = (ca.SX.sym(name, size) for name, size in zip("qvaup", sizes, strict=True))
     r = model.residual(q, v, a, u, p)
     input_matrix = ca.jacobian(r, u)
-    is_square = model.kinematics is None and model.n_u == model.n_v
+    is_square = model.kinematics is None and model.n_u == model.n_v and not model.first_order
     if not is_square or ca.depends_on(input_matrix, u) or ca.sprank(input_matrix) < model.n_v:
         raise SettingsError(
             f'model "{model.name}" is not fully actuated: its inputs ({", ".join(model.inputs)}) do not determine the '

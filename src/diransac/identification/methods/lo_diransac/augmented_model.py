@@ -70,8 +70,7 @@ def augmented_model(model: Model) -> AugmentedModel:
     -------
     AugmentedModel
     """
-    derived = model.kinematics is None
-    own = list(model.coordinates if derived else model.velocities)
+    derived, own = model.kinematics is None, model.rate_names
     later, latent = [f"{n}_later" for n in model.inputs], [f"unmodelled_{n}" for n in own]
     discrepancies = [f"discrepancy_{i}_{k}" for i in range(model.n_v) for k in range(model.n_u + 1)]
 
@@ -96,8 +95,9 @@ def augmented_model(model: Model) -> AugmentedModel:
         {**model.inputs, **dict(zip(later, model.inputs.values(), strict=True))},
         {**model.parameters, **{n: Parameter("") for n in (*discrepancies, "input_delay", *latent)}},
         equations,
-        velocities=None if derived else model.velocities,
+        velocities=None if derived else model.velocities_of_motion,
         kinematics=None if derived else kinematics,
+        first_order=model.first_order,
         sensors=model.sensors_of(arguments),
     )
     return AugmentedModel(augmented, model.n_p, model.n_v, model.n_u)

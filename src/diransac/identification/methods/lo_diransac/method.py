@@ -46,6 +46,11 @@ from diransac.identification.methods.lo_diransac.smoothing import (
     smooth,
     stuck_rows,
 )
+from diransac.identification.methods.lo_diransac.unmeasured import (
+    measured_signals,
+    unmeasured_states,
+    with_unmeasured_states,
+)
 from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
 
 if TYPE_CHECKING:
@@ -201,6 +206,11 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
     report(callback, "smoothing", 0.0)
     intervals, motion, notes = _prepared(settings, dataset)
+    if unmeasured_states(intervals):
+        report(callback, "unmeasured states", 0.05)
+        allowed, measured = len(dataset.model.parameters) - 1, measured_signals(intervals)
+        check_structure(dataset.model, dataset.source, allowed, measured)
+        motion = _completed(intervals, motion, dataset)
     report(callback, "drawing hypotheses", 0.1)
     hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
     unit = discrepancy_units(intervals, motion, hypotheses[0])
@@ -242,6 +252,18 @@ def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:
             raise SettingsError(f'{setting} names "{unknown[0]}", which {dataset.source} lacks; it has {has}')
 
 
+def _completed(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -> Motion:
+    """The motion with its unmeasured states.  Raises IdentificationError: no simulation gives them."""
+    found = with_unmeasured_states(intervals, motion)
+    if found is None:
+        names = ", ".join(unmeasured_states(intervals))
+        raise IdentificationError(
+            f"{dataset.source}: nothing measures {names}, nor a derivative, and every simulation of {names} from the "
+            "other signals diverges; measure it, or bound the parameters of its equation"
+        )
+    return found
+
+
 def _hypotheses(
     settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
 ) -> FloatArray:
@@ -249,10 +271,6 @@ def _hypotheses(
     found = find_hypotheses(settings, intervals, motion, seed, dataset)
     if len(found):
         return found
-    unmeasured = _unmeasured(intervals)
-    if unmeasured:
-        what = f"nothing measures {', '.join(unmeasured)}, nor a derivative"
-        raise IdentificationError(f"{dataset.source}: {what}; lo-diransac needs a signal of each coordinate")
     cause = cause_of_refusal(dataset.model, dataset.layout, _rows_of_logs(intervals, motion))
     raise IdentificationError(f"{dataset.source}: no sample gives parameters within their bounds: {cause}")
 
@@ -273,16 +291,6 @@ def _rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRo
     logged = [np.arange(x.start, x.stop)[intervals.is_logged[x]] for x in intervals.rows_of_logs]
     parts = [motion.parts(intervals.model, rows) for rows in logged]
     return [MotionRows(q, v, a, intervals.inputs[rows], y) for (q, v, a, y), rows in zip(parts, logged, strict=True)]
-
-
-def _unmeasured(intervals: ShootingIntervals) -> list[str]:
-    """Coordinates, or velocities of a model with kinematics, of which neither value nor derivative is measured."""
-    model, seen = intervals.model, np.asarray(intervals.known.any(axis=0))
-    n_q, n_v = model.n_q, model.n_v
-    if model.kinematics is None:
-        return [n for i, n in enumerate(model.coordinates) if not seen[[i, n_q + i, n_q + n_v + i]].any()]
-    lost = [n for i, n in enumerate(model.velocities) if not seen[[n_q + i, n_q + n_v + i]].any()]
-    return [] if seen[:n_q].any() else lost
 
 
 def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
@@ -396,7 +404,10 @@ def _estimate(
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
     units = parameter_units(intervals, found.motion, result.parameters)
     lost = ~((spans < units) | (spans < np.abs(result.parameters)))
-    lost, combinations = unidentifiable(dataset.model, dataset.layout, result.parameters, result.covariance, lost)
+    measured = measured_signals(intervals) if unmeasured_states(intervals) else None
+    lost, combinations = unidentifiable(
+        dataset.model, dataset.layout, result.parameters, result.covariance, lost, measured
+    )
     covariance = result.covariance.copy()
     covariance[lost] = covariance[:, lost] = np.inf
     nonlinear = bool(dataset.model.nonlinear_parameters)

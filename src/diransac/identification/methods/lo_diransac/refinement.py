@@ -431,8 +431,8 @@ def _continuity(intervals: ShootingIntervals, tau: FloatArray) -> FloatArray:
     """Jumps ``(n_x,)`` that are negligible beside the effect of unmodelled accelerations on the state."""
     T = intervals.duration
     velocity = _CONTINUITY * tau * T
-    derived = intervals.model.kinematics is None
-    coordinate = velocity * T if derived else np.full(intervals.model.n_q, velocity.max() * T)
+    n_q, derived = intervals.model.n_q, intervals.model.kinematics is None
+    coordinate = velocity[:n_q] * T if derived else np.full(n_q, velocity.max() * T)
     return np.concatenate([coordinate, velocity])
 
 

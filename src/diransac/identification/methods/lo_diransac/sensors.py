@@ -183,9 +183,10 @@ def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[tuple[Bo
     """
     model = intervals.model
     seen = intervals.known.sum(axis=0) >= _FEWEST
-    kind = np.repeat([0, 1, 2, 3], [model.n_q, model.n_v, model.n_v, len(model.sensors)])
+    n = len(model.velocities_of_motion)
+    kind = np.repeat([0, 1, 3, 2, 3, 4], [model.n_q, n, model.n_v - n, n, model.n_v - n, len(model.sensors)])
     single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen & among)]
-    groups = [(kind == g) & seen & among for g in range(4)]
+    groups = [(kind == g) & seen & among for g in (0, 1, 2, 4)]
     groups = [x for x in groups if 1 < x.sum() < seen.sum()]
     delays = [(x, True) for x in [*groups, *single] if not (x == seen).all()]
     biased = np.array([n in model.biased_sensors for n in model.signals])

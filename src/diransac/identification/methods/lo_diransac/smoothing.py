@@ -169,10 +169,7 @@ def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[
 
 def _chains(model: Model) -> list[list[int]]:
     """Columns among the model's signals of each quantity and of its derivatives, without sensors."""
-    n_q, n_v = model.n_q, model.n_v
-    if model.kinematics is None:
-        return [[d, n_q + d, n_q + n_v + d] for d in range(n_q)]
-    return [[d] for d in range(n_q)] + [[n_q + d, n_q + n_v + d] for d in range(n_v)]
+    return [[model.signals.index(name) for name in chain] for chain in model.chains]
 
 
 def _n_motion(model: Model) -> int:
@@ -220,7 +217,8 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
         rates = np.zeros((len(measured), model.n_q))
         for d in range(model.n_q):
             signals[:, [d]], rates[:, d] = smoother.smoothed(measured[:, [d]], known[:, [d]], centre[:, [d]])
-        lacking = model.n_q + np.flatnonzero(~known[:, model.n_q : model.n_q + model.n_v].any(axis=0))
+        n_x = model.n_q + len(model.velocities_of_motion)
+        lacking = model.n_q + np.flatnonzero(~known[:, model.n_q : n_x].any(axis=0))
         if len(lacking):
             inferred = _velocities_of_rates(model, signals, rates, measured, known, lacking)
             measured[:, lacking], known[:, lacking], centre[:, lacking] = inferred, ~log.gaps[:, None], inferred

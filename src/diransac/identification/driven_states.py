@@ -1,0 +1,232 @@
+"""States that no signal measures, simulated from their own equations and driven by all other states.
+
+An observer compares the accelerations that the equations give to the other velocities with their motion,
+``e' = a(q, v, u, p) + b (v - e)``: the error ``e - v`` is that of the acceleration, low-pass filtered with bandwidth b.
+Initial values, and parameters where these are unknown, are those of least squares (Levenberg-Marquardt), from many
+starts, which are lanes of one batch.
+
+References
+----------
+Ljung 1999, section 7 (prediction errors of observers); Marquardt 1963; Boender, Rinnooy Kan 1987 (random starts).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from diransac.arrays import FloatArray, IntArray
+from diransac.identification.nonlinear import ParameterChart
+from diransac.model import Model, Parameter
+from diransac.simulation import Measurements, RolloutBatch, Simulator, rollouts
+
+if TYPE_CHECKING:
+    from diransac.data.dataset import ParameterLayout
+    from diransac.model.derivation import Symbols
+
+__all__ = ["DrivenStates", "least_squares"]
+
+_N_STARTS = 256
+# Largest factor of a positive parameter in a step; integration steps per sample.
+_LARGEST_FACTOR, _SUBSTEPS = 10.0, 2
+# Damping at the start, its bounds, and its factors after a step down and after one up; the least gain of a step.
+_DAMPING, _DAMPING_BOUNDS, _LESS, _MORE, _CONVERGED = 1e-2, (1e-9, 1e9), 0.2, 6.0, 1e-9
+
+
+@lru_cache(maxsize=16)
+def _driven_model(model: Model, hidden: tuple[str, ...], observed: tuple[str, ...]) -> Model:
+    """States that obey a model's equations, driven by the other ones, and an observer of each observed velocity.
+
+    All are states of first order, in this order; inputs are the other states of the model, and its inputs.
+    """
+    names = [f"driven_{i}" for i in range(len(hidden) + len(observed))]
+    known = {n: model.units[n] for n in model.state if n not in hidden}
+    rows = [model.state.index(n) for n in (*hidden, *observed)]
+
+    def equations(_q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
+        of_hidden = dict(zip(hidden, v, strict=False))
+        x = ca.vertcat(*(of_hidden[n] if n in of_hidden else u[n] for n in model.state))
+        applied, parameters = (
+            ca.vertcat(*(z[n] for n in group)) for z, group in ((u, model.inputs), (p, model.parameters))
+        )
+        rates = model.dynamics(x, applied, parameters)[0][rows]
+        pull = [p.bandwidth_ * (u[n] - e) for n, e in zip(observed, list(v)[len(hidden) :], strict=True)]
+        return list(ca.vertsplit(ca.vertcat(*a) - rates - ca.vertcat(ca.SX(len(hidden), 1), *pull)))
+
+    return Model(
+        f"{model.name}, driven by its measured motion",
+        {},
+        {**known, **model.inputs},
+        {**model.parameters, "bandwidth_": Parameter("1/s", positive=True)},
+        equations,
+        first_order={name: model.units[n] for name, n in zip(names, (*hidden, *observed), strict=True)},
+    )
+
+
+@dataclass(frozen=True)
+class DrivenStates:
+    """Least squares of observers' errors: states that nothing measures, driven by the other states of logs.
+
+    Unknown are the parameters, if they are not given, and the unmeasured states at the beginning of every log.
+
+    Parameters
+    ----------
+    model : Model
+    layout : ParameterLayout
+        Positions of each log's parameters.
+    hidden : tuple of str
+        States that nothing measures.
+    states : (N, n_x) array
+        States of the model in all rows of all logs; those that are hidden are not used.
+    inputs : (N, n_u) array
+    weights : (N, n) array
+        Weight of the error of each velocity that is not hidden; one over its unit squared.
+    rows_of_logs : sequence of slice
+        Rows of each log.
+    dt : float
+        Sampling time, s.
+    bandwidth : float
+        Bandwidth of the observers, 1/s.
+    parameters : (n_p,) array, optional
+        Known parameters.
+    """
+
+    model: Model
+    layout: ParameterLayout
+    hidden: tuple[str, ...]
+    states: FloatArray
+    inputs: FloatArray
+    weights: FloatArray
+    rows_of_logs: Sequence[slice]
+    dt: float
+    bandwidth: float
+    parameters: FloatArray | None = None
+
+    @cached_property
+    def _observed(self) -> tuple[str, ...]:
+        return tuple(n for n in self.model.velocities if n not in self.hidden)
+
+    @cached_property
+    def _driven(self) -> Model:
+        return _driven_model(self.model, self.hidden, self._observed)
+
+    @cached_property
+    def _simulator(self) -> Simulator:
+        return rollouts(self._driven, self._driven.state[len(self.hidden) :], substeps=_SUBSTEPS)
+
+    @cached_property
+    def _inputs(self) -> FloatArray:
+        """Inputs (N, n) of the driven model; they are held from row to row, so that means of the states are taken."""
+        means = self.states.copy()
+        for rows in self.rows_of_logs:
+            means[rows][:-1] = 0.5 * (self.states[rows][1:] + self.states[rows][:-1])
+        known = [i for i, n in enumerate(self.model.state) if n not in self.hidden]
+        return np.hstack([means[:, known], self.inputs])
+
+    @cached_property
+    def _velocities(self) -> FloatArray:
+        """Velocities (N, n) that are observed."""
+        return self.states[:, [self.model.state.index(n) for n in self._observed]]
+
+    @property
+    def _n_parameters(self) -> int:
+        """Number of unknown parameters."""
+        return len(self.layout) if self.parameters is None else 0
+
+    def starts(self) -> FloatArray:
+        """Unknowns (n_starts, n) to start from: parameters over the bounds or six decades, states zero."""
+        n_states = self.layout.n_logs * len(self.hidden)
+        if self.parameters is not None:
+            return np.zeros((1, n_states))
+        chart = ParameterChart(self.layout.bounds)
+        return np.hstack([chart.to_parameters(chart.starts(_N_STARTS)), np.zeros((_N_STARTS, n_states))])
+
+    def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
+        """Unknowns (n_starts, n) after a step within the bounds, in which positive parameters change by a factor."""
+        then = now + step
+        for j, bound in enumerate(self.layout.bounds[: self._n_parameters]):
+            then[:, j] = np.clip(then[:, j], bound.lower, bound.upper)
+            if bound.positive:
+                then[:, j] = np.clip(then[:, j], now[:, j] / _LARGEST_FACTOR, now[:, j] * _LARGEST_FACTOR)
+        return then
+
+    def _places(self, log: int) -> IntArray:
+        """Places of a log's parameters and initial states among the unknowns."""
+        n = len(self.hidden)
+        own = self.layout.index[log] if self.parameters is None else np.arange(0)
+        return np.concatenate([own, self._n_parameters + n * log + np.arange(n)])
+
+    def _batch(self, z: FloatArray, log: int) -> RolloutBatch:
+        """Lanes of a log, one per vector of unknowns (n_starts, n)."""
+        rows, own, n = self.rows_of_logs[log], z[:, self._places(log)], len(self.hidden)
+        parameters = own[:, :-n] if self.parameters is None else np.tile(self.parameters, (len(z), 1))
+        bandwidth = np.full((len(z), 1), self.bandwidth)
+        observed = np.tile(self._velocities[rows.start], (len(z), 1))
+        states = np.hstack([own[:, -n:], observed])
+        return RolloutBatch(np.hstack([parameters, bandwidth]), states, self._inputs[rows], self.dt)
+
+    def linearized(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Cost (n_starts,), infinite after a divergence, its gradient / 2 (n_starts, n), and the normal matrix."""
+        cost, gradient, matrix = np.zeros(len(z)), np.zeros(z.shape), np.zeros((*z.shape, z.shape[1]))
+        free = self.model.parameters if self.parameters is None else ()
+        unknowns = (*free, *self._driven.state[: len(self.hidden)])
+        for i, rows in enumerate(self.rows_of_logs):
+            measured = Measurements(self._velocities[rows], np.ones(rows.stop - rows.start, bool))
+            found = self._simulator.gauss_newton(self._batch(z, i), measured, self.weights[rows], unknowns=unknowns)
+            places = self._places(i)
+            cost += found.cost
+            gradient[:, places] += found.gradient
+            matrix[:, places[:, None], places] += found.normal_matrix
+        return cost, gradient, matrix
+
+    def trajectories(self, z: FloatArray) -> dict[str, FloatArray]:
+        """Unmeasured states and their derivatives (N,) by name, for one vector of unknowns (n,)."""
+        model, n, n_driven = self.model, len(self.hidden), len(self._driven.state)
+        logs = range(len(self.rows_of_logs))
+        series = np.concatenate([self._simulator.trajectories(self._batch(z[None], i))[0] for i in logs])
+        rate_of = dict(zip(model.velocities, model.accelerations, strict=True))
+        states = dict(zip(self.hidden, series[:, :n].T, strict=True))
+        rates = zip(self.hidden, series[:, n_driven : n_driven + n].T, strict=True)
+        return {**states, **{rate_of[name]: values for name, values in rates if name in rate_of}}
+
+
+def least_squares(problem: DrivenStates, z: FloatArray, n_steps: int) -> tuple[FloatArray, FloatArray]:
+    """Unknowns and their costs after steps of Levenberg and Marquardt from every start.
+
+    Parameters
+    ----------
+    problem : DrivenStates
+    z : (n_starts, n) array
+        Unknowns to start from.
+    n_steps : int
+        Largest number of steps.
+
+    Returns
+    -------
+    z : (n_starts, n) array
+    cost : (n_starts,) array
+        Infinite where every simulation diverges.
+    """
+    (cost, gradient, matrix), damping = problem.linearized(z), np.full(len(z), _DAMPING)
+    for _ in range(n_steps):
+        scale = np.sqrt(np.einsum("kii->ki", matrix)) + 1e-300
+        scaled = matrix / scale[:, :, None] / scale[:, None, :] + damping[:, None, None] * np.eye(z.shape[1])
+        step = -np.linalg.solve(scaled, (gradient / scale)[:, :, None])[:, :, 0] / scale
+        trial = problem.moved(z, step)
+        then = problem.linearized(trial)
+        better = then[0] < cost
+        settled = better & (cost - then[0] < _CONVERGED * cost) | (damping >= _DAMPING_BOUNDS[1])
+        z = np.where(better[:, None], trial, z)
+        cost, gradient, matrix = (
+            np.where(better.reshape(-1, *(1,) * (x.ndim - 1)), y, x)
+            for x, y in zip((cost, gradient, matrix), then, strict=True)
+        )
+        damping = np.clip(np.where(better, _LESS, _MORE) * damping, *_DAMPING_BOUNDS)
+        if settled.all():
+            break
+    return z, cost

@@ -1,0 +1,119 @@
+"""Trajectories of states that no signal measures, such as the thrust behind the lag of a motor.
+
+Simulations that the smoothed motion of all other states drives give parameters and trajectories
+(`identification.driven_states`).  The best of them simulates the shooting intervals best, by the scores of hypotheses.
+Its trajectories take the place of smoothed signals until shooting estimates these states with all others.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.identification.driven_states import DrivenStates, least_squares
+from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
+from diransac.identification.methods.lo_diransac.smoothing import Motion
+
+if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+
+__all__ = ["measured_signals", "unmeasured_states", "with_unmeasured_states"]
+
+# Steps from all starts; the number of those that go on, and their further steps.
+_N_STEPS, _N_FINALISTS, _N_FURTHER_STEPS = 15, 12, 60
+# Memory of the observers, in shooting intervals, over which errors of the smoothed motion average out.
+_MEMORY = 4.0
+_TINY = 1e-9
+
+
+def unmeasured_states(intervals: ShootingIntervals) -> tuple[str, ...]:
+    """Names of the states of which no signal, and no derivative of one, is measured.
+
+    Velocities of a model with kinematics follow from its coordinates, where any of these is measured.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+
+    Returns
+    -------
+    tuple of str
+        In the order of the model's states.
+    """
+    model = intervals.model
+    seen = set(measured_signals(intervals))
+    lost = {name for chain in model.chains if seen.isdisjoint(chain) for name in chain}
+    if model.kinematics is not None:
+        inferred = () if seen.isdisjoint(model.coordinates) else model.velocities_of_motion
+        lost -= {*model.coordinates, *inferred}
+    return tuple(n for n in model.state if n in lost)
+
+
+def measured_signals(intervals: ShootingIntervals) -> tuple[str, ...]:
+    """Names of the signals with a sample.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+
+    Returns
+    -------
+    tuple of str
+        In the order of the model's signals.
+    """
+    seen = np.flatnonzero(intervals.known.any(axis=0))
+    return tuple(intervals.model.signals[i] for i in seen)
+
+
+def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Motion | None:
+    """The motion with trajectories of the unmeasured states and of their derivatives.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+
+    Returns
+    -------
+    Motion or None
+        None if every simulation diverges.
+    """
+    problem = _driven(intervals, motion)
+    z, cost = least_squares(problem, problem.starts(), _N_STEPS)
+    z, cost = least_squares(problem, z[np.argsort(cost, kind="stable")[:_N_FINALISTS]], _N_FURTHER_STEPS)
+    z, every = z[np.isfinite(cost)], np.arange(len(intervals))
+    completed = [_completed(motion, problem, one) for one in z]
+    pairs = zip(completed, z[:, : len(intervals.layout)], strict=True)
+    scores = [robust_scores(intervals, one, p[None], every)[0] for one, p in pairs]
+    return completed[int(np.argmin(scores))] if np.isfinite(scores).any() else None
+
+
+def _driven(intervals: ShootingIntervals, motion: Motion) -> DrivenStates:
+    """Least squares with weights of one over the squared spread of the accelerations, as the observers filter them."""
+    model, hidden = intervals.model, unmeasured_states(intervals)
+    bandwidth = 1.0 / (_MEMORY * intervals.duration)
+    others = [i for i, n in enumerate(model.velocities) if n not in hidden]
+    scale = bandwidth / motion.spread[len(model.state) :][others]
+    return DrivenStates(
+        model,
+        intervals.layout,
+        hidden,
+        motion.signals[:, : len(model.state)],
+        intervals.inputs,
+        np.where(intervals.counted[:, None], np.square(scale), 0.0),
+        intervals.rows_of_logs,
+        intervals.dt,
+        bandwidth,
+    )
+
+
+def _completed(motion: Motion, problem: DrivenStates, z: FloatArray) -> Motion:
+    """The motion with the unmeasured states and their derivatives that unknowns (n,) give."""
+    signals, spread = motion.signals.copy(), motion.spread.copy()
+    for name, values in problem.trajectories(z).items():
+        column = problem.model.signals.index(name)
+        signals[:, column], spread[column] = values, values.std() + _TINY
+    return Motion(signals, spread)

@@ -1,0 +1,357 @@
+"""States of first order: models without coordinates, states beside coordinates, and states that nothing measures.
+
+Logs are made by SciPy's `solve_ivp` from equations that are written here once more.
+"""
+
+import pickle
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import diransac as dr
+from diransac.data.preprocessing import differentiate
+from diransac.identification.identifiability import structural
+from diransac.identification.inspection import inspect
+from diransac.model import Model, Parameter
+from diransac.simulation import RolloutBatch, rollouts
+from user_models import dc_motor, flexible_joint, lagged_thrust, oven, tank, tumbling
+
+OVEN = {"capacity": 900.0, "loss": 3.0}
+TANK = {"area": 0.2, "outlet": 6e-4}
+MOTOR = {"inertia": 2e-3, "friction": 1e-3, "constant": 0.05, "resistance": 0.8, "inductance": 0.02}
+THRUST = {"mass": 0.5, "gain": 8.0, "tau": 0.05, "drag": 0.2}
+JOINT = {"rotor": 0.02, "inertia": 0.05, "stiffness": 8.0, "damping": 0.02, "friction": 0.05}
+
+
+# ---------------------------------------------------------------------- independent simulations
+
+
+def excitation(t, seed, highest):
+    """Sum of six sines of unit variance, up to a frequency in Hz."""
+    rng = np.random.default_rng(seed)
+    w, phase, size = (
+        2 * np.pi * rng.uniform(0.1, 1.0, 6) * highest,
+        rng.uniform(0, 2 * np.pi, 6),
+        rng.uniform(0.5, 1, 6),
+    )
+    return sum(a * np.sin(f * t + c) for a, f, c in zip(size, w, phase, strict=True)) / np.sqrt(0.5 * (size**2).sum())
+
+
+def solved(rates, start, t, inputs):
+    """States ``(N, n)`` under inputs that are held from sample to sample, and their derivatives."""
+    states = [np.array(start, float)]
+    for u in inputs[:-1]:
+        end = solve_ivp(lambda _, x, u=u: rates(x, u), (0.0, t[1]), states[-1], rtol=1e-9, atol=1e-12).y[:, -1]
+        states.append(end)
+    return np.array(states), np.array([rates(x, u) for x, u in zip(states, inputs, strict=True)])
+
+
+@cache
+def oven_signals():
+    t = np.arange(1000) * 1.0
+    power, ambient = 400.0 * (excitation(t, 0, 0.02) + 1.2).clip(0.0), 293.0 + 2.0 * np.sin(t / 300.0)
+    u = np.column_stack([power, ambient])
+    x, rates = solved(lambda x, u: [(u[0] - OVEN["loss"] * (x[0] - u[1])) / OVEN["capacity"]], [293.0], t, u)
+    return t, {"temperature": x[:, 0], "temperature_dot": rates[:, 0]}, {"power": power, "ambient": ambient}
+
+
+@cache
+def tank_signals():
+    t = np.arange(1000) * 0.5
+    inflow = 2e-3 * (excitation(t, 1, 0.05) + 1.5).clip(0.0)
+
+    def rates(x, u):
+        return [(u - TANK["outlet"] * np.sqrt(2 * 9.81 * max(x[0], 1e-6))) / TANK["area"]]
+
+    x, dx = solved(rates, [0.4], t, inflow)
+    return t, {"level": x[:, 0], "level_dot": dx[:, 0]}, {"inflow": inflow}
+
+
+@cache
+def motor_signals():
+    t = np.arange(1600) * 0.005
+    voltage = 6.0 * excitation(t, 0, 2.0) + 4.0 * np.sign(excitation(t, 5, 1.0))
+
+    def rates(x, u):
+        _, speed, current = x
+        torque = MOTOR["constant"] * current - MOTOR["friction"] * speed
+        drop = MOTOR["resistance"] * current + MOTOR["constant"] * speed
+        return [speed, torque / MOTOR["inertia"], (u - drop) / MOTOR["inductance"]]
+
+    x, dx = solved(rates, [0.0, 0.0, 0.0], t, voltage)
+    names = ("angle", "angle_dot", "current", "angle_ddot", "current_dot")
+    return t, dict(zip(names, [*x.T, dx[:, 1], dx[:, 2]], strict=True)), {"voltage": voltage}
+
+
+@cache
+def thrust_signals():
+    """Hover under a position controller, whose command has a dither."""
+    t = np.arange(1600) * 0.01
+    target, m = excitation(t, 2, 1.5), THRUST["mass"]
+
+    def rates(x, u):
+        lift = (x[2] - THRUST["drag"] * x[1]) / m - 9.81
+        return [x[1], lift, (THRUST["gain"] * u - x[2]) / THRUST["tau"]]
+
+    x, states, commands = np.array([0.0, 0.0, m * 9.81]), [], []
+    for k in range(len(t)):
+        force = m * (9.81 + 4.0 * (target[k] - x[0]) - 2.5 * x[1]) + np.sin(9.0 * t[k])
+        states.append(x)
+        commands.append(force / THRUST["gain"])
+        x = solve_ivp(lambda _, x: rates(x, commands[-1]), (0.0, t[1]), x, rtol=1e-9, atol=1e-12).y[:, -1]
+    states = np.array(states)
+    return t, dict(zip(("z", "z_dot", "thrust"), states.T, strict=True)), {"command": np.array(commands)}
+
+
+@cache
+def joint_signals():
+    t = np.arange(1600) * 0.005
+    torque = 1.5 * excitation(t, 3, 5.0) + 0.5 * np.sign(excitation(t, 9, 2.0))
+
+    def rates(x, u):
+        spring = JOINT["stiffness"] * (x[0] - x[1]) + JOINT["damping"] * (x[2] - x[3])
+        return [x[2], x[3], (u - JOINT["friction"] * x[2] - spring) / JOINT["rotor"], spring / JOINT["inertia"]]
+
+    x, _ = solved(rates, [0.0, 0.0, 0.0, 0.0], t, torque)
+    return t, dict(zip(("motor", "load", "motor_dot", "load_dot"), x.T, strict=True)), {"torque": torque}
+
+
+def recorded(simulation, names, noise=0.0, outliers=0.0, seed=0):
+    """Log of some signals, with noise and outliers in units of a signal's standard deviation, and the inputs."""
+    rng, (t, signals, inputs) = np.random.default_rng(seed), simulation
+    columns = {}
+    for name in names:
+        x, size = signals[name], signals[name].std()
+        hit = rng.random(len(x)) < outliers
+        columns[name] = x + size * (noise * rng.standard_normal(len(x)) + hit * rng.uniform(-5.0, 5.0, len(x)))
+    return dr.Log.from_arrays(t, {**columns, **inputs})
+
+
+def assert_exact(result, truth, tolerance=1e-4):
+    for name, value in result.parameters.items():
+        assert value == pytest.approx(truth[name], rel=tolerance), name
+
+
+def assert_right(result, truth, largest):
+    """The errors are below a limit, and below four standard errors."""
+    for name, value in result.parameters.items():
+        error = abs(value - truth[name])
+        assert error < largest * truth[name], (name, value)
+        assert error < 4.0 * result.standard_errors[name], (name, value, result.standard_errors[name])
+
+
+# ---------------------------------------------------------------------- models
+
+
+def test_a_state_of_first_order_has_one_derivative():
+    model = dc_motor()
+    assert model.state == ("angle", "angle_dot", "current")
+    assert model.signals[3:] == ("angle_ddot", "current_dot")
+    assert (model.units["current"], model.units["current_dot"]) == ("A", "A/s")
+    assert model.rate_names == ("angle", "current")
+    assert model.chains == (("angle", "angle_dot", "angle_ddot"), ("current", "current_dot"))
+
+
+def test_kinematics_and_states_of_first_order_go_together():
+    rigid = tumbling()
+
+    def equations(q, v, a, u, p):
+        turning = rigid.residual(
+            *(_stacked(x, n) for x, n in ((q, rigid.coordinates), (v, rigid.velocities))),
+            _stacked(a, rigid.velocities),
+            _stacked(u, rigid.inputs),
+            _stacked(p, rigid.parameters),
+        )
+        return [turning[0] + u.tx - v.rotor, turning[1], turning[2], p.tau * a.rotor + v.rotor - u.tx]
+
+    model = tumbling(
+        equations=equations, first_order={"rotor": "N m"}, parameters={**rigid.parameters, "tau": Parameter("s")}
+    )
+    assert model.quaternions == ((0, 1, 2, 3),)
+    assert model.velocities_of_motion == rigid.velocities
+    assert model.chains[-2:] == (("wz", "wz_dot"), ("rotor", "rotor_dot"))
+    assert Model.from_dict(model.to_dict()) == model
+
+
+def _stacked(symbols, names):
+    return ca.vertcat(*(symbols[n] for n in names))
+
+
+def test_models_with_states_of_first_order_are_stored_whole():
+    for model in (oven(), dc_motor()):
+        assert Model.from_dict(model.to_dict()) == model
+        assert pickle.loads(pickle.dumps(model)).first_order == model.first_order
+
+
+def test_a_model_needs_a_state_and_distinct_names():
+    with pytest.raises(dr.ModelError, match="no coordinates or first_order states"):
+        Model("nothing", {}, {}, {"k": Parameter("1")}, lambda q, v, a, u, p: [])
+    with pytest.raises(dr.ModelError, match=r"motor_dot.*twice"):
+        Model("twice", {"motor": "m"}, {}, {"k": Parameter("1")}, lambda *_: [0, 0], first_order={"motor_dot": "m"})
+
+
+def test_simulation_agrees_with_solve_ivp():
+    for model, parameters, (_, signals, inputs), dt in (
+        (tank(), TANK, tank_signals(), 0.5),
+        (dc_motor(), MOTOR, motor_signals(), 0.005),
+    ):
+        start = np.array([signals[n][0] for n in model.state])
+        u = np.column_stack(list(inputs.values()))
+        batch = RolloutBatch(model.parameter_vector(parameters)[None], start, u, dt)
+        series = rollouts(model, substeps=4).trajectories(batch)[0]
+        for name, column in zip(model.signals, series.T, strict=True):
+            np.testing.assert_allclose(column, signals[name], atol=1e-6 * np.abs(signals[name]).max(), err_msg=name)
+
+
+# ---------------------------------------------------------------------- measured states
+
+
+@pytest.mark.parametrize("method", ["ols", "tls", "nls", "diransac", "i-diransac"])
+def test_every_method_is_exact_on_clean_logs(method):
+    settings = dr.Settings(max_iterations=20) if method.endswith("diransac") else None
+    for model, truth, simulation in ((oven(), OVEN, oven_signals()), (dc_motor(), MOTOR, motor_signals())):
+        log = recorded(simulation, simulation[1])
+        assert_exact(dr.identify(model, log, method=method, settings=settings), truth, 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "truth", "simulate", "names"),
+    [
+        (oven, OVEN, oven_signals, ["temperature"]),
+        (tank, TANK, tank_signals, ["level"]),
+        (dc_motor, MOTOR, motor_signals, ["angle", "current"]),
+    ],
+)
+def test_lo_diransac_needs_the_states_alone(make, truth, simulate, names):
+    exact = dr.identify(make(), recorded(simulate(), names), differentiate=True)
+    assert_exact(exact, truth)
+    assert exact.verdict == "usable"
+    assert_right(dr.identify(make(), recorded(simulate(), names, 0.01, 0.1), differentiate=True), truth, 0.02)
+
+
+def test_differentiation_derives_the_rate_of_a_state():
+    t, signals, _ = tank_signals()
+    derived = differentiate(recorded(tank_signals(), ["level"]), tank())
+    inside = (t >= derived.time[0] - 1e-9) & (t <= derived.time[-1] + 1e-9)
+    error = derived["level_dot"] - signals["level_dot"][inside]
+    assert np.sqrt(np.mean(error**2)) < 0.1 * signals["level_dot"].std()
+
+
+def test_a_result_is_stored_validated_and_reported(tmp_path):
+    log = recorded(oven_signals(), ["temperature"], 0.002)
+    result = dr.identify(oven(), log, differentiate=True)
+    result.save(tmp_path / "oven.json")
+    loaded = dr.Result.load(tmp_path / "oven.json")
+    assert loaded.model == oven()
+    assert dr.validate(loaded, log).fit_percent["temperature"] > 98.0
+    dr.write_report(result, log, tmp_path / "oven.html")
+    assert "states of first order temperature (K)" in (tmp_path / "oven.html").read_text()
+
+
+def test_inspection_names_what_excites_a_model_without_coordinates():
+    found = inspect(recorded(oven_signals(), ["temperature"], 0.001), oven()).fitness
+    assert found.derivable == ("temperature_dot",)
+    assert {x.verdict for x in found.excitation.values()} == {"well"}
+
+
+# ---------------------------------------------------------------------- states that nothing measures
+
+KNOWN = {"inertia": MOTOR["inertia"], "friction": MOTOR["friction"]}
+
+
+@pytest.mark.parametrize(
+    ("make", "truth", "simulate", "names", "largest"),
+    [
+        (lagged_thrust, THRUST, thrust_signals, ["z"], 0.03),
+        (lambda: dc_motor(**KNOWN), MOTOR, motor_signals, ["angle_dot"], 0.05),
+        (flexible_joint, JOINT, joint_signals, ["motor"], 0.05),
+    ],
+    ids=["thrust behind a lag", "current of a motor", "load behind a spring"],
+)
+def test_a_state_that_nothing_measures_is_estimated(make, truth, simulate, names, largest):
+    exact = dr.identify(make(), recorded(simulate(), names), differentiate=True)
+    assert_exact(exact, truth)
+    assert exact.verdict == "usable"
+    assert_right(dr.identify(make(), recorded(simulate(), names, 0.005, 0.1), differentiate=True), truth, largest)
+
+
+def test_the_estimated_state_is_the_true_one():
+    t, signals, _ = thrust_signals()
+    found = dr.identify(lagged_thrust(), recorded(thrust_signals(), ["z"]), differentiate=True).diagnosis
+    expected = np.interp(found.smoothed_time, t, signals["thrust"])
+    np.testing.assert_allclose(found.smoothed_states["thrust"], expected, atol=1e-3 * signals["thrust"].max())
+
+
+def test_the_same_seed_gives_the_same_estimate_of_an_unmeasured_state():
+    log = recorded(thrust_signals(), ["z"], 0.005, 0.1)
+    first, second = (dr.identify(lagged_thrust(), log, differentiate=True, seed=3) for _ in range(2))
+    assert first.parameters == second.parameters
+
+
+def test_a_free_scale_is_named_and_no_number_is_given_for_it():
+    result = dr.identify(lagged_thrust(mass=None), recorded(thrust_signals(), ["z"]), differentiate=True)
+    assert set(result.diagnosis.unidentifiable) == {"mass", "gain", "drag"}
+    assert result.parameters["tau"] == pytest.approx(THRUST["tau"], rel=1e-3)
+    assert "gain/mass, drag/mass" in result.diagnosis.combinations[0]
+    assert "not all states are measured" in result.diagnosis.combinations[0]
+
+
+def test_a_motor_without_any_known_constant_is_refused():
+    with pytest.raises(dr.IdentificationError, match="only 3 combinations of them are determined"):
+        dr.identify(dc_motor(), recorded(motor_signals(), ["angle"]), differentiate=True)
+
+
+def test_structure_depends_on_what_is_measured():
+    model = lagged_thrust(mass=None)
+    assert structural(model) == ()
+    assert structural(lagged_thrust()) == structural(lagged_thrust(), ("z",)) == ()
+    assert structural(flexible_joint(), ("motor",)) == ()
+    (ambiguity,) = structural(model, ("z",))
+    assert ambiguity.combinations == ("gain/mass", "drag/mass")
+
+
+@pytest.mark.parametrize("differentiated", [True, False])
+def test_linear_methods_refuse_an_unmeasured_state_in_a_sentence(differentiated):
+    log = recorded(thrust_signals(), ["z", "z_dot"])
+    with pytest.raises(dr.LogError, match=r'"(thrust|z_ddot)" is missing'):
+        dr.identify(lagged_thrust(), log, method="ols", differentiate=differentiated)
+
+
+def test_validation_starts_from_an_estimated_state():
+    t, signals, inputs = thrust_signals()
+    plant = dr.Plant(lagged_thrust(), {n: x for n, x in THRUST.items() if n != "mass"})
+    late = {n: x[400:] for n, x in {**signals, **inputs}.items() if n != "thrust"}
+    scores = dr.validate(plant, dr.Log.from_arrays(t[400:], late), substeps=4)
+    assert scores.rmse["z"] < 1e-3 * signals["z"].std()
+    with pytest.raises(dr.LogError, match=r'"z_dot"'):
+        dr.validate(plant, dr.Log.from_arrays(t, {"z": signals["z"], **inputs}))
+    raw = dr.Log.from_arrays(t, {"z": signals["z"], **inputs})
+    assert dr.validate(plant, differentiate(raw, lagged_thrust())).fit_percent["z"] > 90.0
+
+
+# ---------------------------------------------------------------------- flight
+
+
+def test_a_plan_needs_no_coordinates():
+    plant = dr.Plant(tank(), TANK)
+    plan = dr.plan(plant, waypoints=[{"level": 0.3}, {"level": 0.5}], input_limits={"inflow": (0.0, 8e-3)})
+    log = dr.fly(plant, plan, dr.tvlqr(plant, plan))
+    assert log["level"][[0, -1]] == pytest.approx([0.3, 0.5], abs=1e-6)
+
+
+def test_a_plan_begins_with_its_actuators_at_rest():
+    plant = dr.Plant(lagged_thrust(), {n: x for n, x in THRUST.items() if n != "mass"})
+    plan = dr.plan(plant, waypoints=[{"z": 0.0}, {"z": 1.0}], input_limits={"command": (0.0, 1.2)})
+    start = dict(zip(plan.state_names, plan.states[0], strict=True))
+    assert start == pytest.approx({"z": 0.0, "z_dot": 0.0, "thrust": THRUST["mass"] * 9.81})
+    log = dr.fly(plant, plan, dr.tvlqr(plant, plan))
+    assert log["z"][-1] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_plan_names_the_inputs_that_rest_would_take():
+    plant = dr.Plant(lagged_thrust(), {n: x for n, x in THRUST.items() if n != "mass"})
+    with pytest.raises(dr.PlanningError, match=r"command would have to be 0\.6131"):
+        dr.plan(plant, waypoints=[{"z": 0.0}, {"z": 1.0}], input_limits={"command": (0.0, 0.5)})
