@@ -490,3 +490,25 @@ def test_an_attitude_that_only_sensors_show_is_estimated(model, columns):
     assert np.abs(result.diagnosis.smoothed_states["theta"] - angles).max() < 0.02
     with pytest.raises(dr.LogError, match="theta"):
         dr.identify(model, as_log(log), "ols", differentiate=True)
+
+
+def test_the_lag_of_a_thrust_is_identified_from_an_accelerometer_alone():
+    """Neither the thrust nor any position is measured."""
+    model = dr.Model(
+        "hover",
+        {},
+        {"command": "1"},
+        {"tau": dr.Parameter("s", positive=True), "gain": dr.Parameter("m/s^2", positive=True)},
+        lambda q, v, a, u, p: [p.tau * a.thrust + v.thrust - p.gain * u.command],
+        first_order={"thrust": "m/s^2"},
+        sensors={"acc": dr.Sensor("m/s^2", lambda q, v, a, u, p: v.thrust)},
+    )
+    t, rng, decay = 0.01 * np.arange(1500), np.random.default_rng(0), np.exp(-0.01 / 0.05)
+    command = 0.5 + 0.2 * np.sin(4.4 * t) + 0.15 * np.sign(np.sin(1.9 * t)) + 0.05 * np.sin(19.5 * t)
+    thrust = np.full(len(t), 20.0 * command[0])
+    for k in range(len(t) - 1):  # the exact solution under a held command
+        thrust[k + 1] = 20.0 * command[k] + (thrust[k] - 20.0 * command[k]) * decay
+    acc = thrust + rng.normal(0.0, 0.2, len(t)) + 10.0 * (rng.random(len(t)) < 0.05)
+    result = dr.identify(model, as_log({"t": t, "command": command, "acc": acc}), differentiate=True)
+    assert result.parameters["tau"] == pytest.approx(0.05, rel=0.03)
+    assert within_intervals(result, {"tau": 0.05, "gain": 20.0}) == []
