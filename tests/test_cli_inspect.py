@@ -32,7 +32,7 @@ def test_inspect_finds_what_was_planted(folder: Path):
     assert signals["x_ddot"]["n_spikes"] == signals["x_ddot"]["n_missing"] == 0
     assert signals["x_ddot"]["maximum"] == pytest.approx(1.3, abs=1e-3)
     text = run("inspect", "odd.csv").stdout.splitlines()
-    assert text[1].split() == ["signal", "unit", "minimum", "maximum", "std", "NaN", "spikes", "frozen", "s"]
+    assert text[1].split() == ["signal", "unit", "minimum", "maximum", "std", "Hz", "NaN", "spikes", "frozen", "s"]
     assert next(line for line in text if line.startswith("x_dot ")).split()[-1] == "0.5"
 
 

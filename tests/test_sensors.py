@@ -279,6 +279,8 @@ def test_least_squares_has_a_row_for_each_measured_sample_of_a_sensor(model, col
     used = np.arange(len(log["t"])) % every == 0
     sparse = {n: np.where(used, log[n], np.nan) for n in ("acc_x", "acc_z")}
     result = dr.identify(model, as_log(log, **sparse), "ols")
+    assert len(result.inliers) == result.estimate.n_fitted == len(used)
+    assert "acc_x" in result.evaluation.thresholds
     expected = np.linalg.lstsq(*rows_by_hand(log, used), rcond=None)[0]
     assert_allclose([result.parameters[n] for n in INSTRUMENTS], expected, rtol=1e-8)
     assert_allclose([result.parameters[n] for n in ("mass", "inertia")], [0.25, 0.0041], rtol=1e-3)

@@ -23,12 +23,15 @@ __all__ = [
     "describe_gaps",
     "describe_jitter",
     "numeric_columns",
+    "rows_per_sample",
 ]
 
 
 # In mean intervals: the jitter that is not reported, and the one that is an error; in median intervals: a gap.
 _SILENT_JITTER, _TOLERATED_JITTER, _GAP = 1e-3, 0.2, 1.5
 _ROUNDING = 1e-6
+# Samples of a signal from which its rate is taken.
+_FEWEST_SAMPLES = 5
 
 # Likely seconds from row to row, and the most that are accepted.  Clocks that explain longer ones: their tick in
 # seconds, and the number of ticks from row to row above which it is this clock rather than the next.
@@ -82,11 +85,29 @@ def check_names(names: Iterable[object], source: str) -> None:
             raise LogError(f'{source}: "t" is the time; give the signal another name')
 
 
+def rows_per_sample(known: npt.NDArray[np.bool_]) -> int:
+    """Median number of rows from one sample of a signal to the next; 1 for a signal with a sample in most rows."""
+    rows = np.flatnonzero(known)
+    return int(np.median(np.diff(rows))) if len(rows) >= _FEWEST_SAMPLES else 1
+
+
 def describe_gaps(time: FloatArray, signals: Mapping[str, FloatArray]) -> list[str]:
-    """Sentences about missing and infinite samples: signals, number, and time of the first."""
+    """Sentences about slow signals, and about missing and infinite samples: signals, number, and time of the first."""
     missing = {name: np.isnan(values) for name, values in signals.items()}
+    slow = {name: n for name, x in missing.items() if (n := rows_per_sample(~x)) > 1}
+    rate = (len(time) - 1) / (time[-1] - time[0])
+    sentences = [
+        f"{_quoted([name for name, x in slow.items() if x == n])} sampled at {rate / n:.4g} Hz, one row in {n}"
+        for n in dict.fromkeys(slow.values())
+    ]
+    missing = {name: x for name, x in missing.items() if name not in slow}
     infinite = {name: np.isinf(values) for name, values in signals.items()}
-    return [*_where("NaN", missing, time), *_where("infinite", infinite, time)]
+    return [*sentences, *_where("NaN", missing, time), *_where("infinite", infinite, time)]
+
+
+def _quoted(names: list[str]) -> str:
+    """Subject of a sentence with its verb: ``"x", "z" are``."""
+    return ", ".join(f'"{name}"' for name in names) + (" is" if len(names) == 1 else " are")
 
 
 def _where(word: str, flags: Mapping[str, npt.NDArray[np.bool_]], time: FloatArray) -> list[str]:
@@ -98,9 +119,8 @@ def _where(word: str, flags: Mapping[str, npt.NDArray[np.bool_]], time: FloatArr
     sentences = []
     for names in groups.values():
         flag = flags[names[0]]
-        subject = ", ".join(f'"{name}"' for name in names) + (" is" if len(names) == 1 else " are")
         first = time[int(flag.argmax())]
-        sentences.append(f"{subject} {word} in {flag.sum()} of {len(flag)} rows, first at t = {first:.6g} s")
+        sentences.append(f"{_quoted(names)} {word} in {flag.sum()} of {len(flag)} rows, first at t = {first:.6g} s")
     return sentences
 
 

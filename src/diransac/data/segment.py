@@ -11,6 +11,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.data import preprocessing
+from diransac.data.checks import rows_per_sample
 from diransac.data.log import Log
 from diransac.data.units import conversion, same_unit
 from diransac.errors import LogError, SettingsError
@@ -29,6 +30,8 @@ _FAR = 5.0
 _LONG_HOLD = 3
 # Time, rows, and usual intervals between samples, without a sample of any signal: then the motion is found anew.
 _LONG_SILENCE, _FEWEST_SILENT, _SILENT_INTERVALS = 0.25, 8, 4
+# Fraction of the rows with a sample below which a signal is a slow one.
+_SLOW = 0.5
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Segment:
     ----------
     model : Model
     log : Log
-        The log, with its angles unwrapped.
+        The log, with continuous coordinates; see `preprocessing.continuous`.
     offset : int
         Row of the log that is row 0 of the arrays: the first that counts.
     signals : tuple of str
@@ -201,7 +204,7 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     model : Model
     log : Log
     also : sequence of str, optional
-        Signals in use besides those that the equations name.
+        Signals in use besides those that the equations name; rows without a sample of a sensor among them count, too.
     pointwise : bool, optional
         Whether the equations are evaluated at each row, which needs every signal that they name.
 
@@ -224,18 +227,24 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     used = [n for n in (*signals, *model.inputs) if n in log]
     log.check(used)
     _check_units(model, log, used)
-    log = preprocessing.unwrap(log, [n for n in model.coordinates if n in log and model.coordinates[n] == "rad"])
+    log = preprocessing.continuous(log, model)
     inputs, held = _held_inputs(model, log)
     measured = np.column_stack([log[n] for n in signals])
     gaps = long_runs(held, _LONG_HOLD) | silent_rows(np.isfinite(measured), log.dt)
-    critical = [i for i, n in enumerate(signals) if n in needed or n in also]
-    valid = np.all(np.isfinite(np.hstack([measured[:, critical], inputs])), axis=1) & ~gaps
+    critical = [i for i, n in enumerate(signals) if n in needed or (n in also and n not in model.sensors)]
+    known = np.isfinite(measured[:, critical])
+    valid = _complete(known, pointwise) & np.isfinite(inputs).all(axis=1) & ~gaps
     if not valid.any():
         raise LogError(
             f"{log.source}: no row has a value in every signal in use ({', '.join(used)}); found NaN in each"
+            f"{_slow_signals(log, used)}"
         )
     offset = int(np.argmax(valid))
-    notes = (*log.notes, *_row_notes(valid, held & ~gaps), *_gap_notes(log, gaps, offset))
+    notes = (
+        *log.notes,
+        *_row_notes(valid, held & ~gaps, sampled=known.any(axis=1) | gaps),
+        *_gap_notes(log, gaps, offset),
+    )
     return Segment(
         model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], notes, gaps[offset:]
     )
@@ -254,6 +263,27 @@ def runs(mask: BoolArray) -> list[slice]:
     """
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _complete(known: BoolArray, pointwise: bool) -> BoolArray:
+    """Rows ``(N,)`` that count, of samples ``(N, n)`` that are known.
+
+    Without equations at each row, slow signals, which have samples in fewer than half of the rows, are compared where
+    they have one; a row without a sample of any signal does not count.
+    """
+    slow = np.zeros(known.shape[1], bool) if pointwise else known.mean(axis=0) < _SLOW
+    if not slow.any():
+        return np.asarray(known.all(axis=1))
+    return np.asarray(known.any(axis=1) & (known | slow).all(axis=1))
+
+
+def _slow_signals(log: Log, names: Sequence[str]) -> str:
+    """Clause that names the signals that are sampled less often than the log, with their rates; empty without any."""
+    apart = {n: rows_per_sample(np.isfinite(log[n])) for n in names}
+    slow = [f'"{n}" is sampled at {1.0 / (x * log.dt):.4g} Hz' for n, x in apart.items() if x > 1]
+    if not slow:
+        return ""
+    return f": {', '.join(slow)}, the log at {1.0 / log.dt:.4g} Hz; use lo-diransac, which needs no complete rows"
 
 
 def long_runs(mask: BoolArray, least: int) -> BoolArray:
@@ -328,9 +358,9 @@ def _held_inputs(model: Model, log: Log) -> tuple[FloatArray, BoolArray]:
     return np.column_stack(columns) if columns else np.zeros((len(log), 0)), held
 
 
-def _row_notes(valid: BoolArray, held: BoolArray) -> list[str]:
+def _row_notes(valid: BoolArray, held: BoolArray, sampled: BoolArray) -> list[str]:
     notes = []
-    skipped = int((~valid).sum())
+    skipped = int((~valid & sampled).sum())
     if skipped:
         notes.append(f"{skipped} of {len(valid)} rows were skipped: a signal in use is NaN there")
     if held.any():

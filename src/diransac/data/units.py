@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-__all__ = ["conversion", "same_unit", "split_unit"]
+__all__ = ["conversion", "one_turn", "same_unit", "split_unit"]
 
 _NEGLIGIBLE = 1e-9
 _STANDARD_GRAVITY = 9.80665
@@ -114,6 +114,12 @@ def conversion(a: str, b: str) -> float | None:
         return 1.0
     factors = {x for x in (_factor(p, q) for p in _meanings(a) for q in _meanings(b)) if x is not None}
     return factors.pop() if len(factors) == 1 else None
+
+
+def one_turn(unit: str) -> float | None:
+    """One turn in a unit of angles: 2 pi for ``rad``, 360 for ``deg``; None for other units, ``1`` among them."""
+    found = _parse(unit)
+    return 2.0 * math.pi / found.factor if found is not None and found.powers == {"rad": 1.0} else None
 
 
 def _factor(a: _Unit, b: _Unit) -> float | None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray
+from diransac.data.preprocessing import continuous_quaternions
 from diransac.errors import SettingsError
 from diransac.flight.riccati import Problem, gains_of
 from diransac.flight.trajectory import Trajectory
@@ -30,6 +31,9 @@ VELOCITY_ERROR = 1.0
 UNLIMITED_INPUT = 1.0
 FINAL_SECONDS = 1.0
 """Default weights, explained in `tvlqr`; they are not tuned to any plant."""
+
+_HALF_ANGLE = 0.5
+"""Error of a quaternion per error of the attitude, 1/rad."""
 
 _GRID = 1e-6
 """Tolerance, as a fraction of dt, within which a time counts as that of a row."""
@@ -204,11 +208,13 @@ def tvlqr(
     The default weights follow Bryson's rule and are not tuned: an error of 0.5 in a coordinate (m, rad) or of 1 in a
     velocity (m/s, rad/s) costs as much as full use of an input, which is half the range of its limits, or 1 without
     limits. A state of first order has no weight where the model has coordinates, whose motion it serves, and that of a
-    velocity otherwise. ``Qf`` is ``Q`` times 1 s by default.
+    velocity otherwise. ``Qf`` is ``Q`` times 1 s by default. An attitude error of 0.5 rad is one of 0.25 in its
+    quaternion.
 
     The controller is optimal at its own rate and converges to the continuous one for dt to 0; the last row counts as
-    lasting dt. The four numbers of a quaternion are treated as coordinates: errors along its norm, which no input
-    changes, vanish within one step.
+    lasting dt. Errors of a quaternion are in the tangent space of the reference's: the gains are orthogonal to it, and
+    act on the vector part of the error quaternion, half the attitude error to first order. Changes of its sign along
+    the trajectory are undone before.
 
     Gains rely on the linearised model. Dry friction written as a steep function, ``atan(100 v)``, is linearised as
     strong viscous friction near ``v = 0``, and the resulting gains destabilise a plant at rest: set its parameter to 0.
@@ -267,6 +273,7 @@ def tvlqr_batch(
         raise SettingsError("the plants have different models; call tvlqr_batch for each model's own")
     for trajectory in trajectories:
         _check_columns(model, trajectory)
+    trajectories = [_with_continuous_attitude(model, trajectory) for trajectory in trajectories]
     costs = _CostMatrices(model, Q, R, Qf)
     limits_of_each = [_limits_of(model, trajectory, limits) for trajectory in trajectories]
     problems = [
@@ -299,6 +306,14 @@ def _check_columns(model: Model, trajectory: Trajectory) -> None:
             )
 
 
+def _with_continuous_attitude(model: Model, trajectory: Trajectory) -> Trajectory:
+    """The trajectory, whose quaternions have unit norm and no changes of sign, along which gains are derived."""
+    states = trajectory.states.copy()
+    for four in model.quaternions:
+        states[:, list(four)] = continuous_quaternions(states[:, list(four)])
+    return trajectory if np.array_equal(states, trajectory.states) else replace(trajectory, states=states)
+
+
 def _limits_of(model: Model, trajectory: Trajectory, limits: InputLimits | None) -> tuple[FloatArray, FloatArray]:
     """Smallest and largest inputs (n_u,).
 
@@ -319,7 +334,10 @@ class _CostMatrices:
     """Matrices Q, Qf and R."""
 
     def __init__(self, model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None) -> None:
-        weights = np.repeat([COORDINATE_ERROR**-2.0, VELOCITY_ERROR**-2.0], [model.n_q, model.n_v])
+        errors = np.repeat([COORDINATE_ERROR, VELOCITY_ERROR], [model.n_q, model.n_v])
+        for four in model.quaternions:
+            errors[list(four)] *= _HALF_ANGLE
+        weights = errors**-2.0
         if model.n_q:
             weights[len(weights) - len(model.first_order) :] = 0.0
         self.Q = _matrix("Q", weights if Q is None else Q, model.state)

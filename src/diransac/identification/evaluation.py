@@ -13,7 +13,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.segment import runs
 from diransac.errors import LogError, SettingsError
 from diransac.identification.estimate import Evaluation, Resolution
-from diransac.simulation import Measurements, RolloutBatch, default_threads, rollouts
+from diransac.simulation import Measurements, RolloutBatch, ScoreBatch, default_threads, rollouts
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from diransac.identification.estimate import Diagnosis, Estimate
     from diransac.identification.settings import Settings
     from diransac.model import Model
-    from diransac.simulation import ScoreBatch, Simulator
+    from diransac.simulation import Simulator
 
 __all__ = [
     "Scores",
@@ -40,8 +40,6 @@ __all__ = [
 
 _THRESHOLD_IN_SPREADS = 0.2
 _ACCELERATION_WEIGHT = 0.1
-# Fraction of the rows of every log in which a sensor is measured that is scored by default.
-_MOSTLY_MEASURED = 0.9
 _DEFAULT_RESOLUTION = Resolution()
 
 
@@ -84,8 +82,7 @@ def judged_signals(model: Model, logs: Sequence[Log], settings: Settings) -> tup
     logs : sequence of Log
     settings : Settings
         Weights and thresholds; where either is None, the default signals are compared: velocities and accelerations,
-        coordinates whose velocity is not measured, as far as every log has them, and sensors that are measured in
-        nearly all rows: the other rows do not count.
+        coordinates whose velocity is not measured, and sensors, as far as every log has them.
 
     Returns
     -------
@@ -94,13 +91,7 @@ def judged_signals(model: Model, logs: Sequence[Log], settings: Settings) -> tup
     named = {**(settings.error_weights or {}), **(settings.inlier_thresholds or {})}
     chosen = {n for n, x in named.items() if x > 0.0}
     if settings.error_weights is None or settings.inlier_thresholds is None:
-        measured = [n for n in model.signals if all(n in log for log in logs)]
-        sparse = [
-            n
-            for n in model.sensors
-            if n in measured and any(np.isfinite(log[n]).mean() < _MOSTLY_MEASURED for log in logs)
-        ]
-        chosen.update(_judged_by_default(model, [n for n in measured if n not in sparse]))
+        chosen.update(_judged_by_default(model, [n for n in model.signals if all(n in log for log in logs)]))
     return tuple(n for n in model.signals if n in chosen)
 
 
@@ -132,8 +123,7 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     LogError
         Every signal is constant.
     """
-    sparse = [n for n in dataset.model.sensors if n in dataset.common_signals and not _is_complete(dataset, n)]
-    by_default = _judged_by_default(dataset.model, [n for n in dataset.common_signals if n not in sparse])
+    by_default = _judged_by_default(dataset.model, dataset.common_signals)
     if not by_default and (settings.error_weights is None or settings.inlier_thresholds is None):
         raise LogError(
             f"{dataset.source}: no signal that could be scored is in every log; give one that all logs "
@@ -142,9 +132,7 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     scales = {n: dataset.scales[n] for n in by_default}
     constant = [n for n, scale in scales.items() if scale == 0.0]
     weights, thresholds = settings.error_weights, settings.inlier_thresholds
-    notes = [f"{n} is constant and is not compared" for n in constant]
     if weights is None or thresholds is None:
-        notes += [f"{n} is measured in a part of the rows and is not compared" for n in sparse]
         if len(constant) == len(scales):
             raise LogError(
                 f"{dataset.source}: {', '.join(scales)} are constant; nothing moves in this log. Record a motion"
@@ -166,13 +154,9 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
             "thresholds"
         )
     compared = ", ".join(n for n, x in zip(dataset.signals, eps, strict=True) if x > 0.0)
+    notes = [f"{n} is constant and is not compared" for n in constant]
     notes.append(f"a row is an inlier if {needed} of {n_signals} signals are within their thresholds: {compared}")
     return Scoring(w, eps, needed, tuple(notes))
-
-
-def _is_complete(dataset: Dataset, name: str) -> bool:
-    """True if a signal is measured in every row that counts."""
-    return all(bool(np.isfinite(one.column(name)[one.valid]).all()) for one in dataset.segments)
 
 
 def _with_accelerations(model: Model) -> tuple[str, ...]:
@@ -353,13 +337,20 @@ class Simulation:
             for rows, state in self.starts[i]:
                 lanes = RolloutBatch(own, state, self._inputs[i][rows], one.log.dt)
                 known = Measurements(measured.values[rows], measured.valid[rows])
-                batch = self._simulator.score(lanes, known, thresholds, min_inlier_signals, threads=self._threads)
-                found.append((rows, batch))
+                found.append((rows, self._score(lanes, known, thresholds, min_inlier_signals)))
             logs.append(LogScores(len(one), tuple(found)))
         sums, counts = logs[0].sum_squares, logs[0].inlier_count
         for other in logs[1:]:
             sums, counts = sums + other.sum_squares, counts + other.inlier_count
         return Scores(sums, counts, tuple(logs))
+
+    def _score(
+        self, lanes: RolloutBatch, measured: Measurements, thresholds: FloatArray, min_inlier_signals: int
+    ) -> ScoreBatch:
+        """Scores of a stretch."""
+        if np.isnan(measured.values[measured.valid]).any():
+            return _incomplete_scores(self._simulator, lanes, measured, thresholds, min_inlier_signals)
+        return self._simulator.score(lanes, measured, thresholds, min_inlier_signals, threads=self._threads)
 
     def errors(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
@@ -402,6 +393,31 @@ class Simulation:
         lanes = np.tile(parameters, (len(states), 1))
         batch = RolloutBatch(lanes, states, inputs, one.log.dt, start_rows, n_rows)
         return batch, Measurements(measured, np.ones(len(measured), bool))
+
+
+def _incomplete_scores(
+    simulator: Simulator,
+    lanes: RolloutBatch,
+    measured: Measurements,
+    thresholds: FloatArray,
+    min_inlier_signals: int,
+) -> ScoreBatch:
+    """Scores of a log with slow signals, or sensors, each of which is compared where it has samples.
+
+    The mean square of a signal is that of its samples, and counts for all rows that count.  Of the signals that a row
+    lacks, none need be an inlier: a row needs the same fraction of its own.
+    """
+    known = np.isfinite(measured.values) & measured.valid[:, None]
+    errors = simulator.errors(lanes, replace(measured, values=np.nan_to_num(measured.values)))
+    weight = measured.valid.sum() / np.maximum(known.sum(axis=0), 1)
+    squares = np.where(known, np.square(np.nan_to_num(errors, nan=np.inf)), 0.0).sum(axis=1) * weight
+    judged = thresholds > 0.0
+    needed = np.ceil(min_inlier_signals * (known & judged).sum(axis=1) / max(1, judged.sum()))
+    near = (known & (np.abs(np.nan_to_num(errors, nan=np.inf)) < thresholds)).sum(axis=2)
+    inliers = (near >= np.maximum(needed, 1.0)) & measured.valid
+    diverged = ~np.isfinite(squares).all(axis=1)
+    bits = np.packbits(inliers, axis=0, bitorder="little")
+    return ScoreBatch(lanes, squares, inliers.sum(axis=1), diverged, bits)
 
 
 def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: Settings) -> Evaluation:

@@ -11,6 +11,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data import preprocessing
+from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, usable_sensors
 from diransac.errors import IdentificationError, LogError
 from diransac.identification.estimators import OrdinaryLeastSquares
@@ -43,8 +44,10 @@ class SignalFacts:
         Unit; None where the log does not give it.
     minimum, maximum, standard_deviation : float
         Statistics of the finite samples, in that unit; NaN where there is none.
+    rate : float
+        Samples per second, Hz: that of the log, or that of a slow signal, which has NaN between its samples.
     n_missing : int
-        Number of NaN samples.
+        Number of rows without a sample.
     n_spikes : int
         Number of samples that a Hampel filter would replace.
     frozen : float
@@ -55,6 +58,7 @@ class SignalFacts:
     minimum: float
     maximum: float
     standard_deviation: float
+    rate: float
     n_missing: int
     n_spikes: int
     frozen: float
@@ -156,7 +160,7 @@ class Inspection:
     def __str__(self) -> str:
         end = self.start + self.duration
         head = f"{self.source}: {self.n_rows} rows at {1.0 / self.dt:.6g} Hz, {self.start:.6g} to {end:.6g} s"
-        rows = [["signal", "unit", "minimum", "maximum", "std", "NaN", "spikes", "frozen s"]]
+        rows = [["signal", "unit", "minimum", "maximum", "std", "Hz", "NaN", "spikes", "frozen s"]]
         rows += [[name, *_cells(facts)] for name, facts in self.signals.items()]
         return "\n".join([head, *aligned(rows), *(f"  {note}" for note in self.notes), *self._fitness_lines()])
 
@@ -190,7 +194,8 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
     -------
     Inspection
     """
-    signals = {name: _signal_facts(log, name) for name in log.names}
+    continuous = preprocessing.unwrap(log) if model is None else preprocessing.continuous(log, model)
+    signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names}
     fitness = None if model is None else _fitness(log, model)
     if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
         fitness = dataclasses.replace(fitness, caveat=_caveat(signals, model))
@@ -200,17 +205,18 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
 # ---------------------------------------------------------------------- signals
 
 
-def _signal_facts(log: Log, name: str) -> SignalFacts:
+def _signal_facts(log: Log, name: str, continuous: FloatArray) -> SignalFacts:
+    """Statistics of a signal; its spikes are those of its continuous form, without wraps and changes of sign."""
     values = log[name]
     finite = values[np.isfinite(values)]
     low, high, spread = (finite.min(), finite.max(), _spread(finite)) if len(finite) else (np.nan,) * 3
-    run = _longest_run(values)
-    frozen = run * log.dt if run >= _FROZEN_SAMPLES else 0.0
+    apart = rows_per_sample(np.isfinite(values))
+    run = _longest_run(values if apart == 1 else finite)
+    frozen = run * apart * log.dt if run >= _FROZEN_SAMPLES else 0.0
     with np.errstate(over="ignore"):  # a bound that overflows is infinite, and nothing is beyond it
-        n_spikes = int(preprocessing.hampel(values)[0].sum())
-    return SignalFacts(
-        log.units.get(name), float(low), float(high), float(spread), int(np.isnan(values).sum()), n_spikes, frozen
-    )
+        n_spikes = int(preprocessing.hampel(continuous if apart == 1 else continuous[np.isfinite(values)])[0].sum())
+    n_missing, rate = int(np.isnan(values).sum()), 1.0 / (apart * log.dt)
+    return SignalFacts(log.units.get(name), float(low), float(high), float(spread), rate, n_missing, n_spikes, frozen)
 
 
 def _spread(values: FloatArray) -> float:
@@ -229,7 +235,7 @@ def _cells(facts: SignalFacts) -> tuple[str, ...]:
     numbers = (facts.minimum, facts.maximum, facts.standard_deviation)
     frozen = f"{facts.frozen:.3g}" if facts.frozen else "-"
     counts = (str(facts.n_missing or "-"), str(facts.n_spikes or "-"), frozen)
-    return (facts.unit or "?", *(f"{x:.5g}" for x in numbers), *counts)
+    return (facts.unit or "?", *(f"{x:.5g}" for x in numbers), f"{facts.rate:.4g}", *counts)
 
 
 # ---------------------------------------------------------------------- a model

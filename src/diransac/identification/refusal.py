@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.data.checks import rows_per_sample
 from diransac.errors import IdentificationError
 from diransac.identification.identifiability import Ambiguity, NullSpace, in_words, null_space, of_log, structural
 from diransac.identification.regression import regression_rows
@@ -72,7 +73,8 @@ def _moves(values: FloatArray) -> bool:
     known = np.flatnonzero(np.isfinite(values))
     if not len(known):
         return False
-    values = values[known[0] :: _samples_held(values[known])]
+    values = values[known[0] :: rows_per_sample(np.isfinite(values))]
+    values = values[:: _samples_held(values[np.isfinite(values)])]
     known = np.isfinite(values)
     x = np.where(known, values - np.median(values[known]), 0.0) / (np.abs(values[known]).max() + _TINY)
     size = np.abs(x[known])

@@ -3,12 +3,21 @@
 Each step adds one mapping to ``Log.history`` and, where it changes samples, a sentence to ``Log.notes``.
 """
 
+from diransac.data.preprocessing.continuity import (
+    continuous,
+    continuous_quaternions,
+    unit_quaternions,
+    unwrap,
+    whole_quaternions,
+)
 from diransac.data.preprocessing.differentiation import acting_inputs, differentiate, filter_rows
 from diransac.data.preprocessing.spikes import despike, hampel, running_deviation
-from diransac.data.preprocessing.steps import rename, resample, scale, shift, unwrap
+from diransac.data.preprocessing.steps import rename, resample, scale, shift
 
 __all__ = [
     "acting_inputs",
+    "continuous",
+    "continuous_quaternions",
     "despike",
     "differentiate",
     "filter_rows",
@@ -18,5 +27,7 @@ __all__ = [
     "running_deviation",
     "scale",
     "shift",
+    "unit_quaternions",
     "unwrap",
+    "whole_quaternions",
 ]

@@ -19,12 +19,12 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.data.filters import REACH, FilterSpecification, convolve, half_length, kernels
-from diransac.data.preprocessing.steps import unwrap
+from diransac.data.preprocessing.continuity import continuous, unit_quaternions, whole_quaternions
 from diransac.data.units import same_unit
 from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
 
     from diransac.data.log import Log
     from diransac.model import Model
@@ -74,12 +74,12 @@ def differentiate(log: Log, model: Model, bandwidth: float | None = None) -> Log
     Accelerations are derived from measured velocities where there are any, from coordinates otherwise.  All of the
     model's signals and inputs pass the same zero-phase filter; rows at both ends that it cannot fill are cut.  Missing
     samples are bridged by a cubic if they last no longer than a quarter of the bandwidth's period; a longer gap stays
-    NaN, with the samples within the filter's reach.  Angles in rad are unwrapped.
+    NaN, with the samples within the filter's reach.  Coordinates are made continuous first, and filtered quaternions
+    have unit norm; see `continuous`.
     """
     sources = _sources(log, model)
-    if model.kinematics is None:
-        log = unwrap(log, [q for q, unit in model.coordinates.items() if q in log and unit == "rad"])
-    names = [n for n in _filtered(model) if n in log]
+    log = continuous(log, model)
+    names = _filtered(log, model)
     log.check(names)
     bridged = {name: _bridge(log[name]) for name in names}
     chosen = None
@@ -90,7 +90,7 @@ def differentiate(log: Log, model: Model, bandwidth: float | None = None) -> Log
     L = half_length(wide, log.dt)
     derived = {**{name: (name, 0) for name in names}, **sources}
     blank = {name: _near_long_gaps(log[name], _LONGEST_BRIDGE / (bandwidth * log.dt), L) for name in names}
-    signals = {**log.signals, **_derived(bridged, derived, blank, kernels(wide, log.dt))}
+    signals = _on_spheres({**log.signals, **_derived(bridged, derived, blank, kernels(wide, log.dt))}, model)
     specification = FilterSpecification(bandwidth, wide, {name: source for name, (source, _) in sources.items()})
     filtered = log.with_step(
         _step(specification, chosen, names, L),
@@ -115,6 +115,15 @@ def _derived(
         filtered = convolve(bridged[source] - mean, responses[order]) + (mean if order == 0 else 0.0)
         signals[name] = np.where(blank[source], np.nan, filtered)
     return signals
+
+
+def _on_spheres(signals: Mapping[str, FloatArray], model: Model) -> dict[str, FloatArray]:
+    """The signals, with whole quaternions of unit norm."""
+    projected = dict(signals)
+    for names in whole_quaternions(signals, model):
+        q = np.column_stack([signals[name] for name in names])
+        projected.update(zip(names, unit_quaternions(q).T, strict=True))
+    return projected
 
 
 def filter_rows(
@@ -197,10 +206,14 @@ def _underivable(log: Log, model: Model, name: str, source: str | None) -> str:
     return f'{log.source}: signal "{name}" is missing, and so is "{source}", its source; found {found}. Give either.'
 
 
-def _filtered(model: Model) -> Iterable[str]:
-    """Names of the signals that pass the filter; quaternions and the like do not, as they form no vector space."""
-    coordinates = model.coordinates if model.kinematics is None else ()
-    return (*coordinates, *model.velocities, *model.accelerations, *model.inputs)
+def _filtered(log: Log, model: Model) -> list[str]:
+    """Names of the log's signals that pass the filter.
+
+    Coordinates without a unit that are no velocity's integral and no quaternion may have jumps, and pass none.
+    """
+    quaternions = {name for names in whole_quaternions(log.signals, model) for name in names}
+    smooth = [n for n, unit in model.coordinates.items() if model.kinematics is None or unit != "1" or n in quaternions]
+    return [n for n in (*smooth, *model.velocities, *model.accelerations, *model.inputs) if n in log]
 
 
 def _motions(log: Log, model: Model) -> list[tuple[str, int]]:

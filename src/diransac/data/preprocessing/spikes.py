@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
+from diransac.data.preprocessing.continuity import unwrap
 from diransac.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ _COUNT_ROUNDING, _USUAL = 1e-3, 0.01
 
 
 def despike(log: Log, signals: Sequence[str] | None = None, window: int = 15, threshold: float = 8.0) -> Log:
-    """Log with isolated spikes replaced by the median around them (a Hampel filter).
+    """Log with isolated spikes replaced by the median around them (a Hampel filter), and angles unwrapped before.
 
     Parameters
     ----------
@@ -39,6 +40,7 @@ def despike(log: Log, signals: Sequence[str] | None = None, window: int = 15, th
     SettingsError
         The window is even or below 3, or the threshold is not above 0.
     """
+    log = unwrap(log)
     cleaned, replaced = dict(log.signals), {}
     for name in log.names if signals is None else signals:
         found, median = hampel(log[name], window, threshold)

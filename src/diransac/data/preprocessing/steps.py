@@ -1,4 +1,4 @@
-"""Steps that need no model: names, factors, rates, delays and wrapped angles."""
+"""Steps that need no model: names, factors, rates and delays."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray
-from diransac.data.units import conversion
 from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from diransac.data.log import Log
 
@@ -27,7 +26,6 @@ __all__ = [
     "resample_columns",
     "scale",
     "shift",
-    "unwrap",
 ]
 
 Column = TypeVar("Column")
@@ -35,7 +33,6 @@ Column = TypeVar("Column")
 _BRIDGED_INTERVALS = 3.5
 _MOST_ROWS = 10_000_000
 _ROUNDING = 1e-6
-_WRAPPING = 0.75
 _FOLDING = 0.9
 
 
@@ -261,55 +258,3 @@ def shift(log: Log, delays: Mapping[str, float]) -> Log:
     note = f"{(~covered).sum()} rows cut at the ends, which delayed signals do not cover"
     kept = {name: values[covered] for name, values in signals.items()}
     return log.with_step(step, time=log.time[covered], signals=kept, notes=[note] if not covered.all() else [])
-
-
-# ---------------------------------------------------------------------- angles
-
-
-def unwrap(log: Log, names: Sequence[str]) -> Log:
-    """Log with the jumps by one turn removed from wrapped angles.
-
-    Parameters
-    ----------
-    log : Log
-    names : sequence of str
-        Angles; the turn is 360 for a signal in degrees, 2 pi otherwise.
-
-    Raises
-    ------
-    LogError
-        There is no such signal.
-
-    Notes
-    -----
-    An angle is wrapped if it lies within one turn and jumps by more than half of it, most often by three quarters and
-    more.  Outliers leave that range, or jump by less, and such a signal is not changed.
-    """
-    wrapped = {name: jumps for name in names if (jumps := _jumps(log[name], _turn(log, name)))}
-    if not wrapped:
-        return log
-    signals = {**log.signals, **{name: _unwrapped(log[name], _turn(log, name)) for name in wrapped}}
-    notes = [f'"{name}" was wrapped to one turn; {n} jumps are removed' for name, n in wrapped.items()]
-    return log.with_step({"step": "unwrap", "jumps": wrapped}, signals=signals, notes=notes)
-
-
-def _turn(log: Log, name: str) -> float:
-    factor = conversion(log.units.get(name, "rad"), "rad")
-    return 2.0 * math.pi / (1.0 if factor is None else factor)
-
-
-def _jumps(values: FloatArray, turn: float) -> int:
-    """Number of jumps by more than half a turn in an angle that lies within one turn; 0 if it is not wrapped."""
-    finite = values[np.isfinite(values)]
-    if len(finite) < 2 or np.ptp(finite) > turn * (1.0 + _ROUNDING):
-        return 0
-    jumps = np.abs(np.diff(finite))
-    jumps = jumps[jumps > 0.5 * turn]
-    return len(jumps) if len(jumps) and np.median(jumps) > _WRAPPING * turn else 0
-
-
-def _unwrapped(values: FloatArray, turn: float) -> FloatArray:
-    finite = np.isfinite(values)
-    result = values.copy()
-    result[finite] = np.unwrap(values[finite], period=turn)
-    return result

@@ -7,7 +7,8 @@ Torr and Zisserman 2000, "MLESAC"; Dempster, Laird, Rubin 1977 (EM).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,12 +41,16 @@ class Mixture:
         Half width of the uniform density, each signal's unit.
     floor : (n_s,) array
         Smallest admissible sigma.
+    quaternions : sequence of (int, int, int, int), optional
+        Columns of unit quaternions.  Their errors are in the tangent space, which has three dimensions, and isotropic
+        there: the four components have one sigma.
     """
 
     sigma: FloatArray
     pi: FloatArray
     span: FloatArray
     floor: FloatArray
+    quaternions: Sequence[tuple[int, int, int, int]] = ()
 
     def inlying(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Probability ``(N, n_s)`` that each sample is not an outlier; 0 where it is missing (the E step)."""
@@ -86,13 +91,17 @@ class Mixture:
         """
         weight = inlying.sum(axis=0)
         squares = (inlying * np.square(residuals)).sum(axis=0)
-        sigma = np.sqrt(squares / np.maximum(weight, 1e-9))
+        variance = squares / np.maximum(weight, 1e-9)
+        for four in self.quaternions:
+            columns = list(four)
+            variance[columns] = 4.0 / 3.0 * squares[columns].sum() / max(weight[columns].sum(), 1e-9)
+        sigma = np.sqrt(variance)
         sigma = np.maximum(np.maximum(sigma, _SHRINK * self.sigma), self.floor)
         count = known.sum(axis=0)
         pi = np.clip(1.0 - weight / np.maximum(count, 1), *_FRACTION)
         seen = count >= _FEWEST
         pi = np.where(seen & outliers, pi, self.pi)
-        return Mixture(np.where(seen, sigma, self.sigma), pi, self.span, self.floor)
+        return replace(self, sigma=np.where(seen, sigma, self.sigma), pi=pi)
 
 
 def lower_scale(residuals: FloatArray, known: BoolArray) -> FloatArray:

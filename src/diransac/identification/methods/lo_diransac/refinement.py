@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
@@ -175,7 +175,9 @@ def start(
     low = np.where(intervals.known, intervals.measured, np.inf).min(axis=0)
     high = np.where(intervals.known, intervals.measured, -np.inf).max(axis=0)
     fraction = np.full(len(sigma), 0.3 if settings.outliers else 0.0)
-    noise = Mixture(sigma, fraction, np.where(high > low, high - low, 1.0), floor)
+    seen: BoolArray = np.asarray(intervals.known.any(axis=0))
+    whole = [four for four in intervals.model.quaternions if seen[list(four)].all()]
+    noise = Mixture(sigma, fraction, np.where(high > low, high - low, 1.0), floor, whole)
     sizes = prior.unit * np.r_[np.full(len(shared) - 1, prior.guarded), prior.delay]
     sizes[: len(p)] = intervals.layout.prior_std
     mean = np.concatenate([intervals.layout.prior_mean, np.zeros(len(shared) - len(p))])

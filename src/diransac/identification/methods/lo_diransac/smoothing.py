@@ -24,6 +24,7 @@ from scipy.ndimage import maximum_filter1d, median_filter
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
+from diransac.data.checks import rows_per_sample
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.simulation.compiler import compile_map
 
@@ -217,6 +218,7 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
         rates = np.zeros((len(measured), model.n_q))
         for d in range(model.n_q):
             signals[:, [d]], rates[:, d] = smoother.smoothed(measured[:, [d]], known[:, [d]], centre[:, [d]])
+        _project(model, signals, rates, known)
         n_x = model.n_q + len(model.velocities_of_motion)
         lacking = model.n_q + np.flatnonzero(~known[:, model.n_q : n_x].any(axis=0))
         if len(lacking):
@@ -234,6 +236,20 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
             signals[near, k] = smoothed[near, 0]
     rows, seen = np.arange(len(signals)), np.flatnonzero(~log.gaps)
     return signals if log.gaps.all() else np.column_stack([np.interp(rows, seen, x[seen]) for x in signals.T])
+
+
+def _project(model: Model, signals: FloatArray, rates: FloatArray, known: BoolArray) -> None:
+    """Scale smoothed quaternions to unit norm, and their rates by the same factor, in place.
+
+    The error of a polynomial in the four components is of the order of the fit's along the norm, and vanishes there.
+    """
+    for four in model.quaternions:
+        columns = list(four)
+        if known[:, columns].any(axis=0).all():
+            norms = np.linalg.norm(signals[:, columns], axis=1, keepdims=True)
+            factor = 1.0 / np.where(norms > _FLOOR, norms, 1.0)
+            signals[:, columns] *= factor
+            rates[:, columns] *= factor
 
 
 def _velocities_of_rates(
@@ -331,9 +347,10 @@ def choose_half_width(model: Model, logs: Sequence[Samples], dt: float, narrowes
         Number of samples.
     """
     longest = max(len(log.measured) for log in logs)
-    first = max(_FEWEST, min(round(narrowest / dt), _ENOUGH_SAMPLES))
+    apart = max(rows_per_sample(np.asarray(log.known.any(axis=1))) for log in logs)
+    first = max(_FEWEST * apart, min(round(narrowest / dt), _ENOUGH_SAMPLES))
     widths = [first * 3**k for k in range(20) if k == 0 or 8 * first * 3**k < longest]
-    losses = [_prediction_error(model, logs, dt, half, max(1, half // first)) for half in widths]
+    losses = [_prediction_error(model, logs, dt, half, max(1, half // first) if apart == 1 else 1) for half in widths]
     return int(widths[int(np.argmin(losses))])
 
 
@@ -346,18 +363,26 @@ def _prediction_error(model: Model, logs: Sequence[Samples], dt: float, half: in
         for name in ("measured", "known", "centre")
     )
     about = _joined(model, [log.centre for log in logs])
-    even, near = np.arange(len(offsets)) % 2 == 0, np.abs(offsets) <= half // 2
+    near = np.abs(offsets) <= half // 2
     basis = _basis(offsets / half, half * dt)
     loss = 0.0
     for columns in _chains(model):
         values, oks = measured[:, columns][rows], known[:, columns][rows]
         first = values - centre[:, columns][rows]
         spread = _spread(about[:, columns])
-        fitted = _fit(values, oks & even[:, None], first, basis[: len(columns)], spread)
-        scale = _scale(values - fitted, oks & (near & ~even)[:, None])
+        even = _every_other(oks)
+        fitted = _fit(values, oks & even, first, basis[: len(columns)], spread)
+        scale = _scale(values - fitted, oks & near[:, None] & ~even)
         seen = oks.any(axis=(0, 1))
         loss += float(np.log(np.maximum(scale, _FLOOR * spread + 1e-12))[seen].sum())
     return loss
+
+
+def _every_other(known: BoolArray) -> BoolArray:
+    """Every other row ``(K, n_t, c)``, and of the samples of slow signals every other one."""
+    rows = np.arange(known.shape[1])[:, None] % 2 == 0
+    slow = known.mean(axis=(0, 1)) < 0.5
+    return np.asarray(np.where(slow, np.cumsum(known, axis=1) % 2 == 1, rows))
 
 
 def _joined(model: Model, logs: Sequence[FloatArray]) -> FloatArray:
@@ -399,7 +424,7 @@ def _spread_of_known(values: FloatArray) -> FloatArray:
 
 
 def running_median(measured: FloatArray, known: BoolArray, window: int) -> FloatArray:
-    """Median over a window of rows; gaps are interpolated linearly.
+    """Median over a window of rows, of 5 samples at least; missing samples are interpolated linearly between medians.
 
     Parameters
     ----------
@@ -414,15 +439,12 @@ def running_median(measured: FloatArray, known: BoolArray, window: int) -> Float
     (N, n) array
         0 in signals without a measured sample.
     """
-    rows, bridged = np.arange(len(measured)), np.zeros(measured.shape)
+    rows, medians = np.arange(len(measured)), np.zeros(measured.shape)
     for i in np.flatnonzero(known.any(axis=0)):
-        bridged[:, i] = np.interp(rows, rows[known[:, i]], measured[known[:, i], i])
-    return _medians(bridged, window)
-
-
-def _medians(columns: FloatArray, window: int) -> FloatArray:
-    """Running median of each column; SciPy has a faster algorithm for one dimension."""
-    return np.asarray(np.column_stack([median_filter(x, size=window, mode="mirror") for x in columns.T]))
+        at = rows[known[:, i]]
+        size = max(_FEWEST, 2 * (window // rows_per_sample(known[:, i]) // 2) + 1)
+        medians[:, i] = np.interp(rows, at, median_filter(measured[at, i], size=min(size, window), mode="mirror"))
+    return medians
 
 
 def _basis(t: FloatArray, unit: float) -> FloatArray:

@@ -1,0 +1,291 @@
+"""Coordinates that are continuous in time: angles without their wraps, quaternions without changes of sign.
+
+An angle modulo one turn, and a quaternion up to its sign, are points of a circle and of a projective sphere.  Both are
+compared with the medoid of a few neighbours there: the sample whose distances from all others in the window sum to the
+least.  It is a sample that was measured, whatever the outliers beside it, and the sequence of medoids is continued from
+one to the next.  An outlier therefore neither adds a turn nor changes a sign for the samples after it.
+
+References
+----------
+Kaufman and Rousseeuw 1990, "Finding Groups in Data" (medoid).  Huynh 2009, "Metrics for 3D Rotations" (distances up to
+sign).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.units import one_turn
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Container, Mapping, Sequence
+
+    from diransac.data.log import Log
+    from diransac.model import Model
+
+__all__ = ["continuous", "continuous_quaternions", "unit_quaternions", "unwrap", "whole_quaternions"]
+
+
+# Samples to either side of the one whose medoid is sought, at most; samples of the running medians.
+_REACH, _REACH_OF_ATTITUDES, _WINDOW, _PERSISTS = 5, 3, 25, 5
+# In turns: departures from the medoid that are always or never those of a good sample; deviation of a leap from one
+# turn beside the motion; the margin by which good samples leave the turn to which an angle is wrapped.
+_CLOSE, _FAR, _NEARLY, _MARGIN = 0.05, 0.25, 0.1, 0.02
+_USUAL_MIDDLES = (0.0, 0.5)
+# Fraction of the good samples that lie within that turn, at least.
+_INSIDE = 0.95
+_MANY_SIGMA, _MUCH_MOTION = 8.0, 3.0
+_MAD_TO_STD = 1.4826
+# Difference of two components that counts at most, and the weight of uncapped components, which breaks ties.
+_CAP, _TIE = 1.0, 1e-9
+# Relative deviations of a quaternion's norm that are its own, and those that are rounding errors.
+_OWN_NORM, _ROUNDING = 0.1, 1e-9
+
+
+def continuous(log: Log, model: Model) -> Log:
+    """Log with the coordinates of a model as continuous functions of time.
+
+    Parameters
+    ----------
+    log : Log
+    model : Model
+        Coordinates in rad or deg are angles; `Model.quaternions` are unit quaternions.
+
+    Returns
+    -------
+    Log
+        The same log if nothing is to be changed.  Otherwise angles are unwrapped, as in `unwrap`, and quaternions that
+        are in the log as a whole have a continuous sign and unit norm.
+    """
+    angles = {name: turn for name, unit in model.coordinates.items() if name in log and (turn := one_turn(unit))}
+    log = _without_wraps(log, angles)
+    for names in whole_quaternions(log.signals, model):
+        log = _with_one_sign(log, names)
+    return log
+
+
+# ---------------------------------------------------------------------- angles
+
+
+def unwrap(log: Log, names: Sequence[str] | None = None) -> Log:
+    """Log with the leaps by one turn removed from wrapped angles.
+
+    Parameters
+    ----------
+    log : Log
+    names : sequence of str, optional
+        Angles; the turn is 360 for a signal in degrees, 2 pi otherwise.  None: the signals whose unit is one of angles.
+
+    Raises
+    ------
+    LogError
+        There is no such signal.
+
+    Notes
+    -----
+    A leap is a wrap if it is one turn to within the motion from sample to sample and a tenth of a turn, also across
+    missing samples, and if the signal lies within one turn.  Outliers keep their distance from the angle.
+    """
+    turns = {name: one_turn(log.units.get(name, "1")) for name in (log.names if names is None else names)}
+    return _without_wraps(log, {n: x or 2.0 * math.pi for n, x in turns.items() if x or names is not None})
+
+
+def _without_wraps(log: Log, turns: Mapping[str, float]) -> Log:
+    """Log with its wrapped ones among the named angles unwrapped; name -> one turn, in the signal's unit."""
+    found = {name: _revolutions(log[name], turn) for name, turn in turns.items()}
+    wrapped = {name: k for name, k in found.items() if k.any()}
+    if not wrapped:
+        return log
+    signals = {**log.signals, **{name: log[name] + turns[name] * k for name, k in wrapped.items()}}
+    leaps = {name: int((np.diff(k) != 0).sum()) for name, k in wrapped.items()}
+    notes = [f'"{name}" was wrapped to one turn; {n} jumps are removed' for name, n in leaps.items()]
+    return log.with_step({"step": "unwrap", "jumps": leaps}, signals=signals, notes=notes)
+
+
+def _revolutions(values: FloatArray, turn: float) -> IntArray:
+    """Whole turns ``(N,)`` that are missing in each sample of an angle; all 0 if it is not wrapped."""
+    k = np.zeros(len(values), np.int64)
+    rows = np.flatnonzero(np.isfinite(values))
+    y = values[rows] / turn
+    if len(y) < 2 or np.abs(np.diff(y)).max() <= 0.5:
+        return k
+    motion = _motion(y, rows)
+    good = _agreeing(y, motion)
+    middle = _middle_of_leaps(y[good], motion[good])
+    inside = np.abs(y - middle) <= 0.5 + _MARGIN
+    if not good.any() or median_filter(inside[good], size=_PERSISTS, mode="mirror").mean() < _INSIDE:
+        return k
+    good &= inside
+    angle = _continued(y[good], rows[good])
+    found = np.round(angle - y[good]).astype(np.int64)
+    if not _is_wrapped(y[good], found, middle):
+        return k
+    first = int(np.median(found[:_PERSISTS]))
+    k = found[_nearest(rows[good], len(values))] - first
+    off = np.interp(rows, rows[good], angle) - y
+    close = inside & (np.abs(_remainder(off)) <= np.minimum(_CLOSE + _MUCH_MOTION * motion, _FAR))
+    k[rows[close]] = np.round(off[close]).astype(np.int64) - first
+    return k
+
+
+def _agreeing(y: FloatArray, motion: FloatArray) -> BoolArray:
+    """Samples ``(N,)`` of an angle, in turns, that are close on the circle to a medoid with which most others agree."""
+    reach = int(np.clip(_FAR / max(float(np.quantile(motion, 0.9)), _CLOSE), 1, _REACH))
+    around = _neighbours(len(y), reach)
+    usual = y[_medoids(y[:, None], lambda a, b: np.abs(_remainder(a - b)[:, 0]), around)]
+    off = np.abs(_remainder(usual - y))
+    close = off <= np.clip(_MANY_SIGMA * _MAD_TO_STD * np.median(off) + _MUCH_MOTION * motion, _CLOSE, _FAR)
+    agreement = np.abs(_remainder(y[around] - usual[:, None])) <= np.minimum(_CLOSE + reach * motion, _FAR)[:, None]
+    return np.asarray(close & (agreement.mean(axis=1) >= 0.5))
+
+
+def _remainder(turns: FloatArray) -> FloatArray:
+    """Difference of two angles, in turns, on the circle: from -1/2 to 1/2."""
+    return np.asarray(turns - np.round(turns))
+
+
+def _motion(y: FloatArray, rows: IntArray) -> FloatArray:
+    """Usual size ``(N,)`` of the step on the circle that leads to each sample, in turns; a gap lasts for several."""
+    lasting = np.diff(rows)
+    per_row = median_filter(np.abs(_remainder(np.diff(y))) / lasting, size=_WINDOW, mode="mirror")
+    return np.concatenate([per_row[:1], per_row * lasting])
+
+
+def _continued(y: FloatArray, rows: IntArray) -> FloatArray:
+    """Angles ``(N,)``, in turns, continued by steps that are nearest to those of the usual rate around them."""
+    steps, lasting = np.diff(y), np.diff(rows)
+    expected = lasting * median_filter(_remainder(steps) / lasting, size=_WINDOW, mode="mirror")
+    return np.cumsum(np.r_[y[:1], expected + _remainder(steps - expected)])
+
+
+def _middle_of_leaps(y: FloatArray, motion: FloatArray) -> float:
+    """Middle of the turn to which an angle is wrapped, from its leaps by nearly a turn; NaN without any.
+
+    0 and half a turn are usual, and found from one leap.  Of several, it is that of the turn with the most samples.
+    """
+    leaps = np.abs(np.diff(y))
+    is_wrap = np.abs(leaps - 1.0) <= np.minimum(_NEARLY + _MUCH_MOTION * motion[1:], _FAR)
+    if not is_wrap.any():
+        return np.nan
+    middles = (0.5 * (y[1:] + y[:-1]))[is_wrap]
+    usual = [x for x in _USUAL_MIDDLES if (np.abs(middles - x) <= _MARGIN + 0.5 * motion[1:][is_wrap]).any()]
+    return max([*usual, float(np.median(middles))], key=lambda x: float((np.abs(y - x) <= 0.5 + _MARGIN).mean()))
+
+
+def _is_wrapped(y: FloatArray, k: IntArray, middle: float) -> bool:
+    """True if revolutions ``k`` of good samples, in turns, change for good, or at the ends of a usual turn alone."""
+    usual = median_filter(k, size=_PERSISTS, mode="mirror")
+    leaps = np.flatnonzero(np.diff(k))
+    beyond = np.abs(np.abs(np.r_[y[leaps], y[leaps + 1]] - middle) - 0.5)
+    at_ends = bool(len(leaps)) and middle in _USUAL_MIDDLES and bool((beyond <= _MARGIN).all())
+    return at_ends or bool((usual != usual[0]).any())
+
+
+def _nearest(at: IntArray, n: int) -> IntArray:
+    """Index ``(n,)`` of the nearest of some ascending rows."""
+    return np.searchsorted(0.5 * (at[1:] + at[:-1]), np.arange(n))
+
+
+# ---------------------------------------------------------------------- quaternions
+
+
+def whole_quaternions(names: Container[str], model: Model) -> list[list[str]]:
+    """Names of the components of each of a model's quaternions that is among some signals as a whole."""
+    coordinates = list(model.coordinates)
+    found = [[coordinates[k] for k in four] for four in model.quaternions]
+    return [own for own in found if all(name in names for name in own)]
+
+
+def unit_quaternions(q: FloatArray) -> FloatArray:
+    """Quaternions ``(N, 4)`` scaled to unit norm; those of norm zero are left as they are."""
+    norms = np.linalg.norm(q, axis=1, keepdims=True)
+    return q / np.where(norms > 0.0, norms, 1.0)
+
+
+def continuous_quaternions(q: FloatArray) -> FloatArray:
+    """Unit quaternions of one sign: each is nearer to its neighbours than its opposite is.
+
+    Parameters
+    ----------
+    q : (N, 4) array
+        Quaternions; NaN where a component is missing.
+
+    Returns
+    -------
+    (N, 4) array
+        Of unit norm where all four components are there and none of them is an outlier, which would spread to the
+        others; all others are divided by the median norm.  The first rows have the sign that most of them have.
+    """
+    whole = np.flatnonzero(np.isfinite(q).all(axis=1))
+    norms = np.linalg.norm(q[whole], axis=1)
+    usual_norm = float(np.median(norms)) if len(whole) else 0.0
+    if not usual_norm > 0.0:
+        return q
+    scaled, around = q / usual_norm, _neighbours(len(whole), _REACH_OF_ATTITUDES)
+    medoid = scaled[whole][_medoids(scaled[whole], lambda a, b: np.minimum(*_distances(a, b)), around)]
+    medoid *= np.cumprod(np.r_[1.0, _signs(medoid[1:], medoid[:-1])])[:, None]
+    signs = _signs(scaled, medoid[_nearest(whole, len(q))])
+    if np.median(signs[whole[:_PERSISTS]]) < 0.0:
+        signs = -signs
+    divisor = np.full(len(q), usual_norm)
+    divisor[whole] = np.where(np.abs(norms / usual_norm - 1.0) <= _OWN_NORM, norms, usual_norm)
+    divisor[np.abs(divisor - 1.0) <= _ROUNDING] = 1.0
+    return np.asarray(q * (signs / divisor)[:, None])
+
+
+def _distances(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances ``(N,)`` of quaternions from others and from their opposites; an outlying component counts little."""
+    near, far = (np.nan_to_num(np.abs(x)) for x in (a - b, a + b))
+    near, far = (np.minimum(x, _CAP) + _TIE * x for x in (near, far))
+    return near.sum(axis=1), far.sum(axis=1)
+
+
+def _signs(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Sign ``(N,)`` with which each quaternion is nearer to another."""
+    near, far = _distances(a, b)
+    return np.where(near <= far, 1.0, -1.0)
+
+
+def _with_one_sign(log: Log, names: Sequence[str]) -> Log:
+    q = np.column_stack([log[name] for name in names])
+    found = continuous_quaternions(q)
+    if np.array_equal(found, q, equal_nan=True):
+        return log
+    flipped = int((np.nansum(found * q, axis=1) < 0.0).sum())
+    signals = {**log.signals, **dict(zip(names, found.T, strict=True))}
+    note = (
+        f"{', '.join(names)} change sign in {flipped} of {len(q)} rows, which is the same attitude; they are continued"
+    )
+    return log.with_step(
+        {"step": "align", "quaternion": list(names), "rows": flipped}, signals=signals, notes=[note] if flipped else []
+    )
+
+
+# ---------------------------------------------------------------------- medoids
+
+
+def _neighbours(n: int, reach: int) -> IntArray:
+    """Indices ``(n, 2 reach + 1)`` of the samples about each, mirrored at both ends; fewer where there are fewer."""
+    reach = min(reach, n - 1)
+    padded = np.pad(np.arange(n), reach, mode="reflect")
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1))
+
+
+def _medoids(
+    points: FloatArray, distance: Callable[[FloatArray, FloatArray], FloatArray], around: IntArray
+) -> IntArray:
+    """Index ``(N,)`` of the medoid of the neighbours of each of the points ``(N, n)``; of equals, the nearest."""
+    total = np.zeros(around.shape)
+    for i in range(around.shape[1]):
+        for j in range(i):
+            apart = distance(points[around[:, i]], points[around[:, j]])
+            total[:, i] += apart
+            total[:, j] += apart
+    order = np.argsort(np.abs(np.arange(around.shape[1]) - around.shape[1] // 2), kind="stable")
+    chosen = order[np.argmin(total[:, order], axis=1)]
+    return np.asarray(around[np.arange(len(points)), chosen])
