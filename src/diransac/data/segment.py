@@ -204,7 +204,7 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     model : Model
     log : Log
     also : sequence of str, optional
-        Signals in use besides those that the equations name; rows without a sample of a sensor among them count, too.
+        Signals in use besides those that the equations name.
     pointwise : bool, optional
         Whether the equations are evaluated at each row, which needs every signal that they name.
 
@@ -231,9 +231,10 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     inputs, held = _held_inputs(model, log)
     measured = np.column_stack([log[n] for n in signals])
     gaps = long_runs(held, _LONG_HOLD) | silent_rows(np.isfinite(measured), log.dt)
-    critical = [i for i, n in enumerate(signals) if n in needed or (n in also and n not in model.sensors)]
+    critical = [i for i, n in enumerate(signals) if n in needed or n in also]
     known = np.isfinite(measured[:, critical])
-    valid = _complete(known, pointwise) & np.isfinite(inputs).all(axis=1) & ~gaps
+    is_sensor = np.array([signals[i] in model.sensors for i in critical], bool)
+    valid = _complete(known, is_sensor, pointwise) & np.isfinite(inputs).all(axis=1) & ~gaps
     if not valid.any():
         raise LogError(
             f"{log.source}: no row has a value in every signal in use ({', '.join(used)}); found NaN in each"
@@ -265,13 +266,13 @@ def runs(mask: BoolArray) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _complete(known: BoolArray, pointwise: bool) -> BoolArray:
+def _complete(known: BoolArray, is_sensor: BoolArray, pointwise: bool) -> BoolArray:
     """Rows ``(N,)`` that count, of samples ``(N, n)`` that are known.
 
-    Without equations at each row, slow signals, which have samples in fewer than half of the rows, are compared where
-    they have one; a row without a sample of any signal does not count.
+    Sensors are compared where they have a sample.  Without equations at each row, so are slow signals, which have
+    samples in fewer than half of the rows.  A row without a sample of any signal does not count.
     """
-    slow = np.zeros(known.shape[1], bool) if pointwise else known.mean(axis=0) < _SLOW
+    slow = is_sensor if pointwise else is_sensor | (known.mean(axis=0) < _SLOW)
     if not slow.any():
         return np.asarray(known.all(axis=1))
     return np.asarray(known.any(axis=1) & (known | slow).all(axis=1))
