@@ -1,5 +1,7 @@
 """Systematic errors of the sensors: a delay of each signal or group of signals, and a bias.
 
+A sensor is here whatever measures a signal, with a measurement equation or without.
+
 An error of a sensor that no parameter and no discrepancy explains is in the residuals: a delay in
 proportion to the signal's rate, a bias a constant.  A score test finds the most significant error, given all
 else that is estimated; it costs a call of the simulator, and no fit.  The error is then estimated jointly with all
@@ -55,7 +57,9 @@ class SensorError:
     ratio: float
 
 
-def clear_errors(intervals: ShootingIntervals, fit: Fit, *, delays: bool, biases: bool) -> list[SensorError]:
+def clear_errors(
+    intervals: ShootingIntervals, fit: Fit, among: BoolArray, *, delays: bool, biases: bool
+) -> list[SensorError]:
     """Errors of the sensors that the residuals show most clearly: one of a single signal, and one of a group.
 
     Parameters
@@ -63,6 +67,8 @@ def clear_errors(intervals: ShootingIntervals, fit: Fit, *, delays: bool, biases
     intervals : ShootingIntervals
     fit : Fit
         At its optimum.
+    among : (n_s,) bool array
+        Signals whose errors are tested.
     delays, biases : bool
         Kinds of errors that are tested.
 
@@ -71,7 +77,7 @@ def clear_errors(intervals: ShootingIntervals, fit: Fit, *, delays: bool, biases
     list of SensorError
         Empty if no error is clear.
     """
-    tested = [x for x in _candidates(intervals) if (delays if x[1] else biases)]
+    tested = [x for x in _candidates(intervals, among) if (delays if x[1] else biases)]
     found = _score_tests(intervals, fit, tested) if tested else []
     clear = [x for x in found if x.ratio > _CLEAR and (not x.is_delay or abs(x.size) > _LEAST_DELAY)]
     kinds = [[x for x in clear if (x.signals.sum() > 1) == of_group] for of_group in (False, True)]
@@ -169,14 +175,18 @@ def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return np.nan_to_num(rates, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _candidates(intervals: ShootingIntervals) -> list[tuple[BoolArray, bool]]:
-    """Signals and kinds of the errors that are tested: of each signal, and delays of coordinates, velocities, ..."""
+def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[tuple[BoolArray, bool]]:
+    """Signals and kinds of the errors that are tested: of each signal, and delays of coordinates, velocities, ...
+
+    The bias of a sensor that has one as a parameter is not tested.
+    """
     model = intervals.model
     seen = intervals.known.sum(axis=0) >= _FEWEST
     n = len(model.velocities_of_motion)
-    kind = np.repeat([0, 1, 3, 2, 3], [model.n_q, n, model.n_v - n, n, model.n_v - n])
-    single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen)]
-    groups = [(kind == g) & seen for g in range(3)]
+    kind = np.repeat([0, 1, 3, 2, 3, 4], [model.n_q, n, model.n_v - n, n, model.n_v - n, len(model.sensors)])
+    single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen & among)]
+    groups = [(kind == g) & seen & among for g in (0, 1, 2, 4)]
     groups = [x for x in groups if 1 < x.sum() < seen.sum()]
     delays = [(x, True) for x in [*groups, *single] if not (x == seen).all()]
-    return [*delays, *((x, False) for x in single)]
+    biased = np.array([n in model.biased_sensors for n in model.signals])
+    return [*delays, *((x, False) for x in single if not biased[x].any())]
