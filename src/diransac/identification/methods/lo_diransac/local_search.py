@@ -183,23 +183,27 @@ class LocalSearch:
             report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
             errors = clear_errors(best.intervals, best.refinement.fit, tested, **kinds)
             others = [self._refitted(best, with_error(best.intervals, best.refinement.fit, x)) for x in errors]
-            other = min(others, key=lambda x: x.cost, default=best)
-            if other.cost > best.cost - _WORTH:
+            likelier = self._better(best, others, _WORTH, of_one=True)
+            if likelier is best:
                 break
-            best = other
+            best = likelier
         return best
 
-    def _better(self, now: Explanation, others: Sequence[Explanation]) -> Explanation:
-        """The likeliest explanation of which another timing of the inputs is worth to be believed.
+    def _better(
+        self, now: Explanation, others: Sequence[Explanation], worth: float = _AS_LIKELY, *, of_one: bool = False
+    ) -> Explanation:
+        """The likeliest explanation of which another timing, or an error of a sensor, is worth to be believed.
 
-        A controller's inputs answer disturbances, so that late inputs predict these.  Where the model is not exact, a
-        delay must also explain a good part of the accelerations that are otherwise unmodelled.
+        A controller's inputs answer disturbances, so that late inputs predict these, as late sensors do.  Where the
+        model is not exact, either must also explain a good part of the accelerations that are otherwise unmodelled:
+        of all together, or of one.
         """
-        others = [
-            x
-            for x in others
-            if x.cost < now.cost - _AS_LIKELY and (x.exact or _unexplained(x) < _unexplained(now) - _EXPLAINS)
-        ]
+
+        def explains(x: Explanation) -> bool:
+            lower = _unexplained(now) - _unexplained(x)
+            return bool((lower.max() if of_one else lower.sum()) > _EXPLAINS)
+
+        others = [x for x in others if x.cost < now.cost - worth and (x.exact or explains(x))]
         return min(others, key=lambda x: x.cost, default=now)
 
     def _from_hypotheses(self, intervals: ShootingIntervals, k: int) -> Explanation:
@@ -377,10 +381,10 @@ def fewest_parts(length: int) -> int:
     return next((k for k in range(2, length // _SHORTEST + 1) if length % k == 0), 0)
 
 
-def _unexplained(found: Explanation) -> float:
-    """Sum over the equations of the log of the RMS acceleration that the model does not explain."""
+def _unexplained(found: Explanation) -> FloatArray:
+    """Log of the RMS acceleration ``(n_v,)`` that the model does not explain."""
     left = estimate_parameters(found.intervals, found.refinement.fit, 1.0).unexplained
-    return float(np.log(np.sqrt(np.square(left[found.intervals.occupied]).mean(axis=0)) + 1e-300).sum())
+    return np.asarray(np.log(np.sqrt(np.square(left[found.intervals.occupied]).mean(axis=0)) + 1e-300))
 
 
 def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:

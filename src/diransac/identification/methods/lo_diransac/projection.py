@@ -3,7 +3,7 @@
 Where the model is exact, the parameters of the fit are the estimate.  Where it is not, the log is explained by
 parameters and discrepancies together, in proportions that depend on the noise.  The estimate is then that of least
 squares on noise-free data: ``W p = b`` is solved again on the fitted motion, so that the component of the discrepancies
-in the regressor's column space is attributed to the parameters.  Equations are weighted by their residuals.
+in the regressor's column space is attributed to the parameters.  Equations are weighted by their inertial forces.
 
 Inputs are no instruments: a controller answers disturbances, and its inputs are correlated with them (Forssell, Ljung
 1999).  Nor are any needed: the fitted accelerations are posterior means, whose errors are uncorrelated with themselves,
@@ -35,7 +35,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.hypotheses import WeakForm, equation_scales
+from diransac.identification.methods.lo_diransac.hypotheses import WeakForm
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.methods.lo_diransac.smoothing import split_signals
@@ -181,8 +181,10 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     M = means_of_intervals(intervals, M)
     latent = np.einsum("wij,wj->wi", M, fit.d)
     means = means_of_intervals(intervals, W)
-    p, gains, stuck = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent), _REWEIGHTED)
-    plain = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent), 0)[0]
+    scale = np.sqrt(np.square(np.einsum("wij,wj->wi", M, means_of_intervals(intervals, motion[2]))).mean(axis=0))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    p, gains, stuck = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent), scale, _REWEIGHTED)
+    plain = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent), scale, 0)[0]
     by_rows, by_means = gains
     of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + n_v, n_p))
     level = np.hstack([np.ones((len(push), 1)), intervals.inputs])
@@ -208,12 +210,13 @@ def _bounded_projection(
     now: FloatArray,
     rows: tuple[FloatArray, FloatArray],
     means: tuple[FloatArray, FloatArray],
+    scale: FloatArray,
     reweighted: int,
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], BoolArray]:
     """Parameters within inclusive bounds, gains of rows (n, N, n_v) and of means (n, W, n_v), and those on a bound.
 
-    Arguments are the parameters of the fit, regressors with residuals of rows and of interval means, and the number of
-    steps of reweighting.
+    Arguments are the parameters of the fit, regressors with residuals of rows and of interval means, the inertial force
+    of each equation, and the number of steps of reweighting.
     """
     lower = np.array([-np.inf if x.positive else x.lower for x in intervals.layout.bounds])
     upper = np.array([x.upper for x in intervals.layout.bounds])
@@ -222,7 +225,7 @@ def _bounded_projection(
         free = ~stuck
         left = means[1] + means[0][:, :, stuck] @ (p - now)[stuck]
         known = means[0][:, :, free] @ now[free] - left - means_of_intervals(intervals, rows[1])
-        weights = _robust_weights(intervals, WeakForm(means[0][:, :, free], known), reweighted)
+        weights = _robust_weights(intervals, WeakForm(means[0][:, :, free], known), scale, reweighted)
         gains = tuple(np.zeros((len(now), *x.shape[:2])) for x, _ in (rows, means))
         for gain, (W, _), one in zip(
             gains, (rows, means), (np.repeat(weights, intervals.length, axis=0), weights), strict=True
@@ -237,12 +240,14 @@ def _bounded_projection(
     return p, (gains[0], gains[1]), stuck
 
 
-def _robust_weights(intervals: ShootingIntervals, rows: WeakForm, steps: int) -> FloatArray:
+def _robust_weights(intervals: ShootingIntervals, rows: WeakForm, scale: FloatArray, steps: int) -> FloatArray:
     """Square roots of the weights ``(W, n_v)``: of the equations by their scales, and of intervals by Cauchy's loss.
 
-    A gust of a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.
+    Scales are inertial forces, so that unmodelled accelerations count by their share of the motion: an equation that is
+    wrong throughout, as by the gain of its input, has its say on the parameters that it shares with others.  A gust of
+    a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.
     """
-    scale, loss = equation_scales(rows), np.ones(rows.b.shape)
+    loss = np.ones(rows.b.shape)
     for _ in range(steps):
         gains = least_squares_gains(rows.W, loss / scale)
         left = rows.b - rows.W @ np.einsum("pwi,wi->p", gains, rows.b)

@@ -31,6 +31,8 @@ __all__ = ["SensorError", "clear_errors", "error_of_sensor", "with_error"]
 
 # Standard errors from which on an error of a sensor is tried, and its least delay, samples.
 _CLEAR, _LEAST_DELAY = 3.0, 0.1
+# Groups of which a fit is made at a time.
+_GROUPS = 4
 # Signals that are known in fewer rows than this are not tested.
 _FEWEST = 50
 
@@ -60,7 +62,9 @@ class SensorError:
 def clear_errors(
     intervals: ShootingIntervals, fit: Fit, among: BoolArray, *, delays: bool, biases: bool
 ) -> list[SensorError]:
-    """Errors of the sensors that the residuals show most clearly: one of a single signal, and one of a group.
+    """Errors of the sensors that the residuals show most clearly: one of a single signal, and some of groups.
+
+    Groups that are late alike show nearly as clearly as others that are early; fits of each tell them apart.
 
     Parameters
     ----------
@@ -80,8 +84,9 @@ def clear_errors(
     tested = [x for x in _candidates(intervals, among) if (delays if x[1] else biases)]
     found = _score_tests(intervals, fit, tested) if tested else []
     clear = [x for x in found if x.ratio > _CLEAR and (not x.is_delay or abs(x.size) > _LEAST_DELAY)]
-    kinds = [[x for x in clear if (x.signals.sum() > 1) == of_group] for of_group in (False, True)]
-    return [max(kind, key=lambda x: x.ratio) for kind in kinds if kind]
+    clear.sort(key=lambda x: x.ratio, reverse=True)
+    single = [x for x in clear if x.signals.sum() == 1]
+    return [*single[:1], *[x for x in clear if x.signals.sum() > 1][:_GROUPS]]
 
 
 def error_of_sensor(intervals: ShootingIntervals, fit: Fit, name: str, *, is_delay: bool) -> SensorError | None:
@@ -176,17 +181,20 @@ def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
 
 
 def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[tuple[BoolArray, bool]]:
-    """Signals and kinds of the errors that are tested: of each signal, and delays of coordinates, velocities, ...
+    """Signals and kinds of the errors that are tested: of each signal, and delays of groups.
 
-    The bias of a sensor that has one as a parameter is not tested.
+    A group are the coordinates, the velocities, ..., or those of one unit, as one instrument measures them.  The bias
+    of a sensor that has one as a parameter is not tested.
     """
     model = intervals.model
     seen = intervals.known.sum(axis=0) >= _FEWEST
     n = len(model.velocities_of_motion)
     kind = np.repeat([0, 1, 3, 2, 3, 4], [model.n_q, n, model.n_v - n, n, model.n_v - n, len(model.sensors)])
     single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen & among)]
-    groups = [(kind == g) & seen & among for g in (0, 1, 2, 4)]
-    groups = [x for x in groups if 1 < x.sum() < seen.sum()]
+    unit = np.array([model.units[n] for n in model.signals])
+    masks = [kind == g for g in (0, 1, 2, 4)]
+    masks += [mask & (unit == u) for mask in masks for u in dict.fromkeys(unit[mask])]
+    groups = {x.tobytes(): x for x in (mask & seen & among for mask in masks) if 1 < x.sum() < seen.sum()}.values()
     delays = [(x, True) for x in [*groups, *single] if not (x == seen).all()]
     biased = np.array([n in model.biased_sensors for n in model.signals])
     return [*delays, *((x, False) for x in single if not biased[x].any())]
