@@ -17,7 +17,7 @@ from diransac.errors import (
     SettingsError,
     StudyError,
 )
-from diransac.model import Disturbance, Model, Parameter, Plant
+from diransac.model import Disturbance, Model, Parameter, Plant, Sensor, sensors
 from diransac.model import library as models
 
 if TYPE_CHECKING:
@@ -75,6 +75,7 @@ __all__ = [
     "Result",
     "ResultError",
     "ScikitLearnEstimator",
+    "Sensor",
     "Settings",
     "SettingsError",
     "Study",
@@ -100,6 +101,7 @@ __all__ = [
     "resample",
     "run_study",
     "scale",
+    "sensors",
     "shift",
     "sine",
     "square",

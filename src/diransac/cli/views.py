@@ -179,7 +179,9 @@ class Equations:
     def __str__(self) -> str:
         model = self.model
         signals = [["signal", "unit", ""]]
-        signals += [[name, model.units[name], "predicted"] for name in model.signals]
+        signals += [
+            [name, model.units[name], "sensor" if name in model.sensors else "predicted"] for name in model.signals
+        ]
         signals += [[name, unit, "input"] for name, unit in model.inputs.items()]
         rows = [["parameter", "unit", "bounds"]]
         rows += [[name, parameter.unit, _bounds(parameter)] for name, parameter in model.parameters.items()]

@@ -18,7 +18,7 @@ from diransac.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from diransac.model import Model, Parameter
 
-__all__ = ["Dataset", "ParameterLayout", "as_logs", "distinct_logs"]
+__all__ = ["Dataset", "ParameterLayout", "as_logs", "distinct_logs", "usable_sensors"]
 
 
 # Relative difference of two sampling times below which they are one rate with another jitter.
@@ -165,6 +165,50 @@ def distinct_logs(logs: Log | Iterable[Log]) -> tuple[Log, ...]:
             found = f"{one.source} is given twice" if one.source == other.source else same
             raise LogError(f"{found}; give each log once: repeated samples are no further evidence")
     return several
+
+
+def usable_sensors(model: Model, logs: Sequence[Log], *, regression: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Sensors of a model that can be used.
+
+    Parameters
+    ----------
+    model : Model
+    logs : sequence of Log
+    regression : bool
+        Whether sensors are used as rows of ``W p = b``: affine in the parameters, of measured signals.  Other sensors
+        remain where they have no parameters of their own, because simulations are compared with them.
+
+    Returns
+    -------
+    sensors : tuple of str
+    notes : tuple of str
+        Reasons for those that are left out, a sentence each.
+    """
+    absent = [n for n in model.sensors if not any(n in log for log in logs)]
+    reasons = dict.fromkeys(absent, "no log has such a signal")
+    if regression:
+        reasons |= {n: reason for n in model.sensors if n not in absent and (reason := _unusable(model, n, logs))}
+    left = {x for n in model.sensors if n not in reasons for x in model.sensor_arguments[n]}
+    own = {n: [x for x in model.sensor_arguments[n] if x in model.sensor_parameters and x not in left] for n in reasons}
+    notes = []
+    for reason in dict.fromkeys(reasons.values()):
+        alike = [n for n, x in reasons.items() if x == reason]
+        lost = dict.fromkeys(x for n in alike for x in own[n])
+        if lost or alike[0] not in absent:
+            with_parameters = f" with {', '.join(lost)}, which only sensors depend on" if lost else ""
+            notes.append(f"the fit leaves {', '.join(alike)} out{with_parameters}: {reason}")
+    used = tuple(n for n in model.sensors if n not in absent and not own.get(n))
+    return used, tuple(notes)
+
+
+def _unusable(model: Model, sensor: str, logs: Sequence[Log]) -> str:
+    """Reason why a sensor gives no rows of a regression; empty if it does."""
+    if sensor not in model.affine_sensors:
+        return "a regression needs sensors that are affine in the parameters"
+    needed = [n for n in model.sensor_arguments[sensor] if n in model.signals]
+    having = [log for log in logs if sensor in log]
+    missing = [[n for n in needed if n not in log] for log in having]
+    return f"{', '.join(missing[0])} in the measurement equation is not measured" if all(missing) else ""
 
 
 @dataclass(frozen=True)

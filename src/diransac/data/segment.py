@@ -110,7 +110,17 @@ class Segment:
         for name in self.present:
             full[:, self.model.signals.index(name)] = self.column(name)
         n_q, n_v = self.model.n_q, self.model.n_v
-        return full[:, :n_q], full[:, n_q : n_q + n_v], full[:, n_q + n_v :]
+        return full[:, :n_q], full[:, n_q : n_q + n_v], full[:, n_q + n_v : n_q + 2 * n_v]
+
+    def sensor_samples(self) -> FloatArray:
+        """Measured sensors ``(N, n_y)`` of the model; NaN where one, or a signal in it, is missing."""
+        model, samples = self.model, np.full((len(self), len(self.model.sensors)), np.nan)
+        for k, name in enumerate(model.sensors):
+            needed = [name, *(n for n in model.sensor_arguments[name] if n in model.signals)]
+            if set(needed) <= set(self.present):
+                usable = np.all([np.isfinite(self.column(n)) for n in needed], axis=0)
+                samples[usable, k] = self.column(name)[usable]
+        return samples
 
     def acting_inputs(self) -> FloatArray:
         """Inputs ``(N, n_u)`` that belong to each row's accelerations; see `preprocessing.acting_inputs`."""
@@ -223,7 +233,8 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     gaps = long_runs(held, _LONG_HOLD) | silent_rows(np.isfinite(measured), log.dt)
     critical = [i for i, n in enumerate(signals) if n in needed or n in also]
     known = np.isfinite(measured[:, critical])
-    valid = _complete(known, pointwise) & np.isfinite(inputs).all(axis=1) & ~gaps
+    is_sensor = np.array([signals[i] in model.sensors for i in critical], bool)
+    valid = _complete(known, is_sensor, pointwise) & np.isfinite(inputs).all(axis=1) & ~gaps
     if not valid.any():
         raise LogError(
             f"{log.source}: no row has a value in every signal in use ({', '.join(used)}); found NaN in each"
@@ -255,13 +266,13 @@ def runs(mask: BoolArray) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _complete(known: BoolArray, pointwise: bool) -> BoolArray:
+def _complete(known: BoolArray, is_sensor: BoolArray, pointwise: bool) -> BoolArray:
     """Rows ``(N,)`` that count, of samples ``(N, n)`` that are known.
 
-    Without equations at each row, slow signals, which have samples in fewer than half of the rows, are compared where
-    they have one; a row without a sample of any signal does not count.
+    Sensors are compared where they have a sample.  Without equations at each row, so are slow signals, which have
+    samples in fewer than half of the rows.  A row without a sample of any signal does not count.
     """
-    slow = np.zeros(known.shape[1], bool) if pointwise else known.mean(axis=0) < _SLOW
+    slow = is_sensor if pointwise else is_sensor | (known.mean(axis=0) < _SLOW)
     if not slow.any():
         return np.asarray(known.all(axis=1))
     return np.asarray(known.any(axis=1) & (known | slow).all(axis=1))

@@ -24,8 +24,8 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
 from diransac.errors import IdentificationError, SettingsError
 from diransac.identification.identifiability import NullSpace, null_space
+from diransac.identification.regression import regression_rows
 from diransac.identification.uncertainty import score_inflation
-from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -535,8 +535,9 @@ def name_of(estimator: Estimator) -> str:
 def regression(dataset: Dataset) -> tuple[FloatArray, FloatArray]:
     """``W (N, r, n)`` and ``b (N, r)`` of the rows that count, eqs. (1) and (5), log after log.
 
-    Where a log's signals were derived by a filter, the same filter acts on both sides of the equation.  A per-log
-    parameter has a column per log, which is zero in the rows of the others.
+    Sensors that are affine in the parameters are further equations; their rows are zero where a signal in them is
+    missing.  Where a log's signals were derived by a filter, the same filter acts on both sides of the equation.  A
+    per-log parameter has a column per log, which is zero in the rows of the others.
 
     Parameters
     ----------
@@ -558,9 +559,8 @@ def regression(dataset: Dataset) -> tuple[FloatArray, FloatArray]:
 
 def _segment_regression(one: Segment) -> tuple[FloatArray, FloatArray]:
     """Rows of one log in its own parameters."""
-    model, log = one.model, one.log
-    W, b = compile_map(model.regressor)(*one.state_arrays(), one.acting_inputs())
-    W = W.reshape(len(one), model.n_p, model.n_v).transpose(0, 2, 1)
+    log = one.log
+    W, b = regression_rows(one.model, *one.state_arrays(), one.acting_inputs(), one.sensor_samples())
     W, b = (preprocessing.filter_rows(log.filter, log.dt, rows, one.valid) for rows in (W, b))
     return np.ascontiguousarray(W[one.valid]), np.ascontiguousarray(b[one.valid])
 

@@ -82,7 +82,7 @@ def judged_signals(model: Model, logs: Sequence[Log], settings: Settings) -> tup
     logs : sequence of Log
     settings : Settings
         Weights and thresholds; where either is None, the default signals are compared: velocities and accelerations,
-        and coordinates whose velocity is not measured, as far as every log has them.
+        coordinates whose velocity is not measured, and sensors, as far as every log has them.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def judged_signals(model: Model, logs: Sequence[Log], settings: Settings) -> tup
 
 
 def _judged_by_default(model: Model, measured: Sequence[str]) -> tuple[str, ...]:
-    rates = [n for n in (*model.velocities, *model.accelerations) if n in measured]
+    rates = [n for n in (*model.velocities, *model.accelerations, *model.sensors) if n in measured]
     if model.kinematics is not None:
         bare = [] if any(n in measured for n in model.velocities) else [q for q in model.coordinates if q in measured]
     else:
@@ -138,7 +138,7 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
                 f"{dataset.source}: {', '.join(scales)} are constant; nothing moves in this log. Record a motion"
             )
         moving = {n: scale for n, scale in scales.items() if scale > 0.0}
-        slow = dataset.model.accelerations
+        slow = _with_accelerations(dataset.model)
         if weights is None:
             weights = {n: (_ACCELERATION_WEIGHT if n in slow else 1.0) / x for n, x in moving.items()}
         if thresholds is None:
@@ -157,6 +157,12 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     notes = [f"{n} is constant and is not compared" for n in constant]
     notes.append(f"a row is an inlier if {needed} of {n_signals} signals are within their thresholds: {compared}")
     return Scoring(w, eps, needed, tuple(notes))
+
+
+def _with_accelerations(model: Model) -> tuple[str, ...]:
+    """Names of the accelerations, and of the sensors that depend on them."""
+    sensors = [n for n, used in model.sensor_arguments.items() if not set(used).isdisjoint(model.accelerations)]
+    return (*model.accelerations, *sensors)
 
 
 # ---------------------------------------------------------------------- simulation
@@ -396,7 +402,7 @@ def _incomplete_scores(
     thresholds: FloatArray,
     min_inlier_signals: int,
 ) -> ScoreBatch:
-    """Scores of a log with slow signals, each of which is compared where it has samples.
+    """Scores of a log with slow signals, or sensors, each of which is compared where it has samples.
 
     The mean square of a signal is that of its samples, and counts for all rows that count.  Of the signals that a row
     lacks, none need be an inlier: a row needs the same fraction of its own.

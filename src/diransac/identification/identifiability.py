@@ -222,7 +222,7 @@ def _random_parameters(bounds: Sequence[Parameter], rng: np.random.Generator) ->
 
 
 def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Rows ``(n, n_p)`` of ``dr/dp`` at random motions that satisfy the equations, each of unit size."""
+    """Rows ``(n, n_p)`` of ``dr/dp`` and ``dy/dp`` at random motions that satisfy the equations, each of unit size."""
     n = max(_N_MOTIONS, _PER_PARAMETER * model.n_p)
     q, v, u = (_random_numbers((size, n), rng) for size in (model.n_q, model.n_v, model.n_u))
     for four in model.quaternions:
@@ -230,8 +230,11 @@ def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator) -> F
     repeated = np.repeat(p[:, None], n, axis=1)
     a = np.array(model.dynamics(np.vstack([q, v]), u, repeated)[1])
     symbols = [ca.SX.sym(name, model.residual.size1_in(i)) for i, name in enumerate("qvaup")]
-    slope = ca.Function("slope", symbols, [ca.densify(ca.jacobian(model.residual(*symbols), symbols[4]))])
-    J = np.array(slope(q, v, a, u, repeated)).reshape(model.n_v, n, model.n_p).reshape(-1, model.n_p)
+    outputs = model.residual(*symbols)
+    if model.measurement is not None:
+        outputs = ca.vertcat(outputs, model.measurement(*symbols))
+    slope = ca.Function("slope", symbols, [ca.densify(ca.jacobian(outputs, symbols[4]))])
+    J = np.array(slope(q, v, a, u, repeated)).reshape(outputs.numel(), n, model.n_p).reshape(-1, model.n_p)
     size = np.abs(J).max(axis=1)
     usable = np.isfinite(size) & (size > 0.0) & (size < 1e100)
     return np.asarray(J[usable] / size[usable, None])
@@ -242,7 +245,7 @@ def _output_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, meas
 
     Motions are sequences of Euler's steps, which have the symmetries of the equations.
     """
-    n_x, n_q = len(model.state), model.n_q
+    n_x, n_q, sensor_slopes = len(model.state), model.n_q, _sensor_slopes(model)
     rows, blocks = [model.signals.index(n) for n in measured], []
     for _ in range(_N_TRAJECTORIES):
         x, step = rng.normal(size=n_x), 0.0
@@ -254,9 +257,11 @@ def _output_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, meas
             A, _, P = (np.array(ca.DM(J)) for J in model.rate_jacobians(x, u, p))
             step = step or _STEP / max(1.0, float(np.linalg.norm(A)))
             moved_x, moved_p = A @ of_x, A @ of_p + P
-            seen_x.append(np.vstack([of_x, moved_x[n_q:]])[rows])
-            seen_p.append(np.vstack([of_p, moved_p[n_q:]])[rows])
-            x = x + step * np.array(model.dynamics(x, u, p)[0]).ravel()
+            x_dot, a = (np.array(value).ravel() for value in model.dynamics(x, u, p))
+            C, D, S = (np.array(ca.DM(J)) for J in sensor_slopes(x, a, u, p))
+            seen_x.append(np.vstack([of_x, moved_x[n_q:], C @ of_x + D @ moved_x[n_q:]])[rows])
+            seen_p.append(np.vstack([of_p, moved_p[n_q:], C @ of_p + D @ moved_p[n_q:] + S])[rows])
+            x = x + step * x_dot
             of_x, of_p = of_x + step * moved_x, of_p + step * moved_p
         J_x, J_p = np.concatenate(seen_x), np.concatenate(seen_p)
         if np.isfinite(J_x).all() and np.isfinite(J_p).all():
@@ -264,6 +269,14 @@ def _output_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, meas
             U = U[:, sizes > _RANK_OF_OUTPUTS * sizes[0]]
             blocks.append(J_p - U @ (U.T @ J_p))
     return np.concatenate(blocks) if blocks else np.zeros((0, model.n_p))
+
+
+def _sensor_slopes(model: Model) -> ca.Function:
+    """Function ``(x, a, u, p) -> dy/d(x, a, p)`` of the sensors, three matrices."""
+    sizes = {"x": len(model.state), "a": model.n_v, "u": model.n_u, "p": model.n_p}
+    x, a, u, p = (ca.SX.sym(name, n) for name, n in sizes.items())
+    y = model.readings(x, a, u, p)
+    return ca.Function("sensor_slopes", [x, a, u, p], [ca.jacobian(y, z) for z in (x, a, p)])
 
 
 def _random_numbers(shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:

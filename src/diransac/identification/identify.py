@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diransac.data import preprocessing
-from diransac.data.dataset import Dataset, distinct_logs
+from diransac.data.dataset import Dataset, distinct_logs, usable_sensors
 from diransac.data.log import Log
 from diransac.errors import DiransacError, SettingsError
 from diransac.identification.agreement import disagreements
@@ -186,7 +186,8 @@ class _Task:
 
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
         """Identify from prepared logs."""
-        criteria, model = self.method.criteria, self.known.free()
+        known, unused = self._observed(logs)
+        criteria, model = self.method.criteria, known.free()
         judged = judged_signals(model, logs, criteria)
         dataset = Dataset.of(
             model,
@@ -195,7 +196,7 @@ class _Task:
             pointwise=self.pointwise,
             given=self.given,
             input_hold=self.input_hold,
-            priors=self.known.priors_of_fit,
+            priors=known.priors_of_fit,
         )
         check_motion(dataset)
         fitted = 0.5 if self.compares else 0.95
@@ -208,20 +209,26 @@ class _Task:
             remarks, incomparable = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
         report(progress, "done", 1.0)
         return Result(
-            model=self.known.model,
+            model=known.model,
             method=self.method.name,
             seed=self.seed,
             settings=criteria,
             options=dict(self.method.options()),
-            estimate=self.known.completed(estimate, len(logs)),
+            estimate=known.completed(estimate, len(logs)),
             evaluation=evaluation,
             logs=_summaries(
                 dataset, evaluation, remarks, predictions(estimate, evaluation, dataset, scoring, criteria)
             ),
-            notes=(*dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x), *incomparable),
-            fixed=tuple(n for n in self.known.model.parameters if n in self.known.fixed),
-            priors=dict(self.known.priors),
+            notes=(*unused, *dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x), *incomparable),
+            fixed=tuple(n for n in known.model.parameters if n in known.fixed),
+            priors=dict(known.priors),
         )
+
+    def _observed(self, logs: Sequence[Log]) -> tuple[KnownParameters, tuple[str, ...]]:
+        """The known parameters of the model with the sensors that the method can use, and notes on the others."""
+        free = self.known.free()
+        used, notes = usable_sensors(free, logs, regression=self.method.regresses(free))
+        return self.known.of_model(self.known.model.with_sensors(used)), notes
 
     def with_suggestions(self, progress: Callback | None) -> Result:
         """The result of the model with the terms that a first identification suggests; its notes name them."""
@@ -229,9 +236,9 @@ class _Task:
         note = "no terms were suggested; the model is the given one"
         if found.suggestions:
             note = f"terms were added to the model as suggested: {'; '.join(x.text for x in found.suggestions)}"
-            known = dataclasses.replace(self.known, model=with_terms(self.known.model, found.suggestions))
-            extended = dataclasses.replace(self, known=known)
-            found = extended.run(self.given, within(progress, 0.5, 1.0, "with suggested terms: "))
+            extended = with_terms(found.model, found.suggestions)
+            task = dataclasses.replace(self, known=self.known.of_model(extended))
+            found = task.run(self.given, within(progress, 0.5, 1.0, "with suggested terms: "))
         return dataclasses.replace(found, notes=(note, *found.notes))
 
     def with_sensitivity(self, result: Result, derived: Sequence[Log], progress: Callback | None) -> Result:

@@ -12,7 +12,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
-from diransac.data.dataset import Dataset
+from diransac.data.dataset import Dataset, usable_sensors
 from diransac.errors import IdentificationError, LogError
 from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.evaluation import choose_scoring
@@ -253,6 +253,7 @@ def _fitness(log: Log, model: Model) -> Fitness:
             model.name, missing, derivable, {}, f"not affine in {names}: excitation is known only after identification"
         )
     try:
+        model = model.with_sensors(usable_sensors(model, [derived], regression=True)[0])
         dataset = Dataset.of(model, derived)
         check_motion(dataset)
         ambiguous = structural(model)

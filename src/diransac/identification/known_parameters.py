@@ -84,6 +84,11 @@ class KnownParameters:
             raise SettingsError(f"{both[0]} is fixed and has a prior; give one of them")
         return cls(model, values, beforehand)
 
+    def of_model(self, model: Model) -> KnownParameters:
+        """What is known of the parameters of another model, which has some of them."""
+        fixed = {n: x for n, x in self.fixed.items() if n in model.parameters}
+        return KnownParameters(model, fixed, {n: x for n, x in self.priors.items() if n in model.parameters})
+
     @cached_property
     def held(self) -> tuple[str, ...]:
         """Parameters with a prior that are constants of `free`, because the equations do not determine them.

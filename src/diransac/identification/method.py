@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
     from diransac.identification.estimate import Estimate
     from diransac.identification.settings import Settings
+    from diransac.model import Model
 
 __all__ = ["Callback", "Method", "Progress", "fit", "report", "within"]
 
@@ -55,6 +56,9 @@ class Method(Protocol):
     @property
     def needs_all_signals(self) -> bool:
         """True if the method evaluates the equations at each row and needs every signal in them."""
+
+    def regresses(self, model: Model) -> bool:
+        """True if the method solves ``W p = b``, in which a sensor must be affine in the parameters."""
 
     @property
     def uses(self) -> tuple[str, ...]:

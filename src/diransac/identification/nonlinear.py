@@ -1,7 +1,8 @@
-"""Nonlinear least squares of the accelerations, for models that are not affine in their parameters.
+"""Nonlinear least squares of the accelerations and the sensors, for models that are not affine in their parameters.
 
 The error is that of the predicted acceleration, not that of the equation: an equation can be multiplied by any function
-of the parameters, and its error vanishes with that function; the error of an acceleration does not.
+of the parameters, and its error vanishes with that function; the error of an acceleration does not.  Sensors are
+predicted from the predicted accelerations.
 
 A Gaussian prior ``p_j = m +- s`` is a further error ``(sigma / s) (p_j - m)`` of each fit, with sigma as in
 `estimators`: from the errors of that fit without priors, and their correlation in time.
@@ -20,6 +21,7 @@ from diransac.identification.estimators import (
     BoundEstimator,
     OrdinaryLeastSquares,
     correlations,
+    regression,
     smallest_eigenvalue,
     solve_definite,
 )
@@ -55,11 +57,12 @@ _LOG_BOUND = 27.6
 
 @dataclass(frozen=True)
 class NonlinearLeastSquares:
-    """Least squares of ``(a - a_model(q, v, u, p)) / rms(a)`` within the parameters' bounds.
+    """Least squares of ``(a - a_model(q, v, u, p)) / rms(a)``, and of sensors over their spread, within the bounds.
 
     No starting value is required: ``n_starts`` points spread over six decades, or over the bounds, are evaluated on
     the rows to be fitted, and the best few are refined by Levenberg and Marquardt's method.  Where the model is affine
-    in its parameters, the solution of the linear regression is refined, too.
+    in its parameters, the solution of the linear regression is refined, too; where only sensors are not, all points
+    have the parameters that it determines.
 
     Parameters
     ----------
@@ -88,29 +91,35 @@ class NonlinearLeastSquares:
 
 
 class _BoundNonlinear:
-    """Measured accelerations of the usable rows, and the compiled model of them."""
+    """Measured accelerations and sensors of the usable rows, and the compiled model of them."""
 
     def __init__(self, settings: NonlinearLeastSquares, dataset: Dataset) -> None:
         self._settings, self._layout = settings, dataset.layout
         model = dataset.model
         known = [i for i, n in enumerate(model.accelerations) if n in dataset.common_signals]
-        parts = [_usable(one, known) for one in dataset.segments]
-        self._state, self._inputs, self._accelerations = (np.concatenate(x) for x in zip(*parts, strict=True))
+        shown = [i for i, n in enumerate(model.sensors) if n in dataset.signals]
+        parts = [_usable(one, known, shown) for one in dataset.segments]
+        self._state, self._inputs, self._measured = (np.concatenate(x) for x in zip(*parts, strict=True))
+        self._missing = np.isnan(self._measured)
         self._log_of_row = np.repeat(np.arange(len(parts)), [len(x) for x, _, _ in parts])
-        self._scale = np.sqrt(np.square(self._accelerations).mean(axis=0))
+        self._scale = np.sqrt(np.square(self._measured[:, : len(known)]).mean(axis=0))
+        self._scale = np.append(self._scale, _spreads(self._measured[:, len(known) :]))
         self._scale[self._scale == 0.0] = 1.0
         self._chart = ParameterChart(self._layout.bounds)
-        self._evaluate = _compiled(model, known)
+        self._evaluate = _compiled(model, known, shown)
         self.n_rows = len(self._state)
         self._n_p = len(self._layout)
         self._starts = self._chart.starts(settings.n_starts)
-        self._linear = None if model.nonlinear_parameters else OrdinaryLeastSquares().bind(dataset)
+        self._linear = OrdinaryLeastSquares().bind(dataset) if model.is_affine else None
+        if not (model.is_affine or model.nonlinear_parameters):
+            determined, values = _solution_of_affine_part(dataset)
+            self._starts[:, determined] = self._chart.clip(self._chart.to_free(values[None]))[:, determined]
         self._inflation = 1.0
         everything = np.arange(self.n_rows)[None]
         whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // _ROWS_FOR_WHOLE)]))
         self._starts = np.vstack([whole, self._starts])
         errors, J = self._errors(everything, whole)
-        errors, J = errors.reshape(self.n_rows, len(known)), J.reshape(self.n_rows, len(known), -1)
+        errors, J = errors.reshape(self.n_rows, len(self._scale)), J.reshape(self.n_rows, len(self._scale), -1)
         scale = np.sqrt(np.square(J).mean(axis=(0, 1)))
         J = J / np.where(scale > 0.0, scale, 1.0)
         self._blocks = np.einsum("nri,nrj->nij", J, J)
@@ -239,8 +248,11 @@ class _BoundNonlinear:
         a, da = self._evaluate(self._state[flat], self._inputs[flat], own)
         da = self._scattered(da.reshape(len(flat), own.shape[1], len(self._scale)).transpose(0, 2, 1), flat)
         with np.errstate(over="ignore", invalid="ignore"):
-            errors = ((a - self._accelerations[flat]) / self._scale).reshape(n_lanes, -1)
+            errors = ((a - self._measured[flat]) / self._scale).reshape(n_lanes, -1)
             J = (da / self._scale[:, None]).reshape(n_lanes, -1, self._n_p) * slope[:, None, :]
+        if self._missing.any():
+            missing = self._missing[flat].reshape(n_lanes, -1)
+            errors[missing], J[missing] = 0.0, 0.0
         bad = ~(np.all(np.abs(errors) < _HUGE, axis=1) & np.all(np.abs(J) < _HUGE, axis=(1, 2)))
         errors[bad], J[bad] = np.inf, 0.0
         if prior is None:
@@ -307,10 +319,28 @@ class _SelectedRows:
         return self.bound.fit(self.row_sets)
 
 
-def _usable(one: Segment, known: Sequence[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """States, inputs and known accelerations of one log's usable rows."""
+def _usable(one: Segment, known: Sequence[int], shown: Sequence[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """States, inputs, and known accelerations and sensors of one log's usable rows; sensors may be NaN."""
     q, v, a = (x[one.valid] for x in one.state_arrays())
-    return np.hstack([q, v]), one.acting_inputs()[one.valid], a[:, known]
+    measured = a[:, known]
+    if shown:
+        measured = np.hstack([measured, one.sensor_samples()[one.valid][:, shown]])
+    return np.hstack([q, v]), one.acting_inputs()[one.valid], measured
+
+
+def _spreads(sensors: FloatArray) -> list[float]:
+    """Standard deviation of the finite values of each sensor; 0 without any."""
+    finite = [x[np.isfinite(x)] for x in sensors.T]
+    return [float(x.std()) if len(x) else 0.0 for x in finite]
+
+
+def _solution_of_affine_part(dataset: Dataset) -> tuple[BoolArray, FloatArray]:
+    """Parameters ``(n,)`` in the equations and in affine sensors, as a mask, and their ordinary least squares."""
+    W, b = regression(dataset)
+    rows = W.reshape(-1, W.shape[2])
+    scale = np.abs(rows).max(axis=0)
+    solved = np.linalg.lstsq(rows / np.where(scale > 0.0, scale, 1.0), b.ravel(), rcond=None)[0]
+    return scale > 0.0, solved / np.where(scale > 0.0, scale, 1.0)
 
 
 class ParameterChart:
@@ -356,11 +386,14 @@ class ParameterChart:
         return self.clip(np.where(both, low + rng.uniform(0.0, 1.0, shape) * (high - low), points))
 
 
-def _compiled(model: Model, known: Sequence[int]) -> Map:
-    """Accelerations ``(N, r)`` and ``da/dp (N, n_p r)``, column by column, of rows of (x, u, p)."""
+def _compiled(model: Model, known: Sequence[int], shown: Sequence[int]) -> Map:
+    """Accelerations and sensors ``(N, r)`` and their ``d/dp (N, n_p r)``, column by column, of rows of (x, u, p)."""
     from diransac.simulation.compiler import compile_map
 
     x, u, p = (ca.SX.sym(n, model.dynamics.size1_in(i)) for i, n in enumerate("xup"))
-    a = model.dynamics(x, u, p)[1][list(known)]
+    accelerations = model.dynamics(x, u, p)[1]
+    a = accelerations[list(known)]
+    if shown:
+        a = ca.vertcat(a, model.readings(x, accelerations, u, p)[list(shown)])
     function = ca.Function("accelerations", [x, u, p], ca.cse([a, ca.densify(ca.jacobian(a, p))]))
     return compile_map(function)

@@ -378,7 +378,7 @@ def simulated_parts(observations: Segment, series: FloatArray, restarts: Restart
     return {
         "observations": observations if restarts is None else _restarted(observations, restarts),
         "simulated": series[:, [model.signals.index(name) for name in observations.signals]],
-        "accelerations": dict(zip(model.accelerations, series[:, len(model.state) :].T, strict=True)),
+        "accelerations": {name: series[:, model.signals.index(name)] for name in model.accelerations},
         "restart_period": np.inf if restarts is None else restarts.n_rows * observations.log.dt,
     }
 

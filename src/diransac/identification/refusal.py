@@ -17,7 +17,7 @@ from diransac.arrays import FloatArray
 from diransac.data.checks import rows_per_sample
 from diransac.errors import IdentificationError
 from diransac.identification.identifiability import Ambiguity, NullSpace, in_words, null_space, of_log, structural
-from diransac.simulation.compiler import compile_map
+from diransac.identification.regression import regression_rows
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset, ParameterLayout
@@ -115,23 +115,27 @@ class MotionRows:
     ----------
     q, v, a, u : (N, n_q), (N, n_v), (N, n_v), (N, n_u) array
         Coordinates, velocities, accelerations and inputs, each in its unit.
+    y : (N, n_y) array
+        Sensors; NaN where one is missing.
     """
 
     q: FloatArray
     v: FloatArray
     a: FloatArray
     u: FloatArray
+    y: FloatArray
 
     def scaled(self, model: Model, factors: Mapping[str, float]) -> MotionRows:
         """The rows with inputs, coordinates and states of first order, and their derivatives, multiplied by factors."""
         names = (model.coordinates, model.rate_names, model.inputs)
         of_q, of_v, of_u = (np.array([factors.get(n, 1.0) for n in group]) for group in names)
-        return MotionRows(self.q * of_q, self.v * of_v, self.a * of_v, self.u * of_u)
+        return MotionRows(self.q * of_q, self.v * of_v, self.a * of_v, self.u * of_u, self.y)
 
 
 def motion_rows(dataset: Dataset) -> list[MotionRows]:
     """Rows of each log that count; 0 in signals that a log lacks."""
-    return [MotionRows(*(x[one.valid] for x in (*one.state_arrays(), one.acting_inputs()))) for one in dataset.segments]
+    parts = ((one.valid, (*one.state_arrays(), one.acting_inputs(), one.sensor_samples())) for one in dataset.segments)
+    return [MotionRows(*(x[valid] for x in arrays)) for valid, arrays in parts]
 
 
 def cause_of_refusal(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> str:
@@ -322,8 +326,9 @@ def _equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]
     parts = []
     for i, one in enumerate(logs):
         every = max(1, len(one.q) // _ENOUGH_ROWS)
-        W, b = compile_map(model.regressor)(*(np.ascontiguousarray(x[::every]) for x in (one.q, one.v, one.a, one.u)))
-        W = layout.scattered(W.reshape(len(b), model.n_p, model.n_v).transpose(0, 2, 1), i)
+        few = (np.ascontiguousarray(x[::every]) for x in (one.q, one.v, one.a, one.u, one.y))
+        W, b = regression_rows(model, *few)
+        W = layout.scattered(W, i)
         parts.append(np.concatenate([W, b[:, :, None]], axis=2))
     rows = np.concatenate(parts)
     rows = rows[(np.abs(rows) < _HUGE).all(axis=(1, 2))]

@@ -125,11 +125,13 @@ def with_terms(model: Model, suggestions: Sequence[Suggestion]) -> Model:
     terms = [deserialize(x.term) for x in suggestions]
     derived = model.kinematics is None
 
+    def arguments(q, v, a, u, p):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+        return [*(ca.vertcat(*x) for x in (q, v, a, u)), ca.vertcat(*(p[n] for n in model.parameters))]
+
     def equations(q, v, a, u, p):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-        own = ca.vertcat(*(p[n] for n in model.parameters))
-        motion = [ca.vertcat(*x) for x in (q, v, a, u)]
-        added = [p[x.parameter] * h(*motion, own) for x, h in zip(suggestions, terms, strict=True)]
-        return list(ca.vertsplit(sum(added, model.residual(*motion, own))))
+        own = arguments(q, v, a, u, p)  # type: ignore[no-untyped-call]
+        added = [p[x.parameter] * h(*own) for x, h in zip(suggestions, terms, strict=True)]
+        return list(ca.vertsplit(sum(added, model.residual(*own))))
 
     def kinematics(q, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
         assert model.kinematics is not None
@@ -146,6 +148,7 @@ def with_terms(model: Model, suggestions: Sequence[Suggestion]) -> Model:
         velocities=None if derived else model.velocities_of_motion,
         kinematics=None if derived else kinematics,
         first_order=model.first_order,
+        sensors=model.sensors_of(arguments),
         description=model.description,
     )
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import ModelError, ResultError
 
 if TYPE_CHECKING:
@@ -84,6 +84,18 @@ def call_user(label: str, what: str, function: Callable[..., Any], *arguments: S
     return column
 
 
+def call_sensor(label: str, name: str, equation: Callable[..., Any], *arguments: Symbols) -> ca.SX:
+    """Value of a sensor's measurement equation.
+
+    Raises ModelError: as `call_user`, or it is not one value.
+    """
+    what = f"equations of sensor {name!r}"
+    value = call_user(label, what, equation, *arguments)
+    if value.shape != (1, 1):
+        raise ModelError(f"{label}: {what} return {value.size1()} x {value.size2()} values; return one for each sensor")
+    return value
+
+
 def check_groups(label: str, units: Mapping[str, object], parameters: object) -> None:
     """Raises ModelError: signals are not mappings from names to units, or parameters from names to `Parameter`."""
     for kind, group in units.items():
@@ -100,7 +112,7 @@ def check_groups(label: str, units: Mapping[str, object], parameters: object) ->
 
 
 def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
-    """Check names of coordinates, velocities, states of first order, both kinds' derivatives, inputs and parameters.
+    """Check names of coordinates, velocities, states of first order, derivatives, inputs, parameters and sensors.
 
     Raises ModelError: a name is not an identifier or is used twice, or there are no states or parameters.
     """
@@ -114,7 +126,7 @@ def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
             raise ModelError(f'{label}: the name "t" is reserved for time; choose another')
         if names.count(name) > 1:
             raise ModelError(f"{label}: the name {name!r} is used twice; signals and parameters need different names")
-    for kind, group in (("coordinates or first_order states", [*groups[0], *groups[2]]), ("parameters", groups[-1])):
+    for kind, group in (("coordinates or first_order states", [*groups[0], *groups[2]]), ("parameters", groups[-2])):
         if not group:
             raise ModelError(f"{label}: there are no {kind}; give at least one")
 
@@ -141,6 +153,17 @@ def check_kinematics(label: str, kinematics: ca.Function) -> None:
             f"{label}: kinematics return {kinematics.numel_out(0)} rates; return one for each of {n} coordinates"
         )
     check_constants(label, "kinematics", kinematics)
+
+
+def check_sensors(label: str, probe: Probe, names: Sequence[str]) -> None:
+    """Raises ModelError: a NaN constant in a sensor's equation, or one that is finite at no random point."""
+    for i, _ in _nan_outputs(probe.residual):
+        raise ModelError(f"{label}: sensor {names[i]!r} contains NaN; use casadi's functions, not Python's math")
+    finite: BoolArray = np.asarray(np.isfinite(np.array(probe.residual(*probe.points))).any(axis=1))
+    for name in (n for n, x in zip(names, finite, strict=True) if not x):
+        raise ModelError(
+            f"{label}: sensor {name!r} is not finite at any of {_N_POINTS} random points; check roots and logarithms"
+        )
 
 
 def check_constants(label: str, what: str, function: ca.Function) -> None:
@@ -210,6 +233,10 @@ class Probe:
         finite = np.isfinite(np.array(self.residual(*points)))
         return bool((found[finite] < _TOLERANCE).all())
 
+    def is_affine_in_parameters(self) -> bool:
+        """True if ``r`` is affine in ``p`` within the bounds and everywhere."""
+        return self.is_affine("p", self.points[4]) and self.is_affine("p", self.everywhere)
+
 
 def _within(parameter: Parameter, rng: np.random.Generator) -> FloatArray:
     """Random values ``(n_points,)`` within a parameter's bounds, away from a strict zero."""
@@ -273,7 +300,7 @@ def mass_matrix_sign(label: str, probe: Probe, mass_matrix: ca.Function, acceler
 
 def nonlinear_parameters(probe: Probe, names: Sequence[str]) -> tuple[str, ...]:
     """Names of the parameters in which the residual is not affine, by evaluation within the bounds and everywhere."""
-    if probe.is_affine("p", probe.points[4]) and probe.is_affine("p", probe.everywhere):
+    if probe.is_affine_in_parameters():
         return ()
     symbols = [ca.SX.sym(n, probe.residual.size1_in(i)) for i, n in enumerate(_ARGUMENTS)]
     r = probe.residual(*symbols)

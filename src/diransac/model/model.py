@@ -8,13 +8,15 @@ come
 * the regressor ``W p = b`` with ``W = dr/dp`` and ``b = W p - r`` (Dimmig et al. 2023, eqs. (1) and (5)),
 * the forward dynamics ``a = -M^-1 r(a=0)`` with ``M = dr/da``,
 * the linearisation of the state equation, with ``M da = -dr``.
+
+Sensors are further outputs ``y = h(q, v, a, u, p)``: the measurement equation of an accelerometer, an encoder, ...
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +28,7 @@ from diransac.errors import ModelError, ResultError
 from diransac.model import derivation
 from diransac.model.derivation import Probe, Symbols
 from diransac.model.parameter import Parameter
+from diransac.model.sensors import Sensor, with_parameters_of
 
 __all__ = ["Model"]
 
@@ -59,6 +62,9 @@ class Model:
     first_order : mapping from name to unit, optional
         States with a first derivative only: in the equations ``v.motor`` is the state and ``a.motor`` its derivative;
         the signals are ``motor`` and ``motor_dot``.
+    sensors : mapping from name to Sensor, optional
+        Measurement equations of further columns of a log: an accelerometer, an encoder, ...; see `diransac.sensors`.
+        Parameters that come with a sensor follow the model's own; one that the model declares itself is the model's.
     description : str
         One line for lists of models.
 
@@ -66,8 +72,8 @@ class Model:
     ------
     ModelError
         A name is unknown or repeated, the number of residuals is wrong, a constant is NaN (such as ``math.sin`` of a
-        symbol), Python code branches on a symbol, the residuals are not affine in the accelerations, or the mass matrix
-        is singular.
+        symbol), Python code branches on a symbol, the residuals are not affine in the accelerations, the mass matrix
+        is singular, or a sensor returns anything but one value.
 
     Notes
     -----
@@ -85,9 +91,13 @@ class Model:
         velocities: Mapping[str, str] | None = None,
         kinematics: Kinematics | None = None,
         first_order: Mapping[str, str] | None = None,
+        sensors: Mapping[str, Sensor] | None = None,
         description: str = "",
     ) -> None:
-        self._name_signals(name, coordinates, inputs, parameters, velocities, first_order or {}, description)
+        parameters = with_parameters_of(f'model "{name}"', sensors, parameters)
+        units = {n: x.unit for n, x in (sensors or {}).items()}
+        groups = (coordinates, inputs, parameters, velocities, first_order or {})
+        self._name_signals(name, *groups, description, units)
         if (velocities is None) != (kinematics is None):
             given, missing = ("velocities", "kinematics") if kinematics is None else ("kinematics", "velocities")
             raise ModelError(f'model "{name}": {given} without {missing}; give both, or neither')
@@ -98,6 +108,11 @@ class Model:
         if kinematics is not None:
             rates = derivation.call_user(self._label, "kinematics", kinematics, *self.named(q, v))
             self.kinematics = ca.Function("kinematics", [q, v], [rates], list("qv"), ["q_dot"])
+        named = self.named(q, v, a, u, p)
+        outputs = [derivation.call_sensor(self._label, n, x.equation, *named) for n, x in (sensors or {}).items()]
+        self.measurement: ca.Function | None = None
+        if outputs:
+            self.measurement = ca.Function("measurement", [q, v, a, u, p], [ca.vertcat(*outputs)], list("qvaup"), ["y"])
         self._check()
 
     # ------------------------------------------------------------------ names and sizes
@@ -111,10 +126,11 @@ class Model:
         velocities: Mapping[str, str] | None,
         first_order: Mapping[str, str],
         description: str,
+        sensors: Mapping[str, str],
     ) -> None:
-        self.name, self.description = name, description
+        self.name, self.description, self.sensors = name, description, dict(sensors)
         units = {"coordinates": coordinates, "inputs": inputs, "velocities": velocities or {}}
-        derivation.check_groups(self._label, {**units, "first_order": first_order}, parameters)
+        derivation.check_groups(self._label, {**units, "first_order": first_order, "sensors": sensors}, parameters)
         self.coordinates, self.inputs, self.parameters = dict(coordinates), dict(inputs), dict(parameters)
         self.first_order = dict(first_order)
         if velocities is None:
@@ -124,7 +140,7 @@ class Model:
             of_motion = dict(velocities)
             accelerations = {f"{v}_dot": _per_second(unit) for v, unit in velocities.items()}
         rates = {f"{s}_dot": _per_second(unit) for s, unit in first_order.items()}
-        groups = (coordinates, of_motion, first_order, accelerations, rates, inputs, parameters)
+        groups = (coordinates, of_motion, first_order, accelerations, rates, inputs, parameters, sensors)
         derivation.check_names(self._label, groups)
         self.velocities, self.accelerations = {**of_motion, **self.first_order}, {**accelerations, **rates}
 
@@ -159,13 +175,13 @@ class Model:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Names of the simulated signals: coordinates, velocities, accelerations."""
-        return (*self.state, *self.accelerations)
+        """Names of the simulated signals: coordinates, velocities, accelerations, sensors."""
+        return (*self.state, *self.accelerations, *self.sensors)
 
     @property
     def units(self) -> dict[str, str]:
         """Unit of every signal and input by name."""
-        return {**self.coordinates, **self.velocities, **self.accelerations, **self.inputs}
+        return {**self.coordinates, **self.velocities, **self.accelerations, **self.sensors, **self.inputs}
 
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
         groups = (self.coordinates, self.velocities, self.accelerations, self.inputs, self.parameters)
@@ -219,9 +235,15 @@ class Model:
         derivation.check_residual(self._label, self.residual, tuple(self.accelerations))
         if self.kinematics is not None:
             derivation.check_kinematics(self._label, self.kinematics)
-        self._probe = Probe(self.residual, tuple(self.parameters.values()))
+        self._probe = Probe(self.residual, self._bounds)
         self._mass_matrix, self._bias = derivation.affine_in_acceleration(self._label, self._probe, self.accelerations)
         self._definite = derivation.mass_matrix_sign(self._label, self._probe, self._mass_matrix, self.accelerations)
+        if self.measurement is not None:
+            derivation.check_sensors(self._label, Probe(self.measurement, self._bounds), tuple(self.sensors))
+
+    @property
+    def _bounds(self) -> tuple[Parameter, ...]:
+        return tuple(self.parameters.values())
 
     @property
     def force_sign(self) -> int:
@@ -236,9 +258,15 @@ class Model:
     @cached_property
     def required_signals(self) -> tuple[str, ...]:
         """Names of the signals and inputs that the residuals depend on, which a pointwise estimator requires."""
-        names = (*self.signals, *self.inputs)
-        q, v, a, u, p = self._symbols()
-        depends = ca.which_depends(self.residual(q, v, a, u, p), ca.vertcat(q, v, a, u), 1, False)
+        used = self._names_in(self.residual)
+        return tuple(n for n in (*self.state, *self.accelerations, *self.inputs) if n in used)
+
+    def _names_in(self, function: ca.Function, output: int | None = None) -> tuple[str, ...]:
+        """Names of the states, accelerations, inputs and parameters that a result, or one element of it, depends on."""
+        names = (*self.state, *self.accelerations, *self.inputs, *self.parameters)
+        symbols = self._symbols()
+        result = function(*symbols)
+        depends = ca.which_depends(result if output is None else result[output], ca.vertcat(*symbols), 1, False)
         return tuple(n for n, d in zip(names, depends, strict=True) if d)
 
     def states_behind(self, signals: Iterable[str]) -> tuple[str, ...]:
@@ -246,7 +274,8 @@ class Model:
         x = ca.vertcat(*(ca.SX.sym(n) for n in self.state))
         u, p = ca.SX.sym("u", self.n_u), ca.SX.sym("p", self.n_p)
         rates, accelerations = self.dynamics(x, u, p)
-        feeds = np.array(ca.DM(ca.jacobian_sparsity(ca.vertcat(x, accelerations), x), 1), dtype=bool)
+        outputs = ca.vertcat(x, accelerations, self.readings(x, accelerations, u, p))
+        feeds = np.array(ca.DM(ca.jacobian_sparsity(outputs, x), 1), dtype=bool)
         wanted = set(signals)
         matter = np.any(feeds[[n in wanted for n in self.signals]], axis=0)
         flows = np.array(ca.DM(ca.jacobian_sparsity(rates, x), 1), dtype=bool)
@@ -258,6 +287,102 @@ class Model:
     def quaternions(self) -> tuple[tuple[int, int, int, int], ...]:
         """Indices of the coordinates that form unit quaternions, found by the norm that ``kinematics`` conserves."""
         return () if self.kinematics is None else derivation.find_quaternions(self.kinematics)
+
+    # ------------------------------------------------------------------ sensors
+
+    @cached_property
+    def sensor_arguments(self) -> dict[str, tuple[str, ...]]:
+        """Names of the states, accelerations, inputs and parameters that each sensor depends on."""
+        if self.measurement is None:
+            return {}
+        return {name: self._names_in(self.measurement, k) for k, name in enumerate(self.sensors)}
+
+    @cached_property
+    def sensor_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that sensors depend on, and no residual."""
+        of_sensors = {n for used in self.sensor_arguments.values() for n in used}
+        of_motion = set(self._names_in(self.residual))
+        return tuple(n for n in self.parameters if n in of_sensors and n not in of_motion)
+
+    @cached_property
+    def biased_sensors(self) -> tuple[str, ...]:
+        """Names of the sensors with a parameter that adds a constant to them."""
+        if self.measurement is None:
+            return ()
+        symbols = self._symbols()
+        slopes = ca.jacobian(self.measurement(*symbols), symbols[4])
+        return tuple(n for k, n in enumerate(self.sensors) if any(map(_is_constant, ca.horzsplit(slopes[k, :]))))
+
+    @cached_property
+    def affine_sensors(self) -> tuple[str, ...]:
+        """Names of the sensors that are affine in the parameters."""
+        return tuple(n for n in self.sensors if self._probe_of_sensors((n,)).is_affine_in_parameters())
+
+    @property
+    def is_affine(self) -> bool:
+        """True if the residuals and all sensors are affine in the parameters."""
+        return not self.nonlinear_parameters and len(self.affine_sensors) == len(self.sensors)
+
+    @cached_property
+    def sensor_regressor(self) -> ca.Function:
+        """Function ``(q, v, a, u) -> (S (n_y, n_p), c (n_y))`` with ``y = S p + c`` for the sensors affine in p.
+
+        Rows of the others are zero.
+        """
+        q, v, a, u, p = self._symbols()
+        S, c = ca.SX(len(self.sensors), self.n_p), ca.SX(len(self.sensors), 1)
+        for k, name in enumerate(self.sensors):
+            if name in self.affine_sensors:
+                S[k, :], c[k] = self._probe_of_sensors((name,)).affine_parts("p", (q, v, a, u, p))
+        return ca.Function("sensor_regressor", [q, v, a, u], [ca.densify(S), ca.densify(c)], list("qvau"), ["S", "c"])
+
+    @cached_property
+    def readings(self) -> ca.Function:
+        """Function ``(x, a, u, p) -> y``: the sensors, by the state and the accelerations that belong to it."""
+        q, v, a, u, p = self._symbols()
+        y = ca.SX(0, 1) if self.measurement is None else self.measurement(q, v, a, u, p)
+        return ca.Function("readings", [ca.vertcat(q, v), a, u, p], [ca.densify(y)], ["x", "a", "u", "p"], ["y"])
+
+    def with_sensors(self, names: Collection[str]) -> Model:
+        """The model with some of its sensors, and without the parameters that only the others depend on.
+
+        The model itself where it has no others.
+        """
+        kept = [n for n in self.sensors if n in names]
+        if len(kept) == len(self.sensors):
+            return self
+        needed = {n for name in kept for n in self.sensor_arguments[name]}
+        parameters = [n for n in self.parameters if n in needed or n not in self.sensor_parameters]
+        q, v, a, u, p = self._symbols()
+        own = [symbol for n, symbol in zip(self.parameters, ca.vertsplit(p), strict=True) if n in parameters]
+        symbols = [q, v, a, u, ca.vertcat(*own)]
+        data = {k: x for k, x in self.to_dict().items() if k not in ("checksum", "sensors", "measurement")}
+        data["parameters"] = {n: data["parameters"][n] for n in parameters}
+        data["residual"] = ca.Function(
+            "residual", symbols, [self.residual(q, v, a, u, p)], list("qvaup"), ["r"]
+        ).serialize()
+        if kept and self.measurement is not None:
+            y = self.measurement(q, v, a, u, p)[[list(self.sensors).index(n) for n in kept]]
+            data["sensors"] = {n: self.sensors[n] for n in kept}
+            data["measurement"] = ca.Function("measurement", symbols, [y], list("qvaup"), ["y"]).serialize()
+        return Model.from_dict({**data, "checksum": _checksum(data)})
+
+    def sensors_of(self, arguments: Callable[..., Sequence[ca.SX]]) -> dict[str, Sensor]:
+        """The sensors for another model, of whose symbols ``arguments(q, v, a, u, p)`` returns this model's vectors."""
+
+        def output(k: int) -> Callable[..., ca.SX]:
+            assert self.measurement is not None
+            h = self.measurement
+            return lambda *symbols: h(*arguments(*symbols))[k]
+
+        return {name: Sensor(unit, output(k)) for k, (name, unit) in enumerate(self.sensors.items())}
+
+    def _probe_of_sensors(self, names: Collection[str]) -> Probe:
+        """Probe of some of the measurement equations."""
+        assert self.measurement is not None
+        symbols = self._symbols()
+        y = self.measurement(*symbols)[[k for k, n in enumerate(self.sensors) if n in names]]
+        return Probe(ca.Function("sensors", list(symbols), [y]), self._bounds)
 
     # ------------------------------------------------------------------ derived functions
 
@@ -345,10 +470,12 @@ class Model:
         if not values:
             return self
 
-        def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[Any]:
-            motion = [ca.vertcat(*x) for x in (q, v, a, u)]
+        def arguments(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[ca.SX]:
             own = ca.vertcat(*(values[n] if n in values else p[n] for n in self.parameters))
-            return [self.residual(*motion, own)]
+            return [*(ca.SX(ca.vertcat(*x)) for x in (q, v, a, u)), own]
+
+        def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[Any]:
+            return [self.residual(*arguments(q, v, a, u, p))]
 
         def kinematics(q: Symbols, v: Symbols) -> list[Any]:
             assert self.kinematics is not None
@@ -364,6 +491,7 @@ class Model:
             velocities=self.velocities_of_motion if has_kinematics else None,
             kinematics=kinematics if has_kinematics else None,
             first_order=self.first_order,
+            sensors=self.sensors_of(arguments),
             description=self.description,
         )
 
@@ -380,8 +508,13 @@ class Model:
         return self._definite * ca.ldl_solve(ca.densify(rhs), D, LT, order)
 
     def equations_text(self) -> tuple[str, ...]:
-        """Every residual as readable text, ``0 = ...``, in the signals' names."""
-        return tuple(f"0 = {r}" for r in ca.vertsplit(self.residual(*self._symbols())))
+        """Every residual as readable text, ``0 = ...``, in the signals' names, and every sensor, ``name = ...``."""
+        symbols = self._symbols()
+        residuals = tuple(f"0 = {r}" for r in ca.vertsplit(self.residual(*symbols)))
+        if self.measurement is None:
+            return residuals
+        outputs = zip(self.sensors, ca.vertsplit(self.measurement(*symbols)), strict=True)
+        return (*residuals, *(f"{name} = {y}" for name, y in outputs))
 
     def parameter_vector(self, parameters: Mapping[str, float]) -> FloatArray:
         """Values ``(n_p,)`` in the model's order.
@@ -429,6 +562,8 @@ class Model:
             "kinematics": None if self.kinematics is None else self.kinematics.serialize(),
             **({"first_order": self.first_order} if self.first_order else {}),
         }
+        if self.measurement is not None:
+            data |= {"sensors": self.sensors, "measurement": self.measurement.serialize()}
         return {**data, "checksum": _checksum(data)}
 
     @classmethod
@@ -454,12 +589,17 @@ class Model:
             raise ResultError("the stored model is damaged: its checksum does not match; identify again")
         parameters = {n: _parameter_from_dict(x) for n, x in data["parameters"].items()}
         units = (data["coordinates"], data["inputs"], parameters, data["velocities"], data.get("first_order", {}))
-        model._name_signals(data["name"], *units, data["description"])
+        model._name_signals(data["name"], *units, data["description"], data.get("sensors", {}))
         model.residual = derivation.deserialize(data["residual"])
         stored = data["kinematics"]
         model.kinematics = None if stored is None else derivation.deserialize(stored)
-        sizes = [model.residual.size1_in(i) for i in range(model.residual.n_in())]
-        if sizes != [model.n_q, model.n_v, model.n_v, model.n_u, model.n_p]:
+        stored = data.get("measurement")
+        model.measurement = None if stored is None else derivation.deserialize(stored)
+        wanted = [model.n_q, model.n_v, model.n_v, model.n_u, model.n_p]
+        functions = [model.residual, *([] if model.measurement is None else [model.measurement])]
+        sizes = [[function.size1_in(i) for i in range(function.n_in())] for function in functions]
+        n_sensors = 0 if model.measurement is None else model.measurement.numel_out(0)
+        if any(found != wanted for found in sizes) or n_sensors != len(model.sensors):
             raise ResultError("the stored model is damaged: its names do not fit its equations; identify again")
         model._check()
         return model
@@ -471,6 +611,11 @@ class Model:
         first_order = f", first_order={list(self.first_order)}" if self.first_order else ""
         names = f"coordinates={list(self.coordinates)}{first_order}, parameters={list(self.parameters)}"
         return f"Model({self.name!r}, {names})"
+
+
+def _is_constant(slope: ca.SX) -> bool:
+    """True for an expression without symbols that is not zero."""
+    return bool(slope.is_constant() and float(slope) != 0.0)
 
 
 def _per_second(unit: str, order: int = 1) -> str:

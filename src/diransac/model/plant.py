@@ -208,7 +208,7 @@ class DisturbedModel:
         self.own_states = (*own, "t") if any(_uses_time(one) for one in self.disturbances) else tuple(own)
         self.parameters = (*model.parameters, *(f"{one.name}.{n}" for one in self.disturbances for n in one.constants))
         self.state = (*model.state, *self.own_states)
-        self.signals = (*self.state, *model.accelerations)
+        self.signals = (*self.state, *model.accelerations, *model.sensors)
         self.quaternions = model.quaternions
 
     @cached_property
@@ -276,6 +276,14 @@ class DisturbedModel:
             forces, accelerations, rates = one.effect(q, v, u, p[: self.model.n_p], ca.vertcat(*values, *state, time))
             effects.append((forces, accelerations, rates))
         return effects
+
+    @cached_property
+    def readings(self) -> ca.Function:
+        """Function ``(x, a, u, p) -> y``: the model's sensors, which show the disturbed accelerations."""
+        sizes = {"x": len(self.state), "a": self.model.n_v, "u": self.n_u, "p": self.n_p}
+        x, a, u, p = (ca.SX.sym(n, size) for n, size in sizes.items())
+        y = self.model.readings(x[: len(self.model.state)], a, u, p[: self.model.n_p])
+        return ca.Function("readings", [x, a, u, p], [y], list(sizes), ["y"])
 
     @cached_property
     def rate_jacobians(self) -> ca.Function:

@@ -174,7 +174,7 @@ def _variables(sensitivities: Sensitivities, values: ca.SX) -> ca.SX:
 
 def _driving(model: SimulatedModel, unknowns: Sequence[str], P: ca.SX) -> ca.SX:
     """P = df/dp, as columns of the unknowns; those of initial states are zero."""
-    columns = ca.horzcat(P, ca.SX(len(model.state), len(model.state)))
+    columns = ca.horzcat(P, ca.SX(P.size1(), len(model.state)))
     names = (*model.parameters, *model.state)
     return columns[:, [names.index(name) for name in unknowns]]
 
@@ -252,12 +252,30 @@ def _expressions(
     after = INTEGRATORS[integrator](rates, columns, h, slope, n_q)
     after = _normalised(after, model.quaternions)
     moved = [after[i, 1 + j] for i, j in sensitivities.entries]
-    acceleration = model.dynamics(states[:n_x], hold.at(inputs, 0.0), p)[1]
+    x, u = states[:n_x], hold.at(inputs, 0.0)
+    acceleration, of_acceleration = model.dynamics(x, u, p)[1], slope[n_q:, 1:]
+    sensors, of_sensors = _readings(model, sensitivities.unknowns, (x, acceleration, u, p), (S, of_acceleration))
     return (
         ca.vertcat(after[:, 0], *moved),
-        ca.vertcat(states[:n_x], acceleration),
-        ca.vertcat(S, slope[n_q:, 1:]),
+        ca.vertcat(x, acceleration, sensors),
+        ca.vertcat(S, of_acceleration, of_sensors),
     )
+
+
+def _readings(
+    model: SimulatedModel, unknowns: Sequence[str], at: Sequence[ca.SX], slopes: Sequence[ca.SX]
+) -> tuple[ca.SX, ca.SX]:
+    """Sensors at ``(x, a, u, p)``, and their derivatives from those of state and accelerations; empty without any."""
+    x, a, u, p = (ca.SX.sym(name, vector.numel()) for name, vector in zip("xaup", at, strict=True))
+    y = model.readings(x, a, u, p)
+    if not y.numel():
+        return ca.SX(0, 1), ca.SX(0, len(unknowns))
+    jacobians = ca.Function("jacobians", [x, a, u, p], [ca.jacobian(y, z) for z in (x, a, p)])
+    C, D, P = jacobians(*at)
+    of_x, of_a = slopes
+    # States of disturbances follow the accelerations in the rates of the state; no sensor depends on them.
+    chained = C @ of_x + D @ of_a[: a.numel(), :] if unknowns else ca.SX(y.numel(), 0)
+    return model.readings(*at), chained + _driving(model, unknowns, P)
 
 
 def _normalised(columns: ca.SX, quaternions: Sequence[Sequence[int]]) -> ca.SX:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from diransac.data.dataset import Dataset
     from diransac.identification.method import Callback
+    from diransac.model import Model
 
 __all__ = ["LeastSquares", "bound_to", "fitted"]
 
@@ -71,6 +72,10 @@ class LeastSquares:
     @property
     def _estimator(self) -> Estimator:
         return self.estimator  # type: ignore[return-value]  # as_estimator made it one
+
+    def regresses(self, model: Model) -> bool:
+        """True unless the estimator is nonlinear."""
+        return not isinstance(self.estimator, NonlinearLeastSquares)
 
     def options(self) -> Mapping[str, Any]:
         """An empty mapping: the estimator has the settings."""

@@ -167,6 +167,10 @@ class RansacMethod(ABC):
             rejected=dict(found.rejected),
         )
 
+    def regresses(self, model: Model) -> bool:
+        """True unless the estimator is nonlinear."""
+        return not isinstance(self._estimator(model), NonlinearLeastSquares)
+
     def _estimator(self, model: Model) -> Estimator:
         if self.estimator is not None:
             return as_estimator(self.estimator)

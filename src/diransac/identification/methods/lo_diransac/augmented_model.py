@@ -8,6 +8,8 @@ All discrepancies are parameters of an ordinary model, so that compiled rollouts
   unmodelled accelerations, free in every interval, would attribute that to the parameters.
 - A delay of the inputs, ``u(t - tau) = u - tau du/dt``.
 
+Sensors measure the motion as it is, unmodelled accelerations included.
+
 References
 ----------
 Kennedy, O'Hagan 2001 (models with a discrepancy); Tremolet 2006 (weak-constraint 4D-Var).
@@ -72,11 +74,16 @@ def augmented_model(model: Model) -> AugmentedModel:
     later, latent = [f"{n}_later" for n in model.inputs], [f"unmodelled_{n}" for n in own]
     discrepancies = [f"discrepancy_{i}_{k}" for i in range(model.n_v) for k in range(model.n_u + 1)]
 
-    def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
-        motion = [_stacked(q, model.coordinates), _stacked(v, own), _stacked(a, own) - _stacked(p, latent)]
+    def arguments(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[ca.SX]:
         applied = _stacked(u, model.inputs) + p.input_delay * _stacked(u, later)
+        motion = [_stacked(q, model.coordinates), _stacked(v, own), _stacked(a, own)]
+        return [*motion, applied, _stacked(p, model.parameters)]
+
+    def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
+        coordinates, velocities, accelerations, applied, parameters = arguments(q, v, a, u, p)
+        modelled = accelerations - _stacked(p, latent)
         forces = ca.reshape(_stacked(p, discrepancies), model.n_u + 1, model.n_v).T @ ca.vertcat(1, applied)
-        return list(ca.vertsplit(model.residual(*motion, applied, _stacked(p, model.parameters)) - forces))
+        return list(ca.vertsplit(model.residual(coordinates, velocities, modelled, applied, parameters) - forces))
 
     def kinematics(q: Symbols, v: Symbols) -> list[object]:
         assert model.kinematics is not None
@@ -91,6 +98,7 @@ def augmented_model(model: Model) -> AugmentedModel:
         velocities=None if derived else model.velocities_of_motion,
         kinematics=None if derived else kinematics,
         first_order=model.first_order,
+        sensors=model.sensors_of(arguments),
     )
     return AugmentedModel(augmented, model.n_p, model.n_v, model.n_u)
 

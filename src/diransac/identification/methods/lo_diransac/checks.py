@@ -116,8 +116,9 @@ def _of_plain_least_squares(
     plain = weak.solve(everything)[0]
     _, variance = _change(weak.W, weak.W @ plain - weak.b)
     error = np.sqrt(variance + np.diag(result.covariance))
-    for name, a, b, s in zip(intervals.layout.names, plain, result.parameters, error, strict=True):
+    solved: BoolArray = np.asarray(weak.W.any(axis=(0, 1)))
+    for name, a, b, s, ok in zip(intervals.layout.names, plain, result.parameters, error, solved, strict=True):
         apart, size = abs(a - b), abs(b)
-        if np.isfinite(s) and apart > _CLEAR * s and apart > _SERIOUS * size:
+        if ok and np.isfinite(s) and apart > _CLEAR * s and apart > _SERIOUS * size:
             text = f"Plain least squares gives {name} = {number(a, 3)}, far outside the interval"
             yield Finding("care", f"{text}: outliers and noise explain that, or the model lacks a term.")

@@ -21,9 +21,9 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.nonlinear import NonlinearLeastSquares
+from diransac.identification.regression import regression_rows
 from diransac.identification.sampling import sample_rows
 from diransac.simulation import Measurements, RolloutBatch, rollouts
-from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset, ParameterLayout
@@ -64,29 +64,58 @@ def find_hypotheses(
     if intervals.model.nonlinear_parameters:
         finalists = _nonlinear(settings, intervals, motion, seed, dataset)
     else:
-        finalists = _linear(settings, intervals, motion, seed)
+        finalists = _linear(settings, intervals, motion, seed, dataset)
     if not len(finalists):
         return finalists
     scores = robust_scores(intervals, motion, finalists, np.arange(len(intervals)))
     return finalists[np.argsort(scores, kind="stable")[: np.isfinite(scores).sum()]]
 
 
-def _linear(settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int) -> FloatArray:
-    """Finalists of a model that is affine in its parameters: the best of least squares of random averages."""
-    weak = weak_form(intervals, motion)
+def _linear(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
+) -> FloatArray:
+    """Finalists of a model that is affine in its parameters: the best of least squares of random averages.
+
+    Parameters that only sensors depend on, but not as affine functions, are those of nonlinear least squares.  Where
+    no log has such a sensor, they are 1 if positive and 0 otherwise, and their variance will be infinite.
+    """
+    weak, layout = weak_form(intervals, motion), dataset.layout
     n = len(intervals)
     few = np.unique(np.linspace(0, n - 1, min(settings.n_screening_intervals, n)).astype(int))
-    samples = _admitted(intervals, weak.solve(_samples(settings, weak, seed), intervals.layout))
+    samples = weak.solve(_samples(settings, weak, seed), layout)
+    missing = _in_sensors_alone(dataset) & ~weak.W.any(axis=(0, 1)) & np.isinf(layout.prior_std)
+    if missing.any() and dataset.model.is_affine:
+        samples[:, missing] = [1.0 if x.positive else 0.0 for x, m in zip(layout.bounds, missing, strict=True) if m]
+    elif missing.any():
+        bound = NonlinearLeastSquares().bind(_smoothed_dataset(intervals, motion, dataset))
+        samples[:, missing] = bound.select([np.arange(bound.n_rows)]).fit()[0][missing]
+    samples = _admitted(intervals, samples)
     if not len(samples):
         return samples
     order = np.argsort(robust_scores(intervals, motion, samples, few), kind="stable")
     return samples[order[: settings.n_finalists]]
 
 
+def _in_sensors_alone(dataset: Dataset) -> BoolArray:
+    """Mask ``(n,)`` of the parameters that no equation of motion depends on."""
+    alone = dataset.model.sensor_parameters
+    return np.array([name.partition("[")[0] in alone for name in dataset.layout.names], bool)
+
+
 def _nonlinear(
     settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
 ) -> FloatArray:
     """Finalists of any model: nonlinear least squares of all and of random rows of the smoothed motion."""
+    bound = NonlinearLeastSquares().bind(_smoothed_dataset(intervals, motion, dataset))
+    n, n_p = bound.n_rows, intervals.n_p
+    rows = sample_rows(seed, np.arange(settings.n_nonlinear_samples), n, 0, min(n, settings.largest_sample * n_p))
+    sizes = _generator(seed).integers(n_p, rows.shape[1] + 1, len(rows))
+    samples = [np.sort(some[:size]) for some, size in zip(rows, sizes, strict=True)]
+    return bound.select([np.arange(n), *samples]).fit()
+
+
+def _smoothed_dataset(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -> Dataset:
+    """The dataset with smoothed signals, of which every row counts."""
     segments = tuple(
         replace(
             one,
@@ -96,12 +125,7 @@ def _nonlinear(
         )
         for one, rows in zip(dataset.segments, intervals.rows_of_logs, strict=True)
     )
-    n, n_p = sum(map(len, segments)), intervals.n_p
-    rows = sample_rows(seed, np.arange(settings.n_nonlinear_samples), n, 0, min(n, settings.largest_sample * n_p))
-    sizes = _generator(seed).integers(n_p, rows.shape[1] + 1, len(rows))
-    samples = [np.sort(some[:size]) for some, size in zip(rows, sizes, strict=True)]
-    bound = NonlinearLeastSquares().bind(replace(dataset, segments=segments))
-    return bound.select([np.arange(n), *samples]).fit()
+    return replace(dataset, segments=segments)
 
 
 @dataclass(frozen=True)
@@ -112,6 +136,7 @@ class WeakForm:
     ----------
     W : (n, r, n_p) array
     b : (n, r) array
+        Of the equations, then of the sensors.
     """
 
     W: FloatArray
@@ -161,29 +186,44 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
     WeakForm
     """
     model, H, layout = intervals.model, intervals.length, intervals.layout
-    n_p, n_v = model.n_p, model.n_v
+    n_p = model.n_p
     bump = np.sin(np.pi * (np.arange(H) + 0.5) / H) ** 2
     bump /= bump.sum()
     Ws, bs = [], []
     for i, rows in enumerate(intervals.rows_of_logs):
-        logged = intervals.is_logged[rows]
-        q, v, a = np.split(motion.signals[rows][logged], [model.n_q, model.n_q + n_v], axis=1)
-        W, b = compile_map(model.regressor)(q, v, a, intervals.inputs[rows][logged])
+        logged = np.arange(rows.start, rows.stop)[intervals.is_logged[rows]]
+        q, v, a, y = motion.parts(model, logged)
+        W, b = regression_rows(model, q, v, a, intervals.inputs[logged], y)
+        r = b.shape[1]
         firsts = np.arange(0, len(b) - H + 1, max(1, H // _OVERLAP))
-        gaps = np.concatenate([[0], np.cumsum(intervals.gaps[rows][logged])])
+        gaps = np.concatenate([[0], np.cumsum(intervals.gaps[logged])])
         firsts = firsts[gaps[firsts + H] == gaps[firsts]]
         if not len(firsts):
             continue
-        both = np.concatenate([W, b], axis=1)
+        both = np.concatenate([W.swapaxes(1, 2).reshape(len(b), -1), b], axis=1)
         means = np.lib.stride_tricks.sliding_window_view(both, H, axis=0)[firsts] @ bump
-        Ws.append(layout.scattered(means[:, : n_p * n_v].reshape(-1, n_p, n_v).swapaxes(1, 2), i))
-        bs.append(means[:, n_p * n_v :])
-    return _scaled(WeakForm(np.ascontiguousarray(np.concatenate(Ws)), np.concatenate(bs)))
+        Ws.append(layout.scattered(means[:, : n_p * r].reshape(-1, n_p, r).swapaxes(1, 2), i))
+        bs.append(means[:, n_p * r :])
+    return _scaled(WeakForm(np.ascontiguousarray(np.concatenate(Ws)), np.concatenate(bs)), model.n_v)
 
 
-def _scaled(weak: WeakForm) -> WeakForm:
-    scale = equation_scales(weak)
+def _scaled(weak: WeakForm, n_v: int) -> WeakForm:
+    """The rows in units of the scales of the n_v equations, and of the sensors after them."""
+    scale = equation_scales(WeakForm(weak.W[:, :n_v], weak.b[:, :n_v]))
+    sensors = [_sensor_scale(weak.W[:, k], weak.b[:, k]) for k in range(n_v, weak.b.shape[1])]
+    scale = np.concatenate([scale, sensors])
     return WeakForm(weak.W / scale[:, None], weak.b / scale)
+
+
+def _sensor_scale(W: FloatArray, b: FloatArray) -> float:
+    """Scale of a sensor's rows: the median residual of their own least squares, a hundredth of their terms at least."""
+    used = (b != 0.0) | W.any(axis=1)
+    if not used.any():
+        return 1.0
+    W, b = W[used], b[used]
+    terms = W * np.linalg.lstsq(W, b, rcond=None)[0]
+    size = np.median(np.sqrt(np.square(terms).sum(axis=1) + np.square(b)))
+    return float(max(np.median(np.abs(terms.sum(axis=1) - b)), _SMALL_RESIDUAL * size)) or 1.0
 
 
 def equation_scales(rows: WeakForm) -> FloatArray:

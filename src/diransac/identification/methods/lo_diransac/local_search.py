@@ -23,7 +23,7 @@ from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import estimate_parameters
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
-from diransac.identification.methods.lo_diransac.sensors import clearest_error, error_of_sensor, with_error
+from diransac.identification.methods.lo_diransac.sensors import clear_errors, error_of_sensor, with_error
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -170,14 +170,20 @@ class LocalSearch:
         return best
 
     def _with_sensors(self, best: Explanation) -> Explanation:
-        """The explanation with errors of the sensors, one after the other, as long as they make it likelier."""
+        """The explanation with errors of the sensors, one after the other, as long as they make it likelier.
+
+        Where the model is exact, only the signals of its measurement equations are tested: nothing else depends on
+        them, so that the motion is as likely whatever their delay.
+        """
+        model = best.intervals.model
+        tested = np.full(len(model.signals), not best.exact)
+        tested[len(model.signals) - len(model.sensors) :] = True
         kinds = {"delays": self.settings.sensor_delays is None, "biases": self.settings.sensor_biases is None}
-        for k in range(self.settings.max_sensor_errors if not best.exact else 0):
+        for k in range(self.settings.max_sensor_errors if tested.any() else 0):
             report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
-            error = clearest_error(best.intervals, best.refinement.fit, **kinds)
-            if error is None:
-                break
-            other = self._refitted(best, with_error(best.intervals, best.refinement.fit, error))
+            errors = clear_errors(best.intervals, best.refinement.fit, tested, **kinds)
+            others = [self._refitted(best, with_error(best.intervals, best.refinement.fit, x)) for x in errors]
+            other = min(others, key=lambda x: x.cost, default=best)
             if other.cost > best.cost - _WORTH:
                 break
             best = other

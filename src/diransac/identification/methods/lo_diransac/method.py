@@ -113,7 +113,8 @@ class LoDiransac(LoDiransacSettings):
         Signals whose delay, or bias, is estimated in any case; that of no other is.  None: those that the residuals
         show clearly.
     max_sensor_errors : int, optional
-        Largest number of delays and biases of unnamed sensors that are estimated where the model is not exact.
+        Largest number of delays and biases of unnamed sensors that are estimated; where the model is exact, only of
+        those with a measurement equation.
     substeps : int, optional
         Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
         samples or links are light.
@@ -287,10 +288,9 @@ def _checks(
 
 def _rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRows]:
     """Rows of the smoothed motion of each log."""
-    n_q, n_v = intervals.model.n_q, intervals.model.n_v
     logged = [np.arange(x.start, x.stop)[intervals.is_logged[x]] for x in intervals.rows_of_logs]
-    parts = [np.split(motion.signals[rows], [n_q, n_q + n_v], axis=1) for rows in logged]
-    return [MotionRows(q, v, a, intervals.inputs[rows]) for (q, v, a), rows in zip(parts, logged, strict=True)]
+    parts = [motion.parts(intervals.model, rows) for rows in logged]
+    return [MotionRows(q, v, a, intervals.inputs[rows], y) for (q, v, a, y), rows in zip(parts, logged, strict=True)]
 
 
 def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:

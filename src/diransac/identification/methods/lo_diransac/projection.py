@@ -38,6 +38,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.hypotheses import WeakForm, equation_scales
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.refinement import weights_of
+from diransac.identification.methods.lo_diransac.smoothing import split_signals
 from diransac.identification.uncertainty import combined
 from diransac.simulation.compiler import compile_map
 
@@ -365,7 +366,7 @@ def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArra
 
 
 def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
-    """Change of each parameter that equals the inertial force of an equation.
+    """Change of each parameter that equals the inertial force of an equation, or the spread of a sensor.
 
     Parameters
     ----------
@@ -378,12 +379,18 @@ def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
     Returns
     -------
     (n,) array
-        The smallest over the equations, each in its parameter's unit; 0 where a parameter never acts.
+        The smallest over equations and sensors, each in its parameter's unit; 0 where a parameter never acts.
     """
+    model = intervals.model
     W = _residual_map(intervals.model)(*_smoothed(intervals, motion), _row_parameters(intervals, p, logged=True))[1]
     logs = intervals.log_of_row[intervals.counted]
-    sizes = np.sqrt(np.square(_by_log(intervals, _matrices(W, intervals.model.n_p), logs)).mean(axis=0)).T
-    smallest = (inertial_forces(intervals, motion, p) / np.maximum(sizes, _TINY)).min(axis=1)
+    W, aims = _matrices(W, model.n_p), inertial_forces(intervals, motion, p)
+    if model.measurement is not None:
+        S = _sensor_slopes(model)(*_smoothed(intervals, motion), _row_parameters(intervals, p, logged=True))[0]
+        W = np.concatenate([W, _matrices(S, model.n_p)], axis=1)
+        aims = np.concatenate([aims, motion.spread[-len(model.sensors) :]])
+    sizes = np.sqrt(np.square(_by_log(intervals, W, logs)).mean(axis=0)).T
+    smallest = (aims / np.maximum(sizes, _TINY)).min(axis=1)
     return np.asarray(np.where(sizes.any(axis=1), smallest, 0.0))
 
 
@@ -412,7 +419,7 @@ def inertial_forces(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
 def _smoothed(intervals: ShootingIntervals, motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Smoothed coordinates, velocities, accelerations and the inputs of all logged rows."""
     model, logged = intervals.model, intervals.counted
-    q, v, a = np.split(motion.signals[logged], [model.n_q, model.n_q + model.n_v], axis=1)
+    q, v, a, _ = motion.parts(model, logged)
     return q, v, a, intervals.inputs[logged]
 
 
@@ -420,7 +427,7 @@ def _motion(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatAr
     """Fitted coordinates, velocities and accelerations, and the inputs as they act, each (N, n)."""
     model = intervals.model
     series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
-    q, v, a = np.split(series.reshape(len(intervals.measured), -1), [model.n_q, model.n_q + model.n_v], axis=1)
+    q, v, a, _ = split_signals(model, series.reshape(len(intervals.measured), -1))
     return q, v, a, intervals.inputs + fit.shared[-1] * intervals.moving_inputs[:, model.n_u :]
 
 
@@ -450,6 +457,14 @@ def _residual_map(model: Model) -> Map:
     r = model.residual(q, v, a, u, p)
     slopes = [ca.densify(ca.jacobian(r, x)) for x in (p, a)]
     return compile_map(ca.Function("residuals", [q, v, a, u, p], [ca.densify(r), *slopes]))
+
+
+def _sensor_slopes(model: Model) -> Map:
+    """Derivatives of the sensors with respect to parameters, column by column."""
+    assert model.measurement is not None
+    q, v, a, u, p = (ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup"))
+    S = ca.densify(ca.jacobian(model.measurement(q, v, a, u, p), p))
+    return compile_map(ca.Function("sensor_slopes", [q, v, a, u, p], [S]))
 
 
 def means_of_intervals(intervals: ShootingIntervals, rows: FloatArray) -> FloatArray:

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
+    from diransac.model import Model
 
 __all__ = ["Prior", "Refinement", "make_prior", "refine", "refine_exact", "start", "weights_of"]
 
@@ -132,12 +133,18 @@ def make_prior(settings: LoDiransacSettings, intervals: ShootingIntervals, motio
     Prior
     """
     return Prior(
-        tau=max(settings.prior_model_error, _LEAST_PRIOR) * motion.spread[-intervals.model.n_v :],
+        tau=max(settings.prior_model_error, _LEAST_PRIOR) * _accelerations(intervals.model, motion),
         unit=unit,
         discrepancy=settings.prior_discrepancy,
         guarded=settings.initial_discrepancy,
         delay=settings.prior_delay / intervals.dt,
     )
+
+
+def _accelerations(model: Model, motion: Motion) -> FloatArray:
+    """Spread ``(n_v,)`` of each acceleration."""
+    n_x = model.n_q + model.n_v
+    return motion.spread[n_x : n_x + model.n_v]
 
 
 def start(
@@ -174,7 +181,7 @@ def start(
     sizes = prior.unit * np.r_[np.full(len(shared) - 1, prior.guarded), prior.delay]
     sizes[: len(p)] = intervals.layout.prior_std
     mean = np.concatenate([intervals.layout.prior_mean, np.zeros(len(shared) - len(p))])
-    tau = _TAU_START * motion.spread[n_x:]
+    tau = _TAU_START * _accelerations(intervals.model, motion)
     continuity = motion.spread[:n_x].copy() if settings.gradual_continuity else _continuity(intervals, tau)
     fit = Fit(shared, x, d, residuals, noise, tau, np.zeros(n_v), continuity, sizes, mean)
     return _anchored(intervals, fit) if settings.neighbouring_starts else fit

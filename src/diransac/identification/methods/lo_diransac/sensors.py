@@ -1,5 +1,7 @@
 """Systematic errors of the sensors: a delay of each signal or group of signals, and a bias.
 
+A sensor is here whatever measures a signal, with a measurement equation or without.
+
 An error of a sensor that no parameter and no discrepancy explains is in the residuals: a delay in
 proportion to the signal's rate, a bias a constant.  A score test finds the most significant error, given all
 else that is estimated; it costs a call of the simulator, and no fit.  The error is then estimated jointly with all
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["SensorError", "clearest_error", "error_of_sensor", "with_error"]
+__all__ = ["SensorError", "clear_errors", "error_of_sensor", "with_error"]
 
 # Standard errors from which on an error of a sensor is tried, and its least delay, samples.
 _CLEAR, _LEAST_DELAY = 3.0, 0.1
@@ -55,26 +57,31 @@ class SensorError:
     ratio: float
 
 
-def clearest_error(intervals: ShootingIntervals, fit: Fit, *, delays: bool, biases: bool) -> SensorError | None:
-    """The error of the sensors that the residuals show most clearly.
+def clear_errors(
+    intervals: ShootingIntervals, fit: Fit, among: BoolArray, *, delays: bool, biases: bool
+) -> list[SensorError]:
+    """Errors of the sensors that the residuals show most clearly: one of a single signal, and one of a group.
 
     Parameters
     ----------
     intervals : ShootingIntervals
     fit : Fit
         At its optimum.
+    among : (n_s,) bool array
+        Signals whose errors are tested.
     delays, biases : bool
         Kinds of errors that are tested.
 
     Returns
     -------
-    SensorError or None
-        None if no error is clear.
+    list of SensorError
+        Empty if no error is clear.
     """
-    tested = [x for x in _candidates(intervals) if (delays if x[1] else biases)]
+    tested = [x for x in _candidates(intervals, among) if (delays if x[1] else biases)]
     found = _score_tests(intervals, fit, tested) if tested else []
     clear = [x for x in found if x.ratio > _CLEAR and (not x.is_delay or abs(x.size) > _LEAST_DELAY)]
-    return max(clear, key=lambda x: x.ratio, default=None)
+    kinds = [[x for x in clear if (x.signals.sum() > 1) == of_group] for of_group in (False, True)]
+    return [max(kind, key=lambda x: x.ratio) for kind in kinds if kind]
 
 
 def error_of_sensor(intervals: ShootingIntervals, fit: Fit, name: str, *, is_delay: bool) -> SensorError | None:
@@ -114,9 +121,12 @@ def _score_tests(intervals: ShootingIntervals, fit: Fit, candidates: list[tuple[
         information = float((weights * np.square(sensitivity)).sum() - (of_z * z).sum() - of_s @ s)
         rows = (weights * sensitivity * fit.residuals).sum(axis=1)
         scores = rows.reshape(len(intervals), -1).sum(axis=1) + (at.data_z * z).sum(axis=1) + at.data_s @ s
+        score = float(rows.sum())
+        # An error that is there has a score of one sign in each batch; only the rest of the scores scatters.
+        share = (weights * np.square(sensitivity)).sum(axis=1).reshape(len(intervals), -1).sum(axis=1)
+        scores = scores - score * share / max(share.sum(), 1e-300)
         variance = max(information, float(np.square(np.add.reduceat(scores, batch)).sum()))
         if information > 0.0:
-            score = float(rows.sum())
             found.append(SensorError(signals, is_delay, -score / information, abs(score) / np.sqrt(variance)))
     return found
 
@@ -165,14 +175,18 @@ def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return np.nan_to_num(rates, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _candidates(intervals: ShootingIntervals) -> list[tuple[BoolArray, bool]]:
-    """Signals and kinds of the errors that are tested: of each signal, and delays of coordinates, velocities, ..."""
+def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[tuple[BoolArray, bool]]:
+    """Signals and kinds of the errors that are tested: of each signal, and delays of coordinates, velocities, ...
+
+    The bias of a sensor that has one as a parameter is not tested.
+    """
     model = intervals.model
     seen = intervals.known.sum(axis=0) >= _FEWEST
     n = len(model.velocities_of_motion)
-    kind = np.repeat([0, 1, 3, 2, 3], [model.n_q, n, model.n_v - n, n, model.n_v - n])
-    single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen)]
-    groups = [(kind == g) & seen for g in range(3)]
+    kind = np.repeat([0, 1, 3, 2, 3, 4], [model.n_q, n, model.n_v - n, n, model.n_v - n, len(model.sensors)])
+    single = [np.arange(len(seen)) == i for i in np.flatnonzero(seen & among)]
+    groups = [(kind == g) & seen & among for g in (0, 1, 2, 4)]
     groups = [x for x in groups if 1 < x.sum() < seen.sum()]
     delays = [(x, True) for x in [*groups, *single] if not (x == seen).all()]
-    return [*delays, *((x, False) for x in single)]
+    biased = np.array([n in model.biased_sensors for n in model.signals])
+    return [*delays, *((x, False) for x in single if not biased[x].any())]

@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diransac.errors import SettingsError
 from diransac.identification.candidate_terms import TermLibrary
 from diransac.identification.settings import JUDGING, Settings, check_used
+
+if TYPE_CHECKING:
+    from diransac.model import Model
 
 __all__ = ["LoDiransacSettings"]
 
@@ -79,6 +82,10 @@ class LoDiransacSettings:
             raise SettingsError("input_delay and input_lag are both True; inputs act after a delay or after a lag")
         if not -np.inf < self.delay_range[0] <= 0.0 <= self.delay_range[1] < np.inf:
             raise SettingsError(f"delay_range is {self.delay_range}; give (earliest, latest) in s, with 0 between them")
+
+    def regresses(self, model: Model) -> bool:
+        """False: sensors are compared with simulations."""
+        return False
 
     def options(self) -> Mapping[str, Any]:
         """All settings but the criteria and the user's candidate terms."""

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import maximum_filter1d, median_filter
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
@@ -39,6 +39,7 @@ __all__ = [
     "running_median",
     "screened_inputs",
     "smooth",
+    "split_signals",
     "stuck_rows",
 ]
 
@@ -84,13 +85,23 @@ class Motion:
     Parameters
     ----------
     signals : (N, n_signals) array
-        Each in its unit.
+        Each in its unit; sensors are NaN where they are not measured.
     spread : (n_signals,) array
         Robust standard deviation of each signal over all logs.
     """
 
     signals: FloatArray
     spread: FloatArray
+
+    def parts(self, model: Model, rows: BoolArray | IntArray) -> list[FloatArray]:
+        """Coordinates, velocities, accelerations and sensors in some rows."""
+        return split_signals(model, self.signals[rows])
+
+
+def split_signals(model: Model, signals: FloatArray) -> list[FloatArray]:
+    """Coordinates, velocities, accelerations and sensors ``(N, n)`` of all signals ``(N, n_signals)``."""
+    n_q, n_v = model.n_q, model.n_v
+    return np.split(signals, [n_q, n_q + n_v, n_q + 2 * n_v], axis=1)
 
 
 # ---------------------------------------------------------------------- screening
@@ -158,8 +169,13 @@ def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[
 
 
 def _chains(model: Model) -> list[list[int]]:
-    """Columns among the model's signals of each quantity and of its derivatives."""
+    """Columns among the model's signals of each quantity and of its derivatives, without sensors."""
     return [[model.signals.index(name) for name in chain] for chain in model.chains]
+
+
+def _n_motion(model: Model) -> int:
+    """Number of signals before the sensors."""
+    return len(model.signals) - len(model.sensors)
 
 
 def smooth(model: Model, logs: Sequence[Samples], dt: float, half: int) -> list[Motion]:
@@ -183,13 +199,17 @@ def smooth(model: Model, logs: Sequence[Samples], dt: float, half: int) -> list[
     middle = _joined(
         model, [np.where(log.known.any(axis=0), log.centre, x) for log, x in zip(logs, signals, strict=True)]
     )
-    spread = _spread(middle)
+    n = _n_motion(model)
+    spread = np.concatenate([_spread(middle[:, :n]), *map(_spread_of_known, middle[:, n:].T)])
     spread = np.where(spread > 0.0, spread + 1e-9, 1.0)
     return [Motion(x, spread) for x in signals]
 
 
 def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
-    """Smoothed signals ``(N, n_signals)`` of all rows of one log; those that it lacks follow from those that it has."""
+    """Smoothed signals ``(N, n_signals)`` of all rows of one log; those that it lacks follow from those that it has.
+
+    Sensors are smoothed one by one; they are NaN in rows without a sample nearby.
+    """
     smoother = _Smoother.of(len(log.measured), dt, half)
     measured, known, centre = log.measured.copy(), log.known.copy(), log.centre.copy()
     signals = np.zeros(measured.shape)
@@ -208,6 +228,12 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
     for columns in chains:
         signals[:, columns], _ = smoother.smoothed(measured[:, columns], known[:, columns], centre[:, columns])
         _integrate(signals, known, columns, dt)
+    for k in range(_n_motion(model), len(model.signals)):
+        near = maximum_filter1d(known[:, k], 2 * half + 1, mode="constant")
+        signals[:, [k]] = np.nan
+        if near.any():
+            smoothed, _ = smoother.smoothed(measured[:, [k]], known[:, [k]], centre[:, [k]])
+            signals[near, k] = smoothed[near, 0]
     rows, seen = np.arange(len(signals)), np.flatnonzero(~log.gaps)
     return signals if log.gaps.all() else np.column_stack([np.interp(rows, seen, x[seen]) for x in signals.T])
 
@@ -389,6 +415,12 @@ def _spread(values: FloatArray) -> FloatArray:
     low, median, high = np.quantile(values, [0.1, 0.5, 0.9], axis=0)
     mad, wide = 1.4826 * np.median(np.abs(values - median), axis=0), (high - low) / 2.563
     return np.asarray(np.where(mad > _AT_REST * wide, mad, wide))
+
+
+def _spread_of_known(values: FloatArray) -> FloatArray:
+    """Spread ``(1,)`` of the finite values of a signal; 0 without any."""
+    known = values[np.isfinite(values)]
+    return _spread(known[:, None]) if len(known) else np.zeros(1)
 
 
 def running_median(measured: FloatArray, known: BoolArray, window: int) -> FloatArray:
