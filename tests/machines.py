@@ -6,7 +6,7 @@ package but `Log`.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
@@ -29,6 +29,7 @@ class Machine:
     start : x at row 0
     law : ``(t, x) -> u``, held over a sample
     dt, n_rows : s, and number of samples
+    sensors : by name, a reading from all signals and inputs by name
     """
 
     truth: Mapping[str, float]
@@ -40,6 +41,7 @@ class Machine:
     law: Callable[..., tuple[float, ...]]
     dt: float
     n_rows: int
+    sensors: Mapping[str, Callable[..., np.ndarray]] = field(default_factory=dict)
 
 
 @cache
@@ -61,7 +63,9 @@ def simulate(name, substeps=5):
     signals = dict(zip(machine.states, np.array(states).T, strict=True))
     slopes = dict(zip(machine.states, np.array(rates).T, strict=True))
     signals |= {rate: slopes[state] for state, rate in machine.rates.items()}
-    return np.arange(machine.n_rows) * machine.dt, signals, dict(zip(machine.inputs, np.array(inputs).T, strict=True))
+    acting = dict(zip(machine.inputs, np.array(inputs).T, strict=True))
+    signals |= {sensor: read(**signals, **acting) for sensor, read in machine.sensors.items()}
+    return np.arange(machine.n_rows) * machine.dt, signals, acting
 
 
 def recorded(name, noise=None, outliers=0.0, seed=0):
@@ -302,7 +306,7 @@ MACHINES = {
         (0.0, 0.0, 0.0, 0.2, 0.1),
         drive_law,
         0.02,
-        2000,
+        1500,
     ),
     "voltage-drive": Machine(
         {**DRIVE, "motor_gain": WHEEL_GAIN},
@@ -313,7 +317,11 @@ MACHINES = {
         (0.0, 0.0, 0.0, 0.2, 0.1),
         lambda t, x: tuple(torque / WHEEL_GAIN for torque in drive_law(t, x)),
         0.02,
-        2000,
+        1500,
+        {
+            "left_wheel": lambda speed, yaw_rate, **_: (speed - TRACK / 2 * yaw_rate) / RADIUS,
+            "right_wheel": lambda speed, yaw_rate, **_: (speed + TRACK / 2 * yaw_rate) / RADIUS,
+        },
     ),
     "single-track-vehicle": Machine(
         CAR,
@@ -325,5 +333,10 @@ MACHINES = {
         car_law,
         0.02,
         1500,
+        {
+            "lateral_acceleration": lambda lateral_velocity_dot, speed, yaw_dot, **_: (
+                lateral_velocity_dot + speed * yaw_dot
+            )
+        },
     ),
 }

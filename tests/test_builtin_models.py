@@ -55,19 +55,43 @@ def test_equations_are_those_of_the_machine(name):
     assert result.inlier_fraction == 1.0
 
 
+def assert_within_intervals(name, result, within):
+    """The errors are below a limit, and below four standard errors."""
+    truth = MACHINES[name].truth
+    for parameter, value in result.parameters.items():
+        error = abs(value - truth[parameter])
+        assert error <= within * truth[parameter], parameter
+        assert error <= 4.0 * result.standard_errors[parameter], parameter
+
+
 @pytest.mark.slow
 @EVERY_CASE
 def test_parameters_are_within_their_intervals_with_noise_and_outliers(name):
-    case, truth = CASES[name], MACHINES[name].truth
+    case = CASES[name]
     log = recorded(name, case.noise, outliers=0.08, seed=1)
     result = dr.identify(case.model, log, fixed=known(name), differentiate=True)
-    for parameter, value in result.parameters.items():
-        error = abs(value - truth[parameter])
-        assert error <= case.within * truth[parameter], parameter
-        assert error <= 4.0 * result.standard_errors[parameter], parameter
+    assert_within_intervals(name, result, case.within)
     for signal in case.noise:
         assert result.diagnosis.noise_std[signal] == pytest.approx(case.noise[signal], rel=0.15)
         assert result.diagnosis.outlier_fraction[signal] == pytest.approx(0.08, abs=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "noise", "fixed", "within"),
+    [
+        ("flexible-joint", {"motor": 5e-4}, (), 0.02),
+        ("dc-motor", {"angle": 0.01}, ("torque_constant", "resistance"), 0.1),
+        ("voltage-drive", {"yaw_rate": 0.02, "left_wheel": 0.1, "right_wheel": 0.1}, ("mass",), 0.02),
+        ("single-track-vehicle", {"yaw_dot": 5e-3, "lateral_acceleration": 0.1}, ("mass",), 0.02),
+    ],
+)
+def test_what_vehicles_and_drives_usually_measure_is_enough(name, noise, fixed, within):
+    """The load of a joint, the current of a motor, a robot's pose and the lateral velocity of a car are unmeasured."""
+    log = recorded(name, noise, outliers=0.08, seed=1)
+    values = {parameter: MACHINES[name].truth[parameter] for parameter in fixed}
+    result = dr.identify(CASES[name].model, log, fixed=values, differentiate=True)
+    assert_within_intervals(name, result, within)
 
 
 @EVERY_CASE

@@ -6,9 +6,11 @@ from diransac.errors import ModelError
 from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
+from diransac.model.sensors import Sensor
 
 __all__ = ["differential_drive"]
 
+_SIDES = {"left": -1, "right": 1}
 _UNITS = {"torque": "N m", "voltage": "V"}
 
 
@@ -33,7 +35,8 @@ def differential_drive(wheel_radius: float = 0.05, track: float = 0.3, drive: st
     -------
     Model
         Coordinates x, y (m, midpoint of the axle in the world frame) and yaw (rad); velocities speed s (m/s, forward)
-        and yaw_rate r (rad/s). Inputs left_torque and right_torque, or left_voltage and right_voltage. Parameters mass
+        and yaw_rate r (rad/s). Inputs left_torque and right_torque, or left_voltage and right_voltage. Sensors
+        left_wheel and right_wheel, the wheels' angular velocities w_i (rad/s). Parameters mass
         m of the robot with ``2 I_w / R^2`` of its wheels (kg), inertia J about the midpoint of the axle, with
         ``B^2 I_w / (2 R^2)`` of the wheels' rotation about their axle (kg m^2), moment h (kg m), the mass times the
         distance by which its centre is ahead of the axle, viscous_friction b (N m s/rad) and dry_friction c (N m) of
@@ -51,19 +54,21 @@ def differential_drive(wheel_radius: float = 0.05, track: float = 0.3, drive: st
     """
     if drive not in _UNITS:
         raise ModelError(f"drive is {drive!r}; choose {' or '.join(_UNITS)}")
-    half = track / 2
 
-    def wheel_torque(command: SX, gain: SX | float, speed: SX, p: Symbols) -> SX:
-        w = speed / wheel_radius
-        return gain * command - p.viscous_friction * w - p.dry_friction * sign(w)
+    def rate_of(side: str, v: Symbols) -> SX:
+        return (v.speed + _SIDES[side] * track / 2 * v.yaw_rate) / wheel_radius
 
     def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
         gain = p.motor_gain if drive == "voltage" else 1.0
-        left = wheel_torque(u[f"left_{drive}"], gain, v.speed - half * v.yaw_rate, p)
-        right = wheel_torque(u[f"right_{drive}"], gain, v.speed + half * v.yaw_rate, p)
+        left, right = (
+            gain * u[f"{side}_{drive}"]
+            - p.viscous_friction * rate_of(side, v)
+            - p.dry_friction * sign(rate_of(side, v))
+            for side in _SIDES
+        )
         return [
             p.mass * a.speed - p.moment * v.yaw_rate**2 - (left + right) / wheel_radius,
-            p.inertia * a.yaw_rate + p.moment * v.speed * v.yaw_rate - half * (right - left) / wheel_radius,
+            p.inertia * a.yaw_rate + p.moment * v.speed * v.yaw_rate - track / 2 * (right - left) / wheel_radius,
         ]
 
     gain = {"motor_gain": Parameter("N m/V", positive=True)} if drive == "voltage" else {}
@@ -73,7 +78,7 @@ def differential_drive(wheel_radius: float = 0.05, track: float = 0.3, drive: st
         coordinates={"x": "m", "y": "m", "yaw": "rad"},
         velocities={"speed": "m/s", "yaw_rate": "rad/s"},
         kinematics=lambda q, v: [v.speed * cos(q.yaw), v.speed * sin(q.yaw), v.yaw_rate],
-        inputs={f"{side}_{drive}": _UNITS[drive] for side in ("left", "right")},
+        inputs={f"{side}_{drive}": _UNITS[drive] for side in _SIDES},
         parameters={
             "mass": Parameter("kg", positive=True),
             "inertia": Parameter("kg m^2", positive=True),
@@ -83,4 +88,8 @@ def differential_drive(wheel_radius: float = 0.05, track: float = 0.3, drive: st
             **gain,
         },
         equations=equations,
+        sensors={
+            "left_wheel": Sensor("rad/s", lambda q, v, a, u, p: rate_of("left", v)),
+            "right_wheel": Sensor("rad/s", lambda q, v, a, u, p: rate_of("right", v)),
+        },
     )

@@ -11,11 +11,14 @@ from diransac.errors import ModelError
 from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
+from diransac.model.sensors import Sensor, accelerometer, gyroscope
 
 __all__ = ["quadrotor"]
 
 Rotor = tuple[float, float, int]
 
+_AXES, _ATTITUDE = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
+_VELOCITY, _RATES = ("vx", "vy", "vz"), ("wx", "wy", "wz")
 _DIAGONAL = 1.0 / sqrt(2.0)
 _LAYOUTS: dict[str, tuple[Rotor, ...]] = {
     "x": tuple(
@@ -32,9 +35,10 @@ def quadrotor(
     *,
     speed_unit: str = "rad/s",
     motor_lag: bool = False,
+    imu: bool = False,
     gravity: float = 9.81,
 ) -> Model:
-    """Model of a rigid body with rotors along its z axis, with rotor drag and, optionally, the lag of its motors.
+    """Model of a rigid body with rotors along its z axis, with rotor drag, and optionally motor lag and an IMU.
 
     ``m (v' + g e_z) = T e_B - d (v - (v . e_B) e_B)``, ``T = k_T sum(n_i^2)``
     ``J w' + w x J w = sum([y_i k_T n_i^2, -x_i k_T n_i^2, -s_i k_Q n_i^2])``
@@ -53,6 +57,9 @@ def quadrotor(
         Unit of the inputs, which are proportional to the speeds of the rotors: "rad/s", "rpm", or "1" for a throttle.
     motor_lag : bool
         Whether the speeds follow the inputs with a common time constant, as states of first order.
+    imu : bool
+        Whether columns acc_x, acc_y, acc_z (m/s^2) and gyro_x, gyro_y, gyro_z (rad/s) of a log are those of an
+        accelerometer in the centre of gravity and of a gyroscope, along the axes of the body, each with a bias.
     gravity : float
         g, m/s^2.
 
@@ -63,8 +70,9 @@ def quadrotor(
         velocities vx, vy, vz (m/s, world frame) and wx, wy, wz (rad/s, body frame). Inputs motor1, motor2, ...: speeds
         of the rotors, or with lag their commands, and states of first order speed1, speed2, ... Parameters mass m (kg),
         inertia_x, inertia_y, inertia_z (kg m^2, principal axes), thrust_coefficient k_T and torque_coefficient k_Q
-        (N and N m per square of the speed), drag d of the rotors in their plane (N s/m), motor_time_constant tau (s).
-        All but tau are proportional, and only their ratios are identifiable: fix one, such as the mass.
+        (N and N m per square of the speed), drag d of the rotors in their plane (N s/m), motor_time_constant tau (s),
+        acc_bias_x, ..., gyro_bias_x, ... of the IMU. Mass, inertias, coefficients and drag are proportional, and only
+        their ratios are identifiable: fix one, such as the mass.
 
     Raises
     ------
@@ -89,13 +97,14 @@ def quadrotor(
     return Model(
         name="quadrotor",
         description="a rigid body with parallel rotors, as a unit quaternion, with rotor drag",
-        coordinates={**dict.fromkeys(("x", "y", "z"), "m"), **dict.fromkeys(("qw", "qx", "qy", "qz"), "1")},
-        velocities={**dict.fromkeys(("vx", "vy", "vz"), "m/s"), **dict.fromkeys(("wx", "wy", "wz"), "rad/s")},
+        coordinates={**dict.fromkeys(_AXES, "m"), **dict.fromkeys(_ATTITUDE, "1")},
+        velocities={**dict.fromkeys(_VELOCITY, "m/s"), **dict.fromkeys(_RATES, "rad/s")},
         kinematics=_kinematics,
         first_order=dict.fromkeys(states, speed_unit),
         inputs=dict.fromkeys(names, speed_unit),
         parameters=_parameters(speed_unit, motor_lag),
         equations=equations,
+        sensors=_imu(gravity) if imu else None,
     )
 
 
@@ -113,6 +122,14 @@ def _layout(rotors: str | Sequence[Rotor], arm_length: float) -> tuple[Rotor, ..
                 "seen from above"
             )
     return tuple(rotors)
+
+
+def _imu(gravity: float) -> dict[str, Sensor]:
+    """Accelerometer and gyroscope in the body frame."""
+    return {
+        **accelerometer(_VELOCITY, _ATTITUDE, gravity=(0.0, 0.0, -gravity), axes=_AXES),
+        **gyroscope(_RATES, axes=_AXES),
+    }
 
 
 def _parameters(speed_unit: str, motor_lag: bool) -> dict[str, Parameter]:

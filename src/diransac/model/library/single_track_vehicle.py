@@ -3,6 +3,7 @@
 from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
+from diransac.model.sensors import Sensor
 
 __all__ = ["single_track_vehicle"]
 
@@ -23,9 +24,9 @@ def single_track_vehicle(front_length: float = 1.2, rear_length: float = 1.5) ->
     Model
         Coordinate yaw (rad, r = yaw_dot); state of first order lateral_velocity v (m/s, of the centre of gravity, to
         the left). Inputs steering delta (rad, of the front wheels, to the left) and speed U (m/s, forward, positive).
-        Parameters mass m (kg), inertia J about the vertical axis (kg m^2), front_stiffness C_f and rear_stiffness C_r
-        (cornering stiffnesses of the axles, N/rad). All four are proportional: without a measured force only their
-        ratios are identifiable; fix one, such as the mass.
+        Sensor lateral_acceleration ``v' + U r`` (m/s^2). Parameters mass m (kg), inertia J about the vertical axis
+        (kg m^2), front_stiffness C_f and rear_stiffness C_r (cornering stiffnesses of the axles, N/rad). All four are
+        proportional: without a measured force only their ratios are identifiable; fix one, such as the mass.
 
     References
     ----------
@@ -54,4 +55,7 @@ def single_track_vehicle(front_length: float = 1.2, rear_length: float = 1.5) ->
             "rear_stiffness": Parameter("N/rad", positive=True),
         },
         equations=equations,
+        sensors={
+            "lateral_acceleration": Sensor("m/s^2", lambda q, v, a, u, p: a.lateral_velocity + u.speed * v.yaw),
+        },
     )
