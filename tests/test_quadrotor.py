@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from diransac.identification.identifiability import structural
 
 G, ARM = 9.81, 0.16
 TRUTH = {
@@ -18,7 +17,7 @@ TRUTH = {
     "torque_coefficient": 2.1e-8,
     "drag": 0.3,
 }
-LAG = 0.04
+LAG, BIASES = 0.04, {"acc": (0.3, -0.2, 0.15), "gyro": (0.02, -0.03, 0.01)}
 FRAMES = {  # angle of each arm from forward, counterclockwise, in degrees, and the rotor's direction of rotation
     "x": ((-45.0, 1), (135.0, 1), (45.0, -1), (-135.0, -1)),
     "+": ((-90.0, 1), (90.0, 1), (0.0, -1), (180.0, -1)),
@@ -101,21 +100,84 @@ def flight(frame="x", lag=0.0, n_rows=1000, dt=0.01, substeps=3):
     attitude = np.array([quaternion(R) for R in state[:, 9:18].reshape(-1, 3, 3)])
     signals = dict(zip((*STATES, *QUATERNION), [*state[:, :9].T, *attitude.T], strict=True))
     signals |= {f"{name}_dot": rates[:, 3 + i] for i, name in enumerate(STATES[3:])}
+    readings = {
+        "acc": np.einsum("nji,nj->ni", state[:, 9:18].reshape(-1, 3, 3), rates[:, 3:6] + [0.0, 0.0, G]),
+        "gyro": state[:, 6:9],
+    }
+    for sensor, values in readings.items():
+        signals |= {f"{sensor}_{axis}": values[:, i] + BIASES[sensor][i] for i, axis in enumerate("xyz")}
     if lag:
         signals |= {f"speed{i + 1}": state[:, 18 + i] for i in range(4)}
         signals |= {f"speed{i + 1}_dot": rates[:, 18 + i] for i in range(4)}
     return np.arange(n_rows) * dt, signals | dict(zip(MOTORS, commands.T, strict=True))
 
 
-def recorded(frame="x", lag=0.0, without=()):
+def recorded(frame="x", lag=0.0):
     """Log of a flight without noise."""
     time, columns = flight(frame, lag)
-    return dr.Log.from_arrays(time, {n: x for n, x in columns.items() if n not in without})
+    return dr.Log.from_arrays(time, columns)
+
+
+MASS = {"mass": TRUTH["mass"]}
 
 
 @pytest.mark.parametrize("frame", FRAMES)
 def test_equations_are_those_of_a_rigid_body_with_rotors(frame):
-    model = dr.models.quadrotor(frame, arm_length=ARM)
-    result = dr.identify(model, recorded(frame), "ols", fixed={"mass": TRUTH["mass"]})
+    result = dr.identify(dr.models.quadrotor(frame, arm_length=ARM), recorded(frame), "ols", fixed=MASS)
     assert dict(result.parameters) == pytest.approx(TRUTH, rel=1e-6)
     assert result.inlier_fraction == 1.0
+
+
+def test_rotors_at_given_places_are_those_of_the_named_layout():
+    places, spins = rotors("x")
+    given = [(x, y, int(spin)) for (x, y, _), spin in zip(places, spins, strict=True)]
+    result = dr.identify(dr.models.quadrotor(given), recorded(), "ols", fixed=MASS)
+    assert dict(result.parameters) == pytest.approx(TRUTH, rel=1e-6)
+
+
+def test_an_imu_has_its_biases_and_motors_have_their_lag():
+    model = dr.models.quadrotor(arm_length=ARM, motor_lag=True, imu=True)
+    result = dr.identify(model, recorded(lag=LAG), "ols", fixed=MASS)
+    biases = {
+        f"{sensor}_bias_{axis}": x for sensor, values in BIASES.items() for axis, x in zip("xyz", values, strict=True)
+    }
+    truth = {**TRUTH, **biases, "motor_time_constant": LAG}
+    assert dict(result.parameters) == pytest.approx(truth, rel=1e-6)
+
+
+def test_throttle_has_coefficients_in_newton_and_newton_metres():
+    units = {n: x.unit for n, x in dr.models.quadrotor(speed_unit="1").parameters.items()}
+    assert (units["thrust_coefficient"], units["torque_coefficient"]) == ("N", "N m")
+    assert dr.models.quadrotor().parameters["thrust_coefficient"].unit == "N/(rad/s)^2"
+
+
+@pytest.mark.parametrize(
+    ("rotors", "said"),
+    [
+        ("y", 'rotors = \'y\'; choose "x", "\\+"'),
+        ([(0.1, 0.1, 2)], "counterclockwise"),
+        ([(np.nan, 0.1, 1)], "position"),
+    ],
+)
+def test_rotors_without_a_meaning_are_refused(rotors, said):
+    with pytest.raises(dr.ModelError, match=said):
+        dr.models.quadrotor(rotors)
+
+
+@pytest.mark.slow
+def test_parameters_are_within_their_intervals_with_noise_and_outliers():
+    """Motion capture and gyroscope, without velocities; the quaternion's sign changes once a turn."""
+    time, columns = flight()
+    rng = np.random.default_rng(1)
+    noise = {**dict.fromkeys("xyz", 0.002), **dict.fromkeys(QUATERNION, 0.003), **dict.fromkeys(STATES[6:], 0.03)}
+    measured = {name: columns[name] for name in MOTORS}
+    for name, scale in noise.items():
+        y, hit = columns[name], rng.random(len(time)) < 0.05
+        wild = 5.0 * y.std() * rng.uniform(-1.0, 1.0, len(time))
+        measured[name] = y + scale * rng.standard_normal(len(time)) + hit * wild
+    log = dr.Log.from_arrays(time, measured)
+    result = dr.identify(dr.models.quadrotor(arm_length=ARM), log, fixed=MASS, differentiate=True)
+    for name, value in result.parameters.items():
+        error = abs(value - TRUTH[name])
+        assert error <= 0.01 * TRUTH[name], name
+        assert error <= 4.0 * result.standard_errors[name], name
