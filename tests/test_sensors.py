@@ -116,6 +116,7 @@ def test_encoder_counts_revolutions_and_range_is_a_distance():
         (lambda: dr.sensors.accelerometer(("x", "z"), "theta", lever_arm="unknown"), '"estimated"'),
         (lambda: dr.sensors.accelerometer(("x", "z"), "theta", gravity=(0.0, 0.0, -9.81)), "2 finite numbers"),
         (lambda: dr.sensors.gyroscope(("wx", "wy")), "three angular velocities"),
+        (lambda: dr.sensors.gyroscope(("wx", "wy", "wz"), axes="xy"), "3 names"),
         (lambda: dr.sensors.encoder("joint", counts=0), "other than 0"),
         (lambda: dr.sensors.range_to(None, ("x", "z")), '"estimated"'),
         (lambda: rotorcraft(dr.sensors.accelerometer(tuple("xyz"), "theta")), "planar angle, but there are 3 axes"),

@@ -104,6 +104,7 @@ def accelerometer(
     rates: Sequence[str] | None = None,
     lever_arm: Vector | str = None,
     gravity: Sequence[float] | None = None,
+    axes: Sequence[str] | None = None,
     bias: bool = True,
     scale: bool = False,
     name: str = "acc",
@@ -123,18 +124,21 @@ def accelerometer(
         Position r of the sensor in the body frame, m, from that point; "estimated": parameters ``acc_arm_x``, ...
     gravity : sequence of float, optional
         Gravity g in the world frame, m/s^2; by default 9.81 against the last axis.
+    axes : sequence of str, optional
+        Names of the axes of the body; by default those of the position.
     bias, scale : bool, optional
         Whether each axis has a bias (``acc_bias_x``, m/s^2) and a scale factor (``acc_scale_x``) as parameters.
     name : str, optional
-        Beginning of the names: columns are ``acc_x``, ..., after the names of the position.
+        Beginning of the names: columns are ``acc_x``, ..., after the names of the axes.
 
     Returns
     -------
     dict of str to Sensor
     """
     n = _dimension("accelerometer", position)
+    names = _axes("accelerometer", axes, position)
     g = _vector("gravity", (*(0.0,) * (n - 1), -9.81) if gravity is None else gravity, n)
-    arm, arms = _estimated(lever_arm, [f"{name}_arm_{x}" for x in position], "m", "lever_arm")
+    arm, arms = _estimated(lever_arm, [f"{name}_arm_{x}" for x in names], "m", "lever_arm")
     if arm is not None and not (isinstance(attitude, str) if n == 2 else rates):
         raise ModelError(
             "accelerometer: a lever arm needs the angular velocity; give attitude by the name of a planar angle"
@@ -154,13 +158,14 @@ def accelerometer(
         w, alpha = _column(at.v, rates), _column(at.a, rates)
         return f + ca.cross(alpha, r) + ca.cross(w, ca.cross(w, r))
 
-    return _triad(name, position, "m/s^2", force, bias, scale, arms)
+    return _triad(name, names, "m/s^2", force, bias, scale, arms)
 
 
 def gyroscope(
     rates: str | Sequence[str],
     *,
     attitude: Attitude | None = None,
+    axes: Sequence[str] | None = None,
     bias: bool = True,
     scale: bool = False,
     name: str = "gyro",
@@ -174,6 +179,8 @@ def gyroscope(
     attitude : str, sequence of str or callable, optional
         Rotation R from the body to the world frame, where the angular velocities are those in the world frame; see the
         module. None: they are in the body frame.
+    axes : sequence of str, optional
+        Names of the axes of the body in three dimensions; by default those of the rates.
     bias, scale : bool, optional
         Whether each axis has a bias (``gyro_bias_wx``, rad/s) and a scale factor (``gyro_scale_wx``) as parameters.
     name : str, optional
@@ -192,7 +199,7 @@ def gyroscope(
         w = _column(at.v, rates)
         return w if attitude is None else _rotation(attitude, at, 3).T @ w
 
-    return _triad(name, rates, "rad/s", turned, bias, scale)
+    return _triad(name, _axes("gyroscope", axes, rates), "rad/s", turned, bias, scale)
 
 
 def encoder(
@@ -405,6 +412,15 @@ def _dimension(what: str, names: Sequence[str]) -> int:
     if isinstance(names, str) or len(names) not in (2, 3):
         raise ModelError(f"{what}: {names!r} are not two or three axes; give a sequence of their names")
     return len(names)
+
+
+def _axes(what: str, axes: Sequence[str] | None, default: Sequence[str]) -> Sequence[str]:
+    """Names of the axes, as many as the default."""
+    if axes is None:
+        return default
+    if isinstance(axes, str) or len(axes) != len(default):
+        raise ModelError(f"{what}: axes = {axes!r}; give {len(default)} names")
+    return axes
 
 
 def _column(symbols: Any, names: Sequence[str]) -> ca.SX:

@@ -3,10 +3,16 @@
 from collections.abc import Callable
 
 from diransac.errors import ModelError
+from diransac.model.library.cart_pole import cart_pole
+from diransac.model.library.dc_motor import dc_motor
+from diransac.model.library.differential_drive import differential_drive
 from diransac.model.library.double_pendulum import double_pendulum
 from diransac.model.library.extended_rotorcraft import BLADE_FLAPPING, TABLE_I, extended_rotorcraft
+from diransac.model.library.flexible_joint import flexible_joint
 from diransac.model.library.planar_rotorcraft import planar_rotorcraft
+from diransac.model.library.quadrotor import quadrotor
 from diransac.model.library.servo_axis import servo_axis
+from diransac.model.library.single_track_vehicle import single_track_vehicle
 from diransac.model.library.underwater_vehicle import underwater_vehicle
 from diransac.model.model import Model
 
@@ -15,10 +21,16 @@ __all__ = [
     "BUILTIN",
     "TABLE_I",
     "builtin",
+    "cart_pole",
+    "dc_motor",
+    "differential_drive",
     "double_pendulum",
     "extended_rotorcraft",
+    "flexible_joint",
     "planar_rotorcraft",
+    "quadrotor",
     "servo_axis",
+    "single_track_vehicle",
     "underwater_vehicle",
 ]
 
@@ -27,6 +39,12 @@ BUILTIN: dict[str, Callable[[], Model]] = {
     "servo-axis": servo_axis,
     "underwater-vehicle": underwater_vehicle,
     "double-pendulum": double_pendulum,
+    "cart-pole": cart_pole,
+    "flexible-joint": flexible_joint,
+    "dc-motor": dc_motor,
+    "differential-drive": differential_drive,
+    "single-track-vehicle": single_track_vehicle,
+    "quadrotor": quadrotor,
 }
 
 
