@@ -22,6 +22,7 @@ from diransac.simulation.batch import (
     ScoreBatch,
     Simulator,
 )
+from diransac.simulation.compiler.graph import read_graph
 from diransac.simulation.compiler.lanes import (
     Lanes,
     aligned,
@@ -38,6 +39,7 @@ from diransac.simulation.integrators import HOLDS, INTEGRATORS, Sensitivities, l
 
 if TYPE_CHECKING:
     from diransac.simulation.compiler.time_loop import InputSource, LoopSpecification, Output
+    from diransac.simulation.compiler.vectors import Value
     from diransac.simulation.integrators import SimulatedModel
 
 __all__ = ["Rollouts", "rollouts"]
@@ -123,10 +125,11 @@ class Rollouts(Simulator):
         self.signals = signals
         self._model, self._integrator, self._substeps, self._target = model, integrator, substeps, target
         self._hold = hold
-        self._specifications: dict[tuple[str, ...], tuple[LoopSpecification, Sensitivities]] = {}
+        self._sensitivities: dict[tuple[str, ...], Sensitivities] = {}
+        self._specifications: dict[tuple[str, ...], LoopSpecification] = {}
         self._code: dict[tuple[Any, ...], MachineCode] = {}
         self._lock = RLock()
-        self._specified(())  # refuses now what could not be compiled later
+        read_graph(model.dynamics)  # refuses now what could not be compiled later
 
     def score(
         self,
@@ -278,7 +281,7 @@ class Rollouts(Simulator):
                 f"unknowns are {', '.join(names) or 'none'}, but at least one is needed, each a parameter or a state, "
                 f"once; there are {', '.join(known)}."
             )
-        return names, self._specified(names)[1]
+        return names, self._derivatives(names)
 
     def _run(
         self,
@@ -298,15 +301,25 @@ class Rollouts(Simulator):
             code = self._compiled(output, inputs or inputs_from_log, unknowns, lanes.has_windows)
             run_time_loop(code, lanes, {"step": batch.dt / self._substeps, **values}, threads)
 
-    def _specified(self, unknowns: tuple[str, ...]) -> tuple[LoopSpecification, Sensitivities]:
+    def _derivatives(self, unknowns: tuple[str, ...]) -> Sensitivities:
+        """Structure of the derivatives with respect to some unknowns, found when first needed."""
+        with self._lock:
+            if unknowns not in self._sensitivities:
+                self._sensitivities[unknowns] = sensitivities_of(self._model, unknowns)
+            return self._sensitivities[unknowns]
+
+    def _specified(self, unknowns: tuple[str, ...]) -> LoopSpecification:
         """Expressions of a row and their derivatives with respect to some unknowns, made when first needed."""
         with self._lock:
             if unknowns not in self._specifications:
-                sensitivities = sensitivities_of(self._model, unknowns)
-                specification = loop_specification(
-                    self._model, self.signals, sensitivities, self._integrator, self._substeps, self._hold
+                self._specifications[unknowns] = loop_specification(
+                    self._model,
+                    self.signals,
+                    self._derivatives(unknowns),
+                    self._integrator,
+                    self._substeps,
+                    self._hold,
                 )
-                self._specifications[unknowns] = specification, sensitivities
             return self._specifications[unknowns]
 
     def _compiled(
@@ -315,12 +328,24 @@ class Rollouts(Simulator):
         """Machine code of a variant of the time loop, compiled when first needed."""
         from diransac.simulation.compiler.time_loop import ARGUMENTS, emit_time_loop
 
+        def emit() -> Value:
+            return emit_time_loop(self._specified(unknowns), output, inputs, windows=windows)
+
         variant = (output, inputs, unknowns, windows)
         with self._lock:
             if variant not in self._code:
-                module = emit_time_loop(self._specified(unknowns)[0], output, inputs, windows=windows)
-                self._code[variant] = compile_function(module, "time_loop", ARGUMENTS.values(), self._target)
+                definition = (*self._definition(unknowns), output.__name__, inputs.__name__, repr(windows))
+                code = compile_function(emit, definition, "time_loop", ARGUMENTS.values(), self._target)
+                self._code[variant] = code
             return self._code[variant]
+
+    def _definition(self, unknowns: tuple[str, ...]) -> list[str]:
+        """Texts that determine `loop_specification`: all that it reads of the model, and its other arguments."""
+        model = self._model
+        sizes = (model.n_q, model.n_u, model.n_p, tuple(model.parameters), model.state, model.signals)
+        options = (self.signals, unknowns, self._integrator, self._substeps, self._hold)
+        functions = (model.dynamics, model.rate_jacobians) if unknowns else (model.dynamics,)
+        return [repr((sizes, model.quaternions, options)), *(function.serialize() for function in functions)]
 
 
 def _unpacked(sensitivities: Sensitivities, n_lanes: int, sums: FloatArray, final: FloatArray) -> GaussNewtonBatch:
