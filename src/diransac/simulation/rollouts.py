@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import chain
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
@@ -195,10 +196,9 @@ class Rollouts(Simulator):
         names, sensitivities = self._unknowns(unknowns)
         n_z, n_blocks = len(names), lanes.n_padded // LANES
         sums = aligned((n_blocks, 1 + n_z + n_z * (n_z + 1) // 2, LANES))
-        final = aligned((n_blocks, len(self._model.state) + int(sensitivities.varying.sum()), LANES))
+        final = aligned((n_blocks, len(self._model.state) + int(sensitivities.present.sum()), LANES))
         values = {
             **arranged_weights(lanes, len(self.signals), measurements.values, measurements.valid, weights),
-            "initial_states": sensitivities.appended(lanes.arrays["initial_states"]),
             "sums": sums,
             "final": final,
         }
@@ -222,11 +222,12 @@ class Rollouts(Simulator):
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_s * (1 + n_z)))
         values = {
             **arranged_measurements(lanes, n_s, measurements.values, measurements.valid),
-            "initial_states": sensitivities.appended(lanes.arrays["initial_states"]),
             "series": series,
         }
         self._run(LinearizedErrorOutput, batch, lanes, values, threads, unknowns=names)
-        jacobian = series[..., n_s:].reshape(*series.shape[:2], n_s, n_z)
+        columns = series[..., n_s:].reshape(*series.shape[:2], n_z, n_s)
+        jacobian = np.empty((*series.shape[:2], n_s, n_z))
+        jacobian[..., list(chain(*sensitivities.groups))] = columns.swapaxes(-1, -2)
         return LinearizedErrors(names, series[..., :n_s], jacobian)
 
     def fly(
@@ -315,10 +316,10 @@ class Rollouts(Simulator):
                 self._specifications[unknowns] = loop_specification(
                     self._model,
                     self.signals,
-                    self._derivatives(unknowns),
                     self._integrator,
                     self._substeps,
                     self._hold,
+                    self._derivatives(unknowns) if unknowns else None,
                 )
             return self._specifications[unknowns]
 
@@ -354,18 +355,20 @@ def _unpacked(sensitivities: Sensitivities, n_lanes: int, sums: FloatArray, fina
     Parameters
     ----------
     sums : (n_blocks, 1 + n_z + n_z (n_z + 1) / 2, 8)
-        e' W e, J' W e, and the upper triangle of J' W J.
-    final : (n_blocks, n_states, 8)
-        State, then its varying derivatives.
+        e' W e, J' W e, and the upper triangle of J' W J, the unknowns group by group.
+    final : (n_blocks, n_x + n_entries, 8)
+        State, then its derivatives.
     """
     sums, final = (
         array.swapaxes(1, 2).reshape(len(array) * LANES, array.shape[1])[:n_lanes] for array in (sums, final)
     )
     n_x, n_z = sensitivities.initial.shape
+    place = np.argsort(list(chain(*sensitivities.groups)))
     upper = np.triu_indices(n_z)
-    normal_matrix = np.empty((n_lanes, n_z, n_z))
-    normal_matrix[:, *upper] = normal_matrix[:, *upper[::-1]] = sums[:, 1 + n_z :]
-    cost, gradient = sums[:, 0].copy(), sums[:, 1 : 1 + n_z].copy()
+    pair = np.empty((n_z, n_z), int)
+    pair[upper] = pair[upper[::-1]] = np.arange(1 + n_z, sums.shape[1])
+    cost, gradient = sums[:, 0].copy(), sums[:, 1 + place]
+    normal_matrix = sums[:, pair[np.ix_(place, place)]]
     diverged = np.isinf(cost)
     slopes = sensitivities.matrix(final[:, n_x:])
     slopes[diverged] = np.nan

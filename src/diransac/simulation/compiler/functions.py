@@ -136,7 +136,7 @@ class Scan:
         self._target = target
         self._code: dict[bool, MachineCode] = {}
         self._lock = Lock()
-        self._graph = _graph_of(self._function)  # refuses now what could not be compiled later
+        self._graph = read_graph(self._function, (2,), reciprocals=True)  # refuses now what could not be compiled later
 
     def __call__(self, carry: ArrayLike, rows: ArrayLike, constants: ArrayLike, *, threads: int = 1) -> FloatArray:
         """Outputs of every lane and row.
@@ -206,7 +206,6 @@ class Scan:
             n_states=self._function.numel_in(0),
             n_inputs=self._function.numel_in(1),
             n_signals=self._function.numel_out(1),
-            n_unknowns=0,
             scored=(),
             quaternions=(),
             state_quaternions=(),
@@ -243,10 +242,3 @@ def compile_scan(function: ca.Function, target: Target | None = None) -> Scan:
 def _scan(serialized: str, target: Target | None) -> Scan:
     """Scan by value of what defines it."""
     return Scan(serialized, target)
-
-
-def _graph_of(function: ca.Function) -> Graph:
-    """Graph of the recurrence with an empty Jacobian, which the time loop expects."""
-    arguments = [ca.SX.sym(function.name_in(k), function.sparsity_in(k)) for k in range(3)]
-    whole = ca.Function(function.name(), arguments, [*function(*arguments), ca.SX(0, 0)])
-    return read_graph(whole, (2,), reciprocals=True)
