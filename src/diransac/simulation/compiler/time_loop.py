@@ -198,6 +198,7 @@ class TimeLoop:
         self.arguments = {argument.name: argument for argument in function.args}
         self.v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
         self.builder = self.v.builder
+        self.v.align_frame()
         self.state: list[Variable] = [self.v.variable(self.v.number(0.0)) for _ in range(specification.n_states)]
         self.guard = self.v.variable(self.v.number(0.0))
         """Zero as long as every signal has been finite."""
