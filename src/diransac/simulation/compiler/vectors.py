@@ -64,8 +64,8 @@ class Vectors:
     def align_frame(self) -> None:
         """Align the function's stack frame to a vector, so that no value that LLVM spills straddles two cache lines.
 
-        LLVM lays out the frame before it knows that it must spill, and would leave it at 16 bytes. An assembler statement
-        without code keeps the vector that asks for more.
+        LLVM lays out the frame before it knows that it must spill, and would leave it at 16 bytes. An assembler
+        statement without code keeps the vector that asks for more.
         """
         kept = ir.FunctionType(ir.VoidType(), [POINTER])
         self.builder.call(ir.InlineAsm(kept, "", "r", side_effect=True), [self.array(1)])
