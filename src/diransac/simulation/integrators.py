@@ -204,13 +204,9 @@ def loop_specification(
     scored = tuple(model.signals.index(name) for name in signals)
     after, simulated, points = _expressions(model, integrator, HOLDS[hold], arguments)
     derivatives = _derivatives(model, integrator, scored, sensitivities, points[0].size2()) if sensitivities else None
-    step, further_step = (
-        read_graph(ca.Function("step", arguments, results), (PARAMETER, STEP), reciprocals=True)
-        for results in ([after, simulated, *(points if sensitivities else ())], [after])
-    )
+    step = ca.Function("step", arguments, [after, simulated, *(points if sensitivities else ())])
     return LoopSpecification(
-        step=step,
-        further_step=further_step,
+        step=read_graph(step, (PARAMETER, STEP), reciprocals=True),
         substeps=substeps,
         n_states=len(model.state),
         n_inputs=model.n_u + n_changes,

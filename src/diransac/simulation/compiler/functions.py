@@ -11,7 +11,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
-from diransac.simulation.compiler.graph import Graph, read_graph
+from diransac.simulation.compiler.graph import read_graph
 from diransac.simulation.compiler.lanes import arranged_lanes, run_time_loop
 from diransac.simulation.compiler.machine_code import LANES, MachineCode, Target, compile_function, run_blocks
 
@@ -201,7 +201,6 @@ class Scan:
 
         return LoopSpecification(
             step=self._graph,
-            further_step=Graph((), ((),), ()),
             substeps=1,
             n_states=self._function.numel_in(0),
             n_inputs=self._function.numel_in(1),

@@ -86,7 +86,6 @@ class LoopSpecification:
     ----------
     step : graph of (x, u, p, h) -> (x after one sub-step, signals before it); where derivatives are simulated, it also
         returns the states and inputs of each stage, and the components of the quaternions before they are scaled
-    further_step : graph of (x, u, p, h) -> (x after one sub-step,), for the sub-steps after the first
     substeps : sub-steps per row
     n_states, n_inputs, n_signals : sizes of x, u, and all signals
     n_changes : number of trailing elements of u that the leading ones change by with each sub-step
@@ -97,7 +96,6 @@ class LoopSpecification:
     """
 
     step: Graph
-    further_step: Graph
     substeps: int
     n_states: int
     n_inputs: int
@@ -117,13 +115,12 @@ class Block:
     ----------
     first : position of the first lane among the padded ones
     starts : per lane, row of the log at which it starts; empty if all start at the first
-    step, further_step : invariant results of the graphs
+    step : invariant results of the graph
     """
 
     first: Value
     starts: list[Value]
     step: dict[int, Value]
-    further_step: dict[int, Value]
 
 
 @dataclass(frozen=True)
@@ -235,11 +232,10 @@ class TimeLoop:
 
         if self.columns is not None:
             self.columns.start(lambda element: self._lane_vector("parameters", element, first))
-        constant = [
-            evaluate(v, graph, [k for k in graph.needed(chain(*graph.outputs)) if graph.invariant[k]], load)
-            for graph in (specification.step, specification.further_step)
-        ]
-        return Block(first, self.whole_numbers("start_rows", first) if self.windows else [], *constant)
+        graph = specification.step
+        constant = [k for k in graph.needed(chain(*graph.outputs)) if graph.invariant[k]]
+        starts = self.whole_numbers("start_rows", first) if self.windows else []
+        return Block(first, starts, evaluate(v, graph, constant, load))
 
     def whole_numbers(self, name: str, first: Value) -> list[Value]:
         """Return the eight integers of a block's lanes in an array that holds one for every lane."""
@@ -247,27 +243,27 @@ class TimeLoop:
         return [self.v.lane(vector, lane) for lane in range(LANES)]
 
     def _row(self, output: Output, block: Block, rows: Loop, u: list[Value]) -> None:
-        """Emit the output of one row, then step to the next."""
-        if self.columns is not None:
-            self._row_with_derivatives(output, block, rows, u, self.columns)
+        """Emit one row: its sub-steps share their code, and the first one has the output."""
+        if self.specification.substeps == 1:
+            signals, after = self._substep(block, u)
+            self._output(output, block, rows, u, signals)
+            self._set_state(after)
             return
-        after, signals = self._results(self.specification.step, u, block.step)
-        self._output(output, block, rows, u, signals)
-        self._set_state(after)
-        if self.specification.substeps > 1:
-            self._further_steps(u, block)
-
-    def _row_with_derivatives(self, output: Output, block: Block, rows: Loop, u: list[Value], columns: Columns) -> None:
-        """Emit one row, with the same code for all of its sub-steps: that of the derivatives is long."""
-        builder, n_states = self.builder, self.specification.n_states
         with self.v.repeat(integer(0), integer(self.specification.substeps)) as steps:
-            results = self._results(self.specification.step, self._changed(u, steps.index), block.step)
-            after, signals, states, inputs, quaternions = results
-            n_u = len(inputs) // (len(states) // n_states)
-            columns.advance(Points(_parts(states, n_states), _parts(inputs, n_u), quaternions))
-            with builder.if_then(builder.icmp_signed("==", steps.index, integer(0))):
+            signals, after = self._substep(block, self._changed(u, steps.index))
+            with self.builder.if_then(self.builder.icmp_signed("==", steps.index, integer(0))):
                 self._output(output, block, rows, u, signals)
             self._set_state(after)
+
+    def _substep(self, block: Block, u: list[Value]) -> tuple[list[Value], list[Value]]:
+        """Signals before a sub-step, and the state after it; derivatives are advanced in their arrays."""
+        n_states = self.specification.n_states
+        after, signals, *points = self._results(self.specification.step, u, block.step)
+        if self.columns is not None:
+            states, inputs, quaternions = points
+            n_u = len(inputs) // (len(states) // n_states)
+            self.columns.advance(Points(_parts(states, n_states), _parts(inputs, n_u), quaternions))
+        return signals, after
 
     def _results(self, graph: Graph, u: list[Value], known: dict[int, Value]) -> list[list[Value]]:
         """Outputs of a graph at the current state."""
@@ -281,13 +277,6 @@ class TimeLoop:
         if output.ends_early:
             with self.builder.if_then(self.builder.not_(self.v.any_lane(alive))):
                 self.builder.branch(rows.leave)
-
-    def _further_steps(self, u: list[Value], block: Block) -> None:
-        """Take the sub-steps after the first."""
-        specification = self.specification
-        with self.v.repeat(integer(1), integer(specification.substeps)) as steps:
-            (after,) = self._results(specification.further_step, self._changed(u, steps.index), block.further_step)
-            self._set_state(after)
 
     def _changed(self, u: list[Value], steps: Value) -> list[Value]:
         """Inputs a number of sub-steps after their row."""
