@@ -101,7 +101,14 @@ class _Places:
 
 
 class Columns:
-    """Emitter of the derivatives of a time loop: `state` and `slopes` of each group, column after column."""
+    """Emitter of the derivatives of a time loop.
+
+    Attributes
+    ----------
+    groups : the groups of columns
+    state : for each group, the array of its derivatives of the state, column by column
+    slopes : for each group, the array of its derivatives of the scored signals before the last sub-step
+    """
 
     def __init__(self, v: Vectors, specification: DerivativeSpecification, step: Value, n_quaternions: int) -> None:
         self.v, self.specification, self.groups = v, specification, specification.groups
@@ -203,7 +210,6 @@ class Columns:
         """Emit a change of sign of the derivatives of some signals, in some lanes."""
         for group, array in zip(self.groups, self.slopes, strict=True):
             places = [k for k, signal in enumerate(group.signals) if signal in signals]
-
             self.v.each(0, len(group.unknowns), partial(self._turn, opposite, array, len(group.signals), places))
 
     def _turn(self, opposite: Value, array: Value, width: int, places: list[int], column: Value | int) -> None:
@@ -228,9 +234,10 @@ class Columns:
                 stage, k = divmod(element, n_driving)
                 is_fixed, first = self._driving[number][k]
                 return v.pick(self._array(is_fixed, stage), v.affine(column, 1, first))
-            stage, k = divmod(element, n_shared) if n_shared else (self.specification.n_stages, 0)
-            if stage >= self.specification.n_stages:
-                return v.pick(self._quaternions, element - n_shared * self.specification.n_stages)
+            first_quaternion = n_shared * self.specification.n_stages
+            if element >= first_quaternion:
+                return v.pick(self._quaternions, element - first_quaternion)
+            stage, k = divmod(element, n_shared)
             is_fixed, place = self._shared[k]
             return v.pick(self._array(is_fixed, stage), place)
 
