@@ -1,6 +1,7 @@
-"""Fixtures that every test may use, and one thread per worker of pytest-xdist."""
+"""Fixtures that every test may use, one thread per worker of pytest-xdist, and machine code kept for this run alone."""
 
 import os
+import tempfile
 from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 
@@ -14,6 +15,10 @@ settings.load_profile("untimed")
 if "PYTEST_XDIST_WORKER" in os.environ:  # there is a worker per core; BLAS reads its variable when NumPy is imported
     os.environ.setdefault("DIRANSAC_THREADS", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+if "PYTEST_XDIST_WORKER" not in os.environ:  # workers and child processes inherit the folder
+    MACHINE_CODE = tempfile.TemporaryDirectory(prefix="diransac-tests-", ignore_cleanup_errors=True)
+    os.environ["DIRANSAC_CACHE"] = MACHINE_CODE.name
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"

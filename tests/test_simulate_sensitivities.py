@@ -9,6 +9,9 @@ import pytest
 from diransac.errors import SettingsError
 from diransac.model.library import double_pendulum
 from diransac.simulation import Measurements, RolloutBatch, rollouts
+from diransac.simulation.compiler.outputs import GaussNewtonOutput
+from diransac.simulation.compiler.time_loop import emit_time_loop, inputs_from_log
+from diransac.simulation.integrators import loop_specification, sensitivities_of
 from rolling import (
     BODY,
     EXPLOSIVE,
@@ -302,6 +305,22 @@ def test_sums_have_the_same_bits_for_any_batch_threads_and_target(model, target)
             np.testing.assert_array_equal(getattr(part, name), wanted, err_msg=name)
     rows = linearised(rollouts(model), task)
     assert_same(linearised(engine, task, threads=2), rows)
+
+
+# Compile time --------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_the_code_of_the_sums_grows_in_proportion_to_the_unknowns(substeps):
+    def lines(n):
+        @machine("series", 1, 1, 1, n)
+        def series(q, v, u, p):
+            return [v[0]], [u[0] - sum(p[k] * ca.sin((k + 1) * q[0]) for k in range(n)) - p[n - 1] * v[0]]
+
+        sensitivities = sensitivities_of(series, (*series.parameters, *series.state))
+        row = loop_specification(series, series.signals, "rk4", substeps, "zero-order", sensitivities)
+        return str(emit_time_loop(row, GaussNewtonOutput, inputs_from_log, windows=True)).count("\n")
+
+    few, more, many = lines(6), lines(12), lines(24)
+    assert many - more < 2.2 * (more - few)
 
 
 # Divergence ----------------------------------------------------------------------------------------------------------

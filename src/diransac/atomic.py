@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 __all__ = ["write_text", "write_with"]
 
 
-def write_with(path: str | Path, write: Callable[[Path], None]) -> None:
+def write_with(path: str | Path, write: Callable[[Path], None], *, mode: int | None = None) -> None:
     """Write a file whole or not at all: a temporary file beside it, then a rename.
 
     Parameters
@@ -22,6 +22,8 @@ def write_with(path: str | Path, write: Callable[[Path], None]) -> None:
     write : callable
         ``write(temporary)`` fills the temporary file.  Its errors pass through; ``path`` is then untouched, and nothing
         is left beside it.
+    mode : int, optional
+        Permissions of the file; by default those of the file that it replaces, else those that new files have.
     """
     target = Path(path)
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
@@ -29,7 +31,7 @@ def write_with(path: str | Path, write: Callable[[Path], None]) -> None:
     temporary = Path(name)
     try:
         write(temporary)
-        temporary.chmod(target.stat().st_mode if target.exists() else 0o666 & ~_umask())
+        temporary.chmod(_default_mode(target) if mode is None else mode)
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
@@ -44,7 +46,10 @@ def write_text(path: str | Path, text: str) -> None:
     write_with(path, write)
 
 
-def _umask() -> int:
-    current = os.umask(0)
-    os.umask(current)
-    return current
+def _default_mode(target: Path) -> int:
+    """Permissions of a file, or of a new one."""
+    if target.exists():
+        return target.stat().st_mode
+    umask = os.umask(0)
+    os.umask(umask)
+    return 0o666 & ~umask

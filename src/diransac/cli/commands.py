@@ -36,12 +36,13 @@ from diransac.cli.options import (
     known_methods,
 )
 from diransac.cli.outputs import staged
-from diransac.cli.views import Equations, ModelList, compare_methods
+from diransac.cli.views import CacheState, Equations, ModelList, compare_methods
 from diransac.identification.identify import identify
 from diransac.identification.inspection import inspect
 from diransac.identification.methods import DEFAULT, METHODS
 from diransac.identification.result import Result
 from diransac.identification.validation import cross_validate, validate
+from diransac.simulation.compiler.code_cache import CodeCache
 
 __all__ = ["app"]
 
@@ -236,3 +237,15 @@ def _models(
 ) -> None:
     """List the built-in models, or show the equations of one."""
     screen.show(ModelList() if name is None else Equations(load_model(name)), as_json)
+
+
+@app.command("cache")
+def _cache(
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all entries.")] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Show the folder of compiled machine code, and the number and size of its entries."""
+    cache = CodeCache.of_user()
+    if clear and cache is not None:
+        cache.clear()
+    screen.show(CacheState(cache), as_json)

@@ -1,4 +1,4 @@
-"""Tables of the command line alone: methods side by side, and models."""
+"""Texts of the command line alone: methods side by side, models, and the cache of machine code."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from diransac.identification.method import Method
 from diransac.identification.result import MARKS, Result
 from diransac.model import Model, Parameter
 from diransac.model.library import BUILTIN
+from diransac.simulation.compiler.code_cache import CodeCache
 from diransac.text_table import aligned
 
-__all__ = ["Comparison", "Equations", "ModelList", "compare_methods"]
+__all__ = ["CacheState", "Comparison", "Equations", "ModelList", "compare_methods"]
 
 
 @dataclass(frozen=True)
@@ -186,6 +187,40 @@ class Equations:
         rows = [["parameter", "unit", "bounds"]]
         rows += [[name, parameter.unit, _bounds(parameter)] for name, parameter in model.parameters.items()]
         return "\n".join([model.name, *aligned(signals), "", *aligned(rows), "", *model.equations_text()])
+
+
+@dataclass(frozen=True)
+class CacheState:
+    """Folder, number and size of the entries of a cache of machine code.
+
+    Parameters
+    ----------
+    cache : CodeCache or None
+        None where it is switched off.
+    """
+
+    cache: CodeCache | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Folder (null: none), reason for not using it (empty: it is used), entries, bytes, and their limit."""
+        if self.cache is None:
+            return {"folder": None, "unused": "DIRANSAC_CACHE is off", "entries": 0, "bytes": 0, "limit": 0}
+        sizes = self.cache.sizes()
+        return {
+            "folder": str(self.cache.folder),
+            "unused": self.cache.objection(),
+            "entries": len(sizes),
+            "bytes": sum(sizes.values()),
+            "limit": self.cache.size_limit,
+        }
+
+    def __str__(self) -> str:
+        state = self.to_dict()
+        if self.cache is None:
+            return f"no machine code is kept: {state['unused']}"
+        unused = f"\nnot used: {state['unused']}" if state["unused"] else ""
+        size, limit = (state[name] / 2**20 for name in ("bytes", "limit"))
+        return f"{state['folder']}\n{state['entries']} entries, {size:.1f} of at most {limit:.0f} MiB{unused}"
 
 
 def _bounds(parameter: Parameter) -> str:

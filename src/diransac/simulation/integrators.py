@@ -10,17 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.simulation.compiler.graph import read_graph
 
 if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.model.plant import DisturbedModel
+    from diransac.simulation.compiler.sensitivities import ColumnGroup, DerivativeSpecification
     from diransac.simulation.compiler.time_loop import LoopSpecification
 
     SimulatedModel: TypeAlias = Model | DisturbedModel
@@ -117,76 +119,64 @@ class Sensitivities:
         Names of parameters, and of states for their initial values.
     initial : (n_x, n_z)
         Derivatives of the initial state: 1 of a state with respect to itself, else 0.
-    varying : (n_x, n_z)
-        Entries that change during a rollout; the others keep their initial value.
+    driven : (n_x + n_y, n_z)
+        Elements of df/dz, and below them of the derivatives of the sensors, that are not always zero.
+    present : (n_x, n_z)
+        Derivatives of the state that are not always zero.
     """
 
     unknowns: tuple[str, ...]
     initial: FloatArray
-    varying: BoolArray
+    driven: BoolArray
+    present: BoolArray
 
-    @property
-    def entries(self) -> list[tuple[int, int]]:
-        """Row and column of each varying entry, in the order in which they follow the state."""
-        return [(int(i), int(j)) for i, j in np.argwhere(self.varying)]
+    @cached_property
+    def groups(self) -> list[list[int]]:
+        """Unknowns whose columns have their zeros at the same places, each group in order."""
+        groups: dict[bytes, list[int]] = {}
+        for k in range(len(self.unknowns)):
+            groups.setdefault(self.present[:, k].tobytes() + self.driven[:, k].tobytes(), []).append(k)
+        return list(groups.values())
 
-    def appended(self, states: FloatArray) -> FloatArray:
-        """Initial states (n_x, n), and below them the initial values of the varying entries."""
-        values = self.initial[self.varying]
-        return np.concatenate([states, np.repeat(values[:, None], states.shape[1], axis=1)])
+    @cached_property
+    def entries(self) -> tuple[IntArray, IntArray]:
+        """Rows and columns of the derivatives that the time loop stores, group by group and column by column."""
+        places = [(i, k) for group in self.groups for k in group for i in np.flatnonzero(self.present[:, k])]
+        rows, columns = np.array(places, int).reshape(-1, 2).T
+        return rows, columns
 
     def matrix(self, values: FloatArray) -> FloatArray:
-        """Whole matrices (n, n_x, n_z) from the varying entries (n, n_varying)."""
-        whole = np.repeat(self.initial[None], len(values), axis=0)
-        whole[:, self.varying] = values
+        """Whole matrices (n, n_x, n_z) from the stored derivatives (n, n_entries)."""
+        whole = np.zeros((len(values), *self.initial.shape))
+        rows, columns = self.entries
+        whole[:, rows, columns] = values
         return whole
 
 
 def sensitivities_of(model: SimulatedModel, unknowns: Sequence[str]) -> Sensitivities:
     """Structure of d(state)/d(unknowns): non-zero entries are propagated until no more appear."""
     n_x, n_p, names = len(model.state), model.n_p, (*model.parameters, *model.state)
-    if not unknowns:
-        return Sensitivities((), np.zeros((n_x, 0)), np.zeros((n_x, 0), bool))
     columns = [names.index(name) for name in unknowns]
-    jacobians = model.rate_jacobians
-    A, P = (np.array(ca.DM(jacobians.sparsity_out(k), 1)) != 0 for k in ("dx", "dp"))
-    initial = np.hstack([np.zeros((n_x, n_p)), np.eye(n_x)])[:, columns]
-    driven = np.hstack([P, np.zeros((n_x, n_x), bool)])[:, columns]
-    varying, before = np.zeros_like(driven), None
-    while before is None or not np.array_equal(varying, before):
-        before = varying
-        present = varying | (initial != 0)
-        varying = varying | driven | (A.astype(int) @ present > 0)
+    A, P = (np.array(ca.DM(x.sparsity(), 1)) != 0 for x in _jacobians(model, _symbols(model)))
+    A, initial = A[:n_x], np.hstack([np.zeros((n_x, n_p)), np.eye(n_x)])[:, columns]
+    driven = np.hstack([P, np.zeros((len(P), n_x), bool)])[:, columns]
+    present, before = (initial != 0) | driven[:n_x], None
+    while before is None or not np.array_equal(present, before):
+        before = present
+        present = present | (A.astype(int) @ present > 0)
         for four in model.quaternions:
-            varying[list(four)] |= present[list(four)].any(axis=0)
-    return Sensitivities(tuple(unknowns), initial, varying)
-
-
-def _variables(sensitivities: Sensitivities, values: ca.SX) -> ca.SX:
-    """Sparse matrix (n_x, n_z) of the derivatives, from its varying entries."""
-    S = ca.SX(*sensitivities.initial.shape)
-    for i, j in zip(*np.nonzero(sensitivities.initial), strict=True):
-        S[int(i), int(j)] = 1
-    for k, (i, j) in enumerate(sensitivities.entries):
-        S[i, j] = values[k]
-    return S
-
-
-def _driving(model: SimulatedModel, unknowns: Sequence[str], P: ca.SX) -> ca.SX:
-    """P = df/dp, as columns of the unknowns; those of initial states are zero."""
-    columns = ca.horzcat(P, ca.SX(P.size1(), len(model.state)))
-    names = (*model.parameters, *model.state)
-    return columns[:, [names.index(name) for name in unknowns]]
+            present[list(four)] |= present[list(four)].any(axis=0)
+    return Sensitivities(tuple(unknowns), initial, driven, present)
 
 
 # A row ---------------------------------------------------------------------------------------------------------------
 def loop_specification(
     model: SimulatedModel,
     signals: Sequence[str],
-    sensitivities: Sensitivities,
     integrator: str,
     substeps: int,
     hold: str,
+    sensitivities: Sensitivities | None = None,
 ) -> LoopSpecification:
     """Expressions of one row, as graphs.
 
@@ -196,86 +186,60 @@ def loop_specification(
         The model to simulate.
     signals : sequence of str
         Signals that are compared with measurements.
-    sensitivities : Sensitivities
-        The derivatives to simulate.
     integrator : str
         One of `INTEGRATORS`.
     substeps : int
         Integration steps from one row to the next.
     hold : str
         One of `HOLDS`.
+    sensitivities : Sensitivities, optional
+        The derivatives to simulate.
     """
     from diransac.simulation.compiler.time_loop import PARAMETER, STEP, LoopSpecification
 
-    n_states, n_changes = len(model.state) + len(sensitivities.entries), HOLDS[hold].n_changes(model.n_u)
-    sizes = {"x": n_states, "u": model.n_u + n_changes, "p": model.n_p, "h": 1}
+    n_changes = HOLDS[hold].n_changes(model.n_u)
+    sizes = {"x": len(model.state), "u": model.n_u + n_changes, "p": model.n_p, "h": 1}
     arguments = [ca.SX.sym(name, n) for name, n in sizes.items()]
     scored = tuple(model.signals.index(name) for name in signals)
-    after, simulated, slopes = _expressions(model, sensitivities, integrator, HOLDS[hold], arguments)
-    step, further_step = (
-        read_graph(ca.Function("step", arguments, results), (PARAMETER, STEP), reciprocals=True)
-        for results in ([after, simulated, slopes[list(scored), :]], [after])
-    )
+    after, simulated, points = _expressions(model, integrator, HOLDS[hold], arguments)
+    derivatives = _derivatives(model, integrator, scored, sensitivities, points[0].size2()) if sensitivities else None
+    step = ca.Function("step", arguments, [after, simulated, *(points if sensitivities else ())])
     return LoopSpecification(
-        step=step,
-        further_step=further_step,
+        step=read_graph(step, (PARAMETER, STEP), reciprocals=True),
         substeps=substeps,
-        n_states=n_states,
+        n_states=len(model.state),
         n_inputs=model.n_u + n_changes,
         n_changes=n_changes,
         n_signals=len(model.signals),
-        n_unknowns=slopes.size2(),
         scored=scored,
         quaternions=_scored_quaternions(model, tuple(signals)),
         state_quaternions=tuple(model.quaternions),
+        derivatives=derivatives,
     )
 
 
 def _expressions(
-    model: SimulatedModel, sensitivities: Sensitivities, integrator: str, hold: Hold, arguments: Sequence[ca.SX]
-) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """State after a step with the varying derivatives, all signals before it, and the derivatives of these."""
-    n_x, n_q = len(model.state), model.n_q
-    states, inputs, p, h = arguments
-    S = _variables(sensitivities, states[n_x:])
+    model: SimulatedModel, integrator: str, hold: Hold, arguments: Sequence[ca.SX]
+) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX, ca.SX]]:
+    """State after a step, all signals before it, and the points of the step.
 
-    def rates(columns: ca.SX, fraction: float) -> ca.SX:
-        x, u = columns[:, 0], hold.at(inputs, fraction)
-        rate = model.dynamics(x, u, p)[0]
-        if not sensitivities.unknowns:
-            return rate
-        A, _, P = model.rate_jacobians(x, u, p)
-        return ca.horzcat(rate, A @ columns[:, 1:] + _driving(model, sensitivities.unknowns, P))
+    The points are the states (n_x, n_stages) and inputs (n_u, n_stages) at which the dynamics are evaluated, and the
+    components of the quaternions after the step before they are scaled.
+    """
+    x, inputs, p, h = arguments
+    states, held = [], []
 
-    columns = ca.horzcat(states[:n_x], S)
-    slope = rates(columns, 0.0)
-    after = INTEGRATORS[integrator](rates, columns, h, slope, n_q)
-    after = _normalised(after, model.quaternions)
-    moved = [after[i, 1 + j] for i, j in sensitivities.entries]
-    x, u = states[:n_x], hold.at(inputs, 0.0)
-    acceleration, of_acceleration = model.dynamics(x, u, p)[1], slope[n_q:, 1:]
-    sensors, of_sensors = _readings(model, sensitivities.unknowns, (x, acceleration, u, p), (S, of_acceleration))
-    return (
-        ca.vertcat(after[:, 0], *moved),
-        ca.vertcat(x, acceleration, sensors),
-        ca.vertcat(S, of_acceleration, of_sensors),
-    )
+    def rates(state: ca.SX, fraction: float) -> ca.SX:
+        states.append(state)
+        held.append(hold.at(inputs, fraction))
+        return model.dynamics(state, held[-1], p)[0]
 
-
-def _readings(
-    model: SimulatedModel, unknowns: Sequence[str], at: Sequence[ca.SX], slopes: Sequence[ca.SX]
-) -> tuple[ca.SX, ca.SX]:
-    """Sensors at ``(x, a, u, p)``, and their derivatives from those of state and accelerations; empty without any."""
-    x, a, u, p = (ca.SX.sym(name, vector.numel()) for name, vector in zip("xaup", at, strict=True))
-    y = model.readings(x, a, u, p)
-    if not y.numel():
-        return ca.SX(0, 1), ca.SX(0, len(unknowns))
-    jacobians = ca.Function("jacobians", [x, a, u, p], [ca.jacobian(y, z) for z in (x, a, p)])
-    C, D, P = jacobians(*at)
-    of_x, of_a = slopes
-    # States of disturbances follow the accelerations in the rates of the state; no sensor depends on them.
-    chained = C @ of_x + D @ of_a[: a.numel(), :] if unknowns else ca.SX(y.numel(), 0)
-    return model.readings(*at), chained + _driving(model, unknowns, P)
+    raw = INTEGRATORS[integrator](rates, x, h, rates(x, 0.0), model.n_q)
+    acceleration = model.dynamics(x, held[0], p)[1]
+    sensors = model.readings(x, acceleration, held[0], p)
+    quaternions = ca.vertcat(*(raw[k] for four in model.quaternions for k in four))
+    points = (ca.horzcat(*states), ca.horzcat(*held), quaternions)
+    return _normalised(raw, model.quaternions), ca.vertcat(x, acceleration, sensors), points
 
 
 def _normalised(columns: ca.SX, quaternions: Sequence[Sequence[int]]) -> ca.SX:
@@ -295,6 +259,117 @@ def _scored_quaternions(model: SimulatedModel, signals: tuple[str, ...]) -> tupl
     """Positions among the scored signals of the quaternions that are scored whole."""
     named = [[model.signals[k] for k in four] for four in model.quaternions]
     return tuple(tuple(signals.index(name) for name in four) for four in named if set(four) <= set(signals))
+
+
+# Derivatives of a row ------------------------------------------------------------------------------------------------
+def _derivatives(
+    model: SimulatedModel, integrator: str, scored: Sequence[int], sensitivities: Sensitivities, n_stages: int
+) -> DerivativeSpecification:
+    """Jacobians of the dynamics, and the integrator's step of each group of columns."""
+    from diransac.simulation.compiler.sensitivities import DerivativeSpecification
+    from diransac.simulation.compiler.time_loop import PARAMETER
+
+    names, arguments = (*model.parameters, *model.state), _symbols(model)
+    A, P = _jacobians(model, arguments)
+    driving = ca.horzcat(P, ca.SX(*A.shape))[:, [names.index(name) for name in sensitivities.unknowns]]
+    elements = ca.vertcat(ca.SX(0, 1), *(element for element in _elements(A) if not element.is_constant()))
+    jacobians = read_graph(
+        ca.Function("jacobians", arguments, [elements, ca.densify(driving)]), (PARAMETER,), reciprocals=True
+    )
+    groups = [_column_group(model, integrator, scored, A, sensitivities, group) for group in sensitivities.groups]
+    return DerivativeSpecification(tuple(groups), jacobians, n_stages)
+
+
+def _symbols(model: SimulatedModel) -> list[ca.SX]:
+    """State, inputs and parameters."""
+    return [ca.SX.sym(name, n) for name, n in (("x", len(model.state)), ("u", model.n_u), ("p", model.n_p))]
+
+
+def _jacobians(model: SimulatedModel, arguments: Sequence[ca.SX]) -> tuple[ca.SX, ca.SX]:
+    """Derivatives ``(n_x + n_y, n_x)`` and ``(n_x + n_y, n_p)`` of the rates of the state, and below of the sensors.
+
+    Sensors depend on the state and the parameters by way of the accelerations, too.
+    """
+    A, _, P = model.rate_jacobians(*arguments)
+    x, u, p = arguments
+    a = model.dynamics(x, u, p)[1]
+    symbols = [ca.SX.sym(name, vector.numel()) for name, vector in zip("xaup", (x, a, u, p), strict=True)]
+    y = model.readings(*symbols)
+    if not y.numel():
+        return A, P
+    C, D, E = ca.Function("slopes", symbols, [ca.jacobian(y, symbols[k]) for k in (0, 1, 3)])(x, a, u, p)
+    accelerations = slice(model.n_q, model.n_q + a.numel())
+    return ca.vertcat(A, C + D @ A[accelerations, :]), ca.vertcat(P, D @ P[accelerations, :] + E)
+
+
+def _column_group(
+    model: SimulatedModel,
+    integrator: str,
+    scored: Sequence[int],
+    A: ca.SX,
+    sensitivities: Sensitivities,
+    unknowns: Sequence[int],
+) -> ColumnGroup:
+    """The integrator's step of a column of derivatives, s: that of the linear dynamics `A s + P` of each stage.
+
+    Rows of A beyond those of the state are sensors', of which the first stage gives the derivatives.
+    """
+    from diransac.simulation.compiler.sensitivities import ColumnGroup
+
+    (n_rows, n_x), n_q = A.shape, model.n_q
+    present, driven = (
+        np.flatnonzero(mask[:, unknowns[0]]).tolist() for mask in (sensitivities.present, sensitivities.driven)
+    )
+    column, h = ca.SX.sym("s", len(present)), ca.SX.sym("h")
+    shared: list[ca.SX] = []
+    driving: list[ca.SX] = []
+    slopes_of_stages: list[ca.SX] = []
+
+    def rates(s: ca.SX, _fraction: float) -> ca.SX:
+        elements = [e if e.is_constant() else ca.SX.sym("a") for e in _elements(A)]
+        shared.extend(e for e in elements if not e.is_constant())
+        driving.append(ca.SX.sym("d", len(driven)))
+        moved = ca.SX(A.sparsity(), ca.vertcat(ca.SX(0, 1), *elements)) @ s + _placed(driving[-1], driven, n_rows)
+        slopes_of_stages.append(moved)
+        return moved[:n_x]
+
+    s = _placed(column, present, n_x)
+    slope = rates(s, 0.0)
+    after = INTEGRATORS[integrator](rates, s, h, slope, n_q)
+    for four in model.quaternions:
+        quaternion = ca.SX.sym("q", 4)
+        after = _normalised(ca.horzcat(_placed(quaternion, four, n_x), after), [four])[:, 1]
+        shared.append(quaternion)
+    n_accelerations = len(model.signals) - n_rows
+    motion, sensors = slopes_of_stages[0][n_q : n_q + n_accelerations], slopes_of_stages[0][n_x:]
+    slopes = ca.sparsify(ca.vertcat(s, motion, sensors)[list(scored)])
+    signals = slopes.sparsity().row()
+    step = ca.Function(
+        "column",
+        [column, ca.vertcat(ca.SX(0, 1), *shared), ca.vertcat(*driving), h],
+        [after[present], slopes[signals]],
+    )
+    return ColumnGroup(
+        unknowns=tuple(unknowns),
+        rows=tuple(present),
+        initial=tuple(tuple(sensitivities.initial[present, k].tolist()) for k in unknowns),
+        signals=tuple(signals),
+        driven=tuple(tuple(i + k * n_rows for i in driven) for k in unknowns),
+        step=read_graph(step, (1, 3), reciprocals=True),
+    )
+
+
+def _elements(matrix: ca.SX) -> list[ca.SX]:
+    """Structural non-zeros, column by column."""
+    return [matrix.nz[k] for k in range(matrix.nnz())]
+
+
+def _placed(values: ca.SX, rows: Sequence[int], n: int) -> ca.SX:
+    """Column (n,) that has values in some rows."""
+    column = ca.SX(n, 1)
+    for k, row in enumerate(rows):
+        column[row] = values[k]
+    return column
 
 
 # A step alone --------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import chain
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from diransac.simulation.batch import (
     ScoreBatch,
     Simulator,
 )
+from diransac.simulation.compiler.graph import read_graph
 from diransac.simulation.compiler.lanes import (
     Lanes,
     aligned,
@@ -38,6 +40,7 @@ from diransac.simulation.integrators import HOLDS, INTEGRATORS, Sensitivities, l
 
 if TYPE_CHECKING:
     from diransac.simulation.compiler.time_loop import InputSource, LoopSpecification, Output
+    from diransac.simulation.compiler.vectors import Value
     from diransac.simulation.integrators import SimulatedModel
 
 __all__ = ["Rollouts", "rollouts"]
@@ -123,10 +126,11 @@ class Rollouts(Simulator):
         self.signals = signals
         self._model, self._integrator, self._substeps, self._target = model, integrator, substeps, target
         self._hold = hold
-        self._specifications: dict[tuple[str, ...], tuple[LoopSpecification, Sensitivities]] = {}
+        self._sensitivities: dict[tuple[str, ...], Sensitivities] = {}
+        self._specifications: dict[tuple[str, ...], LoopSpecification] = {}
         self._code: dict[tuple[Any, ...], MachineCode] = {}
         self._lock = RLock()
-        self._specified(())  # refuses now what could not be compiled later
+        read_graph(model.dynamics)  # refuses now what could not be compiled later
 
     def score(
         self,
@@ -192,10 +196,9 @@ class Rollouts(Simulator):
         names, sensitivities = self._unknowns(unknowns)
         n_z, n_blocks = len(names), lanes.n_padded // LANES
         sums = aligned((n_blocks, 1 + n_z + n_z * (n_z + 1) // 2, LANES))
-        final = aligned((n_blocks, len(self._model.state) + int(sensitivities.varying.sum()), LANES))
+        final = aligned((n_blocks, len(self._model.state) + int(sensitivities.present.sum()), LANES))
         values = {
             **arranged_weights(lanes, len(self.signals), measurements.values, measurements.valid, weights),
-            "initial_states": sensitivities.appended(lanes.arrays["initial_states"]),
             "sums": sums,
             "final": final,
         }
@@ -219,11 +222,12 @@ class Rollouts(Simulator):
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_s * (1 + n_z)))
         values = {
             **arranged_measurements(lanes, n_s, measurements.values, measurements.valid),
-            "initial_states": sensitivities.appended(lanes.arrays["initial_states"]),
             "series": series,
         }
         self._run(LinearizedErrorOutput, batch, lanes, values, threads, unknowns=names)
-        jacobian = series[..., n_s:].reshape(*series.shape[:2], n_s, n_z)
+        columns = series[..., n_s:].reshape(*series.shape[:2], n_z, n_s)
+        jacobian = np.empty((*series.shape[:2], n_s, n_z))
+        jacobian[..., list(chain(*sensitivities.groups))] = columns.swapaxes(-1, -2)
         return LinearizedErrors(names, series[..., :n_s], jacobian)
 
     def fly(
@@ -278,7 +282,7 @@ class Rollouts(Simulator):
                 f"unknowns are {', '.join(names) or 'none'}, but at least one is needed, each a parameter or a state, "
                 f"once; there are {', '.join(known)}."
             )
-        return names, self._specified(names)[1]
+        return names, self._derivatives(names)
 
     def _run(
         self,
@@ -298,15 +302,25 @@ class Rollouts(Simulator):
             code = self._compiled(output, inputs or inputs_from_log, unknowns, lanes.has_windows)
             run_time_loop(code, lanes, {"step": batch.dt / self._substeps, **values}, threads)
 
-    def _specified(self, unknowns: tuple[str, ...]) -> tuple[LoopSpecification, Sensitivities]:
+    def _derivatives(self, unknowns: tuple[str, ...]) -> Sensitivities:
+        """Structure of the derivatives with respect to some unknowns, found when first needed."""
+        with self._lock:
+            if unknowns not in self._sensitivities:
+                self._sensitivities[unknowns] = sensitivities_of(self._model, unknowns)
+            return self._sensitivities[unknowns]
+
+    def _specified(self, unknowns: tuple[str, ...]) -> LoopSpecification:
         """Expressions of a row and their derivatives with respect to some unknowns, made when first needed."""
         with self._lock:
             if unknowns not in self._specifications:
-                sensitivities = sensitivities_of(self._model, unknowns)
-                specification = loop_specification(
-                    self._model, self.signals, sensitivities, self._integrator, self._substeps, self._hold
+                self._specifications[unknowns] = loop_specification(
+                    self._model,
+                    self.signals,
+                    self._integrator,
+                    self._substeps,
+                    self._hold,
+                    self._derivatives(unknowns) if unknowns else None,
                 )
-                self._specifications[unknowns] = specification, sensitivities
             return self._specifications[unknowns]
 
     def _compiled(
@@ -315,12 +329,24 @@ class Rollouts(Simulator):
         """Machine code of a variant of the time loop, compiled when first needed."""
         from diransac.simulation.compiler.time_loop import ARGUMENTS, emit_time_loop
 
+        def emit() -> Value:
+            return emit_time_loop(self._specified(unknowns), output, inputs, windows=windows)
+
         variant = (output, inputs, unknowns, windows)
         with self._lock:
             if variant not in self._code:
-                module = emit_time_loop(self._specified(unknowns)[0], output, inputs, windows=windows)
-                self._code[variant] = compile_function(module, "time_loop", ARGUMENTS.values(), self._target)
+                definition = (*self._definition(unknowns), output.__name__, inputs.__name__, repr(windows))
+                code = compile_function(emit, definition, "time_loop", ARGUMENTS.values(), self._target)
+                self._code[variant] = code
             return self._code[variant]
+
+    def _definition(self, unknowns: tuple[str, ...]) -> list[str]:
+        """Texts that determine `loop_specification`: all that it reads of the model, and its other arguments."""
+        model = self._model
+        sizes = (model.n_q, model.n_u, model.n_p, tuple(model.parameters), model.state, model.signals)
+        options = (self.signals, unknowns, self._integrator, self._substeps, self._hold)
+        functions = (model.dynamics, model.rate_jacobians) if unknowns else (model.dynamics,)
+        return [repr((sizes, model.quaternions, options)), *(function.serialize() for function in functions)]
 
 
 def _unpacked(sensitivities: Sensitivities, n_lanes: int, sums: FloatArray, final: FloatArray) -> GaussNewtonBatch:
@@ -329,18 +355,20 @@ def _unpacked(sensitivities: Sensitivities, n_lanes: int, sums: FloatArray, fina
     Parameters
     ----------
     sums : (n_blocks, 1 + n_z + n_z (n_z + 1) / 2, 8)
-        e' W e, J' W e, and the upper triangle of J' W J.
-    final : (n_blocks, n_states, 8)
-        State, then its varying derivatives.
+        e' W e, J' W e, and the upper triangle of J' W J, the unknowns group by group.
+    final : (n_blocks, n_x + n_entries, 8)
+        State, then its derivatives.
     """
     sums, final = (
         array.swapaxes(1, 2).reshape(len(array) * LANES, array.shape[1])[:n_lanes] for array in (sums, final)
     )
     n_x, n_z = sensitivities.initial.shape
+    place = np.argsort(list(chain(*sensitivities.groups)))
     upper = np.triu_indices(n_z)
-    normal_matrix = np.empty((n_lanes, n_z, n_z))
-    normal_matrix[:, *upper] = normal_matrix[:, *upper[::-1]] = sums[:, 1 + n_z :]
-    cost, gradient = sums[:, 0].copy(), sums[:, 1 : 1 + n_z].copy()
+    pair = np.empty((n_z, n_z), int)
+    pair[upper] = pair[upper[::-1]] = np.arange(1 + n_z, sums.shape[1])
+    cost, gradient = sums[:, 0].copy(), sums[:, 1 + place]
+    normal_matrix = sums[:, pair[np.ix_(place, place)]]
     diverged = np.isinf(cost)
     slopes = sensitivities.matrix(final[:, n_x:])
     slopes[diverged] = np.nan

@@ -7,8 +7,10 @@
 | `elementary.py` | sin, atan2, exp, pow and the like of such vectors |
 | `operations.py` | vector form of every operation, and the emission of graphs, once or over rows |
 | `machine_code.py` | LLVM module to callable machine code; threads |
+| `code_cache.py` | machine code on disk |
 | `functions.py` | `Map` and `Scan`: SX functions over arrays |
 | `time_loop.py` | the time loop of a simulation, and the sources of its inputs |
+| `sensitivities.py` | derivatives of the state in the time loop: columns in memory, stepped in loops |
 | `outputs.py` | outputs of the time loop: scores, sums, series |
 | `lanes.py` | arrays of many rollouts, arranged for the time loop |
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
-from diransac.simulation.compiler.graph import Graph, read_graph
+from diransac.simulation.compiler.graph import read_graph
 from diransac.simulation.compiler.lanes import arranged_lanes, run_time_loop
 from diransac.simulation.compiler.machine_code import LANES, MachineCode, Target, compile_function, run_blocks
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from diransac.simulation.compiler.time_loop import LoopSpecification
+    from diransac.simulation.compiler.vectors import Value
 
 
 __all__ = ["Map", "Scan", "compile_map", "compile_scan"]
@@ -30,7 +31,7 @@ class Map:
     """An SX function over many rows; made by `compile_map`, compiled when first called."""
 
     def __init__(self, serialized: str, target: Target | None) -> None:
-        self._function = ca.Function.deserialize(serialized)
+        self._function, self._serialized = ca.Function.deserialize(serialized), serialized
         self._target = target
         self._code: dict[tuple[bool, ...], MachineCode] = {}
         self._lock = Lock()
@@ -84,13 +85,16 @@ class Map:
         """Machine code for inputs some of which are shared by all rows."""
         from diransac.simulation.compiler.operations import emit_map_loop, map_signature
 
+        function, definition = self._function, ("map", self._serialized, repr(shared))
+
+        def emit() -> Value:
+            graph = read_graph(function, [k for k, fixed in enumerate(shared) if fixed])
+            return emit_map_loop(graph, [function.numel_in(k) for k in range(function.n_in())])
+
         with self._lock:
             if shared not in self._code:
-                function = self._function
-                graph = read_graph(function, [k for k, fixed in enumerate(shared) if fixed])
-                module = emit_map_loop(graph, [function.numel_in(k) for k in range(function.n_in())])
                 signature = map_signature(function.n_in() + function.n_out())
-                self._code[shared] = compile_function(module, "map_loop", signature, self._target)
+                self._code[shared] = compile_function(emit, definition, "map_loop", signature, self._target)
             return self._code[shared]
 
 
@@ -128,11 +132,11 @@ class Scan:
     """
 
     def __init__(self, serialized: str, target: Target | None) -> None:
-        self._function = ca.Function.deserialize(serialized)
+        self._function, self._serialized = ca.Function.deserialize(serialized), serialized
         self._target = target
         self._code: dict[bool, MachineCode] = {}
         self._lock = Lock()
-        self._graph = _graph_of(self._function)  # refuses now what could not be compiled later
+        self._graph = read_graph(self._function, (2,), reciprocals=True)  # refuses now what could not be compiled later
 
     def __call__(self, carry: ArrayLike, rows: ArrayLike, constants: ArrayLike, *, threads: int = 1) -> FloatArray:
         """Outputs of every lane and row.
@@ -181,10 +185,14 @@ class Scan:
         from diransac.simulation.compiler.outputs import SignalOutput
         from diransac.simulation.compiler.time_loop import ARGUMENTS, emit_time_loop, inputs_from_log
 
+        def emit() -> Value:
+            return emit_time_loop(self._specification(), SignalOutput, inputs_from_log, windows=windows)
+
+        definition = ("scan", self._serialized, repr(windows))
         with self._lock:
             if windows not in self._code:
-                module = emit_time_loop(self._specification(), SignalOutput, inputs_from_log, windows=windows)
-                self._code[windows] = compile_function(module, "time_loop", ARGUMENTS.values(), self._target)
+                code = compile_function(emit, definition, "time_loop", ARGUMENTS.values(), self._target)
+                self._code[windows] = code
             return self._code[windows]
 
     def _specification(self) -> LoopSpecification:
@@ -193,12 +201,10 @@ class Scan:
 
         return LoopSpecification(
             step=self._graph,
-            further_step=Graph((), ((),), ()),
             substeps=1,
             n_states=self._function.numel_in(0),
             n_inputs=self._function.numel_in(1),
             n_signals=self._function.numel_out(1),
-            n_unknowns=0,
             scored=(),
             quaternions=(),
             state_quaternions=(),
@@ -235,10 +241,3 @@ def compile_scan(function: ca.Function, target: Target | None = None) -> Scan:
 def _scan(serialized: str, target: Target | None) -> Scan:
     """Scan by value of what defines it."""
     return Scan(serialized, target)
-
-
-def _graph_of(function: ca.Function) -> Graph:
-    """Graph of the recurrence with an empty Jacobian, which the time loop expects."""
-    arguments = [ca.SX.sym(function.name_in(k), function.sparsity_in(k)) for k in range(3)]
-    whole = ca.Function(function.name(), arguments, [*function(*arguments), ca.SX(0, 0)])
-    return read_graph(whole, (2,), reciprocals=True)

@@ -1,4 +1,4 @@
-"""Machine code from LLVM's intermediate representation, run on several threads."""
+"""Machine code from LLVM's intermediate representation or from the cache, run on several threads."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import ctypes
 import os
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from diransac.errors import SettingsError
+from diransac.simulation.compiler.code_cache import CodeCache, hashed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
+    from collections.abc import Callable, Collection, Iterable, Sequence
     from concurrent.futures import ThreadPoolExecutor
 
 __all__ = ["LANES", "MachineCode", "Target", "compile_function", "default_threads", "run_blocks"]
@@ -82,27 +84,68 @@ def _binding() -> LLVM:
     return binding
 
 
-def compile_function(module: LLVM, name: str, signature: Collection[str], target: Target | None = None) -> MachineCode:
-    """Compile one function of an LLVM module, optimised, to machine code.
+def compile_function(
+    emit: Callable[[], LLVM],
+    definition: Iterable[str],
+    name: str,
+    signature: Collection[str],
+    target: Target | None = None,
+) -> MachineCode:
+    """Machine code of one function of an LLVM module, from the cache if it is there.
 
     Parameters
     ----------
-    module : llvmlite `ir.Module`
+    emit : returns the llvmlite `ir.Module`; called only if the code is not in the cache
+    definition : texts that, with the sources of this package, determine the module
     name : the function
     signature : kind of each argument, `pointer`, `integer` (64 bits) or `number` (float64)
     target : processor to compile for; this one by default
     """
-    binding = _binding()
-    target = target or Target.host()
-    triple = binding.Target.from_default_triple()
-    machine = triple.create_target_machine(cpu=target.cpu, features=target.features, opt=CODE_GENERATION)
-    parsed = binding.parse_assembly(str(module))
-    _optimise(parsed, machine)
-    engine = binding.create_mcjit_compiler(parsed, machine)
+    binding, machine = _binding(), _machine(target or Target.host())
+    code = _object_code(emit, _key(target or Target.host(), name, definition), machine)
+    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), machine)
+    engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()
     kinds = {"pointer": ctypes.c_void_p, "integer": ctypes.c_int64, "number": ctypes.c_double}
     prototype = ctypes.CFUNCTYPE(None, *(kinds[kind] for kind in signature))
     return MachineCode(prototype(engine.get_function_address(name)), engine)
+
+
+def _machine(target: Target) -> LLVM:
+    """LLVM's code generator for a processor."""
+    triple = _binding().Target.from_default_triple()
+    return triple.create_target_machine(cpu=target.cpu, features=target.features, opt=CODE_GENERATION)
+
+
+def _object_code(emit: Callable[[], LLVM], key: str, machine: LLVM) -> bytes:
+    """Object file of a module, from the cache or compiled and kept there."""
+    cache = CodeCache.of_user()
+    if cache is not None and (kept := cache.read(key)) is not None:
+        return kept
+    parsed = _binding().parse_assembly(str(emit()))
+    _optimise(parsed, machine)
+    code = bytes(machine.emit_object(parsed))
+    if cache is not None:
+        cache.write(key, code)
+    return code
+
+
+def _key(target: Target, name: str, definition: Iterable[str]) -> str:
+    """Key of a function's machine code: what it is compiled from, by what, and for which processor."""
+    binding = _binding()
+    settings = (binding.get_default_triple(), target.cpu, target.features, name)
+    return hashed([*_versions(), *settings, *definition])
+
+
+@cache
+def _versions() -> tuple[str, ...]:
+    """Versions of what emits and compiles code: the libraries, and the sources of this package."""
+    import casadi as ca
+    import llvmlite
+
+    llvm = ".".join(str(number) for number in _binding().llvm_version_info)
+    sources = sorted(Path(__file__).parents[1].rglob("*.py"))
+    return (llvmlite.__version__, llvm, ca.CasadiMeta.version(), hashed(path.read_text("utf-8") for path in sources))
 
 
 def _optimise(module: LLVM, machine: LLVM) -> None:

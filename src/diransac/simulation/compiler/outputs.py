@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from itertools import combinations_with_replacement
+from functools import partial
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 from llvmlite import ir
 
 from diransac.simulation.compiler.machine_code import LANES
-from diransac.simulation.compiler.vectors import BYTE, DOUBLE, NUMBERS, Value, integer
+from diransac.simulation.compiler.vectors import BYTE, DOUBLE, Value, integer
 
 if TYPE_CHECKING:
+    from diransac.simulation.compiler.sensitivities import Columns
     from diransac.simulation.compiler.time_loop import Block, LoopRow, TimeLoop
 
 __all__ = [
@@ -37,18 +39,16 @@ class _Output:
     def end(self, block: Block) -> None:
         """Nothing after the last row."""
 
-    def errors(self, block: Block, row: LoopRow) -> tuple[list[Value], list[list[Value | None]]]:
-        """Simulated less measured, and the Jacobian; a quaternion first takes the sign that is nearer."""
+    def errors(self, block: Block, row: LoopRow) -> list[Value]:
+        """Simulated less measured; a quaternion, and its derivatives, first take the sign that is nearer."""
         v = self.v
-        predicted, slopes = [row.signals[k] for k in self.specification.scored], row.slopes
+        predicted = [row.signals[k] for k in self.specification.scored]
         measured = self.loop.logged("measured", len(predicted), block, row.index)
         for four in self.specification.quaternions:
             predicted, opposite = v.turned_towards(predicted, measured, four)
-            slopes = [
-                [s if s is None else v.select(opposite, v.neg(s), s) for s in row_of] if k in four else row_of
-                for k, row_of in enumerate(slopes)
-            ]
-        return [v.sub(x, y) for x, y in zip(predicted, measured, strict=True)], slopes
+            if self.loop.columns is not None:
+                self.loop.columns.turn(opposite, four)
+        return [v.sub(x, y) for x, y in zip(predicted, measured, strict=True)]
 
 
 # Sums ----------------------------------------------------------------------------------------------------------------
@@ -79,7 +79,7 @@ class ScoreOutput(_Output):
         (flags,) = self.loop.logged("valid", 1, block, row.index, BYTE)
         valid = self.loop.builder.icmp_unsigned("!=", flags, ir.Constant(flags.type, [ir.Constant(BYTE, 0)] * LANES))
         n_inside = v.integer(0)
-        for k, (error, total) in enumerate(zip(self.errors(block, row)[0], self.sums, strict=True)):
+        for k, (error, total) in enumerate(zip(self.errors(block, row), self.sums, strict=True)):
             counted = v.select(valid, error, v.number(0.0))
             square = v.mul(counted, counted)
             v.set(total, v.add(v.get(total), square))
@@ -105,72 +105,142 @@ class ScoreOutput(_Output):
 class GaussNewtonOutput(_Output):
     """`sums` (n_blocks, 1 + n_z + n_z (n_z + 1) / 2, 8) of e'we, J'we, J'wJ's upper triangle; `final` states.
 
-    The sums exceed the registers: each is loaded, increased and stored in its final place, close together for a block.
-    In a lane that diverged e'we is infinite, the other sums are zero, and the final state is NaN.
+    Unknowns are in the order of their groups. The sums exceed the registers: each is loaded, increased and stored in
+    its final place, close together for a block. `final` (n_blocks, n_states + n_derivatives, 8) is the state, then the
+    derivatives of each group. In a lane that diverged e'we is infinite, the other sums are zero, and `final` is NaN.
     """
 
     ends_early = True
 
     def __init__(self, loop: TimeLoop) -> None:
         super().__init__(loop)
-        n_z = self.specification.n_unknowns
-        self.pairs = list(combinations_with_replacement(range(n_z), 2))
-        self.n_sums = 1 + n_z + len(self.pairs)
+        self.columns = _columns_of(loop)
+        groups = self.columns.groups
+        self.first_unknowns = list(accumulate((len(group.unknowns) for group in groups), initial=0))
+        self.n_z = self.first_unknowns[-1]
+        self.n_sums = 1 + self.n_z + self.n_z * (self.n_z + 1) // 2
+        self.n_final = self.specification.n_states + sum(len(group.unknowns) * len(group.rows) for group in groups)
+        self.weighted = [self.v.array(len(group.unknowns) * len(group.signals)) for group in groups]
 
     def start(self, block: Block) -> None:
         """Set the sums to zero."""
-        for k in range(self.n_sums):
-            self.v.store(self.v.number(0.0), *self._place("sums", block, self.n_sums, k))
+        self.sums = self._first(block, "sums", self.n_sums)
+        self.v.each(0, self.n_sums, lambda k: self.v.put(self.v.number(0.0), self.sums, k))
 
     def row(self, block: Block, row: LoopRow) -> None:
         """Add a row to the sums."""
-        v, n_z = self.v, self.specification.n_unknowns
-        errors, slopes = self.errors(block, row)
+        v = self.v
+        errors = self.errors(block, row)
         weights = self.loop.logged("weights", len(errors), block, row.index)
         weighted = [v.mul(w, e) for w, e in zip(weights, errors, strict=True)]
-        scaled = [
-            [None if s is None else v.mul(w, s) for s in of_signal]
-            for w, of_signal in zip(weights, slopes, strict=True)
-        ]
-        self._add(block, 0, list(zip(weighted, errors, strict=True)))
-        for j in range(n_z):
-            self._add(block, 1 + j, [(s[j], w) for s, w in zip(slopes, weighted, strict=True)])
-        for k, (i, j) in enumerate(self.pairs):
-            self._add(block, 1 + n_z + k, [(s[i], t[j]) for s, t in zip(slopes, scaled, strict=True)])
+        self._add(0, list(zip(weighted, errors, strict=True)))
+        for number in range(len(self.columns.groups)):
+            self._add_gradient(number, weights, weighted)
+        for left in range(len(self.columns.groups)):
+            self._add_products(left)
 
-    def _add(self, block: Block, k: int, products: list[tuple[Value | None, Value | None]]) -> None:
-        """Add products, one per signal, to a sum; those with a factor that is always zero are left out."""
-        v = self.v
-        present = [(x, y) for x, y in products if x is not None and y is not None]
-        if not present:
-            return
-        base, index = self._place("sums", block, self.n_sums, k)
-        total = v.load(base, index, NUMBERS)
-        for x, y in present:
-            total = v.fma(x, y, total)
-        v.store(total, base, index)
+    def _add_gradient(self, number: int, weights: list[Value], weighted: list[Value]) -> None:
+        """Add a row's J'we of a group, and compute its w J."""
+        v, group = self.v, self.columns.groups[number]
+
+        def add(column: Value | int) -> None:
+            products = []
+            for k, signal in enumerate(group.signals):
+                place = v.affine(column, len(group.signals), k)
+                slope = v.pick(self.columns.slopes[number], place)
+                v.put(v.mul(weights[signal], slope), self.weighted[number], place)
+                products.append((slope, weighted[signal]))
+            self._add(v.affine(column, 1, 1 + self.first_unknowns[number]), products)
+
+        v.each(0, len(group.unknowns), add)
+
+    def _add_products(self, left: int) -> None:
+        """Add a row's J'wJ of the columns of a group with themselves and with those of later groups."""
+        v, group = self.v, self.columns.groups[left]
+
+        def add(column: Value | int) -> None:
+            slopes = {
+                signal: v.pick(self.columns.slopes[left], v.affine(column, len(group.signals), k))
+                for k, signal in enumerate(group.signals)
+            }
+            line = self._line(v.affine(column, 1, self.first_unknowns[left]))
+            for right in range(left, len(self.columns.groups)):
+                self._add_line(line, slopes, right, column if left == right else 0)
+
+        v.each(0, len(group.unknowns), add)
+
+    def _add_line(self, line: Value | int, slopes: dict[int, Value], right: int, first: Value | int) -> None:
+        """Add the products of one column with those of a group, from the first on."""
+        v, group = self.v, self.columns.groups[right]
+        common = [(k, signal) for k, signal in enumerate(group.signals) if signal in slopes]
+
+        def add(column: Value | int) -> None:
+            weighted = (v.pick(self.weighted[right], v.affine(column, len(group.signals), k)) for k, _ in common)
+            products = [(slopes[signal], value) for (_, signal), value in zip(common, weighted, strict=True)]
+            self._add(v.affine(column, 1, v.affine(line, 1, self.first_unknowns[right])), products)
+
+        if common:
+            v.each(first, len(group.unknowns), add)
+
+    def _line(self, unknown: Value | int) -> Value | int:
+        """Place of (unknown, 0) in the upper triangle, had it one: 1 + n_z + unknown (2 n_z - 1 - unknown) / 2."""
+        if isinstance(unknown, int):
+            return 1 + self.n_z + unknown * (2 * self.n_z - 1 - unknown) // 2
+        builder = self.loop.builder
+        twice = builder.mul(unknown, builder.sub(integer(2 * self.n_z - 1), unknown))
+        return builder.add(builder.ashr(twice, integer(1)), integer(1 + self.n_z))
+
+    def _add(self, place: Value | int, products: list[tuple[Value, Value]]) -> None:
+        """Add products, one per signal, to a sum."""
+        total = self.v.pick(self.sums, place)
+        for x, y in products:
+            total = self.v.fma(x, y, total)
+        self.v.put(total, self.sums, place)
 
     def end(self, block: Block) -> None:
         """Write the sums and the final state; mark lanes in which anything is not finite."""
-        v = self.v
-        n_states = self.specification.n_states
-        totals = [v.load(*self._place("sums", block, self.n_sums, k), NUMBERS) for k in range(self.n_sums)]
-        states = [v.get(variable) for variable in self.loop.state]
-        guard = v.get(self.loop.guard)
-        for value in (*totals, *states):
-            guard = v.fma(value, v.number(0.0), guard)
-        diverged = v.is_nan(guard)
-        for k, total in enumerate(totals):
-            instead = v.number(0.0 if k else float("inf"))
-            v.store(v.select(diverged, instead, total), *self._place("sums", block, self.n_sums, k))
-        for k, state in enumerate(states):
-            final = v.select(diverged, v.number(float("nan")), state)
-            v.store(final, *self._place("final", block, n_states, k))
+        v, guard = self.v, self.loop.guard
+        final = self._first(block, "final", self.n_final)
+        for k, variable in enumerate(self.loop.state):
+            v.put(v.get(variable), final, k)
+        first = self.specification.n_states
+        for group, state in zip(self.columns.groups, self.columns.state, strict=True):
+            size = len(group.unknowns) * len(group.rows)
+            v.each(0, size, partial(self._copy, state, final, first))
+            first += size
+        written = [(self.sums, self.n_sums, 0.0), (final, self.n_final, float("nan"))]
+        for array, size, _ in written:
+            v.each(0, size, partial(self._guard, array))
+        diverged = v.is_nan(v.get(guard))
+        with self.loop.builder.if_then(v.any_lane(diverged)):
+            for array, size, instead in written:
+                v.each(0, size, partial(self._replace, array, diverged, instead))
+            self._replace(self.sums, diverged, float("inf"), 0)
 
-    def _place(self, name: str, block: Block, width: int, k: int) -> tuple[Value, Value]:
-        """Array, and position in it, of a block's vector; `first` is eight times the block."""
-        builder = self.loop.builder
-        return self.arguments[name], builder.add(builder.mul(block.first, integer(width)), integer(k * LANES))
+    def _copy(self, source: Value, target: Value, first: int, index: Value | int) -> None:
+        """Copy one vector to its place among others."""
+        self.v.put(self.v.pick(source, index), target, self.v.affine(index, 1, first))
+
+    def _guard(self, array: Value, index: Value | int) -> None:
+        """Include one vector among the values that are to be finite."""
+        v, guard = self.v, self.loop.guard
+        v.set(guard, v.fma(v.pick(array, index), v.number(0.0), v.get(guard)))
+
+    def _replace(self, array: Value, lanes: Value, value: float, index: Value | int) -> None:
+        """Replace some lanes of one vector."""
+        self.v.put(self.v.select(lanes, self.v.number(value), self.v.pick(array, index)), array, index)
+
+    def _first(self, block: Block, name: str, width: int) -> Value:
+        """First of a block's vectors in an array; `first` is eight times the block."""
+        start = self.loop.builder.mul(block.first, integer(width))
+        return self.loop.builder.gep(self.arguments[name], [start], source_etype=DOUBLE)
+
+
+def _columns_of(loop: TimeLoop) -> Columns:
+    """Derivatives of a loop that simulates them."""
+    if loop.columns is None:
+        raise TypeError("this output takes derivatives, which the loop does not simulate")
+    return loop.columns
 
 
 # Series --------------------------------------------------------------------------------------------------------------
@@ -217,14 +287,20 @@ class ErrorOutput(_SeriesOutput):
 
     def values(self, block: Block, row: LoopRow) -> list[Value]:
         """Errors of the scored signals."""
-        return self.errors(block, row)[0]
+        return self.errors(block, row)
 
 
 class LinearizedErrorOutput(_SeriesOutput):
-    """Errors of the scored signals, then their Jacobian, signal by signal."""
+    """Errors of the scored signals, then their derivatives, unknown by unknown in the order of the groups."""
 
     def values(self, block: Block, row: LoopRow) -> list[Value]:
-        """Errors of the scored signals, then their Jacobian."""
-        errors, slopes = self.errors(block, row)
-        zero = self.v.number(0.0)
-        return [*errors, *(zero if s is None else s for of_signal in slopes for s in of_signal)]
+        """Errors of the scored signals, then their derivatives."""
+        values = self.errors(block, row)
+        columns = _columns_of(self.loop)
+        for group, slopes in zip(columns.groups, columns.slopes, strict=True):
+            for column in range(len(group.unknowns)):
+                found = dict.fromkeys(range(len(self.specification.scored)), self.v.number(0.0))
+                for k, signal in enumerate(group.signals):
+                    found[signal] = self.v.pick(slopes, column * len(group.signals) + k)
+                values += found.values()
+        return values

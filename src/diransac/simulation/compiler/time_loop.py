@@ -14,6 +14,7 @@ from llvmlite import ir
 
 from diransac.simulation.compiler.machine_code import LANES
 from diransac.simulation.compiler.operations import evaluate, numbers
+from diransac.simulation.compiler.sensitivities import Columns, Points
 from diransac.simulation.compiler.vectors import (
     DOUBLE,
     INTEGER,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from diransac.simulation.compiler.graph import Graph
+    from diransac.simulation.compiler.sensitivities import DerivativeSpecification
 
 __all__ = [
     "ARGUMENTS",
@@ -82,28 +84,27 @@ class LoopSpecification:
 
     Attributes
     ----------
-    step : graph of (x, u, p, h) -> (x after one sub-step, signals before it, Jacobian (n_s, n_z) of the scored ones)
-    further_step : graph of (x, u, p, h) -> (x after one sub-step,), for the sub-steps after the first
+    step : graph of (x, u, p, h) -> (x after one sub-step, signals before it); where derivatives are simulated, it also
+        returns the states and inputs of each stage, and the components of the quaternions before they are scaled
     substeps : sub-steps per row
-    n_states, n_inputs, n_signals, n_unknowns : sizes of x, u, all signals, and the unknowns of the Jacobian; x is the
-        model's state, followed by its varying sensitivities
+    n_states, n_inputs, n_signals : sizes of x, u, and all signals
     n_changes : number of trailing elements of u that the leading ones change by with each sub-step
     scored : positions of the scored signals among all signals
     quaternions : positions of whole quaternions among the scored signals; their sign is arbitrary
     state_quaternions : positions of all quaternions in x
+    derivatives : expressions of the derivatives of x, if they are simulated
     """
 
     step: Graph
-    further_step: Graph
     substeps: int
     n_states: int
     n_inputs: int
     n_signals: int
-    n_unknowns: int
     scored: tuple[int, ...]
     quaternions: tuple[tuple[int, ...], ...]
     state_quaternions: tuple[tuple[int, ...], ...]
     n_changes: int = 0
+    derivatives: DerivativeSpecification | None = None
 
 
 @dataclass(frozen=True)
@@ -114,13 +115,12 @@ class Block:
     ----------
     first : position of the first lane among the padded ones
     starts : per lane, row of the log at which it starts; empty if all start at the first
-    step, further_step : invariant results of the graphs
+    step : invariant results of the graph
     """
 
     first: Value
     starts: list[Value]
     step: dict[int, Value]
-    further_step: dict[int, Value]
 
 
 @dataclass(frozen=True)
@@ -132,14 +132,12 @@ class LoopRow:
     index : row of the rollout
     inputs : inputs from this row to the next
     signals : states and accelerations at this row
-    slopes : Jacobian of the scored signals, by signal and unknown; None where always zero
     alive : lanes in which every signal has been finite in all rows so far
     """
 
     index: Value
     inputs: list[Value]
     signals: list[Value]
-    slopes: list[list[Value | None]]
     alive: Value
 
 
@@ -197,9 +195,15 @@ class TimeLoop:
         self.arguments = {argument.name: argument for argument in function.args}
         self.v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
         self.builder = self.v.builder
+        self.v.align_frame()
         self.state: list[Variable] = [self.v.variable(self.v.number(0.0)) for _ in range(specification.n_states)]
         self.guard = self.v.variable(self.v.number(0.0))
         """Zero as long as every signal has been finite."""
+        self.columns: Columns | None = None
+        """Derivatives of the state, if they are simulated."""
+        if specification.derivatives is not None:
+            n_quaternions = 4 * len(specification.state_quaternions)
+            self.columns = Columns(self.v, specification.derivatives, self.arguments["step"], n_quaternions)
 
     def emit(self, variant: type[Output], inputs: InputSource) -> None:
         """Emit the whole function."""
@@ -226,11 +230,12 @@ class TimeLoop:
                 return self._lane_vector("parameters", element, first)
             return v.splat(self.arguments["step"])
 
-        constant = [
-            evaluate(v, graph, [k for k in graph.needed(chain(*graph.outputs)) if graph.invariant[k]], load)
-            for graph in (specification.step, specification.further_step)
-        ]
-        return Block(first, self.whole_numbers("start_rows", first) if self.windows else [], *constant)
+        if self.columns is not None:
+            self.columns.start(lambda element: self._lane_vector("parameters", element, first))
+        graph = specification.step
+        constant = [k for k in graph.needed(chain(*graph.outputs)) if graph.invariant[k]]
+        starts = self.whole_numbers("start_rows", first) if self.windows else []
+        return Block(first, starts, evaluate(v, graph, constant, load))
 
     def whole_numbers(self, name: str, first: Value) -> list[Value]:
         """Return the eight integers of a block's lanes in an array that holds one for every lane."""
@@ -238,34 +243,40 @@ class TimeLoop:
         return [self.v.lane(vector, lane) for lane in range(LANES)]
 
     def _row(self, output: Output, block: Block, rows: Loop, u: list[Value]) -> None:
-        """Emit the output of one row, then step to the next."""
-        v, graph = self.v, self.specification.step
-        results = self._evaluate(graph, chain(*graph.outputs), u, block.step)
-        after, signals, slopes = (numbers(v, results, positions) for positions in graph.outputs)
+        """Emit one row: its sub-steps share their code, and the first one has the output."""
+        if self.specification.substeps == 1:
+            signals, after = self._substep(block, u)
+            self._output(output, block, rows, u, signals)
+            self._set_state(after)
+            return
+        with self.v.repeat(integer(0), integer(self.specification.substeps)) as steps:
+            signals, after = self._substep(block, self._changed(u, steps.index))
+            with self.builder.if_then(self.builder.icmp_signed("==", steps.index, integer(0))):
+                self._output(output, block, rows, u, signals)
+            self._set_state(after)
+
+    def _substep(self, block: Block, u: list[Value]) -> tuple[list[Value], list[Value]]:
+        """Signals before a sub-step, and the state after it; derivatives are advanced in their arrays."""
+        n_states = self.specification.n_states
+        after, signals, *points = self._results(self.specification.step, u, block.step)
+        if self.columns is not None:
+            states, inputs, quaternions = points
+            n_u = len(inputs) // (len(states) // n_states)
+            self.columns.advance(Points(_parts(states, n_states), _parts(inputs, n_u), quaternions))
+        return signals, after
+
+    def _results(self, graph: Graph, u: list[Value], known: dict[int, Value]) -> list[list[Value]]:
+        """Outputs of a graph at the current state."""
+        results = self._evaluate(graph, chain(*graph.outputs), u, known)
+        return [numbers(self.v, results, positions) for positions in graph.outputs]
+
+    def _output(self, output: Output, block: Block, rows: Loop, u: list[Value], signals: list[Value]) -> None:
+        """Emit the output of one row."""
         alive = self._still_finite(signals)
-        output.row(block, LoopRow(rows.index, u, signals, self._by_signal(slopes), alive))
+        output.row(block, LoopRow(rows.index, u, signals, alive))
         if output.ends_early:
-            with self.builder.if_then(self.builder.not_(v.any_lane(alive))):
+            with self.builder.if_then(self.builder.not_(self.v.any_lane(alive))):
                 self.builder.branch(rows.leave)
-        self._set_state(after)
-        if self.specification.substeps > 1:
-            self._further_steps(u, block)
-
-    def _by_signal(self, slopes: list[Value]) -> list[list[Value | None]]:
-        """Jacobian by signal and unknown, from its elements column by column."""
-        graph, n_scored = self.specification.step, len(self.specification.scored)
-        zeros = [graph.instructions[k].is_zero for k in graph.outputs[2]]
-        entries = [None if zero else slope for slope, zero in zip(slopes, zeros, strict=True)]
-        return [entries[k::n_scored] for k in range(n_scored)]
-
-    def _further_steps(self, u: list[Value], block: Block) -> None:
-        """Take the sub-steps after the first."""
-        specification = self.specification
-        (after,) = specification.further_step.outputs
-        with self.v.repeat(integer(1), integer(specification.substeps)) as steps:
-            moved = self._changed(u, steps.index)
-            results = self._evaluate(specification.further_step, after, moved, block.further_step)
-            self._set_state(numbers(self.v, results, after))
 
     def _changed(self, u: list[Value], steps: Value) -> list[Value]:
         """Inputs a number of sub-steps after their row."""
@@ -308,6 +319,11 @@ class TimeLoop:
         """One element of an array that holds a value for every lane."""
         index = self.builder.add(self.builder.mul(self.arguments["n_padded"], integer(element)), first)
         return self.v.load(self.arguments[name], index, NUMBERS)
+
+
+def _parts(values: list[Value], size: int) -> list[list[Value]]:
+    """Consecutive parts of a size."""
+    return [values[first : first + size] for first in range(0, len(values), size)]
 
 
 # Sources of the inputs ------------------------------------------------------------------------------------------------

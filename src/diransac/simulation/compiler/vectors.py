@@ -61,6 +61,15 @@ class Vectors:
         self.builder = builder
         self._memory: dict[tuple[str, Value], Value] = {}
 
+    def align_frame(self) -> None:
+        """Align the function's stack frame to a vector, so that no value that LLVM spills straddles two cache lines.
+
+        LLVM lays out the frame before it knows that it must spill, and would leave it at 16 bytes. An assembler
+        statement without code keeps the vector that asks for more.
+        """
+        kept = ir.FunctionType(ir.VoidType(), [POINTER])
+        self.builder.call(ir.InlineAsm(kept, "", "r", side_effect=True), [self.array(1)])
+
     def once(self, name: str, operand: Value, emit: Callable[[], Value]) -> Value:
         """`emit()`, or its earlier value for the same name and operand: sin and cos share their work."""
         key = (name, operand)
@@ -280,6 +289,47 @@ class Vectors:
     def store_bits(self, condition: Value, base: Value, index: Value) -> None:
         """Store a condition at element `index` of an array of bytes, the first lane in the lowest bit."""
         self.builder.store(self.builder.bitcast(condition, BITS), self.builder.gep(base, [index], source_etype=BITS))
+
+    def array(self, size: int) -> Value:
+        """Return a new array of vectors, on the stack."""
+        with self.builder.goto_entry_block():
+            place = self.builder.alloca(NUMBERS, size=max(size, 1))
+            place.align = 8 * LANES
+            return self.builder.bitcast(place, POINTER)
+
+    def pick(self, array: Value, index: Value | int) -> Value:
+        """Load vector `index` of an array of vectors."""
+        return self.builder.load(self._vector(array, index), typ=NUMBERS, align=8 * LANES)
+
+    def put(self, value: Value, array: Value, index: Value | int) -> None:
+        """Store vector `index` of an array of vectors."""
+        self.builder.store(value, self._vector(array, index), align=8 * LANES)
+
+    def _vector(self, array: Value, index: Value | int) -> Value:
+        """Address of vector `index` of an array of vectors."""
+        at = integer(index) if isinstance(index, int) else index
+        return self.builder.gep(array, [at], source_etype=NUMBERS)
+
+    def affine(self, index: Value | int, factor: int, offset: Value | int = 0) -> Value | int:
+        """Return `index * factor + offset`, a number if both are numbers."""
+        if isinstance(index, int):
+            product: Value | int = index * factor
+        else:
+            product = index if factor == 1 else self.builder.mul(index, integer(factor))
+        if isinstance(product, int) and isinstance(offset, int):
+            return product + offset
+        if isinstance(offset, int) and not offset:
+            return product
+        terms = (integer(term) if isinstance(term, int) else term for term in (product, offset))
+        return self.builder.add(*terms)
+
+    def each(self, first: Value | int, end: int, emit: Callable[[Value | int], None]) -> None:
+        """Emit `emit(index)` in a loop over every index from `first` to before `end`; without a loop if it is one."""
+        if isinstance(first, int) and end - first == 1:
+            emit(first)
+            return
+        with self.repeat(integer(first) if isinstance(first, int) else first, integer(end)) as loop:
+            emit(loop.index)
 
     # Control -------------------------------------------------------------------------------------------------------
     def variable(self, value: Value) -> Variable:
