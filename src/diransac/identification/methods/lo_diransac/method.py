@@ -67,6 +67,8 @@ _FEWEST_INTERVALS = 4
 _OUTLIER = 0.5
 # Fraction of a signal's spread from which on its noise leaves nothing to explain.
 _ALL_OF_IT = 0.8
+# Unexplained part of an acceleration from which on states that nothing measures are doubtful.
+_MUCH = 0.1
 # A significant delay: so many standard errors, and so many samples.
 _SIGNIFICANT, _SMALL_DELAY = 3.0, 0.25
 # Samples of running medians at most: spikes last for samples, however many of them there are in a second.
@@ -233,6 +235,7 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
     checks = (
         *_checks(settings, intervals, motion, refined),
+        *_checks_of_unmeasured(intervals, motion, result),
         *findings_of_fit(likeliest, motion, result),
     )
     found = _Found(dataset, intervals, motion, refined.fit, result, bool(settings.input_delay or settings.input_lag))
@@ -284,6 +287,20 @@ def _checks(
         yield Finding("bad", f"The model explains almost nothing of this log: {advice}.")
     if not refined.converged and settings.max_steps:
         yield Finding("care", f"Local optimisation did not converge within its limit of {settings.max_steps} steps.")
+
+
+def _checks_of_unmeasured(intervals: ShootingIntervals, motion: Motion, result: ProjectedEstimate) -> Iterator[Finding]:
+    """A finding where much is unexplained of a motion of which nothing measures a part: either may be anything."""
+    names, model = unmeasured_states(intervals), intervals.model
+    first = model.n_q + model.n_v
+    left = np.sqrt(np.square(result.unexplained[intervals.occupied]).mean(axis=0))
+    share = (left / motion.spread[first : first + model.n_v]).max()
+    if names and share > _MUCH:
+        yield Finding(
+            "bad",
+            f"Nothing measures {', '.join(names)}, and the model leaves {100.0 * share:.2g} % of an acceleration "
+            f"unexplained: the log does not tell one from the other. Measure {', '.join(names)}.",
+        )
 
 
 def _rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRows]:
