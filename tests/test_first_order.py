@@ -278,6 +278,16 @@ def test_a_state_that_nothing_measures_is_estimated(make, truth, simulate, names
     assert_right(dr.identify(make(), recorded(simulate(), names, 0.005, 0.1), differentiate=True), truth, largest)
 
 
+def test_a_hidden_motion_beside_forces_that_the_model_lacks_is_not_relied_on():
+    """A torque on the motor that is not recorded: the load, which nothing measures, could explain it as well."""
+    t, signals, inputs = joint_signals()
+    unrecorded = excitation(t, 21, 3.0)
+    log = recorded((t, signals, {"torque": inputs["torque"] - unrecorded}), ["motor"], 0.001)
+    found = dr.identify(flexible_joint(), log, differentiate=True)
+    assert found.verdict == "do not rely on this"
+    assert any(x.startswith("Nothing measures load, and the model leaves") for x in found.findings)
+
+
 def test_the_estimated_state_is_the_true_one():
     t, signals, _ = thrust_signals()
     found = dr.identify(lagged_thrust(), recorded(thrust_signals(), ["z"]), differentiate=True).diagnosis

@@ -305,7 +305,7 @@ class _BoundSums:
             return np.asarray(self._estimator.solve(gram, prior) * self._scale[-1] / self._scale[:-1])
 
     def prior_sums(self, gram: FloatArray, n_rows: IntArray, shift: FloatArray | None = None) -> _PriorSums | None:
-        """What priors add to the sums of sets of as many rows; None without priors."""
+        """Sums of priors beside those of sets of as many rows; None without priors."""
         if not self._has_prior.any():
             return None
         noise = self._inflation * self._residual_variance(gram, n_rows)[0]
@@ -358,7 +358,7 @@ class _SelectedSums:
         return self.bound.solve(self.gram, self.n_rows)
 
     def prior_sums(self, shift: FloatArray | None = None) -> _PriorSums | None:
-        """What priors add to the sums."""
+        """Sums of priors."""
         return self.bound.prior_sums(self.gram, self.n_rows, shift)
 
 

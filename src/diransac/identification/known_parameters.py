@@ -85,7 +85,7 @@ class KnownParameters:
         return cls(model, values, beforehand)
 
     def of_model(self, model: Model) -> KnownParameters:
-        """What is known of the parameters of another model, which has some of them."""
+        """Known parameters of another model, which has some of these."""
         fixed = {n: x for n, x in self.fixed.items() if n in model.parameters}
         return KnownParameters(model, fixed, {n: x for n, x in self.priors.items() if n in model.parameters})
 

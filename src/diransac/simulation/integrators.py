@@ -302,6 +302,12 @@ def _jacobians(model: SimulatedModel, arguments: Sequence[ca.SX]) -> tuple[ca.SX
     return ca.vertcat(A, C + D @ A[accelerations, :]), ca.vertcat(P, D @ P[accelerations, :] + E)
 
 
+def _slopes_of_signals(model: SimulatedModel, s: ca.SX, moved: ca.SX) -> ca.SX:
+    """Derivatives of all signals, from those of the state, and of its rates with the sensors below."""
+    n_accelerations = len(model.signals) - moved.numel()
+    return ca.vertcat(s, moved[model.n_q : model.n_q + n_accelerations], moved[s.numel() :])
+
+
 def _column_group(
     model: SimulatedModel,
     integrator: str,
@@ -316,7 +322,7 @@ def _column_group(
     """
     from diransac.simulation.compiler.sensitivities import ColumnGroup
 
-    (n_rows, n_x), n_q = A.shape, model.n_q
+    n_rows, n_x = A.shape
     present, driven = (
         np.flatnonzero(mask[:, unknowns[0]]).tolist() for mask in (sensitivities.present, sensitivities.driven)
     )
@@ -335,14 +341,12 @@ def _column_group(
 
     s = _placed(column, present, n_x)
     slope = rates(s, 0.0)
-    after = INTEGRATORS[integrator](rates, s, h, slope, n_q)
+    after = INTEGRATORS[integrator](rates, s, h, slope, model.n_q)
     for four in model.quaternions:
         quaternion = ca.SX.sym("q", 4)
         after = _normalised(ca.horzcat(_placed(quaternion, four, n_x), after), [four])[:, 1]
         shared.append(quaternion)
-    n_accelerations = len(model.signals) - n_rows
-    motion, sensors = slopes_of_stages[0][n_q : n_q + n_accelerations], slopes_of_stages[0][n_x:]
-    slopes = ca.sparsify(ca.vertcat(s, motion, sensors)[list(scored)])
+    slopes = ca.sparsify(_slopes_of_signals(model, s, slopes_of_stages[0])[list(scored)])
     signals = slopes.sparsity().row()
     step = ca.Function(
         "column",

@@ -89,7 +89,6 @@ def differential_drive(wheel_radius: float = 0.05, track: float = 0.3, drive: st
         },
         equations=equations,
         sensors={
-            "left_wheel": Sensor("rad/s", lambda q, v, a, u, p: rate_of("left", v)),
-            "right_wheel": Sensor("rad/s", lambda q, v, a, u, p: rate_of("right", v)),
+            f"{side}_wheel": Sensor("rad/s", lambda q, v, a, u, p, side=side: rate_of(side, v)) for side in _SIDES
         },
     )

@@ -12,7 +12,7 @@
 | `normal_equations.py`, `arrowhead.py` | all intervals as one quadratic, and its solution in O(N) |
 | `refinement.py` | local optimisation, from easy to exact |
 | `local_search.py` | explanations of a log, of which the likeliest is chosen |
-| `sensors.py` | delays and biases of sensors |
+| `sensor_errors.py` | delays and biases of sensors |
 | `projection.py` | parameters and covariance |
 | `checks.py` | findings of a fit on itself |
 | `missing_terms.py` | terms that explain the unmodelled forces |

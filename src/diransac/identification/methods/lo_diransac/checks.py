@@ -58,16 +58,16 @@ def findings_of_fit(found: Explanation, motion: Motion, result: ProjectedEstimat
 
 def _of_sensors(intervals: ShootingIntervals) -> Iterator[Finding]:
     """Delays and biases of sensors."""
-    sensors = intervals.sensors
-    if sensors is None:
+    errors = intervals.sensor_errors
+    if errors is None:
         return
     for i, name in enumerate(intervals.model.signals):
-        if sensors.delay[i]:
-            time = number(1e3 * abs(sensors.delay[i]) * intervals.dt, 3)
-            sense = "late" if sensors.delay[i] > 0.0 else "early"
+        if errors.delay[i]:
+            time = number(1e3 * abs(errors.delay[i]) * intervals.dt, 3)
+            sense = "late" if errors.delay[i] > 0.0 else "early"
             yield Finding("care", f"{name} is recorded {time} ms {sense}, a sensor delay that the estimate includes.")
-        if sensors.bias[i]:
-            size, unit = number(sensors.bias[i], 3), intervals.model.units[name]
+        if errors.bias[i]:
+            size, unit = number(errors.bias[i], 3), intervals.model.units[name]
             yield Finding("care", f"{name} has a sensor bias of {size} {unit}, which the estimate includes.")
 
 

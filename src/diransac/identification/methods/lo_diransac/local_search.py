@@ -23,7 +23,7 @@ from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import estimate_parameters
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
-from diransac.identification.methods.lo_diransac.sensors import clear_errors, error_of_sensor, with_error
+from diransac.identification.methods.lo_diransac.sensor_errors import clear_errors, error_of_sensor, with_error
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -318,7 +318,7 @@ class LocalSearch:
         left = old.delay + old.lag + fit.shared[-1] - intervals.delay - intervals.lag
         if intervals.hold != old.hold:
             left = 0.0
-        prior = now.prior if intervals.sensors is not old.sensors else free
+        prior = now.prior if intervals.sensor_errors is not old.sensor_errors else free
         # A wide prior that the evidence narrows: a narrow one would never widen where nothing moves.
         is_wide = prior is self.prior and prior is not now.prior
         sizes = np.append(fit.prior[:-1], max(prior.delay, _WHOLE_SAMPLE) if is_wide else prior.delay)

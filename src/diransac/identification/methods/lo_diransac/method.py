@@ -48,6 +48,7 @@ from diransac.identification.methods.lo_diransac.smoothing import (
 )
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
+    unmeasured_by_name,
     unmeasured_states,
     with_unmeasured_states,
 )
@@ -259,7 +260,7 @@ def _completed(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -
     """The motion with its unmeasured states.  Raises IdentificationError: no simulation gives them."""
     found = with_unmeasured_states(intervals, motion)
     if found is None:
-        names = ", ".join(unmeasured_states(intervals))
+        names = unmeasured_by_name(intervals)
         raise IdentificationError(
             f"{dataset.source}: nothing measures {names}, nor a derivative, and every simulation of {names} from the "
             "other signals diverges; measure it, or bound the parameters of its equation"
@@ -291,15 +292,15 @@ def _checks(
 
 def _checks_of_unmeasured(intervals: ShootingIntervals, motion: Motion, result: ProjectedEstimate) -> Iterator[Finding]:
     """A finding where much is unexplained of a motion of which nothing measures a part: either may be anything."""
-    names, model = unmeasured_states(intervals), intervals.model
+    names, model = unmeasured_by_name(intervals), intervals.model
     first = model.n_q + model.n_v
     left = np.sqrt(np.square(result.unexplained[intervals.occupied]).mean(axis=0))
     share = (left / motion.spread[first : first + model.n_v]).max()
     if names and share > _MUCH:
         yield Finding(
             "bad",
-            f"Nothing measures {', '.join(names)}, and the model leaves {100.0 * share:.2g} % of an acceleration "
-            f"unexplained: the log does not tell one from the other. Measure {', '.join(names)}.",
+            f"Nothing measures {names}, and the model leaves {100.0 * share:.2g} % of an acceleration unexplained: the "
+            f"log does not tell one from the other. Measure {names}.",
         )
 
 

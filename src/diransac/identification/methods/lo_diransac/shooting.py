@@ -27,7 +27,7 @@ _WELL_CONDITIONED = 1e8
 
 
 @dataclass(frozen=True)
-class Sensors:
+class SensorErrors:
     """Systematic errors of the sensors, and what they measured.
 
     Parameters
@@ -82,7 +82,7 @@ class ShootingIntervals:
         Samples by which the inputs act later than they are recorded.
     lag : float, optional
         Time constant of a first-order lag of the actuators, samples; 0 without one.
-    sensors : Sensors, optional
+    sensor_errors : SensorErrors, optional
         Errors of the sensors of which ``measured`` is corrected.
     """
 
@@ -100,7 +100,7 @@ class ShootingIntervals:
     hold: str = "zero-order"
     delay: int = 0
     lag: float = 0.0
-    sensors: Sensors | None = None
+    sensor_errors: SensorErrors | None = None
 
     @classmethod
     def of(
@@ -258,7 +258,7 @@ class ShootingIntervals:
         -------
         ShootingIntervals
         """
-        old = self.sensors or Sensors(self.measured, self.sampled, np.zeros(len(delay)), np.zeros(len(bias)))
+        old = self.sensor_errors or SensorErrors(self.measured, self.sampled, np.zeros(len(delay)), np.zeros(len(bias)))
         measured, sampled = old.measured.copy(), old.sampled.copy()
         for i, whole in enumerate(np.round(delay).astype(int)):
             for rows in self.rows_of_logs:
@@ -267,8 +267,8 @@ class ShootingIntervals:
                 at = np.clip(at, rows.start, rows.stop - 1)
                 measured[rows, i], sampled[rows, i] = old.measured[at, i], old.sampled[at, i] & inside
         measured += (delay - np.round(delay)) * rates - bias
-        sensors = replace(old, delay=delay, bias=bias)
-        return replace(self, measured=np.where(sampled, measured, 0.0), sampled=sampled, sensors=sensors)
+        errors = replace(old, delay=delay, bias=bias)
+        return replace(self, measured=np.where(sampled, measured, 0.0), sampled=sampled, sensor_errors=errors)
 
     def split(self, parts: int) -> ShootingIntervals:
         """The same rows in intervals of a fraction of the length."""

@@ -19,7 +19,7 @@ from diransac.identification.methods.lo_diransac.smoothing import Motion
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["measured_signals", "unmeasured_states", "with_unmeasured_states"]
+__all__ = ["measured_signals", "unmeasured_by_name", "unmeasured_states", "with_unmeasured_states"]
 
 # Steps from all starts; the number of those that go on, and their further steps.
 _N_STEPS, _N_FINALISTS, _N_FURTHER_STEPS = 15, 12, 60
@@ -49,6 +49,22 @@ def unmeasured_states(intervals: ShootingIntervals) -> tuple[str, ...]:
         inferred = () if seen.isdisjoint(model.coordinates) else model.velocities_of_motion
         lost -= {*model.coordinates, *inferred}
     return tuple(n for n in model.state if n in lost)
+
+
+def unmeasured_by_name(intervals: ShootingIntervals) -> str:
+    """Unmeasured states in words: those of which the others are derivatives.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+
+    Returns
+    -------
+    str
+        Names, separated by commas; empty without any.
+    """
+    lost = unmeasured_states(intervals)
+    return ", ".join(chain[0] for chain in intervals.model.chains if chain[0] in lost)
 
 
 def measured_signals(intervals: ShootingIntervals) -> tuple[str, ...]:

@@ -151,7 +151,7 @@ def with_error(intervals: ShootingIntervals, fit: Fit, error: SensorError) -> Sh
     ShootingIntervals
     """
     n = len(error.signals)
-    old = intervals.sensors
+    old = intervals.sensor_errors
     delay = np.zeros(n) if old is None else old.delay
     bias = np.zeros(n) if old is None else old.bias
     more = np.where(error.signals, error.size, 0.0)
