@@ -36,7 +36,16 @@ from diransac.model.derivation import deserialize
 if TYPE_CHECKING:
     from diransac.identification.candidate_terms import CandidateTerm, CandidateTerms
 
-__all__ = ["MeanForces", "SelectedTerm", "Suggestion", "select_terms", "spanned", "suggestions_of", "with_terms"]
+__all__ = [
+    "MeanForces",
+    "SelectedTerm",
+    "Suggestion",
+    "changes_beside",
+    "select_terms",
+    "spanned",
+    "suggestions_of",
+    "with_terms",
+]
 
 # Smallest gain of the log-likelihood beyond its penalties, nats; smallest share of the remaining force; smallest force
 # over the inertial one; smallest coefficient over its standard error.
@@ -238,6 +247,35 @@ def select_terms(means: MeanForces) -> tuple[SelectedTerm, ...]:
     slopes, errors = _Step.together(_averaged(means), chosen).regression(chosen)
     parts = zip(chosen, slopes, errors, _shares(means, chosen), strict=True)
     return tuple(SelectedTerm(k, -float(x), float(s), share) for k, x, s, share in parts)
+
+
+def changes_beside(means: MeanForces, selected: Sequence[SelectedTerm]) -> FloatArray:
+    """Changes of the coefficients of the own columns when selected terms join them.
+
+    Parameters
+    ----------
+    means : MeanForces
+    selected : sequence of SelectedTerm
+
+    Returns
+    -------
+    (m,) array
+        0 without terms.
+    """
+    m, chosen = means.own.shape[2], [x.index for x in selected]
+    scale = _scale(means, chosen)
+    force = _rows(-means.force[:, :, None], scale)[:, 0]
+    beside, alone = (
+        _slopes(_rows(np.concatenate([means.own, means.terms[:, :, terms]], axis=2), scale), force)[:m]
+        for terms in (chosen, [])
+    )
+    return np.asarray(beside - alone)
+
+
+def _slopes(A: FloatArray, b: FloatArray) -> FloatArray:
+    """Coefficients of least squares of b on the columns of A."""
+    norm = np.linalg.norm(A, axis=0) + _TINY
+    return np.asarray(np.linalg.lstsq(A / norm, b, rcond=_RANK)[0] / norm)
 
 
 def _averaged(means: MeanForces) -> MeanForces:

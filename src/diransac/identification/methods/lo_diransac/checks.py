@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,17 +25,47 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["findings_of_fit"]
+__all__ = ["Change", "changes_between_halves", "findings_of_fit"]
 
 # A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious.
 _CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
 # Residual of an equation over that of the worst, at least.
 _SMALLEST = 1e-6
+_TINY = 1e-300
 # Intervals of half the logs from which parameters and their scatter are estimated, at least.
 _FEWEST_INTERVALS = 9
 
 
-def findings_of_fit(found: Explanation, motion: Motion, result: ProjectedEstimate) -> Iterator[Finding]:
+@dataclass(frozen=True)
+class Change:
+    """A parameter that differs between the halves of the logs: a payload, a battery, a machine that wears.
+
+    Parameters
+    ----------
+    index : int
+        Of the parameter.
+    first, second : float
+        Its value in each half, its unit.
+    """
+
+    index: int
+    first: float
+    second: float
+
+    @property
+    def apart(self) -> float:
+        """Difference over the mean of both."""
+        return abs(self.first - self.second) / max(0.5 * (abs(self.first) + abs(self.second)), _TINY)
+
+    @property
+    def variance(self) -> float:
+        """Variance over the log of a parameter that changes uniformly, with these means over its halves."""
+        return (self.first - self.second) ** 2 / 3.0
+
+
+def findings_of_fit(
+    found: Explanation, motion: Motion, result: ProjectedEstimate, changes: Sequence[Change]
+) -> Iterator[Finding]:
     """Findings for and against an estimate.
 
     Parameters
@@ -43,6 +74,8 @@ def findings_of_fit(found: Explanation, motion: Motion, result: ProjectedEstimat
     motion : Motion
         Smoothed motion over the rows of the intervals.
     result : ProjectedEstimate
+    changes : sequence of Change
+        Result of `changes_between_halves`.
 
     Returns
     -------
@@ -51,8 +84,8 @@ def findings_of_fit(found: Explanation, motion: Motion, result: ProjectedEstimat
     if found.intervals.hold == "linear" and not found.intervals.lag:
         yield Finding("note", "Inputs that vary linearly between samples explain this log better than held ones.")
     yield from _of_sensors(found.intervals)
+    yield from (_of_change(found.intervals.layout.names[x.index], x) for x in changes)
     if not found.exact:
-        yield from _of_halves(found, result)
         yield from _of_plain_least_squares(found.intervals, motion, result)
 
 
@@ -61,38 +94,56 @@ def _of_sensors(intervals: ShootingIntervals) -> Iterator[Finding]:
     errors = intervals.sensor_errors
     if errors is None:
         return
-    for i, name in enumerate(intervals.model.signals):
-        if errors.delay[i]:
-            time = number(1e3 * abs(errors.delay[i]) * intervals.dt, 3)
-            sense = "late" if errors.delay[i] > 0.0 else "early"
-            yield Finding("care", f"{name} is recorded {time} ms {sense}, a sensor delay that the estimate includes.")
-        if errors.bias[i]:
-            size, unit = number(errors.bias[i], 3), intervals.model.units[name]
+    signals = np.array(intervals.model.signals)
+    for delay in dict.fromkeys(errors.delay[errors.delay != 0.0].tolist()):
+        late = signals[errors.delay == delay]
+        names = f"{', '.join(late[:-1])} and {late[-1]} are" if len(late) > 1 else f"{late[0]} is"
+        time, sense = number(1e3 * abs(delay) * intervals.dt, 3), "late" if delay > 0.0 else "early"
+        text = f"{names} recorded {time} ms {sense} with respect to the other signals"
+        yield Finding("care", f"{text}, a sensor delay that the estimate includes.")
+    for name, bias in zip(signals, errors.bias, strict=True):
+        if bias:
+            size, unit = number(bias, 3), intervals.model.units[name]
             yield Finding("care", f"{name} has a sensor bias of {size} {unit}, which the estimate includes.")
 
 
-def _of_halves(found: Explanation, result: ProjectedEstimate) -> Iterator[Finding]:
-    """Parameters that differ between the halves of the logs: a payload, a battery, a machine that wears."""
+def _of_change(name: str, change: Change) -> Finding:
+    first, second = number(change.first, 3), number(change.second, 3)
+    text = f"{name} changes during the log, from {first} in its first half to {second} in its second"
+    advice = "a payload, a drifting gain or another regime; identify stretches of the log one by one"
+    return Finding("bad" if change.apart > _SERIOUS else "care", f"{text}: {advice}.")
+
+
+def changes_between_halves(found: Explanation, result: ProjectedEstimate) -> list[Change]:
+    """Parameters that clearly differ between the halves of the logs.
+
+    Parameters
+    ----------
+    found : Explanation
+    result : ProjectedEstimate
+
+    Returns
+    -------
+    list of Change
+        Empty where the model is exact.
+    """
     intervals = found.intervals
+    place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
+    first = place < 0.5 * np.bincount(intervals.log_of)[intervals.log_of]
+    if found.exact or min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
+        return []
     _, rows, regressors, _ = residuals_of_motion(intervals, found.refinement.fit, result.parameters)
     W = means_of_intervals(intervals, regressors * intervals.counted[:, None, None])
     residuals = means_of_intervals(intervals, rows * intervals.counted[:, None])
-    place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
-    first = place < 0.5 * np.bincount(intervals.log_of)[intervals.log_of]
-    if min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
-        return
-    changes, variances = zip(*(_change(W[half], residuals[half]) for half in (first, ~first)), strict=True)
-    p = result.parameters[None] + np.array(changes)
-    error = np.sqrt(sum(variances))
+    moved, variances = zip(*(_change(W[half], residuals[half]) for half in (first, ~first)), strict=True)
+    halves, errors = result.parameters[None] + np.array(moved), np.sqrt(sum(variances))
+    both = [Change(k, *x) for k, x in enumerate(halves.T.tolist())]
     determined = np.isfinite(np.diag(result.covariance))
-    for name, (a, b), s, ok in zip(intervals.layout.names, p.T, error, determined, strict=True):
-        apart, size = abs(a - b), 0.5 * (abs(a) + abs(b))
-        if ok and apart > _CLEAR * s and apart > _DIFFERENT * size:
-            text = (
-                f"{name} changes during the log, from {number(a, 3)} in its first half to {number(b, 3)} in its second"
-            )
-            advice = "a payload, a drifting gain or another regime; identify stretches of the log one by one"
-            yield Finding("bad" if apart > _SERIOUS * size else "care", f"{text}: {advice}.")
+    return [
+        x
+        for x, s, ok in zip(both, errors, determined, strict=True)
+        if ok and abs(x.first - x.second) > _CLEAR * s and x.apart > _DIFFERENT
+    ]
 
 
 def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -23,13 +23,15 @@ from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import estimate_parameters
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
-from diransac.identification.methods.lo_diransac.sensor_errors import clear_errors, error_of_sensor, with_error
+from diransac.identification.methods.lo_diransac.sensor_errors import clear_errors, errors_of, with_errors
+from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
+    from diransac.identification.methods.lo_diransac.sensor_errors import SensorError
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
@@ -60,8 +62,8 @@ _EXPLAINS, _FIXED = float(np.log(1.25)), 1e-6
 _SMALL_GAIN = 0.03
 # Gain of evidence, nats, that an error of a sensor is worth.
 _WORTH = 20.0
-# Refinements of an error of a sensor that is estimated in any case; its change in standard errors that ends them.
-_REFINEMENTS, _REFINED = 3, 1.0
+# Newton steps of the errors of sensors at most; changes over standard errors that end them.
+_REFINEMENTS, _REFINED = 4, 0.1
 # Inputs that vary linearly between samples act half a sample before held ones.
 _LINEAR = (-0.9, -0.1)
 
@@ -135,7 +137,11 @@ class LocalSearch:
         shifted = [intervals, *([replace(intervals, delay=delay)] if delay else [])]
         best, *others = [self._from_hypotheses(x, k) for k, x in enumerate(shifted)]
         best = self._with_timing(self._better(best, others), free_hold=free_hold)
-        return self._with_sensors(self._with_named_sensors(best))
+        found = self._with_sensors(self._with_named_sensors(best))
+        if found is best:
+            return best
+        # Inputs are late, or early, with respect to sensors that are so themselves.
+        return self._with_refined_errors(self._with_timing(found, free_hold=free_hold))
 
     def _with_timing(self, best: Explanation, *, free_hold: bool) -> Explanation:
         """The explanation with another timing of the inputs, where that makes it likelier or is required."""
@@ -158,16 +164,13 @@ class LocalSearch:
 
     def _with_named_sensors(self, best: Explanation) -> Explanation:
         """The explanation with the errors of the sensors that the settings name."""
-        named = [(name, True) for name in self.settings.sensor_delays or ()]
-        named += [(name, False) for name in self.settings.sensor_biases or ()]
-        for name, is_delay in named:
-            report(self.callback, "errors of the sensors", 0.8)
-            for k in range(_REFINEMENTS):
-                error = error_of_sensor(best.intervals, best.refinement.fit, name, is_delay=is_delay)
-                if error is None or (k and error.ratio < _REFINED):
-                    break
-                best = self._refitted(best, with_error(best.intervals, best.refinement.fit, error))
-        return best
+        place = best.intervals.model.signals.index
+        named = [ErrorKind((place(name),), is_delay=True) for name in self.settings.sensor_delays or ()]
+        named += [ErrorKind((place(name),), is_delay=False) for name in self.settings.sensor_biases or ()]
+        if not named:
+            return best
+        report(self.callback, "errors of the sensors", 0.8)
+        return self._simplified(self._with_refined_errors(best, named))
 
     def _with_sensors(self, best: Explanation) -> Explanation:
         """The explanation with errors of the sensors, one after the other, as long as they make it likelier.
@@ -182,12 +185,33 @@ class LocalSearch:
         for k in range(self.settings.max_sensor_errors if tested.any() else 0):
             report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
             errors = clear_errors(best.intervals, best.refinement.fit, tested, **kinds)
-            others = [self._refitted(best, with_error(best.intervals, best.refinement.fit, x)) for x in errors]
+            others = [self._with_errors(best, [x]) for x in errors]
             likelier = self._better(best, others, _WORTH, of_one=True)
             if likelier is best:
                 break
-            best = likelier
+            best = self._simplified(likelier)
         return best
+
+    def _with_refined_errors(self, best: Explanation, more: Sequence[ErrorKind] = ()) -> Explanation:
+        """The explanation at the optimum of its errors of sensors, and of more, with the same freedom."""
+        for _ in range(_REFINEMENTS):
+            old = best.intervals.sensor_errors
+            kinds = dict.fromkeys([*(old.kinds if old else ()), *more])
+            errors = errors_of(best.intervals, best.refinement.fit, tuple(kinds))
+            if all(x.ratio < _REFINED for x in errors):
+                break
+            best = self._with_errors(best, errors)
+        return best
+
+    def _with_errors(self, now: Explanation, errors: Sequence[SensorError]) -> Explanation:
+        """The explanation with errors of sensors, with the same freedom."""
+        intervals = with_errors(now.intervals, now.refinement.fit, errors)
+        begin = with_residuals(intervals, now.refinement.fit)
+        if now.exact:
+            refined = refine_exact(self.settings, intervals, begin, now.prior, now.cost)
+        else:
+            refined = refine(self.settings, intervals, begin, now.prior, settled=True)
+        return replace(now, intervals=intervals, refinement=refined)
 
     def _better(
         self, now: Explanation, others: Sequence[Explanation], worth: float = _AS_LIKELY, *, of_one: bool = False
@@ -251,6 +275,10 @@ class LocalSearch:
             if all(found[-1].cost < x.cost for x in found[:-1]):
                 waiting.insert(0, found[-1].fit.shared[: intervals.n_p])
         return min(found, key=lambda x: x.cost)
+
+    def _simplified(self, found: Explanation) -> Explanation:
+        """The explanation without the freedom that is no longer likely."""
+        return found if found.exact else self._simplest(found, self._prior_of(found.intervals))
 
     def _simplest(self, flexible: Explanation, prior: Prior) -> Explanation:
         """The exact model, if it is as likely; otherwise unmodelled accelerations that vary as fast as is likely.
@@ -318,17 +346,16 @@ class LocalSearch:
         left = old.delay + old.lag + fit.shared[-1] - intervals.delay - intervals.lag
         if intervals.hold != old.hold:
             left = 0.0
-        prior = now.prior if intervals.sensor_errors is not old.sensor_errors else free
         # A wide prior that the evidence narrows: a narrow one would never widen where nothing moves.
-        is_wide = prior is self.prior and prior is not now.prior
-        sizes = np.append(fit.prior[:-1], max(prior.delay, _WHOLE_SAMPLE) if is_wide else prior.delay)
+        is_wide = free is self.prior and free is not now.prior
+        sizes = np.append(fit.prior[:-1], max(free.delay, _WHOLE_SAMPLE) if is_wide else free.delay)
         left = left if free is self.prior else 0.0
         begin = with_residuals(intervals, replace(fit, shared=np.append(fit.shared[:-1], left), prior=sizes))
         if now.exact:
             refined = refine_exact(self.settings, intervals, begin, free, now.cost)
             return Explanation(intervals, refined, free, exact=True)
-        refined = refine(self.settings, intervals, begin, prior, settled=True)
-        return self._simplest(Explanation(intervals, refined, prior, exact=False), free)
+        refined = refine(self.settings, intervals, begin, free, settled=True)
+        return self._simplest(Explanation(intervals, refined, free, exact=False), free)
 
     def _with_likeliest_lag(self, intervals: ShootingIntervals) -> ShootingIntervals:
         """The lag, from half a sample to the latest delay, with which simulations by the best hypothesis agree best."""

@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ from diransac.errors import IdentificationError, LogError, ModelError, SettingsE
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report
-from diransac.identification.methods.lo_diransac.checks import findings_of_fit
+from diransac.identification.methods.lo_diransac.checks import changes_between_halves, findings_of_fit
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
 from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
@@ -58,6 +58,8 @@ if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
     from diransac.data.segment import Segment
     from diransac.identification.method import Callback
+    from diransac.identification.methods.lo_diransac.checks import Change
+    from diransac.identification.methods.lo_diransac.missing_terms import MissingTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.refinement import Refinement
     from diransac.identification.settings import Settings
@@ -234,17 +236,28 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
     if reached or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
+    changes = changes_between_halves(likeliest, result)
+    lacks = None
+    if settings.suggestions and not likeliest.exact:
+        lacks = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
+    ambiguity = _ambiguity(len(result.parameters), changes, lacks)
     checks = (
         *_checks(settings, intervals, motion, refined),
         *_checks_of_unmeasured(intervals, motion, result),
-        *findings_of_fit(likeliest, motion, result),
+        *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), changes),
     )
-    found = _Found(dataset, intervals, motion, refined.fit, result, bool(settings.input_delay or settings.input_lag))
+    forced = bool(settings.input_delay or settings.input_lag)
+    found = _Found(dataset, intervals, motion, refined.fit, result, ambiguity, forced)
     estimate = _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
-    if likeliest.exact or not settings.suggestions:
-        return estimate
-    terms = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
-    return replace(estimate, suggestions=terms)
+    return estimate if lacks is None else replace(estimate, suggestions=lacks.suggestions)
+
+
+def _ambiguity(n: int, changes: Sequence[Change], lacks: MissingTerms | None) -> FloatArray:
+    """Covariance of parameters that change during the log, or with terms that the model lacks."""
+    found = np.zeros((n, n)) if lacks is None else np.outer(lacks.change, lacks.change)
+    for one in changes:
+        found[one.index, one.index] += one.variance
+    return found
 
 
 def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:
@@ -380,13 +393,17 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
 
 @dataclass(frozen=True)
 class _Found:
-    """Parts of an estimate; a forced delay or lag of the inputs need not be significant."""
+    """Parts of an estimate; a forced delay or lag of the inputs need not be significant.
+
+    ``ambiguity (n, n)`` is a covariance besides that of the result, for what one set of parameters cannot be.
+    """
 
     dataset: Dataset
     intervals: ShootingIntervals
     motion: Motion
     fit: Fit
     result: ProjectedEstimate
+    ambiguity: FloatArray
     forced: bool
 
     @property
@@ -426,7 +443,7 @@ def _estimate(
     lost, combinations = unidentifiable(
         dataset.model, dataset.layout, result.parameters, result.covariance, lost, measured
     )
-    covariance = result.covariance.copy()
+    covariance = result.covariance + found.ambiguity
     covariance[lost] = covariance[:, lost] = np.inf
     nonlinear = bool(dataset.model.nonlinear_parameters)
     return Estimate(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -12,20 +13,43 @@ from diransac.identification.candidate_terms import TermLibrary, candidate_terms
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.projection import residuals_of_motion
 from diransac.identification.methods.lo_diransac.refinement import weights_of
-from diransac.identification.suggestions import MeanForces, Suggestion, select_terms, spanned, suggestions_of
+from diransac.identification.suggestions import (
+    MeanForces,
+    Suggestion,
+    changes_beside,
+    select_terms,
+    spanned,
+    suggestions_of,
+)
 
 if TYPE_CHECKING:
     from diransac.identification.candidate_terms import CandidateTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["missing_terms"]
+__all__ = ["MissingTerms", "missing_terms"]
+
+
+@dataclass(frozen=True)
+class MissingTerms:
+    """Terms that the model lacks.
+
+    Parameters
+    ----------
+    suggestions : tuple of Suggestion
+        The one that explains most first; empty where none is supported by the logs.
+    change : (n,) array
+        Change of the parameters in a regression that has the terms, too.
+    """
+
+    suggestions: tuple[Suggestion, ...]
+    change: FloatArray
 
 
 def missing_terms(
     intervals: ShootingIntervals, fit: Fit, parameters: FloatArray, library: TermLibrary | None = None
-) -> tuple[Suggestion, ...]:
-    """Suggested terms of the model, the one that explains most first; empty where none is supported by the logs.
+) -> MissingTerms:
+    """Terms that explain the unmodelled forces, each supported by the logs.
 
     Parameters
     ----------
@@ -39,12 +63,14 @@ def missing_terms(
 
     Returns
     -------
-    tuple of Suggestion
+    MissingTerms
     """
     rows = _Rows(intervals, *residuals_of_motion(intervals, fit, parameters))
     speeds = np.sqrt(np.square(rows.motion[1][intervals.counted]).mean(axis=0))
     candidates = candidate_terms(intervals.model, speeds, library)
-    return suggestions_of(candidates, select_terms(_mean_forces(rows, fit, candidates)))
+    means = _mean_forces(rows, fit, candidates)
+    selected = select_terms(means)
+    return MissingTerms(suggestions_of(candidates, selected), changes_beside(means, selected)[: intervals.n_p])
 
 
 class _Rows:

@@ -9,10 +9,10 @@ Inputs are no instruments: a controller answers disturbances, and its inputs are
 1999).  Nor are any needed: the fitted accelerations are posterior means, whose errors are uncorrelated with themselves,
 so that they do not bias the slopes of a regression on them (Berkson 1950).
 
-The covariance has four parts: that of the fit, propagated through the projection; that of the unmodelled forces
-outside the regressor's column space, as a sample of forces that differ from log to log; and, because a constant
-deviation from the model is not averaged out, the changes under a tenfold wider prior on model error and under least
-squares without a robust loss.
+The covariance has four parts: that of the fit and of the errors of its sensors, propagated through the projection;
+that of the unmodelled forces outside the regressor's column space, as a sample of forces that differ from log to log;
+and, because a constant deviation from the model is not averaged out, the changes under a tenfold wider prior on model
+error and under least squares without a robust loss.
 
 A Gaussian prior of a parameter is a term of the fit, so that the parameters of an exact model have it already.  The
 projection is a regression on the motion, which leaves priors out: its result and covariance are combined with them as
@@ -38,6 +38,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.hypotheses import WeakForm
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.refinement import weights_of
+from diransac.identification.methods.lo_diransac.sensor_errors import effect_on
 from diransac.identification.methods.lo_diransac.smoothing import split_signals
 from diransac.identification.uncertainty import combined
 from diransac.simulation.compiler import compile_map
@@ -138,7 +139,8 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     sums = batch_sums(scores)
     more = np.sqrt(np.maximum(1.0, np.square(sums).sum(axis=0) / (np.diag(s[:n_p]) + _TINY)))
     p, delay = fit.shared[:n_p], at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
-    return ProjectedEstimate(p, s[:n_p] * np.outer(more, more), unexplained(intervals, fit, p), float(np.sqrt(delay)))
+    covariance = s[:n_p] * np.outer(more, more) + effect_on(intervals, fit, z, s)
+    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p), float(np.sqrt(delay)))
 
 
 def _with_wide_priors(intervals: ShootingIntervals, fit: Fit) -> Fit:
@@ -193,7 +195,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means, M)
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(of_z, of_s)
-    covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s
+    covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s + effect_on(intervals, fit, z, s)
     unmade = latent - means @ np.einsum("pwi,wi->p", by_means, latent)
     unpushed = push - W @ np.einsum("pni,ni->p", by_rows, push)
     of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)

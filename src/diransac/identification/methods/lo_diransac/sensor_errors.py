@@ -14,6 +14,7 @@ Rao 1948 (score test); Furgale, Rehder, Siegwart 2013 (delays of sensors).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -22,12 +23,13 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.refinement import weights_of
+from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["SensorError", "clear_errors", "error_of_sensor", "with_error"]
+__all__ = ["SensorError", "clear_errors", "effect_on", "errors_of", "with_errors"]
 
 # Standard errors from which on an error of a sensor is tried, and its least delay, samples.
 _CLEAR, _LEAST_DELAY = 3.0, 0.1
@@ -35,6 +37,8 @@ _CLEAR, _LEAST_DELAY = 3.0, 0.1
 _GROUPS = 4
 # Signals that are known in fewer rows than this are not tested.
 _FEWEST = 50
+# Part of the information of an error that other unknowns must leave.
+_DETERMINED = 1e-6
 
 
 @dataclass(frozen=True)
@@ -43,18 +47,14 @@ class SensorError:
 
     Parameters
     ----------
-    signals : (n_s,) bool array
-        Signals that have it.
-    is_delay : bool
-        A delay in samples, or a bias in the signal's unit.
+    kind : ErrorKind
     size : float
-        Its estimate.
+        Its estimate, samples or the signal's unit.
     ratio : float
         Its size over its standard error.
     """
 
-    signals: BoolArray
-    is_delay: bool
+    kind: ErrorKind
     size: float
     ratio: float
 
@@ -81,82 +81,154 @@ def clear_errors(
     list of SensorError
         Empty if no error is clear.
     """
-    tested = [x for x in _candidates(intervals, among) if (delays if x[1] else biases)]
-    found = _score_tests(intervals, fit, tested) if tested else []
-    clear = [x for x in found if x.ratio > _CLEAR and (not x.is_delay or abs(x.size) > _LEAST_DELAY)]
+    tested = [x for x in _candidates(intervals, among) if (delays if x.is_delay else biases)]
+    if not tested:
+        return []
+    scores = _Scores(intervals, fit)
+    found = [x for x in map(scores.tested, tested) if x is not None]
+    clear = [x for x in found if x.ratio > _CLEAR and (not x.kind.is_delay or abs(x.size) > _LEAST_DELAY)]
     clear.sort(key=lambda x: x.ratio, reverse=True)
-    single = [x for x in clear if x.signals.sum() == 1]
-    return [*single[:1], *[x for x in clear if x.signals.sum() > 1][:_GROUPS]]
+    single = [x for x in clear if len(x.kind.signals) == 1]
+    return [*single[:1], *[x for x in clear if len(x.kind.signals) > 1][:_GROUPS]]
 
 
-def error_of_sensor(intervals: ShootingIntervals, fit: Fit, name: str, *, is_delay: bool) -> SensorError | None:
-    """The error of one signal, clear or not.
+def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> list[SensorError]:
+    """What is left of some errors together, clear or not.
 
     Parameters
     ----------
     intervals : ShootingIntervals
     fit : Fit
         At its optimum.
-    name : str
-        Signal of the model.
-    is_delay : bool
-        A delay, or a bias.
+    kinds : sequence of ErrorKind
 
     Returns
     -------
-    SensorError or None
-        None if the log does not determine it.
+    list of SensorError
+        Without those that the log does not determine.
     """
-    signal = np.array([x == name for x in intervals.model.signals])
-    return next(iter(_score_tests(intervals, fit, [(signal, is_delay)])), None)
+    scores = _Scores(intervals, fit)
+    slopes = [scores.slope(x) for x in kinds]
+    determined, covariance, _, _ = scores.together(slopes)
+    sizes = -covariance @ np.array([slopes[k].score for k in determined])
+    ratios = np.abs(sizes) / np.sqrt(np.diag(covariance))
+    return [SensorError(kinds[k], float(x), float(r)) for k, x, r in zip(determined, sizes, ratios, strict=True)]
 
 
-def _score_tests(intervals: ShootingIntervals, fit: Fit, candidates: list[tuple[BoolArray, bool]]) -> list[SensorError]:
-    """Estimates of errors of the sensors, each given all else that is estimated."""
-    weights, rates = weights_of(intervals, fit), signal_rates(intervals, fit)
-    at = linearize(intervals, fit, weights)
-    batch = np.arange(0, len(intervals), max(1, round(np.sqrt(len(intervals)))))
-    found: list[SensorError] = []
-    for signals, is_delay in candidates:
-        sensitivity = np.where(signals, -rates if is_delay else 1.0, 0.0)
+def effect_on(intervals: ShootingIntervals, fit: Fit, z: FloatArray, s: FloatArray) -> FloatArray:
+    """Covariance of functions of a fit by the uncertainty of the errors of its sensors.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        At its optimum.
+    z, s : (W, k, n) and (n_s, n) array
+        Result of `Arrowhead.functional` for the functions' gradients.
+
+    Returns
+    -------
+    (n, n) array
+        0 without such errors.
+    """
+    if intervals.sensor_errors is None:
+        return np.zeros((s.shape[1], s.shape[1]))
+    scores = _Scores(intervals, fit)
+    _, covariance, of_z, of_s = scores.together([scores.slope(x) for x in intervals.sensor_errors.kinds])
+    slopes = np.einsum("wkn,wke->ne", z, of_z) + s.T @ of_s
+    return np.asarray(slopes @ covariance @ slopes.T)
+
+
+@dataclass(frozen=True)
+class _Slope:
+    """Derivatives of the cost, and of its gradient, with respect to one error.
+
+    Parameters
+    ----------
+    kind : ErrorKind
+    sensitivity : (N, n) array
+        Of the residuals of its signals.
+    of_z, of_s : (W, k) and (n_s,) array
+        Of the gradient of the fit.
+    score : float
+    """
+
+    kind: ErrorKind
+    sensitivity: FloatArray
+    of_z: FloatArray
+    of_s: FloatArray
+    score: float
+
+
+class _Scores:
+    """Score tests at a fit: of errors one by one, or estimates of several together."""
+
+    def __init__(self, intervals: ShootingIntervals, fit: Fit) -> None:
+        self.intervals, self.fit = intervals, fit
+        self.weights, self.rates = weights_of(intervals, fit), signal_rates(intervals, fit)
+        self.at = linearize(intervals, fit, self.weights)
+
+    def slope(self, kind: ErrorKind) -> _Slope:
+        """Derivatives with respect to an error."""
+        columns = list(kind.signals)
+        own = -self.rates[:, columns] if kind.is_delay else np.ones((len(self.rates), len(columns)))
         # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
-        moved = linearize(replace(intervals, measured=intervals.measured - sensitivity), fit, weights)
-        of_z, of_s = at.data_z - moved.data_z, (at.data_s - moved.data_s).sum(axis=0)
-        z, s = (x[..., 0] for x in at.system.functional(of_z[:, :, None], of_s[:, None]))
-        information = float((weights * np.square(sensitivity)).sum() - (of_z * z).sum() - of_s @ s)
-        rows = (weights * sensitivity * fit.residuals).sum(axis=1)
-        scores = rows.reshape(len(intervals), -1).sum(axis=1) + (at.data_z * z).sum(axis=1) + at.data_s @ s
-        score = float(rows.sum())
+        measured = self.intervals.measured.copy()
+        measured[:, columns] -= own
+        moved = linearize(replace(self.intervals, measured=measured), self.fit, self.weights)
+        score = float((self.weights[:, columns] * own * self.fit.residuals[:, columns]).sum())
+        return _Slope(kind, own, self.at.data_z - moved.data_z, (self.at.data_s - moved.data_s).sum(axis=0), score)
+
+    def tested(self, kind: ErrorKind) -> SensorError | None:
+        """Estimate of an error, given all else that is estimated, or None if the log does not determine it."""
+        slope, n = self.slope(kind), len(self.intervals)
+        columns = list(kind.signals)
+        z, s = (x[..., 0] for x in self.at.system.functional(slope.of_z[:, :, None], slope.of_s[:, None]))
+        weighted = self.weights[:, columns] * slope.sensitivity
+        share = (weighted * slope.sensitivity).sum(axis=1).reshape(n, -1).sum(axis=1)
+        information = float(share.sum() - (slope.of_z * z).sum() - slope.of_s @ s)
+        if information <= 0.0:
+            return None
+        rows = (weighted * self.fit.residuals[:, columns]).sum(axis=1).reshape(n, -1).sum(axis=1)
+        scores = rows + (self.at.data_z * z).sum(axis=1) + self.at.data_s @ s
         # An error that is there has a score of one sign in each batch; only the rest of the scores scatters.
-        share = (weights * np.square(sensitivity)).sum(axis=1).reshape(len(intervals), -1).sum(axis=1)
-        scores = scores - score * share / max(share.sum(), 1e-300)
-        variance = max(information, float(np.square(np.add.reduceat(scores, batch)).sum()))
-        if information > 0.0:
-            found.append(SensorError(signals, is_delay, -score / information, abs(score) / np.sqrt(variance)))
-    return found
+        scores = scores - slope.score * share / max(share.sum(), 1e-300)
+        batches = np.add.reduceat(scores, np.arange(0, n, max(1, round(np.sqrt(n)))))
+        variance = max(information, float(np.square(batches).sum()))
+        return SensorError(kind, -slope.score / information, abs(slope.score) / np.sqrt(variance))
+
+    def together(self, slopes: Sequence[_Slope]) -> tuple[list[int], FloatArray, FloatArray, FloatArray]:
+        """Errors that the log determines, their covariance, and what they change of the gradient of the fit."""
+        of_z, of_s = np.stack([x.of_z for x in slopes], axis=-1), np.stack([x.of_s for x in slopes], axis=-1)
+        z, s = self.at.system.functional(of_z, of_s)
+        direct = np.array([[self._product(x, y) for y in slopes] for x in slopes])
+        information = direct - np.einsum("wke,wkf->ef", of_z, z) - of_s.T @ s
+        found = [k for k in range(len(slopes)) if information[k, k] > _DETERMINED * direct[k, k]]
+        covariance = np.linalg.pinv(information[np.ix_(found, found)], hermitian=True)
+        return found, covariance, of_z[..., found], of_s[:, found]
+
+    def _product(self, x: _Slope, y: _Slope) -> float:
+        """Information that two errors have in common, before other unknowns take theirs."""
+        common = sorted({*x.kind.signals} & {*y.kind.signals})
+        a, b = (one.sensitivity[:, [one.kind.signals.index(k) for k in common]] for one in (x, y))
+        return float((self.weights[:, common] * a * b).sum())
 
 
-def with_error(intervals: ShootingIntervals, fit: Fit, error: SensorError) -> ShootingIntervals:
-    """The intervals with measurements that are corrected of an error, too.
+def with_errors(intervals: ShootingIntervals, fit: Fit, errors: Sequence[SensorError]) -> ShootingIntervals:
+    """The intervals with measurements that are corrected of errors, too.
 
     Parameters
     ----------
     intervals : ShootingIntervals
     fit : Fit
         Of which the rates of signals are taken.
-    error : SensorError
+    errors : sequence of SensorError
 
     Returns
     -------
     ShootingIntervals
     """
-    n = len(error.signals)
-    old = intervals.sensor_errors
-    delay = np.zeros(n) if old is None else old.delay
-    bias = np.zeros(n) if old is None else old.bias
-    more = np.where(error.signals, error.size, 0.0)
-    delay, bias = (delay + more, bias) if error.is_delay else (delay, bias + more)
-    return intervals.corrected(delay, bias, signal_rates(intervals, fit))
+    return intervals.corrected({x.kind: x.size for x in errors}, signal_rates(intervals, fit))
 
 
 def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
@@ -180,7 +252,7 @@ def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return np.nan_to_num(rates, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[tuple[BoolArray, bool]]:
+def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[ErrorKind]:
     """Signals and kinds of the errors that are tested: of each signal, and delays of groups.
 
     A group are the coordinates, the velocities, ..., or those of one unit, as one instrument measures them.  The bias
@@ -194,7 +266,8 @@ def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[tuple[Bo
     unit = np.array([model.units[n] for n in model.signals])
     masks = [kind == g for g in (0, 1, 2, 4)]
     masks += [mask & (unit == u) for mask in masks for u in dict.fromkeys(unit[mask])]
-    groups = {x.tobytes(): x for x in (mask & seen & among for mask in masks) if 1 < x.sum() < seen.sum()}.values()
-    delays = [(x, True) for x in [*groups, *single] if not (x == seen).all()]
+    groups = [mask & seen & among for mask in masks]
+    late = [x for x in (*groups, *single) if x.any() and not (x == seen).all()]
     biased = np.array([n in model.biased_sensors for n in model.signals])
-    return [*delays, *((x, False) for x in single if not biased[x].any())]
+    kinds = [*((x, True) for x in late), *((x, False) for x in single if not biased[x].any())]
+    return list(dict.fromkeys(ErrorKind(tuple(np.flatnonzero(x).tolist()), is_delay) for x, is_delay in kinds))

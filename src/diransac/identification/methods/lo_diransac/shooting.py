@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -20,10 +20,25 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.simulation import GaussNewtonBatch, Simulator
 
-__all__ = ["ShootingIntervals"]
+__all__ = ["ErrorKind", "ShootingIntervals"]
 
 _DIVERGED = 1e6
 _WELL_CONDITIONED = 1e8
+
+
+@dataclass(frozen=True)
+class ErrorKind:
+    """A delay in samples, or a bias in the signal's unit, that one signal has, or a group alike.
+
+    Parameters
+    ----------
+    signals : tuple of int
+        Indices of the signals.
+    is_delay : bool
+    """
+
+    signals: tuple[int, ...]
+    is_delay: bool
 
 
 @dataclass(frozen=True)
@@ -39,12 +54,15 @@ class SensorErrors:
         Samples by which each signal is recorded late.
     bias : (n_s,) array
         Constant error of each signal, its unit.
+    kinds : tuple of ErrorKind
+        What of these is estimated.
     """
 
     measured: FloatArray
     sampled: BoolArray
     delay: FloatArray
     bias: FloatArray
+    kinds: tuple[ErrorKind, ...]
 
 
 @dataclass(frozen=True)
@@ -242,15 +260,13 @@ class ShootingIntervals:
         edges = [*self.first_of_log.tolist(), len(self.recorded)]
         return [slice(a, b) for a, b in pairwise(edges)]
 
-    def corrected(self, delay: FloatArray, bias: FloatArray, rates: FloatArray) -> ShootingIntervals:
-        """The intervals with measurements that are corrected of errors of the sensors.
+    def corrected(self, more: Mapping[ErrorKind, float], rates: FloatArray) -> ShootingIntervals:
+        """The intervals with measurements that are corrected of further errors of the sensors.
 
         Parameters
         ----------
-        delay : (n_s,) array
-            Samples by which each signal is recorded late.
-        bias : (n_s,) array
-            Constant error of each signal, its unit.
+        more : mapping from ErrorKind to float
+            Samples by which signals are recorded later, or constant errors that are larger.
         rates : (N, n_s) array
             Change of each signal per sample, for the fractions of a sample.
 
@@ -258,7 +274,11 @@ class ShootingIntervals:
         -------
         ShootingIntervals
         """
-        old = self.sensor_errors or SensorErrors(self.measured, self.sampled, np.zeros(len(delay)), np.zeros(len(bias)))
+        none = np.zeros(len(self.model.signals))
+        old = self.sensor_errors or SensorErrors(self.measured, self.sampled, none, none, ())
+        delay, bias = old.delay.copy(), old.bias.copy()
+        for kind, size in more.items():
+            (delay if kind.is_delay else bias)[list(kind.signals)] += size
         measured, sampled = old.measured.copy(), old.sampled.copy()
         for i, whole in enumerate(np.round(delay).astype(int)):
             for rows in self.rows_of_logs:
@@ -267,7 +287,7 @@ class ShootingIntervals:
                 at = np.clip(at, rows.start, rows.stop - 1)
                 measured[rows, i], sampled[rows, i] = old.measured[at, i], old.sampled[at, i] & inside
         measured += (delay - np.round(delay)) * rates - bias
-        errors = replace(old, delay=delay, bias=bias)
+        errors = replace(old, delay=delay, bias=bias, kinds=tuple(dict.fromkeys([*old.kinds, *more])))
         return replace(self, measured=np.where(sampled, measured, 0.0), sampled=sampled, sensor_errors=errors)
 
     def split(self, parts: int) -> ShootingIntervals:
