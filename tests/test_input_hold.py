@@ -62,7 +62,7 @@ def found():
     return {
         (method, hold): dr.identify(PENDULUM, LOG, method, input_hold=hold)
         for method in METHODS
-        for hold in ("zero-order", "linear")
+        for hold in ("zero-order", "linear", "smooth")
     }
 
 
@@ -82,9 +82,10 @@ def largest_error(result):
     return max(abs(x / TRUE[name] - 1.0) for name, x in result.parameters.items())
 
 
-def test_lo_diransac_finds_the_parameters_of_a_continuous_motion_without_a_delay(found):
-    assert largest_error(found["lo-diransac", "linear"]) < 0.003
-    assert abs(found["lo-diransac", "linear"].diagnosis.input_delay) < 0.001
+@pytest.mark.parametrize(("hold", "error"), [("linear", 0.003), ("smooth", 0.0005)])
+def test_lo_diransac_finds_the_parameters_of_a_continuous_motion_without_a_delay(found, hold, error):
+    assert largest_error(found["lo-diransac", hold]) < error
+    assert abs(found["lo-diransac", hold].diagnosis.input_delay) < 0.001
 
 
 def test_lo_diransac_finds_half_a_sample_of_delay_where_continuous_inputs_are_held(found):
@@ -95,9 +96,10 @@ def test_lo_diransac_finds_half_a_sample_of_delay_where_continuous_inputs_are_he
 
 def test_lo_diransac_interpolates_continuous_inputs_where_no_hold_is_requested():
     result = dr.identify(PENDULUM, LOG)
-    assert result.estimate.resolution.hold == "linear"
+    assert result.estimate.resolution.hold == "smooth"
     assert abs(result.diagnosis.input_delay) < 0.001
-    assert largest_error(result) < 0.005
+    assert largest_error(result) < 0.0005
+    assert "Inputs that vary smoothly between samples" in " ".join(map(str, result.findings))
 
 
 def test_least_squares_of_the_equations_do_not_depend_on_the_hold(found):
@@ -155,18 +157,19 @@ def test_a_subset_of_the_logs_has_the_request_of_the_whole():
     assert Dataset.of(PENDULUM, LOG).hold == "zero-order"
 
 
+@pytest.mark.parametrize("hold", ["linear", "smooth"])
 @pytest.mark.parametrize("length", [20, 23])
-def test_shooting_intervals_of_a_log_do_not_depend_on_the_next_log(length):
+def test_shooting_intervals_of_a_log_do_not_depend_on_the_next_log(length, hold):
     logs = [
         (np.column_stack([log[n] for n in PENDULUM.signals]), np.ones((200, 3), bool), log["torque"][:, None])
         for log in (pendulum_log(phase, 10.0) for phase in (0.0, 2.0))
     ]
-    both = _intervals(logs, length)
+    both = _intervals(logs, length, hold)
     shared = np.append(list(TRUE.values()), np.zeros(both.n_shared - 3))
     x, d = both.measured[both.starts, :2], np.zeros((len(both), 1))
     residuals = both.residuals(shared, x, d)
     for i, rows in enumerate(both.rows_of_logs):
-        alone = _intervals(logs[i : i + 1], length)
+        alone = _intervals(logs[i : i + 1], length, hold)
         own = both.log_of == i
         np.testing.assert_array_equal(residuals[rows], alone.residuals(shared, x[own], d[own]))
         np.testing.assert_array_equal(
@@ -174,10 +177,10 @@ def test_shooting_intervals_of_a_log_do_not_depend_on_the_next_log(length):
         )
 
 
-def _intervals(logs, length):
+def _intervals(logs, length, hold):
     layout = ParameterLayout(PENDULUM.parameters, len(logs))
     logs = [(*log, np.zeros(len(log[-1]), bool)) for log in logs]
-    return ShootingIntervals.of(PENDULUM, layout, logs, 0.05, length, 5, "linear")
+    return ShootingIntervals.of(PENDULUM, layout, logs, 0.05, length, 5, hold)
 
 
 # Results -------------------------------------------------------------------------------------------------------------
@@ -200,6 +203,7 @@ def test_a_result_without_a_hold_in_its_json_was_simulated_with_a_zero_order_hol
 @EVERY_METHOD
 def test_a_printed_result_names_interpolated_inputs(found, method):
     assert "inputs interpolated linearly" in str(found[method, "linear"])
+    assert "inputs interpolated smoothly" in str(found[method, "smooth"])
     assert "interpolated" not in str(found[method, "zero-order"])
 
 
@@ -225,7 +229,7 @@ def replace_hold(result, hold):
 # Refusals, and the command line --------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", ["cubic", "", 1, ["linear"]])
 def test_an_unknown_hold_is_refused_by_name(name):
-    message = "input_hold is .*; choose zero-order, linear, or None"
+    message = "input_hold is .*; choose zero-order, linear, smooth, or None"
     with pytest.raises(SettingsError, match=message):
         dr.identify(PENDULUM, LOG, "ols", input_hold=name)
     with pytest.raises(SettingsError, match=message):

@@ -1,4 +1,4 @@
-"""Rollouts under inputs that are interpolated linearly between rows, against slow, independent integrators."""
+"""Rollouts under inputs that are interpolated between rows, against slow, independent integrators."""
 
 import numpy as np
 import pytest
@@ -26,17 +26,30 @@ EVERY_MODEL = pytest.mark.parametrize("model", [ROTORCRAFT, PENDULUM, BODY], ids
 EVERY_INTEGRATOR = pytest.mark.parametrize("integrator", INTEGRATORS)
 
 
-def interpolated(task, t):
+EVERY_HOLD = pytest.mark.parametrize("hold", ["linear", "smooth"])
+
+
+def interpolated(task, t, hold="linear"):
     """Inputs at a time; after the last row, those of the last row."""
     times = task.dt * np.arange(len(task.inputs))
-    return np.array([np.interp(t, times, column) for column in task.inputs.T])
+    if hold == "linear" or t >= times[-1]:
+        return np.array([np.interp(t, times, column) for column in task.inputs.T])
+    row = min(int(t / task.dt + 1e-9), len(times) - 2)
+    firsts = [first for first in (row - 1, row) if 0 <= first <= len(times) - 3]
+    parabolas = [lagrange(task.inputs[k : k + 3], t / task.dt - k) for k in firsts]
+    return np.mean(parabolas, axis=0)
 
 
-def plain_trajectory(model, task, p, integrator, substeps):
+def lagrange(points, s):
+    """The parabola through three points at 0, 1 and 2."""
+    return (s - 1) * (s - 2) / 2 * points[0] - s * (s - 2) * points[1] + s * (s - 1) / 2 * points[2]
+
+
+def plain_trajectory(model, task, p, integrator, substeps, hold):
     """Signals row by row, each stage of each step with the inputs at its own time."""
 
     def slope(x, t):
-        return np.array(model.dynamics(x, interpolated(task, t), p)[0]).ravel()
+        return np.array(model.dynamics(x, interpolated(task, t, hold), p)[0]).ravel()
 
     n_q, h, x, rows = model.n_q, task.dt / substeps, task.states, []
     for row, u in enumerate(task.inputs):
@@ -56,15 +69,16 @@ def plain_trajectory(model, task, p, integrator, substeps):
     return np.array(rows)
 
 
+@EVERY_HOLD
 @pytest.mark.parametrize("substeps", [1, 4])
 @EVERY_INTEGRATOR
 @EVERY_MODEL
-def test_trajectories_agree_with_a_plain_loop(model, integrator, substeps):
+def test_trajectories_agree_with_a_plain_loop(model, integrator, substeps, hold):
     task = log_of(model, 40)
-    engine = rollouts(model, integrator=integrator, substeps=substeps, hold="linear")
+    engine = rollouts(model, integrator=integrator, substeps=substeps, hold=hold)
     found = engine.trajectories(batch_of(task, task.parameters[:2]))
     for p, signals in zip(task.parameters, found, strict=False):
-        expected = plain_trajectory(model, task, p, integrator, substeps)
+        expected = plain_trajectory(model, task, p, integrator, substeps, hold)
         np.testing.assert_allclose(signals, expected, rtol=1e-12, atol=1e-12)
 
 
@@ -85,13 +99,13 @@ def test_steps_agree_with_scipy_under_interpolated_inputs(model, substeps):
         x = solve_ivp(slope, span, x, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
 
 
-def test_smooth_inputs_are_followed_to_second_order_and_by_a_zero_order_hold_to_first():
+def test_continuous_inputs_are_followed_to_the_order_of_each_hold():
     p, errors = np.array([[1.5, 0.4]]), {}
     exact = solve_ivp(
         lambda t, x: np.array(PENDULUM.dynamics(x, [np.sin(3 * t)], p[0])[0]).ravel(), (0, 2), [0.3, 0.0],
         "DOP853", rtol=1e-12, atol=1e-13,
     ).y[:, -1]  # fmt: skip
-    for hold in ("zero-order", "linear"):
+    for hold in ("zero-order", "linear", "smooth"):
         for n in (40, 80):
             inputs = np.sin(3 * np.linspace(0, 2, n + 1))[:, None]
             batch = RolloutBatch(p, [0.3, 0.0], inputs, 2 / n)
@@ -99,22 +113,37 @@ def test_smooth_inputs_are_followed_to_second_order_and_by_a_zero_order_hold_to_
             errors[hold, n] = np.linalg.norm(end - exact)
     assert errors["zero-order", 40] / errors["zero-order", 80] == pytest.approx(2, rel=0.1)
     assert errors["linear", 40] / errors["linear", 80] == pytest.approx(4, rel=0.1)
+    assert errors["smooth", 40] / errors["smooth", 80] > 8 * 0.9
+    assert errors["smooth", 40] < 0.03 * errors["linear", 40]
 
 
 @pytest.mark.parametrize("substeps", [1, 3])
-def test_constant_inputs_are_the_same_under_both_holds(substeps):
+def test_constant_inputs_are_the_same_under_every_hold(substeps):
     task = log_of(BODY, 30)
     task.inputs[:] = task.inputs[0]
-    both = [
-        rollouts(BODY, substeps=substeps, hold=hold).trajectories(batch_of(task)) for hold in ("zero-order", "linear")
+    held, *others = [
+        rollouts(BODY, substeps=substeps, hold=hold).trajectories(batch_of(task))
+        for hold in ("zero-order", "linear", "smooth")
     ]
-    np.testing.assert_allclose(both[0], both[1], rtol=1e-13, atol=1e-13)
+    for one in others:
+        np.testing.assert_allclose(held, one, rtol=1e-13, atol=1e-13)
 
 
 # The last row, and windows -------------------------------------------------------------------------------------------
 def final_states(engine, task, **rows):
     weights = np.ones(len(engine.signals))
     return engine.gauss_newton(batch_of(task, **rows), measurements_of(engine, task), weights).final_states
+
+
+def test_smooth_inputs_of_a_log_do_not_depend_on_those_of_its_neighbours():
+    first, second = log_of(ROTORCRAFT, 20), log_of(ROTORCRAFT, 30, seed=1)
+    engine, p, inputs = rollouts(ROTORCRAFT, substeps=2, hold="smooth"), first.parameters[:1], first.inputs
+    together = np.vstack([inputs, second.inputs])
+    for rows in (slice(0, 20), slice(20, 50)):
+        lane = {"start_rows": np.array([rows.start]), "n_rows": rows.stop - rows.start}
+        among = RolloutBatch(p, first.states, together, 0.01, **lane, first_rows=np.array([0, 20]))
+        alone = RolloutBatch(p, first.states, together[rows], 0.01)
+        np.testing.assert_array_equal(engine.trajectories(among), engine.trajectories(alone))
 
 
 @pytest.mark.parametrize("substeps", [1, 3])
@@ -161,12 +190,13 @@ def test_scores_errors_and_sums_are_of_one_simulation(target):
     assert_same(score_of(engine, task, threads=2, **window), scores)
 
 
+@EVERY_HOLD
 @EVERY_INTEGRATOR
 @EVERY_MODEL
-def test_the_jacobian_is_that_of_central_differences(model, integrator):
+def test_the_jacobian_is_that_of_central_differences(model, integrator, hold):
     task = log_of(model, 25)
     task.measured[:] = 0.0  # so that no quaternion changes its sign
-    engine = rollouts(model, integrator=integrator, substeps=3, hold="linear")
+    engine = rollouts(model, integrator=integrator, substeps=3, hold=hold)
     p, n_p = task.parameters[0], model.n_p
     found = engine.linearized_errors(batch_of(task, p[None]), measurements_of(engine, task)).jacobian[0]
     z = np.concatenate([p, task.states])
@@ -184,8 +214,11 @@ def test_a_model_without_inputs_has_nothing_to_interpolate():
         "swing", {"angle": "rad"}, {}, {"k": Parameter("1/s^2")}, lambda q, v, a, u, p: [a.angle + p.k * q.angle]
     )
     batch = RolloutBatch([[2.0]], [0.5, 0.0], np.zeros((30, 0)), 0.05)
-    both = [rollouts(swing, substeps=2, hold=hold).trajectories(batch) for hold in ("zero-order", "linear")]
-    np.testing.assert_array_equal(*both)
+    held, *others = [
+        rollouts(swing, substeps=2, hold=x).trajectories(batch) for x in ("zero-order", "linear", "smooth")
+    ]
+    for one in others:
+        np.testing.assert_array_equal(held, one)
 
 
 def test_equal_holds_are_one_simulator_and_others_another():
@@ -194,7 +227,7 @@ def test_equal_holds_are_one_simulator_and_others_another():
 
 
 def test_an_unknown_hold_is_refused_by_name():
-    with pytest.raises(SettingsError, match="hold 'cubic' is unknown; choose one of zero-order, linear"):
+    with pytest.raises(SettingsError, match="hold 'cubic' is unknown; choose one of zero-order, linear, smooth"):
         rollouts(PENDULUM, hold="cubic")
 
 

@@ -130,7 +130,7 @@ class Search:
             "--input-hold",
             callback=_known_hold,
             metavar="|".join(HOLDS),
-            help="Inputs between samples: held, or interpolated linearly.",
+            help="Inputs between samples: held, or interpolated linearly or smoothly.",
         ),
     ] = None
 

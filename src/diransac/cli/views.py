@@ -73,9 +73,9 @@ class Comparison:
             yield f"{', '.join(diagnosed)} is evaluated on measured signals, the others on derived ones, too"
         elif diagnosed and len(self.results) > 1:
             yield "fit error and inliers are those of one simulation of the whole log, outliers and drift included"
-        interpolated = [name for name, x in self.results.items() if x.estimate.resolution.hold == "linear"]
-        if interpolated:
-            yield f"{', '.join(interpolated)}: inputs interpolated linearly"
+        said = {name: x.estimate.resolution.interpolation for name, x in self.results.items()}
+        for text in dict.fromkeys(filter(None, said.values())):
+            yield f"{', '.join(name for name, x in said.items() if x == text)}: {text}"
         for name, result in self.results.items():
             yield from (f"{MARKS[x.level]} {name}: {x}" for x in result.findings if x.level in MARKS)
 

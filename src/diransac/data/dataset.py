@@ -226,7 +226,7 @@ class Dataset:
     layout : ParameterLayout
         Positions of each log's parameters in the vector of all parameters.
     input_hold : str, optional
-        Requested hold of the inputs between samples, "zero-order" or "linear"; None: the method's choice.
+        Requested hold of the inputs between samples, such as "zero-order"; None: the method's choice.
     """
 
     model: Model

@@ -95,7 +95,7 @@ class Resolution:
     substeps : int, optional
         Integration steps per sample.
     hold : str, optional
-        Inputs between samples: "zero-order", held, or "linear", interpolated.
+        Inputs between samples: "zero-order", held; "linear" or "smooth", interpolated.
     timing : InputTiming, optional
         Delay and lag after which recorded inputs act.
     """
@@ -104,6 +104,12 @@ class Resolution:
     substeps: int = 1
     hold: str = "zero-order"
     timing: InputTiming = field(default_factory=InputTiming)
+
+    @property
+    def interpolation(self) -> str:
+        """How inputs are interpolated, in words; empty where they are held."""
+        how = {"linear": "linearly", "smooth": "smoothly"}.get(self.hold)
+        return f"inputs interpolated {how}" if how else ""
 
 
 @dataclass(frozen=True, eq=False)

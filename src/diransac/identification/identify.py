@@ -73,9 +73,9 @@ def identify(
     bandwidth : float, optional
         Bandwidth of the differentiating filter, Hz; None: chosen from each log.
     input_hold : str, optional
-        Inputs between samples in every simulation: "zero-order", held, as those of a digital controller are; "linear",
-        interpolated, for continuous inputs such as those of a sensor.  None: "zero-order"; lo-diransac chooses the
-        likelier one.
+        Inputs between samples in every simulation: "zero-order", held, as those of a digital controller are; "linear"
+        or "smooth", interpolated, for continuous inputs such as those of a sensor.  None: "zero-order"; lo-diransac
+        chooses the likeliest.
     fixed : mapping of str to float, or iterable of str, optional
         Value of each parameter that is not to be identified, in its unit; None, or a name alone, for its nominal
         value (``Parameter.value``).  The result has it, with a standard error of zero, and names it in ``fixed``.

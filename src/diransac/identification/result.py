@@ -452,8 +452,8 @@ class Result:
     def _summary(self) -> str:
         whole = "" if self.diagnosis is None else "in one simulation of the whole log: "
         parts = [f"{whole}fit error {self.fit_error:.4g}", f"inliers {100.0 * self.inlier_fraction:.1f} %"]
-        if self.estimate.resolution.hold == "linear":
-            parts.append("inputs interpolated linearly")
+        if self.estimate.resolution.interpolation:
+            parts.append(self.estimate.resolution.interpolation)
         parts.append(f"fitted to {self.n_fitted} rows")
         if self.iterations:
             rejected = ", ".join(f"{n} {reason}" for reason, n in self.rejected.items())

@@ -47,6 +47,9 @@ class RolloutBatch:
         Row at which each lane starts; row 0 by default.
     n_rows : int, optional
         Rows that a lane simulates; the whole log by default, required with `start_rows`.
+    first_rows : (n,), optional
+        First row of each log where the rows are those of several logs, in order; smooth inputs of one log do not depend
+        on those of another.  Row 0 by default.
 
     Raises
     ------
@@ -60,6 +63,7 @@ class RolloutBatch:
     dt: float
     start_rows: IntArray | None = None
     n_rows: int | None = None
+    first_rows: IntArray | None = None
 
     def __post_init__(self) -> None:
         parameters = checked_array("parameters", self.parameters, (None, None))
@@ -106,6 +110,11 @@ class RolloutBatch:
     def n_log(self) -> int:
         """Number of rows of the log."""
         return len(self.inputs)
+
+    @property
+    def logs(self) -> IntArray:
+        """First row of each log."""
+        return np.zeros(1, np.int64) if self.first_rows is None else self.first_rows
 
     @property
     def rows_per_lane(self) -> int:

@@ -37,11 +37,11 @@ Dynamics = Callable[[ca.SX, float], ca.SX]
 class Hold(Protocol):
     """Inputs from one row to the next, as the time loop reads and the integration steps evaluate them."""
 
-    def columns(self, inputs: FloatArray, substeps: int) -> FloatArray:
-        """Columns of each row (n_log, n_columns) from its inputs (n_log, n_u)."""
+    def columns(self, inputs: FloatArray, substeps: int, first_rows: IntArray) -> FloatArray:
+        """Columns of each row (n_log, n_columns) from its inputs (n_log, n_u), and the first row of each log."""
 
     def n_changes(self, n_u: int) -> int:
-        """Number of trailing columns that the leading ones change by with each sub-step."""
+        """Number of trailing columns, differences by which the columns before them change with each sub-step."""
 
     def at(self, columns: ca.SX, fraction: float) -> ca.SX:
         """Inputs (n_u,) after a fraction of a sub-step, from the columns at its beginning."""
@@ -50,7 +50,7 @@ class Hold(Protocol):
 class _ZeroOrderHold:
     """Inputs of a row until the next."""
 
-    def columns(self, inputs: FloatArray, _substeps: int) -> FloatArray:
+    def columns(self, inputs: FloatArray, _substeps: int, _first_rows: IntArray) -> FloatArray:
         """The inputs."""
         return inputs
 
@@ -66,7 +66,7 @@ class _ZeroOrderHold:
 class _LinearHold:
     """Linear interpolation between the inputs of a row and of the next; those of the last row are held."""
 
-    def columns(self, inputs: FloatArray, substeps: int) -> FloatArray:
+    def columns(self, inputs: FloatArray, substeps: int, _first_rows: IntArray) -> FloatArray:
         """The inputs, then their changes in a sub-step."""
         return np.hstack([inputs, np.diff(inputs, axis=0, append=inputs[-1:]) / substeps])
 
@@ -80,8 +80,37 @@ class _LinearHold:
         return columns[:n_u] + fraction * columns[n_u:]
 
 
-HOLDS: dict[str, Hold] = {"zero-order": _ZeroOrderHold(), "linear": _LinearHold()}
-"""Inputs between rows: held, or interpolated linearly (first-order hold)."""
+class _SmoothHold:
+    """A parabola from the inputs of a row to those of the next; those of the last row are held.
+
+    Its curvature is the mean of the second differences at both rows, so that its mean is that of the cubic polynomial
+    through four rows.
+    """
+
+    def columns(self, inputs: FloatArray, substeps: int, first_rows: IntArray) -> FloatArray:
+        """The inputs, then their first and second differences from sub-step to sub-step."""
+        curvature = np.zeros_like(inputs)
+        for log in np.split(np.arange(len(inputs)), first_rows[first_rows > 0]):
+            if len(log) > 2:
+                bends = np.pad(np.diff(inputs[log], 2, axis=0), ((1, 1), (0, 0)), mode="edge")
+                curvature[log[:-1]] = 0.5 * (bends[:-1] + bends[1:])
+        change = np.diff(inputs, axis=0, append=inputs[-1:])
+        first = change / substeps - (substeps - 1) / (2 * substeps**2) * curvature
+        return np.hstack([inputs, first, curvature / substeps**2])
+
+    def n_changes(self, n_u: int) -> int:
+        """Every input changes, and its change does."""
+        return 2 * n_u
+
+    def at(self, columns: ca.SX, fraction: float) -> ca.SX:
+        """Newton's interpolation."""
+        n_u = columns.numel() // 3
+        u, first, second = columns[:n_u], columns[n_u : 2 * n_u], columns[2 * n_u :]
+        return u + fraction * first + 0.5 * fraction * (fraction - 1.0) * second
+
+
+HOLDS: dict[str, Hold] = {"zero-order": _ZeroOrderHold(), "linear": _LinearHold(), "smooth": _SmoothHold()}
+"""Inputs between rows: held, interpolated linearly (first-order hold), or by parabolas."""
 
 
 # Integrators ---------------------------------------------------------------------------------------------------------

@@ -68,9 +68,10 @@ def rollouts(
         The last one steps velocities first, then coordinates with the new velocities.
     substeps : int
         Integration steps from one row to the next.
-    hold : {"zero-order", "linear"}
-        Inputs from one row to the next: those of the row, or interpolated linearly to those of the next at the time of
-        every stage of every step; after the last row of the log, its own.  A closed loop has a zero-order hold.
+    hold : {"zero-order", "linear", "smooth"}
+        Inputs from one row to the next: those of the row, or interpolated to those of the next at the time of every
+        stage of every step, linearly or by parabolas; after the last row of the log, its own.  A closed loop has a
+        zero-order hold.
     target : Target, optional
         Processor to compile for; this one by default.
 
@@ -268,7 +269,7 @@ class Rollouts(Simulator):
             (self._model.n_p, len(self._model.state), n_u + hold.n_changes(n_u)),
             batch.parameters,
             batch.initial_states,
-            hold.columns(u, self._substeps),
+            hold.columns(u, self._substeps, batch.logs),
             batch.start_rows,
             batch.rows_per_lane,
         )

@@ -88,7 +88,8 @@ class LoopSpecification:
         returns the states and inputs of each stage, and the components of the quaternions before they are scaled
     substeps : sub-steps per row
     n_states, n_inputs, n_signals : sizes of x, u, and all signals
-    n_changes : number of trailing elements of u that the leading ones change by with each sub-step
+    n_changes : number of trailing elements of u that the leading ones change by with each sub-step: those are the
+        differences of the inputs of one order after the other, as in Newton's interpolation
     scored : positions of the scored signals among all signals
     quaternions : positions of whole quaternions among the scored signals; their sign is arbitrary
     state_quaternions : positions of all quaternions in x
@@ -283,9 +284,22 @@ class TimeLoop:
         v, n_changes = self.v, self.specification.n_changes
         if not n_changes:
             return u
+        n_u = len(u) - n_changes
         elapsed = v.splat(self.builder.sitofp(steps, DOUBLE))
-        moving, changes = u[:n_changes], u[-n_changes:]
-        return [*(v.fma(elapsed, change, value) for value, change in zip(moving, changes, strict=True)), *changes]
+        orders = [u[k : k + n_u] for k in range(0, len(u), n_u)]
+        return [x for k in range(len(orders)) for x in self._interpolated(orders[k:], elapsed)]
+
+    def _interpolated(self, orders: list[list[Value]], elapsed: Value) -> list[Value]:
+        """Newton's interpolation from differences of every order."""
+        v, found = self.v, orders[-1]
+        for order, lower in reversed(list(enumerate(orders[:-1]))):
+            if order:
+                later = v.sub(elapsed, v.splat(DOUBLE(order)))
+                factor = v.mul(later, v.splat(DOUBLE(1.0 / (order + 1))))
+            else:
+                factor = elapsed
+            found = [v.fma(factor, x, y) for x, y in zip(found, lower, strict=True)]
+        return found
 
     def _set_state(self, after: list[Value]) -> None:
         """Set the state."""

@@ -81,8 +81,9 @@ def findings_of_fit(
     -------
     iterator of Finding
     """
-    if found.intervals.hold == "linear" and not found.intervals.lag:
-        yield Finding("note", "Inputs that vary linearly between samples explain this log better than held ones.")
+    if found.intervals.hold != "zero-order" and not found.intervals.lag:
+        how = {"linear": "linearly", "smooth": "smoothly"}[found.intervals.hold]
+        yield Finding("note", f"Inputs that vary {how} between samples explain this log better than held ones.")
     yield from _of_sensors(found.intervals)
     yield from (_of_change(found.intervals.layout.names[x.index], x) for x in changes)
     if not found.exact:

@@ -297,7 +297,7 @@ def robust_scores(intervals: ShootingIntervals, motion: Motion, parameters: Floa
         own = np.take_along_axis(own, intervals.layout.index[logs], axis=1)
     batch = RolloutBatch(
         own, np.tile(motion.signals[starts, :n_x], (n, 1)), intervals.inputs, intervals.dt, np.tile(starts, n),
-        intervals.length,
+        intervals.length, intervals.first_of_log,
     )  # fmt: skip
     compared = Measurements(intervals.measured[:, seen], intervals.measurements.valid)
     errors = rollouts(intervals.model, names, hold=intervals.hold).errors(batch, compared).reshape(n, -1, len(names))

@@ -64,8 +64,8 @@ _SMALL_GAIN = 0.03
 _WORTH = 20.0
 # Newton steps of the errors of sensors at most; changes over standard errors that end them.
 _REFINEMENTS, _REFINED = 4, 0.1
-# Inputs that vary linearly between samples act half a sample before held ones.
-_LINEAR = (-0.9, -0.1)
+# Inputs that vary between samples act half a sample before held ones.
+_CONTINUOUS = (-0.9, -0.1)
 
 
 @dataclass(frozen=True)
@@ -332,8 +332,8 @@ class LocalSearch:
         if free_hold and intervals.hold == "zero-order":
             if late > _WHOLE_SAMPLE and settings.input_lag is not False and not settings.input_delay:
                 timings.append(replace(intervals, delay=0, lag=float(late), hold="linear"))
-            if _LINEAR[0] < late < _LINEAR[1]:
-                timings.append(replace(intervals, delay=0, hold="linear"))
+            if _CONTINUOUS[0] < late < _CONTINUOUS[1]:
+                timings += [replace(intervals, delay=0, hold=hold) for hold in ("linear", "smooth")]
         return timings
 
     def _refitted(self, now: Explanation, intervals: ShootingIntervals, free: Prior | None = None) -> Explanation:

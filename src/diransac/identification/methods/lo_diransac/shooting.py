@@ -94,7 +94,7 @@ class ShootingIntervals:
     substeps : int
         Integration steps from row to row.
     hold : str, optional
-        Inputs from row to row, "zero-order" or "linear".  Only the state after the last row of a log, which nothing
+        Inputs from row to row, one of `HOLDS`.  Only the state after the last row of a log, which nothing
         uses, depends on the inputs of the next log.
     delay : int, optional
         Samples by which the inputs act later than they are recorded.
@@ -146,7 +146,7 @@ class ShootingIntervals:
         substeps : int
             Integration steps from row to row.
         hold : str, optional
-            Inputs from row to row, "zero-order" or "linear".
+            Inputs from row to row, one of `HOLDS`.
 
         Returns
         -------
@@ -327,7 +327,13 @@ class ShootingIntervals:
         rest = np.broadcast_to(shared[self.n_p :], (len(chosen), len(shared) - self.n_p))
         parameters = np.hstack([own, rest, d[chosen]])
         return RolloutBatch(
-            parameters, x[chosen], self.moving_inputs, self.dt, self.starts[chosen], self.length + more_rows
+            parameters,
+            x[chosen],
+            self.moving_inputs,
+            self.dt,
+            self.starts[chosen],
+            self.length + more_rows,
+            self.first_of_log,
         )
 
     @cached_property
