@@ -210,7 +210,8 @@ class LocalSearch:
         if now.exact:
             refined = refine_exact(self.settings, intervals, begin, now.prior, now.cost)
         else:
-            refined = refine(self.settings, intervals, begin, now.prior, settled=True)
+            to_beat = now.refinement.cost
+            refined = refine(self.settings, intervals, begin, now.prior, settled=True, to_beat=to_beat)
         return replace(now, intervals=intervals, refinement=refined)
 
     def _better(
@@ -310,7 +311,8 @@ class LocalSearch:
         x = series[:, :: intervals.length, :n_x].reshape(-1, n_x)
         rho = fit.rho ** (1.0 / parts)
         begin = with_residuals(intervals, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
-        refined = refine(self.settings, intervals, begin, coarse.prior, settled=True)
+        to_beat = coarse.refinement.cost
+        refined = refine(self.settings, intervals, begin, coarse.prior, settled=True, to_beat=to_beat)
         return Explanation(intervals, refined, coarse.prior, exact=False)
 
     def _timings(self, now: Explanation, *, free_hold: bool) -> list[ShootingIntervals]:

@@ -54,7 +54,9 @@ _SIGMA_FLOOR = 1e-5
 # Prior size of the unmodelled accelerations at least, in spreads of the accelerations: none would make them singular.
 _LEAST_PRIOR = 1e-6
 # Discrepancies of a model that is taken to be exact, over their prior sizes.
-_EXACT, _EXACT_STEPS = 1e-3, 25
+_EXACT = 1e-3
+# Steps after which a fit is compared with a likelier one, each time; gains of so many steps that it may need to win.
+_COMPARED_STEPS, _PATIENCE = 6, 4
 # Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
 # the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
 _UNBROKEN = 0.01
@@ -218,8 +220,30 @@ def _loss_by_interval(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return np.asarray(losses.reshape(len(intervals), -1).sum(axis=1))
 
 
+@dataclass
+class _Race:
+    """A fit that is given up where it will hardly become likelier than another one."""
+
+    to_beat: float
+    before: float = np.inf
+
+    def is_lost(self, intervals: ShootingIntervals, fit: Fit, steps: int) -> bool:
+        """Whether the fit would need more than a few times its latest gain to win; tried every few steps."""
+        if not steps or steps % _COMPARED_STEPS or not np.isfinite(self.to_beat):
+            return False
+        now, before = negative_log_evidence(intervals, fit), self.before
+        self.before = now
+        return now - self.to_beat > _PATIENCE * (before - now)
+
+
 def refine(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, *, settled: bool = False
+    settings: LoDiransacSettings,
+    intervals: ShootingIntervals,
+    fit: Fit,
+    prior: Prior,
+    *,
+    settled: bool = False,
+    to_beat: float = np.inf,
 ) -> Refinement:
     """Fit after steps and updates until convergence, first with a robust tau, then with that of the evidence.
 
@@ -232,13 +256,16 @@ def refine(
     prior : Prior
     settled : bool, optional
         Whether the initial fit is near the solution already.
+    to_beat : float, optional
+        Negative log evidence of another fit; this one is given up where it will hardly become likelier.
 
     Returns
     -------
     Refinement
     """
     damping, robust, converged, steps = 0.0, settings.robust_model_error and not settled, False, 0
-    while steps < settings.max_steps and (robust or not converged):
+    race = _Race(to_beat)
+    while steps < settings.max_steps and (robust or not converged) and not race.is_lost(intervals, fit, steps):
         steps += 1
         robust = robust and not converged
         moved, solved, damping = _step(intervals, fit, damping)
@@ -262,7 +289,7 @@ def refine_exact(
         Initial fit, as from `refine`.
     prior : Prior
     to_beat : float
-        Negative log evidence of another fit; this one is given up where it is far from converging to a likelier one.
+        Negative log evidence of another fit; this one is given up where it will hardly become likelier.
 
     Returns
     -------
@@ -275,10 +302,8 @@ def refine_exact(
     tau = _NEARLY_EXACT * prior.tau
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
-    damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
-    while steps < settings.max_steps and not converged:
-        if steps == _EXACT_STEPS and negative_log_evidence(intervals, fit) > to_beat:
-            break
+    damping, converged, steps, jumps, race = 0.0, False, 0, fit.continuity_std, _Race(to_beat)
+    while steps < settings.max_steps and not converged and not race.is_lost(intervals, fit, steps):
         steps += 1
         moved, solved, damping = _step(intervals, fit, damping)
         inlying = moved.noise.inlying(moved.residuals, intervals.known)

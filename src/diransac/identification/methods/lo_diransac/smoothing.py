@@ -347,8 +347,9 @@ def choose_half_width(model: Model, logs: Sequence[Samples], dt: float, narrowes
         Number of samples.
     """
     longest = max(len(log.measured) for log in logs)
-    apart = max(rows_per_sample(np.asarray(log.known.any(axis=1))) for log in logs)
-    first = max(_FEWEST * apart, min(round(narrowest / dt), _ENOUGH_SAMPLES))
+    n_motion = len(model.signals) - len(model.sensors)
+    apart = max(rows_per_sample(np.asarray(log.known[:, :n_motion].any(axis=1))) for log in logs)
+    first = max(_FEWEST * apart, min(round(narrowest / dt), _ENOUGH_SAMPLES * apart))
     widths = [first * 3**k for k in range(20) if k == 0 or 8 * first * 3**k < longest]
     losses = [_prediction_error(model, logs, dt, half, max(1, half // first) if apart == 1 else 1) for half in widths]
     return int(widths[int(np.argmin(losses))])
