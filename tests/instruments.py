@@ -7,7 +7,7 @@ with a lever arm and a gyroscope see what a strapped-down instrument would.
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from scipy.integrate import odeint
 
 GRAVITY, ARM = 9.81, 0.177
 TRUTH = {"mass": 0.25, "inertia": 0.0041, "drag": 0.012}
@@ -36,7 +36,7 @@ def flight(seed: int = 0, duration: float = 10.0, dt: float = 0.01, **changes: f
         moment = p["inertia"] / ARM * (30.0 * (-lean - x[2]) - 8.0 * x[5] + 6.0 * aims[2][k])
         states.append(x)
         inputs.append((thrust, moment))
-        x = solve_ivp(motion, (0.0, dt), x, "DOP853", args=(inputs[-1], p), rtol=1e-10, atol=1e-12).y[:, -1]
+        x = odeint(motion, x, [0.0, dt], (inputs[-1], p), tfirst=True, rtol=1e-10, atol=1e-12)[-1]
     q, u = np.array(states), np.array(inputs)
     a = np.array([motion(0.0, *row, p)[3:] for row in zip(q, u, strict=True)])
     names = [f"{n}{end}" for end in ("", "_dot", "_ddot") for n in ("x", "z", "theta")]

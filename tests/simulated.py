@@ -8,6 +8,7 @@ under ``u_j``.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -17,9 +18,9 @@ GRAVITY = 9.81
 ARM_LENGTH = 0.177
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Machine:
-    """A plant written by hand.
+    """A plant written by hand; equal to itself alone.
 
     Parameters
     ----------
@@ -258,9 +259,14 @@ def rollout(machine, parameters, start, inputs, dt, substeps=1):
 
 def flight(machine, n_rows, dt, truth=None, substeps=1):
     """Signals ``(N, n_signals)`` and inputs ``(N, n_u)`` of the machine under its law, held between rows."""
-    n = len(machine.coordinates)
-    p = np.array(list((truth or machine.truth).values()))
-    x = np.array(machine.start)
+    signals, inputs = _flown(machine, n_rows, dt, tuple((truth or machine.truth).values()), substeps)
+    return signals.copy(), inputs.copy()
+
+
+@cache
+def _flown(machine, n_rows, dt, truth, substeps):
+    """The same; a flight that many tests ask for is simulated once."""
+    n, p, x = len(machine.coordinates), np.array(truth), np.array(machine.start)
     signals, inputs = np.empty((n_rows, 3 * n)), np.empty((n_rows, len(machine.inputs)))
     for row in range(n_rows):
         inputs[row] = machine.law(row * dt, x[:n], x[n:])

@@ -1,4 +1,4 @@
-r"""README.md, docs/ and examples/, run as they are shown.
+r"""README.md and docs/, run as they are shown.
 
 A page runs from top to bottom in a folder of its own, with ``examples/`` inside and the real logs in
 ``../shared/data``:
@@ -27,7 +27,6 @@ from diransac.cli.commands import app
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED = REPOSITORY.parent / "shared"
 PAGES = [page for page in (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))) if page.is_file()]
-EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
 NOT_RUN = {"cd", "git", "make", "pip"}
 LANGUAGES = {"", "python", "console", "text", "toml", "json", "yaml", "csv", "mermaid"}
 
@@ -117,12 +116,6 @@ def test_page_marks_every_block_with_a_plain_language(page: Path):
     found = blocks(page.read_text())
     odd = {f"line {block.line - 1}: {block.info!r}" for block in found if block.info not in LANGUAGES}
     assert not odd, f"{page.name}: mark blocks with one of {sorted(LANGUAGES)}; text is for what cannot run"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
-def test_example_runs(example: Path, folder: Path):
-    run_command(["python", str(example)], folder)
 
 
 def test_blocks_are_found_with_their_lines_and_without_their_indent():

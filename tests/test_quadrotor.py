@@ -27,6 +27,7 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 MOTORS = ("motor1", "motor2", "motor3", "motor4")
 
 
+@cache
 def rotors(frame):
     """Positions (4, 3), m, and directions (4,)."""
     angles, spins = np.array(FRAMES[frame]).T
@@ -40,10 +41,12 @@ def accelerations(R, v, w, speeds, frame):
     thrusts = TRUTH["thrust_coefficient"] * speeds**2
     in_body = R.T @ v
     force = R @ (np.array([0.0, 0.0, thrusts.sum()]) - TRUTH["drag"] * np.array([in_body[0], in_body[1], 0.0]))
-    J = np.diag([TRUTH["inertia_x"], TRUTH["inertia_y"], TRUTH["inertia_z"]])
-    moment = np.cross(positions, thrusts[:, None] * np.array([0.0, 0.0, 1.0])).sum(axis=0)
-    moment[2] -= TRUTH["torque_coefficient"] * (spins * speeds**2).sum()
-    return force / TRUTH["mass"] - [0.0, 0.0, G], np.linalg.solve(J, moment - np.cross(w, J @ w))
+    Jx, Jy, Jz = TRUTH["inertia_x"], TRUTH["inertia_y"], TRUTH["inertia_z"]
+    turning = -TRUTH["torque_coefficient"] * (spins * speeds**2).sum()
+    roll, pitch, yaw = positions[:, 1] @ thrusts, -positions[:, 0] @ thrusts, turning
+    wx, wy, wz = w
+    alpha = [(roll + (Jy - Jz) * wy * wz) / Jx, (pitch + (Jz - Jx) * wz * wx) / Jy, (yaw + (Jx - Jy) * wx * wy) / Jz]
+    return force / TRUTH["mass"] - [0.0, 0.0, G], np.array(alpha)
 
 
 def slope(x, commands, frame, lag):

@@ -42,14 +42,14 @@ def clean(name, n, dt):
 
 def covered(name, memory, n=2500):
     """How often the 95 % interval of each parameter holds the truth, with noise in the equation of every row."""
-    machine, dt = MACHINES[name], 0.02 if name == "underwater-vehicle" else 0.01
+    model, machine, dt = builtin(name), MACHINES[name], 0.02 if name == "underwater-vehicle" else 0.01
     signals, inputs = clean(name, n, dt)
     truth, hits = list(machine.truth.values()), np.zeros(len(machine.truth))
     for trial in range(TRIALS):
         rng = np.random.default_rng([7, trial])
         noise = np.column_stack([autoregressive(rng, n, memory) for _ in inputs.T])
         log = as_log(machine, signals, inputs + 0.2 * inputs.std(axis=0) * noise, dt)
-        intervals = dr.identify(builtin(name), log, "ols", settings=SETTINGS).intervals(0.95)
+        intervals = dr.identify(model, log, "ols", settings=SETTINGS).intervals(0.95)
         hits += [low <= x <= high for (low, high), x in zip(intervals.values(), truth, strict=True)]
     return hits / TRIALS
 
@@ -70,12 +70,12 @@ def test_intervals_of_nonlinear_least_squares_hold_the_truth_as_often():
     machine, trials = MACHINES["underwater-vehicle"], 40
     signals, inputs = clean("underwater-vehicle", 200, 0.05)
     truth, hits = np.array(list(machine.truth.values())), np.zeros(4)
-    quick = dr.NonlinearLeastSquares(n_starts=5, n_followed=1)
+    quick, model = dr.NonlinearLeastSquares(n_starts=5, n_followed=1), builtin("underwater-vehicle")
     width = student.ppf(0.975, N_BLOCKS - 1)
     for trial in range(trials):
         noisy = signals.copy()
         noisy[:, 2] += 0.1 * np.random.default_rng([3, trial]).normal(size=200)
-        bound = quick.bind(Dataset.of(builtin("underwater-vehicle"), as_log(machine, noisy, inputs, 0.05)))
+        bound = quick.bind(Dataset.of(model, as_log(machine, noisy, inputs, 0.05)))
         rows = np.arange(200)
         errors = np.sqrt(np.diag(jackknife_covariance(bound, rows)))
         hits += np.abs(bound.select([rows]).fit()[0] - truth) <= width * errors
