@@ -1,5 +1,7 @@
 """What lo-diransac takes a log to be: exact or not, late, lagging, with gaps, with sensors that err, with a payload."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import regime_flights as flights
@@ -57,6 +59,17 @@ def test_late_sensors_are_named():
     assert all(found.inside.values())
     said = [x for x in found.findings if x.startswith("x and z are recorded")]
     assert float(said[0].split("recorded ")[1].split(" ms late")[0]) == pytest.approx(10.0, abs=1.0)
+
+
+def test_late_positions_beside_timely_velocities_leave_the_parameters_exact():
+    arm = flights.REGIMES["arm noisy"]
+    machine = replace(arm.machine, noise={**arm.machine.noise, "q1_dot": 2e-3, "q2_dot": 2e-3})
+    regime = replace(arm, machine=machine, exact=False, fault=flights.Fault(late={"q1": 0.01, "q2": 0.01}))
+    found = METHODS["lo"](regime, SEED, flights.recordings(regime, [SEED])[0])
+    assert found.worst < 0.05
+    assert all(found.inside.values())
+    said = [x for x in found.findings if x.startswith("q1 and q2 are recorded")]
+    assert float(said[0].split("recorded ")[1].split(" ms late")[0]) == pytest.approx(10.0, abs=0.5)
 
 
 @pytest.mark.parametrize("name", ["rotor payload -30 %", "rotor battery sag 15 %"])

@@ -175,16 +175,16 @@ class LocalSearch:
     def _with_sensors(self, best: Explanation) -> Explanation:
         """The explanation with errors of the sensors, one after the other, as long as they make it likelier.
 
-        Where the model is exact, only the signals of its measurement equations are tested: nothing else depends on
-        them, so that the motion is as likely whatever their delay.
+        Where the model is exact, groups are tested, and single signals of its measurement equations: nothing else
+        depends on them, so that the motion is as likely whatever their delay.
         """
         model = best.intervals.model
-        tested = np.full(len(model.signals), not best.exact)
-        tested[len(model.signals) - len(model.sensors) :] = True
+        alone = np.full(len(model.signals), not best.exact)
+        alone[len(model.signals) - len(model.sensors) :] = True
         kinds = {"delays": self.settings.sensor_delays is None, "biases": self.settings.sensor_biases is None}
-        for k in range(self.settings.max_sensor_errors if tested.any() else 0):
+        for k in range(self.settings.max_sensor_errors):
             report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
-            errors = clear_errors(best.intervals, best.refinement.fit, tested, **kinds)
+            errors = clear_errors(best.intervals, best.refinement.fit, alone, **kinds)
             others = [self._with_errors(best, [x]) for x in errors]
             likelier = self._better(best, others, _WORTH, of_one=True)
             if likelier is best:

@@ -72,7 +72,7 @@ def clear_errors(
     fit : Fit
         At its optimum.
     among : (n_s,) bool array
-        Signals whose errors are tested.
+        Signals whose own errors are tested, besides those of groups.
     delays, biases : bool
         Kinds of errors that are tested.
 
@@ -266,7 +266,7 @@ def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[ErrorKin
     unit = np.array([model.units[n] for n in model.signals])
     masks = [kind == g for g in (0, 1, 2, 4)]
     masks += [mask & (unit == u) for mask in masks for u in dict.fromkeys(unit[mask])]
-    groups = [mask & seen & among for mask in masks]
+    groups = [mask & seen for mask in masks]
     late = [x for x in (*groups, *single) if x.any() and not (x == seen).all()]
     biased = np.array([n in model.biased_sensors for n in model.signals])
     kinds = [*((x, True) for x in late), *((x, False) for x in single if not biased[x].any())]
