@@ -10,7 +10,14 @@ import pytest
 import diransac as dr
 from command_line import run
 from diransac.identification.candidate_terms import candidate_terms
-from diransac.identification.suggestions import MeanForces, SelectedTerm, select_terms, suggestions_of, with_terms
+from diransac.identification.suggestions import (
+    MeanForces,
+    SelectedTerm,
+    changes_beside,
+    select_terms,
+    suggestions_of,
+    with_terms,
+)
 from user_models import tumbling
 
 RNG = np.random.default_rng(20240607)
@@ -45,6 +52,19 @@ def autocorrelated(rng, n, rho=0.9):
     for k in range(1, n):
         x[k] = rho * x[k - 1] + np.sqrt(1 - rho**2) * x[k]
     return x
+
+
+def test_parameters_change_by_what_a_missing_term_had_biased_them():
+    rng = np.random.default_rng(3)
+    made = means(rng, n=2000, noise=0.01 * rng.standard_normal((2000, 2)))
+    own = np.concatenate([made.own, np.zeros((2000, 2, 1))], axis=2)  # nothing depends on the last parameter
+    own[:, 0, 0] += made.terms[:, 0, 6]  # of unit variance, as the rest of the column
+    made = replace(made, own=own, force=made.force - 0.8 * made.terms[:, :, 6])
+    change = changes_beside(made, select_terms(made))
+    assert change[0] == pytest.approx(-0.4, abs=0.15)  # the equation where the term acts has less weight
+    assert abs(change[1]) < 0.05
+    assert change[2] == 0.0
+    assert not changes_beside(made, ()).any()
 
 
 def test_planted_terms_are_found_with_their_coefficients_within_five_standard_errors():

@@ -420,6 +420,10 @@ class Result:
     def _text(self) -> str:
         return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
 
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name}={value:.4g}" for name, value in self.parameters.items())
+        return f"<Result of {self.method} for {self.model.name}: {values}; {self.verdict}>"
+
     def __str__(self) -> str:
         parts = (self._headline(), *self._table(), *self._prior_lines(), self._summary())
         return "\n".join([*parts, *self._diagnosed(), *self._assessed()])

@@ -273,8 +273,9 @@ def changes_beside(means: MeanForces, selected: Sequence[SelectedTerm]) -> Float
 
 
 def _slopes(A: FloatArray, b: FloatArray) -> FloatArray:
-    """Coefficients of least squares of b on the columns of A."""
-    norm = np.linalg.norm(A, axis=0) + _TINY
+    """Coefficients of least squares of b on the columns of A; 0 for columns of zeros."""
+    norm = np.linalg.norm(A, axis=0)
+    norm[norm == 0.0] = 1.0
     return np.asarray(np.linalg.lstsq(A / norm, b, rcond=_RANK)[0] / norm)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.estimate import Finding
-from diransac.identification.methods.lo_diransac.hypotheses import weak_form
+from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
 from diransac.identification.methods.lo_diransac.projection import (
     batch_sums,
     least_squares_gains,
@@ -32,6 +32,8 @@ _CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
 # Residual of an equation over that of the worst, at least.
 _SMALLEST = 1e-6
 _TINY = 1e-300
+# Log residual of each signal that is as small.
+_AS_WELL = 0.03
 # Intervals of half the logs from which parameters and their scatter are estimated, at least.
 _FEWEST_INTERVALS = 9
 
@@ -160,17 +162,26 @@ def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArra
 def _of_plain_least_squares(
     intervals: ShootingIntervals, motion: Motion, result: ProjectedEstimate
 ) -> Iterator[Finding]:
-    """Parameters of plain least squares of the smoothed motion that lie far outside their intervals."""
+    """Parameters of plain least squares of the smoothed motion that lie far outside their intervals.
+
+    They are no alarm where simulations with them agree less with the log.
+    """
     if intervals.model.nonlinear_parameters:
         return
     weak = weak_form(intervals, motion)
     everything: BoolArray = np.ones((1, *weak.b.shape), bool)
     plain = weak.solve(everything)[0]
+    both, seen = np.array([plain, result.parameters]), intervals.known.any(axis=0)
+    worse, own = robust_scores(intervals, motion, both, np.arange(len(intervals)))
+    if not worse < own + _AS_WELL * seen.sum():
+        return
     _, variance = _change(weak.W, weak.W @ plain - weak.b)
     error = np.sqrt(variance + np.diag(result.covariance))
     solved: BoolArray = np.asarray(weak.W.any(axis=(0, 1)))
     for name, a, b, s, ok in zip(intervals.layout.names, plain, result.parameters, error, solved, strict=True):
         apart, size = abs(a - b), abs(b)
         if ok and np.isfinite(s) and apart > _CLEAR * s and apart > _SERIOUS * size:
-            text = f"Plain least squares gives {name} = {number(a, 3)}, far outside the interval"
-            yield Finding("care", f"{text}: outliers and noise explain that, or the model lacks a term.")
+            text = (
+                f"Plain least squares explains the log as well, with {name} = {number(a, 3)} far outside the interval"
+            )
+            yield Finding("care", f"{text}: noise of the smoothed motion, or a term that the model lacks.")
