@@ -338,26 +338,25 @@ class LocalSearch:
                 timings += [replace(intervals, delay=0, hold=hold) for hold in ("linear", "smooth")]
         return timings
 
-    def _refitted(self, now: Explanation, intervals: ShootingIntervals, free: Prior | None = None) -> Explanation:
+    def _refitted(self, now: Explanation, intervals: ShootingIntervals, prior: Prior | None = None) -> Explanation:
         """The likeliest explanation with another timing, from the fit of this one.
 
-        The free prior is that of another timing; None: as the settings admit it.
+        The prior is that of the new fit; None: as the settings admit a delay.
         """
-        free = free or self._prior_of(intervals)
+        prior = prior or self._prior_of(intervals)
         fit, old = now.refinement.fit, now.intervals
+        frees = prior.delay > self._undelayed.delay
         left = old.delay + old.lag + fit.shared[-1] - intervals.delay - intervals.lag
-        if intervals.hold != old.hold:
-            left = 0.0
+        left = left if frees and intervals.hold == old.hold else 0.0
         # A wide prior that the evidence narrows: a narrow one would never widen where nothing moves.
-        is_wide = free is self.prior and free is not now.prior
-        sizes = np.append(fit.prior[:-1], max(free.delay, _WHOLE_SAMPLE) if is_wide else free.delay)
-        left = left if free is self.prior else 0.0
+        is_wide = frees and prior.delay > now.prior.delay
+        sizes = np.append(fit.prior[:-1], max(prior.delay, _WHOLE_SAMPLE) if is_wide else prior.delay)
         begin = with_residuals(intervals, replace(fit, shared=np.append(fit.shared[:-1], left), prior=sizes))
         if now.exact:
-            refined = refine_exact(self.settings, intervals, begin, free, now.cost)
-            return Explanation(intervals, refined, free, exact=True)
-        refined = refine(self.settings, intervals, begin, free, settled=True)
-        return self._simplest(Explanation(intervals, refined, free, exact=False), free)
+            refined = refine_exact(self.settings, intervals, begin, prior, now.cost)
+            return Explanation(intervals, refined, prior, exact=True)
+        refined = refine(self.settings, intervals, begin, prior, settled=True)
+        return self._simplest(Explanation(intervals, refined, prior, exact=False), prior)
 
     def _with_likeliest_lag(self, intervals: ShootingIntervals) -> ShootingIntervals:
         """The lag, from half a sample to the latest delay, with which simulations by the best hypothesis agree best."""
