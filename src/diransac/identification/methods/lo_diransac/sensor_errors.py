@@ -39,6 +39,7 @@ _GROUPS = 4
 _FEWEST = 50
 # Part of the information of an error that other unknowns must leave.
 _DETERMINED = 1e-6
+_TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]
     slopes = [scores.slope(x) for x in kinds]
     determined, covariance, _, _ = scores.together(slopes)
     sizes = -covariance @ np.array([slopes[k].score for k in determined])
-    ratios = np.abs(sizes) / np.sqrt(np.diag(covariance))
+    ratios = np.abs(sizes) / (np.sqrt(np.diag(covariance)) + _TINY)
     return [SensorError(kinds[k], float(x), float(r)) for k, x, r in zip(determined, sizes, ratios, strict=True)]
 
 
@@ -192,7 +193,7 @@ class _Scores:
         rows = (weighted * self.fit.residuals[:, columns]).sum(axis=1).reshape(n, -1).sum(axis=1)
         scores = rows + (self.at.data_z * z).sum(axis=1) + self.at.data_s @ s
         # An error that is there has a score of one sign in each batch; only the rest of the scores scatters.
-        scores = scores - slope.score * share / max(share.sum(), 1e-300)
+        scores = scores - slope.score * share / max(share.sum(), _TINY)
         batches = np.add.reduceat(scores, np.arange(0, n, max(1, round(np.sqrt(n)))))
         variance = max(information, float(np.square(batches).sum()))
         return SensorError(kind, -slope.score / information, abs(slope.score) / np.sqrt(variance))
