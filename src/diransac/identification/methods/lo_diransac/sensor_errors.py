@@ -31,15 +31,16 @@ if TYPE_CHECKING:
 
 __all__ = ["SensorError", "clear_errors", "effect_on", "errors_of", "with_errors"]
 
-# Standard errors from which on an error of a sensor is tried, and its least delay, samples.
-_CLEAR, _LEAST_DELAY = 3.0, 0.1
+# Standard errors from which on an error of a sensor is tried; its least delay, samples; its largest, over the log.
+_CLEAR, _LEAST_DELAY, _LATEST = 3.0, 0.1, 0.1
 # Groups of which a fit is made at a time.
 _GROUPS = 4
 # Signals that are known in fewer rows than this are not tested.
 _FEWEST = 50
 # Part of the information of an error that other unknowns must leave.
 _DETERMINED = 1e-6
-_TINY = 1e-300
+# Change of a signal over its size that is a rounding error.
+_ROUNDING, _TINY = 1e-9, 1e-300
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,8 @@ def clear_errors(
         return []
     scores = _Scores(intervals, fit)
     found = [x for x in map(scores.tested, tested) if x is not None]
-    clear = [x for x in found if x.ratio > _CLEAR and (not x.kind.is_delay or abs(x.size) > _LEAST_DELAY)]
+    latest = _LATEST * max(x.stop - x.start for x in intervals.rows_of_logs)
+    clear = [x for x in found if x.ratio > _CLEAR and (not x.kind.is_delay or _LEAST_DELAY < abs(x.size) < latest)]
     clear.sort(key=lambda x: x.ratio, reverse=True)
     single = [x for x in clear if len(x.kind.signals) == 1]
     return [*single[:1], *[x for x in clear if len(x.kind.signals) > 1][:_GROUPS]]
@@ -233,7 +235,7 @@ def with_errors(intervals: ShootingIntervals, fit: Fit, errors: Sequence[SensorE
 
 
 def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
-    """Change of each simulated signal per sample.
+    """Change of each simulated signal per sample; none where it is a rounding error.
 
     Parameters
     ----------
@@ -250,7 +252,8 @@ def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     for rows in intervals.rows_of_logs:
         if rows.stop - rows.start > 1:
             rates[rows] = np.gradient(signals[rows], axis=0)
-    return np.nan_to_num(rates, nan=0.0, posinf=0.0, neginf=0.0)
+    rates, signals = (np.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0) for x in (rates, signals))
+    return np.where(np.abs(rates).max(axis=0) > _ROUNDING * np.abs(signals).max(axis=0), rates, 0.0)
 
 
 def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[ErrorKind]:
