@@ -107,7 +107,7 @@ class Resolution:
 
     @property
     def interpolation(self) -> str:
-        """How inputs are interpolated, in words; empty where they are held."""
+        """Interpolation of the inputs, in words; empty where they are held."""
         how = {"linear": "linearly", "smooth": "smoothly"}.get(self.hold)
         return f"inputs interpolated {how}" if how else ""
 

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from diransac.data.segment import Segment
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.checks import Change
+    from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.missing_terms import MissingTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.refinement import Refinement
@@ -223,21 +224,12 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
     intervals, refined = likeliest.intervals, likeliest.refinement
     report(callback, "estimating parameters", 0.9)
-    projects = settings.projection and not likeliest.exact
-    result = (
-        estimate_parameters(intervals, refined.fit, settings.prior_inflation)
-        if projects
-        else fitted_parameters(intervals, refined.fit)
-    )
-    reached = not intervals.layout.admits(result.parameters[None])[0]
+    result, reached = _parameters(settings, likeliest)
     if reached:
-        # The fit satisfies the bounds; least squares on its motion may violate a strict one.
-        result = fitted_parameters(intervals, refined.fit)
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
     if reached or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
-    changes = changes_between_halves(likeliest, result)
-    lacks = None
+    changes, lacks = changes_between_halves(likeliest, result), None
     if settings.suggestions and not likeliest.exact:
         lacks = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
     ambiguity = _ambiguity(len(result.parameters), changes, lacks)
@@ -250,6 +242,17 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
     found = _Found(dataset, intervals, motion, refined.fit, result, ambiguity, forced)
     estimate = _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
     return estimate if lacks is None else replace(estimate, suggestions=lacks.suggestions)
+
+
+def _parameters(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[ProjectedEstimate, bool]:
+    """Parameters of an explanation; True if they are those of the fit because others would violate a strict bound."""
+    intervals, fit = likeliest.intervals, likeliest.refinement.fit
+    if likeliest.exact or not settings.projection:
+        return fitted_parameters(intervals, fit), False
+    result = estimate_parameters(intervals, fit, settings.prior_inflation)
+    if intervals.layout.admits(result.parameters[None])[0]:
+        return result, False
+    return fitted_parameters(intervals, fit), True
 
 
 def _ambiguity(n: int, changes: Sequence[Change], lacks: MissingTerms | None) -> FloatArray:

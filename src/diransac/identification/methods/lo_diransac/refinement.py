@@ -228,7 +228,7 @@ class _Race:
     before: float = np.inf
 
     def is_lost(self, intervals: ShootingIntervals, fit: Fit, steps: int) -> bool:
-        """Whether the fit would need more than a few times its latest gain to win; tried every few steps."""
+        """True if the fit would need more than a few times its latest gain to win; tried every few steps."""
         if not steps or steps % _COMPARED_STEPS or not np.isfinite(self.to_beat):
             return False
         now, before = negative_log_evidence(intervals, fit), self.before

@@ -96,7 +96,7 @@ def clear_errors(
 
 
 def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> list[SensorError]:
-    """What is left of some errors together, clear or not.
+    """Remainders of some errors, estimated together, clear or not.
 
     Parameters
     ----------
