@@ -185,7 +185,7 @@ class LocalSearch:
         for k in range(self.settings.max_sensor_errors):
             report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
             errors = clear_errors(best.intervals, best.refinement.fit, alone, **kinds)
-            others = [self._with_errors(best, [x]) for x in errors]
+            others = [self._with_errors(best, [x], to_beat=best.refinement.cost) for x in errors]
             likelier = self._better(best, others, _WORTH, of_one=True)
             if likelier is best:
                 break
@@ -203,14 +203,13 @@ class LocalSearch:
             best = self._with_errors(best, errors)
         return best
 
-    def _with_errors(self, now: Explanation, errors: Sequence[SensorError]) -> Explanation:
-        """The explanation with errors of sensors, with the same freedom."""
+    def _with_errors(self, now: Explanation, errors: Sequence[SensorError], *, to_beat: float = np.inf) -> Explanation:
+        """The explanation with errors of sensors, with the same freedom; given up where it will hardly beat a cost."""
         intervals = with_errors(now.intervals, now.refinement.fit, errors)
         begin = with_residuals(intervals, now.refinement.fit)
         if now.exact:
-            refined = refine_exact(self.settings, intervals, begin, now.prior, now.cost)
+            refined = refine_exact(self.settings, intervals, begin, now.prior, to_beat)
         else:
-            to_beat = now.refinement.cost
             refined = refine(self.settings, intervals, begin, now.prior, settled=True, to_beat=to_beat)
         return replace(now, intervals=intervals, refinement=refined)
 

@@ -228,12 +228,12 @@ class _Race:
     before: float = np.inf
 
     def is_lost(self, intervals: ShootingIntervals, fit: Fit, steps: int) -> bool:
-        """True if the fit would need more than a few times its latest gain to win; tried every few steps."""
+        """True if the fit is behind by more than a few times its latest gain; compared every few steps."""
         if not steps or steps % _COMPARED_STEPS or not np.isfinite(self.to_beat):
             return False
         now, before = negative_log_evidence(intervals, fit), self.before
         self.before = now
-        return now - self.to_beat > _PATIENCE * (before - now)
+        return now - self.to_beat > _PATIENCE * max(before - now, 0.0)
 
 
 def refine(
