@@ -13,11 +13,13 @@
 | `sensitivities.py` | derivatives of the state in the time loop: columns in memory, stepped in loops |
 | `outputs.py` | outputs of the time loop: scores, sums, series |
 | `lanes.py` | arrays of many rollouts, arranged for the time loop |
+| `block_tridiagonal.py`, `block_elimination.py` | block-tridiagonal systems, and their elimination, emitted |
 
 LLVM is loaded when something is first compiled.
 """
 
+from diransac.simulation.compiler.block_tridiagonal import BlockSolution, solve_blocks
 from diransac.simulation.compiler.functions import Map, Scan, compile_map, compile_scan
 from diransac.simulation.compiler.machine_code import Target
 
-__all__ = ["Map", "Scan", "Target", "compile_map", "compile_scan"]
+__all__ = ["BlockSolution", "Map", "Scan", "Target", "compile_map", "compile_scan", "solve_blocks"]

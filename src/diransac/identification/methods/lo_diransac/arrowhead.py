@@ -6,12 +6,7 @@
     | B_0' B_1' B_2' ...   C  |
 
 Each window is coupled to its neighbours and to the parameters only, so that a solution and the required blocks of the
-inverse cost O(W).  Blocks are eliminated by cyclic reduction: all odd ones at once, then every other one of what is
-left, so that each of the log2(W) levels is a handful of operations on stacks of small matrices.
-
-References
-----------
-Hockney 1965 and Heller 1976 (cyclic reduction); Takahashi, Fagan, Chen 1973 (selected inverse).
+inverse cost O(W).  Windows are eliminated by compiled code, for the border as further right-hand sides.
 """
 
 from __future__ import annotations
@@ -21,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.simulation.compiler import solve_blocks
 
 __all__ = ["Arrowhead", "Factored"]
 
@@ -126,14 +122,16 @@ class Arrowhead:
         E = self.below * sz[1:, :, None] * sz[:-1, None, :]
         B = self.border * sz[:, :, None] * sp
         C = self.corner * sp[:, None] * sp + (damping + self.ridge) * np.eye(m)
-        solved, var, below, log_det = _reduce(D, E, np.concatenate([B, right_z * sz[:, :, None]], axis=2))
-        gain, alone = solved[:, :, :m], solved[:, :, m:]
-        left = C - np.einsum("wki,wkj->ij", B, gain)
+        solved, inverse, below, log_det = solve_blocks(D, E, np.concatenate([B, right_z * sz[:, :, None]], axis=2))
+        gain = solved[:, :, :m]
+        common = B.reshape(-1, m).T @ solved.reshape(len(B) * k, -1)
+        left = C - common[:, :m]
         var_p = _inverse(left)
-        p = var_p @ (right_p * sp[:, None] - np.einsum("wki,wkc->ic", B, alone))
-        z = alone - gain @ p
-        var = var + gain @ var_p @ gain.swapaxes(1, 2)
-        below = below + gain[1:] @ var_p @ gain[:-1].swapaxes(1, 2)
+        p = var_p @ (right_p * sp[:, None] - common[:, m:])
+        z = solved[:, :, m:] - gain @ p
+        moved = gain @ var_p
+        var = inverse + moved @ gain.swapaxes(1, 2)
+        below = below + moved[1:] @ gain[:-1].swapaxes(1, 2)
         return Factored(
             z * sz[:, :, None],
             p * sp[:, None],
@@ -141,7 +139,7 @@ class Arrowhead:
             below * sz[1:, :, None] * sz[:-1, None, :],
             var_p * sp[:, None] * sp,
             gain * sz[:, :, None] / sp,
-            float(log_det + _log_det(left) - 2.0 * (np.log(sz).sum() + np.log(sp).sum())),
+            float(log_det + np.linalg.slogdet(left)[1] - 2.0 * (np.log(sz).sum() + np.log(sp).sum())),
         )
 
 
@@ -154,48 +152,3 @@ def _inverse(A: FloatArray) -> FloatArray:
     """Inverse of a symmetric matrix; singular directions have a large variance instead of an error."""
     values, vectors = np.linalg.eigh(0.5 * (A + A.T))
     return np.asarray((vectors / np.maximum(values, 1e-15)) @ vectors.T)
-
-
-def _log_det(A: FloatArray) -> float:
-    """Logarithm of the determinants of positive definite matrices, all together."""
-    return float(np.linalg.slogdet(A)[1].sum())
-
-
-def _reduce(D: FloatArray, E: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """``A^-1 R (W, k, c)``; of ``A^-1`` the diagonal blocks (W, k, k) and those below (W-1, k, k); ``log det A``."""
-    n, k, c = R.shape
-    if n == 1:
-        inverse = np.asarray(np.linalg.inv(D))
-        return inverse @ R, np.asarray(inverse, np.float64), E, _log_det(D)
-    n_odd, n_even = n // 2, n - n // 2
-    has_right = n_even > n_odd  # whether the last odd block has a neighbour on its right, too
-    left = E[0::2]
-    right = np.zeros_like(left)
-    right[: len(E[1::2])] = E[1::2].swapaxes(1, 2)
-    eye = np.broadcast_to(np.eye(k), (n_odd, k, k))
-    solved = np.linalg.solve(D[1::2], np.concatenate([left, right, R[1::2], eye], axis=2))
-    Fl, Fr, Ro, Io = np.split(solved, [k, 2 * k, 2 * k + c], axis=2)
-    De, Re = D[0::2].copy(), R[0::2].copy()
-    lt, rt = left.swapaxes(1, 2), right.swapaxes(1, 2)
-    De[:n_odd] -= lt @ Fl
-    Re[:n_odd] -= lt @ Ro
-    m = n_even - 1
-    De[1:] -= (rt @ Fr)[:m]
-    Re[1:] -= (rt @ Ro)[:m]
-    Xe, Se, Te, log_det = _reduce(De, -(rt @ Fl)[:m], Re)
-    if not has_right:  # a neighbour that isn't there: couples to nothing
-        Xe_r = np.concatenate([Xe[1:], np.zeros_like(Xe[:1])])
-        Se_r = np.concatenate([Se[1:], np.zeros_like(Se[:1])])
-        T = np.concatenate([Te, np.zeros_like(Se[:1])])
-    else:
-        Xe_r, Se_r, T = Xe[1:], Se[1:], Te
-    Xl, Sl = Xe[:n_odd], Se[:n_odd]
-    X, S, off = np.empty_like(R), np.empty_like(D), np.empty_like(E)
-    to_left = -(Fl @ Sl + Fr @ T)
-    to_right = -(Fl @ T.swapaxes(1, 2) + Fr @ Se_r)
-    X[0::2], S[0::2] = Xe, Se
-    X[1::2] = Ro - Fl @ Xl - Fr @ Xe_r
-    S[1::2] = Io - to_left @ Fl.swapaxes(1, 2) - to_right @ Fr.swapaxes(1, 2)
-    off[0::2] = to_left
-    off[1::2] = to_right.swapaxes(1, 2)[: len(off[1::2])]
-    return X, S, off, log_det + _log_det(D[1::2])

@@ -21,7 +21,7 @@ from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
-from diransac.identification.methods.lo_diransac.projection import estimate_parameters
+from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
 from diransac.identification.methods.lo_diransac.sensor_errors import clear_errors, errors_of, with_errors
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
@@ -286,7 +286,7 @@ class LocalSearch:
         The prior is that of the exact model.
         """
         intervals, fit = flexible.intervals, flexible.refinement.fit
-        projected = estimate_parameters(intervals, fit, 1.0).parameters
+        projected = projected_parameters(intervals, fit)
         starts = np.array([projected, self.hypotheses[0]])
         starts = starts[: 1 + bool((np.abs(starts[1] - starts[0]) > _APART * np.abs(starts[0])).any())]
         for p in starts[intervals.layout.admits(starts)]:
@@ -318,7 +318,7 @@ class LocalSearch:
         """Other timings of the inputs that the fit suggests: whole samples of delay, a lag, or another hold."""
         settings = self.settings
         intervals, fit = now.intervals, now.refinement.fit
-        local, error = fit.shared[-1], estimate_parameters(intervals, fit, 1.0).delay_error
+        local, error = fit.shared[-1], now.refinement.delay_error
         late = intervals.delay + intervals.lag + local
         if settings.input_lag and not intervals.lag:
             hold = "linear" if free_hold else intervals.hold
@@ -410,8 +410,9 @@ def fewest_parts(length: int) -> int:
 
 def _unexplained(found: Explanation) -> FloatArray:
     """Log of the RMS acceleration ``(n_v,)`` that the model does not explain."""
-    left = estimate_parameters(found.intervals, found.refinement.fit, 1.0).unexplained
-    return np.asarray(np.log(np.sqrt(np.square(left[found.intervals.occupied]).mean(axis=0)) + 1e-300))
+    intervals, fit = found.intervals, found.refinement.fit
+    left = unexplained(intervals, fit, projected_parameters(intervals, fit))
+    return np.asarray(np.log(np.sqrt(np.square(left[intervals.occupied]).mean(axis=0)) + 1e-300))
 
 
 def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:

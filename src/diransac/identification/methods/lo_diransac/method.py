@@ -239,7 +239,7 @@ def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback:
         *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), changes),
     )
     forced = bool(settings.input_delay or settings.input_lag)
-    found = _Found(dataset, intervals, motion, refined.fit, result, ambiguity, forced)
+    found = _Found(dataset, intervals, motion, refined, result, ambiguity, forced)
     estimate = _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
     return estimate if lacks is None else replace(estimate, suggestions=lacks.suggestions)
 
@@ -404,7 +404,7 @@ class _Found:
     dataset: Dataset
     intervals: ShootingIntervals
     motion: Motion
-    fit: Fit
+    refinement: Refinement
     result: ProjectedEstimate
     ambiguity: FloatArray
     forced: bool
@@ -412,12 +412,12 @@ class _Found:
     @property
     def late(self) -> float:
         """Delay of the inputs, lag included, samples."""
-        return float(self.intervals.delay + self.intervals.lag + self.fit.shared[-1])
+        return float(self.intervals.delay + self.intervals.lag + self.refinement.fit.shared[-1])
 
     @property
     def is_late(self) -> bool:
         """True for a significant delay."""
-        return abs(self.late) > max(_SIGNIFICANT * self.result.delay_error, _SMALL_DELAY)
+        return abs(self.late) > max(_SIGNIFICANT * self.refinement.delay_error, _SMALL_DELAY)
 
     @property
     def timing(self) -> InputTiming:
@@ -467,7 +467,7 @@ def _estimate(
 
 def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ...]) -> Diagnosis:
     """Noise, faults and unmodelled forces, by name and over the rows of the given logs."""
-    dataset, intervals, fit, result = found.dataset, found.intervals, found.fit, found.result
+    dataset, intervals, fit, result = found.dataset, found.intervals, found.refinement.fit, found.result
     model, dt = dataset.model, intervals.dt
     columns = {name: model.signals.index(name) for name in dataset.signals}
     seen = intervals.known.any(axis=0)
@@ -493,7 +493,7 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
         smoothed_time=begins + dt * place.astype(float),
         smoothed_states=dict(zip(model.state, fit.x[shown].T.copy(), strict=True)),
         input_delay=found.late * dt,
-        input_delay_error=result.delay_error * dt,
+        input_delay_error=found.refinement.delay_error * dt,
         input_delay_significant=found.is_late,
         unidentifiable=lost,
         combinations=combinations,

@@ -28,6 +28,7 @@ Plumlee 2017 (discrepancies orthogonal to the model); White 1982 (inference unde
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -60,6 +61,7 @@ __all__ = [
     "least_squares_gains",
     "means_of_intervals",
     "parameter_units",
+    "projected_parameters",
     "residuals_of_motion",
     "unexplained",
 ]
@@ -84,14 +86,11 @@ class ProjectedEstimate:
     unexplained : (W, n_v) array
         Mean over each interval of the accelerations that the model with these parameters does not explain; 0 where an
         interval has no row that counts.
-    delay_error : float
-        Standard error of the delay, samples.
     """
 
     parameters: FloatArray
     covariance: FloatArray
     unexplained: FloatArray
-    delay_error: float
 
 
 def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation: float) -> ProjectedEstimate:
@@ -112,9 +111,27 @@ def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation:
     """
     wide = _with_wide_priors(intervals, fit)
     found = _solution(intervals, wide)
-    change = _solution(intervals, _inflated_prior(intervals, wide, prior_inflation)).parameters - found.parameters
+    change = projected_parameters(intervals, _inflated_prior(intervals, wide, prior_inflation)) - found.parameters
     found = replace(found, covariance=found.covariance + np.outer(change, change))
     return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
+
+
+def projected_parameters(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+    """Parameters ``(n,)`` that solve the equations on the fitted motion by least squares, without priors.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        Most probable motion.
+
+    Returns
+    -------
+    (n,) array
+        Within the inclusive bounds.
+    """
+    rows = _Rows.of(intervals, fit)
+    return _bounded_projection(intervals, fit.shared[: intervals.n_p], rows, _REWEIGHTED)[0]
 
 
 def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -138,9 +155,9 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     scores = np.einsum("wkp,wk->wp", z, at.data_z) + at.data_s @ s
     sums = batch_sums(scores)
     more = np.sqrt(np.maximum(1.0, np.square(sums).sum(axis=0) / (np.diag(s[:n_p]) + _TINY)))
-    p, delay = fit.shared[:n_p], at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
+    p = fit.shared[:n_p]
     covariance = s[:n_p] * np.outer(more, more) + effect_on(intervals, fit, z, s)
-    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p), float(np.sqrt(delay)))
+    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p))
 
 
 def _with_wide_priors(intervals: ShootingIntervals, fit: Fit) -> Fit:
@@ -167,73 +184,96 @@ def _inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fi
     return replace(inflated, shared=fit.shared + step.step_p, x=x, d=d)
 
 
+@dataclass(frozen=True)
+class _Rows:
+    """Equations on the fitted motion, ``r(p) = g + M d`` with discrepancies g and unmodelled accelerations d.
+
+    Parameters
+    ----------
+    W : (N, n_v, n) array
+    push : (N, n_v) array
+        g in every row.
+    means : (W, n_v, n) array
+        W in the mean over each interval.
+    M : (W, n_v, n_v) array
+    latent : (W, n_v) array
+        ``M d``.
+    scale : (n_v,) array
+        Inertial force of each equation; 1 for one without.
+    """
+
+    W: FloatArray
+    push: FloatArray
+    means: FloatArray
+    M: FloatArray
+    latent: FloatArray
+    scale: FloatArray
+
+    @classmethod
+    def of(cls, intervals: ShootingIntervals, fit: Fit) -> _Rows:
+        """Equations of the logged rows."""
+        evaluate, motion = _residual_map(intervals.model), _motion(intervals, fit)
+        logged = intervals.counted[:, None]
+        push, W, M = (x * logged for x in evaluate(*motion, _row_parameters(intervals, fit.shared)))
+        W, M = _regressors(intervals, W), _matrices(M, intervals.model.n_v)
+        push = push - np.einsum("nij,nj->ni", M, np.repeat(fit.d, intervals.length, axis=0))
+        M = means_of_intervals(intervals, M)
+        inertial = np.einsum("wij,wj->wi", M, means_of_intervals(intervals, motion[2]))
+        scale = np.sqrt(np.square(inertial).mean(axis=0))
+        latent = np.einsum("wij,wj->wi", M, fit.d)
+        return cls(W, push, means_of_intervals(intervals, W), M, latent, np.where(scale > 0.0, scale, 1.0))
+
+
 def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     """Parameters, and the first two parts of their covariance.
 
-    In the fit the equations hold exactly, with the discrepancies and the unmodelled accelerations besides:
-    ``r(p) = g + M d``.  The component of either in the regressor's column space is attributed to the parameters: of the
-    discrepancies row by row; of the unmodelled accelerations, which are constant over an interval, by interval means.
+    The component of the discrepancies and of the unmodelled accelerations in the regressor's column space is attributed
+    to the parameters: of the discrepancies row by row; of the accelerations, which are constant over an interval, by
+    interval means.
     """
-    n_p, n_s, n_x, n_v = intervals.n_p, len(fit.shared), fit.x.shape[1], intervals.model.n_v
-    evaluate, motion = _residual_map(intervals.model), _motion(intervals, fit)
-    logged = intervals.counted[:, None]
-    push, W, M = (x * logged for x in evaluate(*motion, _row_parameters(intervals, fit.shared)))
-    W, M = _regressors(intervals, W), _matrices(M, n_v)
-    push = push - np.einsum("nij,nj->ni", M, np.repeat(fit.d, intervals.length, axis=0))
-    M = means_of_intervals(intervals, M)
-    latent = np.einsum("wij,wj->wi", M, fit.d)
-    means = means_of_intervals(intervals, W)
-    scale = np.sqrt(np.square(np.einsum("wij,wj->wi", M, means_of_intervals(intervals, motion[2]))).mean(axis=0))
-    scale = np.where(scale > 0.0, scale, 1.0)
-    p, gains, stuck = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent), scale, _REWEIGHTED)
-    plain = _bounded_projection(intervals, fit.shared[:n_p], (W, push), (means, latent), scale, 0)[0]
+    n_p, n_s, n_x = intervals.n_p, len(fit.shared), fit.x.shape[1]
+    rows = _Rows.of(intervals, fit)
+    p, gains, stuck = _bounded_projection(intervals, fit.shared[:n_p], rows, _REWEIGHTED)
+    plain = _bounded_projection(intervals, fit.shared[:n_p], rows, 0)[0]
     by_rows, by_means = gains
-    of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + n_v, n_p))
-    level = np.hstack([np.ones((len(push), 1)), intervals.inputs])
+    of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + fit.d.shape[1], n_p))
+    level = np.hstack([np.ones((len(rows.push), 1)), intervals.inputs])
     of_s[:n_p] = np.eye(n_p)
     of_s[n_p:-1] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
-    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means, M)
+    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means, rows.M)
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(of_z, of_s)
     covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s + effect_on(intervals, fit, z, s)
-    unmade = latent - means @ np.einsum("pwi,wi->p", by_means, latent)
-    unpushed = push - W @ np.einsum("pni,ni->p", by_rows, push)
+    unmade = rows.latent - rows.means @ np.einsum("pwi,wi->p", by_means, rows.latent)
+    unpushed = rows.push - rows.W @ np.einsum("pni,ni->p", by_rows, rows.push)
     of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)
     sums = batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
     covariance = covariance + sums.T @ sums + np.outer(plain - p, plain - p)
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
-    delay = at.system.solve(at.right_z, at.right_s).var_p[-1, -1]
-    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p), float(np.sqrt(delay)))
+    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p))
 
 
 def _bounded_projection(
-    intervals: ShootingIntervals,
-    now: FloatArray,
-    rows: tuple[FloatArray, FloatArray],
-    means: tuple[FloatArray, FloatArray],
-    scale: FloatArray,
-    reweighted: int,
+    intervals: ShootingIntervals, now: FloatArray, rows: _Rows, reweighted: int
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], BoolArray]:
     """Parameters within inclusive bounds, gains of rows (n, N, n_v) and of means (n, W, n_v), and those on a bound.
 
-    Arguments are the parameters of the fit, regressors with residuals of rows and of interval means, the inertial force
-    of each equation, and the number of steps of reweighting.
+    Arguments are the parameters of the fit, the equations on its motion, and the number of steps of reweighting.
     """
     lower = np.array([-np.inf if x.positive else x.lower for x in intervals.layout.bounds])
     upper = np.array([x.upper for x in intervals.layout.bounds])
     stuck, p = np.zeros(len(now), bool), now
     for _ in range(len(now) + 1):
         free = ~stuck
-        left = means[1] + means[0][:, :, stuck] @ (p - now)[stuck]
-        known = means[0][:, :, free] @ now[free] - left - means_of_intervals(intervals, rows[1])
-        weights = _robust_weights(intervals, WeakForm(means[0][:, :, free], known), scale, reweighted)
-        gains = tuple(np.zeros((len(now), *x.shape[:2])) for x, _ in (rows, means))
-        for gain, (W, _), one in zip(
-            gains, (rows, means), (np.repeat(weights, intervals.length, axis=0), weights), strict=True
-        ):
+        left = rows.latent + rows.means[:, :, stuck] @ (p - now)[stuck]
+        known = rows.means[:, :, free] @ now[free] - left - means_of_intervals(intervals, rows.push)
+        weights = _robust_weights(intervals, WeakForm(rows.means[:, :, free], known), rows.scale, reweighted)
+        gains = tuple(np.zeros((len(now), *x.shape[:2])) for x in (rows.W, rows.means))
+        every = np.repeat(weights, intervals.length, axis=0)
+        for gain, W, one in zip(gains, (rows.W, rows.means), (every, weights), strict=True):
             gain[free] = least_squares_gains(W[:, :, free], one)
-        found = now - np.einsum("pni,ni->p", gains[0], rows[1]) - np.einsum("pwi,wi->p", gains[1], left)
+        found = now - np.einsum("pni,ni->p", gains[0], rows.push) - np.einsum("pwi,wi->p", gains[1], left)
         p = np.where(stuck, p, found)
         outside = (p < lower) | (p > upper)
         if not outside.any():
@@ -458,6 +498,7 @@ def _by_log(intervals: ShootingIntervals, W: FloatArray, logs: IntArray) -> Floa
     return full
 
 
+@lru_cache(maxsize=64)
 def _residual_map(model: Model) -> Map:
     """Residuals, and their derivatives with respect to parameters and accelerations, column by column."""
     q, v, a, u, p = (ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup"))
@@ -466,6 +507,7 @@ def _residual_map(model: Model) -> Map:
     return compile_map(ca.Function("residuals", [q, v, a, u, p], [ca.densify(r), *slopes]))
 
 
+@lru_cache(maxsize=64)
 def _sensor_slopes(model: Model) -> Map:
     """Derivatives of the sensors with respect to parameters, column by column."""
     assert model.measurement is not None

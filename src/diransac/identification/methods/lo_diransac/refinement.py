@@ -107,6 +107,8 @@ class Refinement:
         Most probable motion and parameters.
     cost : float
         Negative log evidence, the likelihood integrated over all unknowns (Laplace), up to a constant.
+    delay_error : float
+        Standard error of the delay of the inputs, samples; infinite where a rollout diverges.
     steps : int
         Number of Gauss-Newton steps.
     converged : bool
@@ -115,6 +117,7 @@ class Refinement:
 
     fit: Fit
     cost: float
+    delay_error: float
     steps: int
     converged: bool
 
@@ -231,7 +234,7 @@ class _Race:
         """True if the fit is behind by more than a few times its latest gain; compared every few steps."""
         if not steps or steps % _COMPARED_STEPS or not np.isfinite(self.to_beat):
             return False
-        now, before = negative_log_evidence(intervals, fit), self.before
+        now, before = _evidence(intervals, fit)[0], self.before
         self.before = now
         return now - self.to_beat > _PATIENCE * max(before - now, 0.0)
 
@@ -273,7 +276,7 @@ def refine(
         errors = np.sqrt(np.diag(solved.var_p)[: intervals.n_p])
         converged = _unchanged(fit, updated, errors)
         fit = updated
-    return Refinement(fit, negative_log_evidence(intervals, fit), steps, converged and not robust)
+    return Refinement(fit, *_evidence(intervals, fit), steps, converged and not robust)
 
 
 def refine_exact(
@@ -316,34 +319,25 @@ def refine_exact(
         updated = replace(moved, noise=noise, prior=sizes, tau=tau, continuity_std=continuity)
         converged = bool((tau == fit.tau).all()) and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
         fit = updated
-    return Refinement(fit, negative_log_evidence(intervals, fit), steps, converged)
+    return Refinement(fit, *_evidence(intervals, fit), steps, converged)
 
 
-def negative_log_evidence(intervals: ShootingIntervals, fit: Fit) -> float:
-    """Negative logarithm of the probability of the measurements, given the scales of a fit, by Laplace's method.
+def _evidence(intervals: ShootingIntervals, fit: Fit) -> tuple[float, float]:
+    """Negative logarithm of the probability of the measurements by Laplace's method, and standard error of the delay.
 
-    Freedom costs: a discrepancy whose prior is wide counts against a fit unless it explains the log better.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-        At its optimum.
-
-    Returns
-    -------
-    float
-        Up to a constant that fits of the same log have in common; infinite where a rollout diverges.
+    Up to a constant that fits of the same log have in common, given the scales of a fit at its optimum; both are
+    infinite where a rollout diverges.  Freedom costs: a discrepancy whose prior is wide counts against a fit unless it
+    explains the log better.
     """
     loss = fit.noise.negative_log_likelihood(fit.residuals, intervals.known).sum()
     beforehand = cost(intervals, fit, np.zeros_like(fit.residuals))
     if not np.isfinite(loss + beforehand):
-        return np.inf
+        return np.inf, np.inf
     at = linearize(intervals, fit, weights_of(intervals, fit))
-    log_det = at.system.solve(at.right_z, at.right_s).log_det
+    solved = at.system.solve(at.right_z, at.right_s)
     scales = intervals.linked.sum() * np.log(fit.continuity_std).sum() + np.log(innovation_std(intervals, fit)).sum()
     scales += np.log(fit.prior[np.isfinite(fit.prior)]).sum()
-    return float(loss + 0.5 * beforehand + 0.5 * log_det + scales)
+    return float(loss + 0.5 * beforehand + 0.5 * solved.log_det + scales), float(np.sqrt(solved.var_p[-1, -1]))
 
 
 def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
@@ -409,7 +403,7 @@ def _update(
     else:
         expected = prior.tau
         squares, determined, rho = _process(intervals, fit, solved, expected)
-    tau = _evidence(expected, fit.tau, squares, determined)
+    tau = _size(expected, fit.tau, squares, determined)
     if not settings.model_error:
         tau = np.maximum(_SHRINK * fit.tau, 1e-3 * expected)
     continuity = np.maximum(_continuity(intervals, tau), _SHRINK * fit.continuity_std)
@@ -435,7 +429,7 @@ def _process(
     return squares, determined, rho
 
 
-def _evidence(expected: FloatArray, now: FloatArray, squares: FloatArray, determined: FloatArray) -> FloatArray:
+def _size(expected: FloatArray, now: FloatArray, squares: FloatArray, determined: FloatArray) -> FloatArray:
     """Size of discrepancies from the sum of their squares and the number of them that the logs determine."""
     size = np.sqrt((squares + np.square(expected)) / (determined + 1.0))
     return np.asarray(np.clip(size, _SHRINK * now, now / _SHRINK))
@@ -450,7 +444,7 @@ def _discrepancies(fit: Fit, prior: Prior, variance: FloatArray, n_p: int) -> Fl
         if len(unit):
             squares = np.square(fit.shared[members] / unit).sum()
             determined = (1.0 - variance[members] / np.square(now)).clip(0.0).sum()
-            sizes[members] = unit * _evidence(np.array(size), now[0] / unit[0], squares, determined)
+            sizes[members] = unit * _size(np.array(size), now[0] / unit[0], squares, determined)
     return sizes
 
 

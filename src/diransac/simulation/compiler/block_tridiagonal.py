@@ -1,0 +1,78 @@
+"""Symmetric positive definite block-tridiagonal systems: solutions, and the inverse where the system is not zero.
+
+| D_0  E_0'          |
+| E_0  D_1  E_1'     |
+|      E_1  D_2  ... |
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.simulation.compiler.machine_code import LANES, MachineCode, compile_function
+
+if TYPE_CHECKING:
+    from diransac.simulation.compiler.vectors import Value
+
+__all__ = ["BlockSolution", "solve_blocks"]
+
+_SIGNATURE = {
+    **dict.fromkeys(("blocks", "below", "inverse_below", "pivots"), "pointer"),
+    **dict.fromkeys(("n", "k", "padded_k", "padded_c"), "integer"),
+}
+
+
+class BlockSolution(NamedTuple):
+    """Solution of a block-tridiagonal system ``A``.
+
+    Attributes
+    ----------
+    solved : (n, k, c) ``A^-1 R``
+    inverse : (n, k, k) diagonal blocks of ``A^-1``
+    inverse_below : (n - 1, k, k) blocks of ``A^-1`` below the diagonal
+    log_det : logarithm of the determinant of ``A``
+    """
+
+    solved: FloatArray
+    inverse: FloatArray
+    inverse_below: FloatArray
+    log_det: float
+
+
+def solve_blocks(diagonal: FloatArray, below: FloatArray, right: FloatArray) -> BlockSolution:
+    """Solution of a positive definite system; its diagonal should be near one.
+
+    Parameters
+    ----------
+    diagonal : (n, k, k) symmetric blocks
+    below : (n - 1, k, k) blocks below the diagonal
+    right : (n, k, c) right-hand sides
+    """
+    n, k, c = right.shape
+    padded_k, padded_c = (-(-size // LANES) * LANES for size in (k, c))
+    blocks = np.zeros((n, k, 2 * padded_k + padded_c))
+    blocks[:, :, :k] = diagonal
+    blocks[:-1, :, padded_k : padded_k + k] = below.swapaxes(1, 2)
+    blocks[:, :, 2 * padded_k : 2 * padded_k + c] = right
+    coupling = np.ascontiguousarray(below, np.float64)
+    inverse_below, pivots = np.zeros((n - 1, padded_k, padded_k)), np.empty((n, k))
+    arrays = (blocks, coupling, inverse_below, pivots)
+    _code().call(*(array.ctypes.data for array in arrays), n, k, padded_k, padded_c)
+    solved = blocks[:, :, 2 * padded_k : 2 * padded_k + c]
+    return BlockSolution(solved, blocks[:, :, :k], inverse_below[:, :k, :k], float(np.log(pivots).sum()))
+
+
+@cache
+def _code() -> MachineCode:
+    """Machine code for systems of any size."""
+
+    def emit() -> Value:
+        from diransac.simulation.compiler.block_elimination import emit_block_elimination
+
+        return emit_block_elimination("solve_blocks")
+
+    return compile_function(emit, (), "solve_blocks", _SIGNATURE.values())
