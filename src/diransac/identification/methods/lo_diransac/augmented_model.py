@@ -57,6 +57,12 @@ class AugmentedModel:
         """Number of input gain and bias discrepancies."""
         return self.n_v * (self.n_u + 1)
 
+    @property
+    def unknowns(self) -> tuple[str, ...]:
+        """The unknowns of an interval: its state, unmodelled accelerations, and those that intervals share."""
+        names = tuple(self.model.parameters)
+        return (*self.model.state, *names[-self.n_v :], *names[: -self.n_v])
+
 
 @lru_cache(maxsize=16)
 def augmented_model(model: Model) -> AugmentedModel:

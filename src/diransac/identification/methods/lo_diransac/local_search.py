@@ -185,8 +185,11 @@ class LocalSearch:
         for k in range(self.settings.max_sensor_errors):
             report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
             errors = clear_errors(best.intervals, best.refinement.fit, alone, **kinds)
-            others = [self._with_errors(best, [x], to_beat=best.refinement.cost) for x in errors]
-            likelier = self._better(best, others, _WORTH, of_one=True)
+            likelier = best
+            for error in errors:
+                trial = self._with_errors(best, [error], to_beat=likelier.cost)
+                if trial.cost < likelier.cost and self._better(best, [trial], _WORTH, of_one=True) is trial:
+                    likelier = trial
             if likelier is best:
                 break
             best = self._simplified(likelier)

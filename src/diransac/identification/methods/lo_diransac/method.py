@@ -53,6 +53,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     with_unmeasured_states,
 )
 from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
+from diransac.simulation import default_threads
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -206,7 +207,7 @@ def configured(settings: Settings, **options: Any) -> LoDiransac:
     return LoDiransac(settings, **options)
 
 
-def _fitted(settings: LoDiransacSettings, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
+def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
     """Parameters of the dataset's model, step by step."""
     _check_sensors(settings, dataset)
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
@@ -336,7 +337,7 @@ def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Ref
 # ---------------------------------------------------------------------- preparation
 
 
-def _prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
+def _prepared(settings: LoDiransac, dataset: Dataset) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
     """The logs in intervals of the motion's own time scale, and the motion, row by row of the intervals."""
     model, dt = dataset.model, dataset.dt
     screened = [_screened(settings, one, dt) for one in dataset.segments]
@@ -362,6 +363,7 @@ def _prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingI
     motions = smooth(model, samples, dt, half)
     logs = [(x.measured, x.known, u, x.gaps) for x, u in zip(samples, inputs, strict=True)]
     intervals = ShootingIntervals.of(model, dataset.layout, logs, dt, half, settings.substeps, dataset.hold)
+    intervals = replace(intervals, threads=settings.criteria.threads or default_threads())
     rows = zip(motions, intervals.rows_of_logs, strict=True)
     signals = np.concatenate([_to_length(x.signals, r.stop - r.start) for x, r in rows])
     return intervals, Motion(signals, motions[0].spread), tuple(notes)

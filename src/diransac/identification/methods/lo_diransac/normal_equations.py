@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 
 if TYPE_CHECKING:
@@ -138,10 +138,9 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     """
     n_x, k = fit.x.shape[1], fit.x.shape[1] + fit.d.shape[1]
     sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights)
-    order = _order(sums.gradient.shape[1] - k, n_x, k)
-    H, g = sums.normal_matrix[:, order][:, :, order], -sums.gradient[:, order]
+    H, g = sums.normal_matrix, -sums.gradient
     data_z, data_s = g[:, :k].copy(), _in_places(intervals, g[:, k:])
-    F = sums.final_slopes[:-1][:, :, order]
+    F = sums.final_slopes[:-1]
     linked = intervals.linked
     jumps = np.where(linked[:, None], fit.x[1:] - sums.final_states[:-1], 0.0)
     F = F if linked.all() else np.where(linked[:, None, None], F, 0.0)
@@ -245,12 +244,6 @@ def _shared_blocks(
         whole[np.ix_(at, at)] += corner[own].sum(axis=0)
         total[at] += right[own].sum(axis=0)
     return wide, whole, total
-
-
-def _order(n_s: int, n_x: int, k: int) -> IntArray:
-    """Places of (x, d, s) among the rollouts' unknowns, which are (s, d, x)."""
-    n_v = k - n_x
-    return np.concatenate([np.arange(n_s + n_v, n_s + k), np.arange(n_s, n_s + n_v), np.arange(n_s)])
 
 
 def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:

@@ -102,6 +102,8 @@ class ShootingIntervals:
         Time constant of a first-order lag of the actuators, samples; 0 without one.
     sensor_errors : SensorErrors, optional
         Errors of the sensors of which ``measured`` is corrected.
+    threads : int, optional
+        Threads of the simulations with derivatives.
     """
 
     model: Model
@@ -119,6 +121,7 @@ class ShootingIntervals:
     delay: int = 0
     lag: float = 0.0
     sensor_errors: SensorErrors | None = None
+    threads: int = 1
 
     @classmethod
     def of(
@@ -347,8 +350,12 @@ class ShootingIntervals:
         return np.nan_to_num(errors, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
 
     def gauss_newton(self, shared: FloatArray, x: FloatArray, d: FloatArray, weights: FloatArray) -> GaussNewtonBatch:
-        """Least-squares sums of every interval with ``weights (N, n_s)``; other arguments as `batch`."""
-        return self.rollouts.gauss_newton(self.batch(shared, x, d), self.measurements, weights)
+        """Least-squares sums of every interval with ``weights (N, n_s)``; other arguments as `batch`.
+
+        Unknowns are in the order of x, d and the shared ones.
+        """
+        batch, unknowns = self.batch(shared, x, d), self.augmented.unknowns
+        return self.rollouts.gauss_newton(batch, self.measurements, weights, unknowns=unknowns, threads=self.threads)
 
     def ends(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
         """Final states (W - 1, n_x) of all intervals but the last; the successor's initial state where unlinked."""
@@ -365,7 +372,7 @@ class ShootingIntervals:
         One Newton step; states are unchanged where it has no solution.
         """
         sums = self.gauss_newton(shared, x, d, np.zeros(self.measured.shape))
-        jumps, slopes = x[1:] - sums.final_states[:-1], sums.final_slopes[:-1, :, -x.shape[1] :]
+        jumps, slopes = x[1:] - sums.final_states[:-1], sums.final_slopes[:-1, :, : x.shape[1]]
         finite = np.isfinite(jumps).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2)) & self.linked
         usable = np.flatnonzero(finite)
         usable = usable[np.linalg.cond(slopes[usable]) < _WELL_CONDITIONED]
