@@ -23,13 +23,14 @@ from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
-from diransac.identification.methods.lo_diransac.sensor_errors import clear_errors, errors_of, with_errors
+from diransac.identification.methods.lo_diransac.sensor_errors import clear_errors, errors_of, signal_rates, with_errors
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from diransac.identification.method import Callback
+    from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
     from diransac.identification.methods.lo_diransac.sensor_errors import SensorError
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
@@ -141,7 +142,8 @@ class LocalSearch:
         if found is best:
             return best
         # Inputs are late, or early, with respect to sensors that are so themselves.
-        return self._with_refined_errors(self._with_timing(found, free_hold=free_hold))
+        found = self._with_refined_errors(self._with_timing(found, free_hold=free_hold))
+        return self._with_refined_errors(self._with_fewest_delays(found))
 
     def _with_timing(self, best: Explanation, *, free_hold: bool) -> Explanation:
         """The explanation with another timing of the inputs, where that makes it likelier or is required."""
@@ -206,10 +208,36 @@ class LocalSearch:
             best = self._with_errors(best, errors)
         return best
 
+    def _with_fewest_delays(self, now: Explanation) -> Explanation:
+        """The explanation in the time of the inputs, if fewer delays are needed in it.
+
+        Time has no origin: inputs that are late, and some sensors early alike, are the other sensors late.
+        """
+        intervals, fit = now.intervals, now.refinement.fit
+        late = intervals.delay + fit.shared[-1]
+        if intervals.sensor_errors is None or intervals.lag or self.settings.input_delay or abs(late) < _SMALL_DELAY:
+            return now
+        of_signals = np.where(intervals.known.any(axis=0), intervals.sensor_errors.delay + late, 0.0)
+        of_signals[np.abs(of_signals) < _SMALL_DELAY] = 0.0
+        if np.count_nonzero(np.unique(of_signals)) > np.count_nonzero(np.unique(intervals.sensor_errors.delay)):
+            return now
+        retimed = intervals.with_delays(of_signals, signal_rates(intervals, fit))
+        shared = np.append(fit.shared[:-1], 0.0)
+        x = _states_after(intervals, fit, round(late))
+        begin = with_residuals(retimed, replace(fit, x=x, shared=shared))
+        found = self._optimised(now, retimed, begin)
+        likelier = found.cost / retimed.known.sum() < (now.cost + _AS_LIKELY) / intervals.known.sum()
+        return found if likelier else now
+
     def _with_errors(self, now: Explanation, errors: Sequence[SensorError], *, to_beat: float = np.inf) -> Explanation:
         """The explanation with errors of sensors, with the same freedom; given up where it will hardly beat a cost."""
         intervals = with_errors(now.intervals, now.refinement.fit, errors)
-        begin = with_residuals(intervals, now.refinement.fit)
+        return self._optimised(now, intervals, with_residuals(intervals, now.refinement.fit), to_beat)
+
+    def _optimised(
+        self, now: Explanation, intervals: ShootingIntervals, begin: Fit, to_beat: float = np.inf
+    ) -> Explanation:
+        """The explanation of other intervals with the same freedom."""
         if now.exact:
             refined = refine_exact(self.settings, intervals, begin, now.prior, to_beat)
         else:
@@ -409,6 +437,15 @@ def fewest_parts(length: int) -> int:
         The smallest above one with parts that are not too short; 0 where there is none.
     """
     return next((k for k in range(2, length // _SHORTEST + 1) if length % k == 0), 0)
+
+
+def _states_after(intervals: ShootingIntervals, fit: Fit, rows: int) -> FloatArray:
+    """States ``(W, n_x)`` of a fit so many rows after the intervals' starts; at an end of a log those of its edge."""
+    series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
+    series = series.reshape(len(intervals.measured), -1)[:, : fit.x.shape[1]]
+    last = np.array([rows_of_log.stop - 1 for rows_of_log in intervals.rows_of_logs])
+    at = np.clip(intervals.starts + rows, intervals.first_of_log[intervals.log_of], last[intervals.log_of])
+    return np.asarray(series[at])
 
 
 def _unexplained(found: Explanation) -> FloatArray:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 
 if TYPE_CHECKING:
@@ -98,6 +98,13 @@ class NormalEquations:
     data_z : (W, n_x + n_v) array
     data_s : (W, n_s) array
         The part of each interval's measurements in it.
+    jumps : (W - 1, n_x) array
+        States at the intervals' starts less the ends of the intervals before; 0 where a log or a gap ends.
+    slopes : (W - 1, n_x, n) array
+        Derivatives of the ends, with respect to the states and unmodelled accelerations of the interval, and to the
+        shared unknowns of its log.
+    precision : (W - 1, n_x) array
+        Of the jumps.
     """
 
     system: Arrowhead
@@ -105,6 +112,40 @@ class NormalEquations:
     right_s: FloatArray
     data_z: FloatArray
     data_s: FloatArray
+    jumps: FloatArray
+    slopes: FloatArray
+    precision: FloatArray
+
+    def corrected(self, intervals: ShootingIntervals, fit: Fit, moved: Fit) -> tuple[FloatArray, FloatArray]:
+        """Right-hand sides of a step that makes up for the curvature of the rollouts along another step.
+
+        Where continuity is tight, ends that are curved fill the cost of a step that is right otherwise, and no step but
+        a tiny one would lower it (Maratos' effect; Nocedal and Wright 2006, section 18.3, second-order correction).
+
+        Parameters
+        ----------
+        intervals : ShootingIntervals
+        fit : Fit
+            Of these equations.
+        moved : Fit
+            After the other step.
+
+        Returns
+        -------
+        (W, k) array, (n_s,) array
+            Not finite where a rollout diverges.
+        """
+        n_x, k = fit.x.shape[1], self.right_z.shape[1]
+        z = np.hstack([moved.x - fit.x, moved.d - fit.d])
+        s = (moved.shared - fit.shared)[_places(intervals)[intervals.log_of]]
+        linear = self.jumps + z[1:, :n_x] - np.einsum("wij,wj->wi", self.slopes, np.hstack([z, s])[:-1])
+        found = moved.x[1:] - intervals.ends(moved.shared, moved.x, moved.d)
+        excess = self.precision * np.where(intervals.linked[:, None], found - linear, 0.0)
+        pulled = np.einsum("wij,wi->wj", self.slopes, excess)
+        right_z = self.right_z.copy()
+        right_z[:-1] += pulled[:, :k]
+        right_z[1:, :n_x] -= excess
+        return right_z, self.right_s + _in_places(intervals, pulled[:, k:]).sum(axis=0)
 
 
 def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
@@ -166,18 +207,22 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     border, corner, right = _shared_blocks(intervals, H[:, :k, k:], H[:, k:, k:], g[:, k:])
     blocks = (H[:, :k, :k], E, border, corner + np.diag(beforehand))
     system = Arrowhead(*blocks, _FINE_RIDGE) if len(intervals.layout.with_prior) else Arrowhead(*blocks)
-    return NormalEquations(system, g[:, :k], right - beforehand * (fit.shared - fit.prior_mean), data_z, data_s)
+    right = right - beforehand * (fit.shared - fit.prior_mean)
+    return NormalEquations(system, g[:, :k], right, data_z, data_s, jumps, F, precision)
+
+
+def _places(intervals: ShootingIntervals) -> IntArray:
+    """Places of the shared unknowns of each log, (n_logs, n)."""
+    rest = np.arange(intervals.n_p, intervals.n_shared)
+    return np.hstack([intervals.layout.index, np.broadcast_to(rest, (intervals.layout.n_logs, len(rest)))])
 
 
 def _in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
-    """Values of each interval's own shared unknowns in the places of its log, (W, n_s)."""
+    """Values ``(n, ...)`` of the first intervals' own shared unknowns in the places of their logs, (n, n_s)."""
     if intervals.layout.is_shared:
         return values.copy()
-    rest = np.arange(intervals.n_p, intervals.n_shared)
-    index = intervals.layout.index[intervals.log_of]
-    place = np.hstack([index, np.broadcast_to(rest, (len(index), len(rest)))])
     wide = np.zeros((len(values), intervals.n_shared))
-    np.put_along_axis(wide, place, values, axis=1)
+    np.put_along_axis(wide, _places(intervals)[intervals.log_of[: len(values)]], values, axis=1)
     return wide
 
 
@@ -233,12 +278,9 @@ def _shared_blocks(
     """Border ``(W, k, n_s)``, sums of corner ``(n_s, n_s)`` and right side ``(n_s,)`` in the places of each log."""
     if intervals.layout.is_shared:
         return border, corner.sum(axis=0), right.sum(axis=0)
-    n_own, n_s = intervals.model.n_p, intervals.n_shared
-    rest = np.arange(intervals.n_p, n_s)
-    place = np.hstack([intervals.layout.index, np.broadcast_to(rest, (intervals.layout.n_logs, len(rest)))])
-    assert place.shape[1] == n_own + len(rest)
+    n_s = intervals.n_shared
     wide, whole, total = np.zeros((*border.shape[:2], n_s)), np.zeros((n_s, n_s)), np.zeros(n_s)
-    for i, at in enumerate(place):
+    for i, at in enumerate(_places(intervals)):
         own = np.flatnonzero(intervals.log_of == i)
         wide[own[:, None, None], np.arange(border.shape[1])[None, :, None], at] = border[own]
         whole[np.ix_(at, at)] += corner[own].sum(axis=0)

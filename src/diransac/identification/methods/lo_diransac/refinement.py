@@ -69,6 +69,8 @@ _MOST_ALIKE = 0.98
 # Tau until convergence, over its prior: noise must not absorb model error.
 _GUARDED = 10.0
 _MAX_TRIALS, _MAX_SWEEPS = 8, 12
+# Corrections of a step for the curvature of the rollouts, before it is damped.
+_CORRECTIONS = 1
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
 
 
@@ -356,20 +358,29 @@ def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
 
 
 def _step(intervals: ShootingIntervals, fit: Fit, damping: float) -> tuple[Fit, Factored, float]:
-    """One Gauss-Newton step within the bounds, damped until the cost falls, and the damping of the next step."""
+    """One Gauss-Newton step within the bounds, corrected or damped until the cost falls; damping of the next one."""
     weights = weights_of(intervals, fit)
     at, before = linearize(intervals, fit, weights), cost(intervals, fit, weights)
-    n_x = fit.x.shape[1]
     for _ in range(_MAX_TRIALS):
-        solved = at.system.solve(at.right_z, at.right_s, damping)
-        shared = _bounded(intervals, fit.shared, fit.shared + solved.step_p)
-        z = solved.step_z - solved.gain @ (shared - fit.shared - solved.step_p)
-        x, d = fit.x + z[:, :n_x], fit.d + z[:, n_x:]
-        trial = replace(fit, shared=shared, x=x, d=d, residuals=intervals.residuals(shared, x, d))
-        if cost(intervals, trial, weights) <= before * (1.0 + 1e-9):
-            return trial, solved, damping / 10.0 if damping > _LEAST_DAMPING else 0.0
+        right = at.right_z, at.right_s
+        for _ in range(1 + _CORRECTIONS):
+            solved = at.system.solve(*right, damping)
+            trial = _moved(intervals, fit, solved)
+            if cost(intervals, trial, weights) <= before * (1.0 + 1e-9):
+                return trial, solved, damping / 10.0 if damping > _LEAST_DAMPING else 0.0
+            right = at.corrected(intervals, fit, trial)
+            if not np.isfinite(right[0]).all():
+                break
         damping = max(10.0 * damping, _FIRST_DAMPING)
     return fit, solved, damping
+
+
+def _moved(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:
+    """The fit after a step whose shared unknowns stay within their bounds."""
+    shared, n_x = _bounded(intervals, fit.shared, fit.shared + step.step_p), fit.x.shape[1]
+    z = step.step_z - step.gain @ (shared - fit.shared - step.step_p)
+    x, d = fit.x + z[:, :n_x], fit.d + z[:, n_x:]
+    return replace(fit, shared=shared, x=x, d=d, residuals=intervals.residuals(shared, x, d))
 
 
 def _bounded(intervals: ShootingIntervals, now: FloatArray, then: FloatArray) -> FloatArray:

@@ -293,6 +293,31 @@ class ShootingIntervals:
         errors = replace(old, delay=delay, bias=bias, kinds=tuple(dict.fromkeys([*old.kinds, *more])))
         return replace(self, measured=np.where(sampled, measured, 0.0), sampled=sampled, sensor_errors=errors)
 
+    def with_delays(self, delay: FloatArray, rates: FloatArray) -> ShootingIntervals:
+        """The intervals with other delays of the sensors, and inputs as recorded.
+
+        Parameters
+        ----------
+        delay : (n_s,) array
+            Samples by which each signal is recorded late; those of one group are equal.
+        rates : (N, n_s) array
+            Change of each signal per sample, for the fractions of a sample.
+
+        Returns
+        -------
+        ShootingIntervals
+            With the biases of these.
+        """
+        old = self.sensor_errors
+        assert old is not None
+        late = {
+            ErrorKind(tuple(np.flatnonzero(delay == x).tolist()), True): float(x)
+            for x in np.unique(delay[delay != 0.0])
+        }
+        bias = {x: float(old.bias[x.signals[0]]) for x in old.kinds if not x.is_delay}
+        recorded = replace(self, measured=old.measured, sampled=old.sampled, sensor_errors=None, delay=0)
+        return recorded.corrected({**late, **bias}, rates)
+
     def split(self, parts: int) -> ShootingIntervals:
         """The same rows in intervals of a fraction of the length."""
         return replace(self, length=self.length // parts, log_of=np.repeat(self.log_of, parts))
