@@ -377,10 +377,23 @@ class ShootingIntervals:
     def gauss_newton(self, shared: FloatArray, x: FloatArray, d: FloatArray, weights: FloatArray) -> GaussNewtonBatch:
         """Least-squares sums of every interval with ``weights (N, n_s)``; other arguments as `batch`.
 
-        Unknowns are in the order of x, d and the shared ones.
+        Unknowns are in the order of x, d and the shared ones.  Derivatives of signals that nothing measures are left
+        out, which are most of them in many logs.
         """
+        names, columns = self._derived
+        derived = rollouts(self.augmented.model, names, substeps=self.substeps, hold=self.hold)
+        measurements = Measurements(self.measured[:, columns], self.measurements.valid)
         batch, unknowns = self.batch(shared, x, d), self.augmented.unknowns
-        return self.rollouts.gauss_newton(batch, self.measurements, weights, unknowns=unknowns, threads=self.threads)
+        return derived.gauss_newton(batch, measurements, weights[:, columns], unknowns=unknowns, threads=self.threads)
+
+    @cached_property
+    def _derived(self) -> tuple[tuple[str, ...], IntArray]:
+        """Names and indices of the signals that the logs have, quaternions as a whole."""
+        signals, seen = self.augmented.model.signals, np.array(self.sampled.any(axis=0))
+        for four in self.model.quaternions:
+            seen[list(four)] = seen[list(four)].any()
+        columns = np.flatnonzero(seen)
+        return tuple(signals[k] for k in columns), columns
 
     def ends(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
         """Final states (W - 1, n_x) of all intervals but the last; the successor's initial state where unlinked."""
