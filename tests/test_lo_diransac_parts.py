@@ -15,7 +15,7 @@ from diransac.identification.methods.lo_diransac.local_search import fewest_part
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import Fit, cost, linearize, with_residuals
 from diransac.identification.methods.lo_diransac.projection import unexplained
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+from diransac.identification.methods.lo_diransac.shooting import ErrorKind, ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
     Samples,
     choose_half_width,
@@ -301,6 +301,41 @@ def test_a_gauss_newton_step_solves_a_linear_problem_at_once():
     again = linearize(intervals, there, weights)
     assert np.abs(again.right_z).max() < 1e-6 * np.abs(first.right_z).max()
     assert np.abs(again.right_s[:1]).max() < 1e-6 * np.abs(first.right_s).max()
+
+
+def test_a_corrected_step_keeps_to_tight_continuity_along_curved_rollouts():
+    """Maratos' effect: a step that is right for what was measured breaks the motion by the curvature of rollouts."""
+    intervals, signals = intervals_of(n_rows=200)
+    fit = replace(perturbed_fit(intervals, signals), d=np.zeros((len(intervals), 3)), continuity_std=np.full(6, 1e-7))
+    fit = with_residuals(intervals, fit)
+    weights = np.ones(signals.shape)
+    at = linearize(intervals, fit, weights)
+
+    def after(right):
+        step = at.system.solve(*right)
+        return moved(intervals, fit, step.step_z, step.step_p)
+
+    plain = after((at.right_z, at.right_s))
+    corrected = after(at.corrected(intervals, fit, plain))
+    broken, kept, best = (cost(intervals, one, weights) for one in (plain, corrected, fit))
+    assert kept < 0.01 * broken
+    assert np.square(corrected.residuals).sum() < 1.1 * np.square(plain.residuals).sum()
+    assert kept < best
+
+
+def test_delays_are_those_of_sensors_in_another_time():
+    """Inputs one sample late and velocities one early are coordinates one late."""
+    intervals, signals = intervals_of(n_rows=100)
+    rates = np.gradient(signals, axis=0)
+    velocities, coordinates = ErrorKind((3, 4, 5), is_delay=True), ErrorKind((0, 1, 2), is_delay=True)
+    bias = {ErrorKind((8,), is_delay=False): 0.25}
+    late = replace(intervals, delay=1).corrected({velocities: -1.02, **bias}, rates)
+    found = late.with_delays(np.r_[np.full(3, 1.02), np.zeros(6)], rates)
+    expected = intervals.corrected({coordinates: 1.02, **bias}, rates)
+    assert found.delay == 0
+    assert set(found.sensor_errors.kinds) == {coordinates, *bias}
+    assert (found.measured == expected.measured).all()
+    assert (found.known == expected.known).all()
 
 
 # ---------------------------------------------------------------------- hypotheses

@@ -194,7 +194,7 @@ class LocalSearch:
                     likelier = trial
             if likelier is best:
                 break
-            best = self._simplified(likelier)
+            best = self._simplified(self._with_refined_errors(likelier))
         return best
 
     def _with_refined_errors(self, best: Explanation, more: Sequence[ErrorKind] = ()) -> Explanation:
@@ -209,25 +209,27 @@ class LocalSearch:
         return best
 
     def _with_fewest_delays(self, now: Explanation) -> Explanation:
-        """The explanation in the time of the inputs, if fewer delays are needed in it.
+        """The explanation with delays that are equal as one, in the time of the inputs if fewer are needed in it.
 
         Time has no origin: inputs that are late, and some sensors early alike, are the other sensors late.
         """
         intervals, fit = now.intervals, now.refinement.fit
+        if intervals.sensor_errors is None or intervals.lag or self.settings.input_delay:
+            return now
         late = intervals.delay + fit.shared[-1]
-        if intervals.sensor_errors is None or intervals.lag or self.settings.input_delay or abs(late) < _SMALL_DELAY:
+        late = late if abs(late) > _SMALL_DELAY else 0.0
+        delays = np.where(intervals.known.any(axis=0), intervals.sensor_errors.delay + late, 0.0)
+        delays = _grouped(delays, _SMALL_DELAY)
+        before = np.count_nonzero(np.unique(intervals.sensor_errors.delay)) + bool(late)
+        if np.count_nonzero(np.unique(delays)) >= before:
             return now
-        of_signals = np.where(intervals.known.any(axis=0), intervals.sensor_errors.delay + late, 0.0)
-        of_signals[np.abs(of_signals) < _SMALL_DELAY] = 0.0
-        if np.count_nonzero(np.unique(of_signals)) > np.count_nonzero(np.unique(intervals.sensor_errors.delay)):
-            return now
-        retimed = intervals.with_delays(of_signals, signal_rates(intervals, fit))
-        shared = np.append(fit.shared[:-1], 0.0)
+        retimed = intervals.with_delays(delays, signal_rates(intervals, fit))
         x = _states_after(intervals, fit, round(late))
-        begin = with_residuals(retimed, replace(fit, x=x, shared=shared))
+        begin = with_residuals(retimed, replace(fit, x=x, shared=np.append(fit.shared[:-1], 0.0)))
         found = self._optimised(now, retimed, begin)
-        likelier = found.cost / retimed.known.sum() < (now.cost + _AS_LIKELY) / intervals.known.sum()
-        return found if likelier else now
+        # Samples at the ends of the logs differ.
+        as_likely = found.cost / retimed.known.sum() < (now.cost + _AS_LIKELY) / intervals.known.sum()
+        return found if as_likely else now
 
     def _with_errors(self, now: Explanation, errors: Sequence[SensorError], *, to_beat: float = np.inf) -> Explanation:
         """The explanation with errors of sensors, with the same freedom; given up where it will hardly beat a cost."""
@@ -437,6 +439,15 @@ def fewest_parts(length: int) -> int:
         The smallest above one with parts that are not too short; 0 where there is none.
     """
     return next((k for k in range(2, length // _SHORTEST + 1) if length % k == 0), 0)
+
+
+def _grouped(values: FloatArray, apart: float) -> FloatArray:
+    """The values with neighbours that are nearer to each other replaced by their mean; 0 where they are near 0."""
+    found = np.where(np.abs(values) > apart, values, 0.0)
+    distinct = np.unique(found[found != 0.0])
+    for group in np.split(distinct, np.flatnonzero(np.diff(distinct) > apart) + 1):
+        found[np.isin(found, group)] = group.mean()
+    return found
 
 
 def _states_after(intervals: ShootingIntervals, fit: Fit, rows: int) -> FloatArray:
