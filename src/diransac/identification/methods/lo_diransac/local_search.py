@@ -186,7 +186,7 @@ class LocalSearch:
         kinds = {"delays": self.settings.sensor_delays is None, "biases": self.settings.sensor_biases is None}
         for k in range(self.settings.max_sensor_errors):
             report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
-            errors = clear_errors(best.intervals, best.refinement.fit, alone, **kinds)
+            errors = clear_errors(best.intervals, best.refinement.fit, alone, worth=_WORTH, **kinds)
             likelier = best
             for error in errors:
                 trial = self._with_errors(best, [error], to_beat=likelier.cost)

@@ -69,8 +69,8 @@ _MOST_ALIKE = 0.98
 # Tau until convergence, over its prior: noise must not absorb model error.
 _GUARDED = 10.0
 _MAX_TRIALS, _MAX_SWEEPS = 8, 12
-# Corrections of a step for the curvature of the rollouts, before it is damped.
-_CORRECTIONS = 1
+# Part of what is left of the excess of its cost when a step is corrected for the curvature of the rollouts, at most.
+_CORRECTED = 0.3
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
 
 
@@ -362,15 +362,16 @@ def _step(intervals: ShootingIntervals, fit: Fit, damping: float) -> tuple[Fit, 
     weights = weights_of(intervals, fit)
     at, before = linearize(intervals, fit, weights), cost(intervals, fit, weights)
     for _ in range(_MAX_TRIALS):
-        right = at.right_z, at.right_s
-        for _ in range(1 + _CORRECTIONS):
+        right, excess = (at.right_z, at.right_s), np.inf
+        while True:
             solved = at.system.solve(*right, damping)
             trial = _moved(intervals, fit, solved)
-            if cost(intervals, trial, weights) <= before * (1.0 + 1e-9):
+            more = cost(intervals, trial, weights) - before
+            if more <= 1e-9 * before:
                 return trial, solved, damping / 10.0 if damping > _LEAST_DAMPING else 0.0
-            right = at.corrected(intervals, fit, trial)
-            if not np.isfinite(right[0]).all():
+            if not more < _CORRECTED * excess:
                 break
+            right, excess = at.corrected(intervals, fit, trial), more
         damping = max(10.0 * damping, _FIRST_DAMPING)
     return fit, solved, damping
 

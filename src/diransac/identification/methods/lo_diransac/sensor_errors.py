@@ -54,19 +54,23 @@ class SensorError:
         Its estimate, samples or the signal's unit.
     ratio : float
         Its size over its standard error.
+    gain : float
+        Evidence that it would gain, nats, if the residuals were white.
     """
 
     kind: ErrorKind
     size: float
     ratio: float
+    gain: float
 
 
 def clear_errors(
-    intervals: ShootingIntervals, fit: Fit, among: BoolArray, *, delays: bool, biases: bool
+    intervals: ShootingIntervals, fit: Fit, among: BoolArray, *, worth: float, delays: bool, biases: bool
 ) -> list[SensorError]:
     """Errors of the sensors that the residuals show most clearly: one of a single signal, and some of groups.
 
-    Groups that are late alike show nearly as clearly as others that are early; fits of each tell them apart.
+    Groups that are late alike show nearly as clearly as others that are early; fits of each tell them apart.  They are
+    judged by the evidence that they promise: a delay of many samples leaves residuals whose scores scatter by itself.
 
     Parameters
     ----------
@@ -75,6 +79,8 @@ def clear_errors(
         At its optimum.
     among : (n_s,) bool array
         Signals whose own errors are tested, besides those of groups.
+    worth : float
+        Evidence that a group's error must promise, nats.
     delays, biases : bool
         Kinds of errors that are tested.
 
@@ -89,10 +95,12 @@ def clear_errors(
     scores = _Scores(intervals, fit)
     found = [x for x in map(scores.tested, tested) if x is not None]
     latest = _LATEST * max(x.stop - x.start for x in intervals.rows_of_logs)
-    clear = [x for x in found if x.ratio > _CLEAR and (not x.kind.is_delay or _LEAST_DELAY < abs(x.size) < latest)]
-    clear.sort(key=lambda x: x.ratio, reverse=True)
-    single = [x for x in clear if len(x.kind.signals) == 1]
-    return [*single[:1], *[x for x in clear if len(x.kind.signals) > 1][:_GROUPS]]
+    found = [x for x in found if not x.kind.is_delay or _LEAST_DELAY < abs(x.size) < latest]
+    single = [x for x in found if len(x.kind.signals) == 1 and x.ratio > _CLEAR]
+    groups = [x for x in found if len(x.kind.signals) > 1 and x.gain > worth]
+    single.sort(key=lambda x: x.ratio, reverse=True)
+    groups.sort(key=lambda x: x.gain, reverse=True)
+    return [*single[:1], *groups[:_GROUPS]]
 
 
 def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> list[SensorError]:
@@ -115,7 +123,10 @@ def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]
     determined, covariance, _, _ = scores.together(slopes)
     sizes = -covariance @ np.array([slopes[k].score for k in determined])
     ratios = np.abs(sizes) / (np.sqrt(np.diag(covariance)) + _TINY)
-    return [SensorError(kinds[k], float(x), float(r)) for k, x, r in zip(determined, sizes, ratios, strict=True)]
+    return [
+        SensorError(kinds[k], float(x), float(r), float(0.5 * r**2))
+        for k, x, r in zip(determined, sizes, ratios, strict=True)
+    ]
 
 
 def effect_on(intervals: ShootingIntervals, fit: Fit, z: FloatArray, s: FloatArray) -> FloatArray:
@@ -198,7 +209,8 @@ class _Scores:
         scores = scores - slope.score * share / max(share.sum(), _TINY)
         batches = np.add.reduceat(scores, np.arange(0, n, max(1, round(np.sqrt(n)))))
         variance = max(information, float(np.square(batches).sum()))
-        return SensorError(kind, -slope.score / information, abs(slope.score) / np.sqrt(variance))
+        gain = 0.5 * slope.score**2 / information
+        return SensorError(kind, -slope.score / information, abs(slope.score) / np.sqrt(variance), gain)
 
     def together(self, slopes: Sequence[_Slope]) -> tuple[list[int], FloatArray, FloatArray, FloatArray]:
         """Errors that the log determines, their covariance, and what they change of the gradient of the fit."""
