@@ -46,6 +46,12 @@ def test_velocities_that_are_not_logged_follow_from_the_kinematics():
     assert found.verdict == "usable"
 
 
+def test_a_load_that_nothing_measures_is_found_though_smoothing_takes_its_resonance_for_noise():
+    found = judged("flexible joint motor angle", 1001)
+    assert found.verdict == "usable"
+    assert all(found.inside.values())
+
+
 def test_a_lag_of_the_actuators_is_estimated_and_named():
     found = judged("rotor motor lag 50 ms")
     assert found.worst < 0.2

@@ -119,7 +119,7 @@ class LocalSearch:
     prior: Prior
     callback: Callback | None
 
-    def likeliest(self, intervals: ShootingIntervals, *, free_hold: bool) -> Explanation:
+    def likeliest(self, intervals: ShootingIntervals, *, free_hold: bool, to_beat: float = np.inf) -> Explanation:
         """The likeliest explanation of the log.
 
         Parameters
@@ -128,6 +128,8 @@ class LocalSearch:
             With inputs as recorded.
         free_hold : bool
             Whether another hold of the inputs may be an explanation.
+        to_beat : float, optional
+            Cost of another explanation; the search ends early if this one is behind before it is elaborated.
 
         Returns
         -------
@@ -137,7 +139,10 @@ class LocalSearch:
         delay = self._likeliest_delay(intervals)
         shifted = [intervals, *([replace(intervals, delay=delay)] if delay else [])]
         best, *others = [self._from_hypotheses(x, k) for k, x in enumerate(shifted)]
-        best = self._with_timing(self._better(best, others), free_hold=free_hold)
+        best = self._better(best, others)
+        if best.cost > to_beat:
+            return best
+        best = self._with_timing(best, free_hold=free_hold)
         found = self._with_sensors(self._with_named_sensors(best))
         if found is best:
             return best

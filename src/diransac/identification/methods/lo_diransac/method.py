@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -76,6 +77,9 @@ _ALL_OF_IT = 0.8
 _MUCH = 0.1
 # A significant delay: so many standard errors, and so many samples.
 _SIGNIFICANT, _SMALL_DELAY = 3.0, 0.25
+# Factors by which the motion's time scale is shorter in further searches of doubtful unmeasured states, and its least
+# samples.
+_NARROWER, _FEWEST_SAMPLES = (2, 3), 5
 # Samples of running medians at most: spikes last for samples, however many of them there are in a second.
 _MOST_INPUTS, _MOST_SAMPLES = 15, 31
 _GAUSSIAN = 10_000
@@ -211,8 +215,78 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     """Parameters of the dataset's model, step by step."""
     _check_sensors(settings, dataset)
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
+    best = _searched(settings, dataset, seed, callback)
+    for narrower in _NARROWER if best.is_doubtful else ():
+        with suppress(IdentificationError):
+            other = _searched(settings, dataset, seed, callback, narrower, best.likeliest.cost)
+            best = min(best, other, key=lambda x: x.likeliest.cost)
+        if not best.is_doubtful:
+            break
+    likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
+    notes, refined = best.notes, likeliest.refinement
+    report(callback, "estimating parameters", 0.9)
+    if best.reached:
+        notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
+    if best.reached or dataset.layout.on_bounds(result.parameters).any():
+        check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
+    changes, lacks = changes_between_halves(likeliest, result), None
+    if settings.suggestions and not likeliest.exact:
+        lacks = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
+    ambiguity = _ambiguity(len(result.parameters), changes, lacks)
+    checks = (
+        *_checks(settings, intervals, motion, refined),
+        *_checks_of_unmeasured(best),
+        *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), changes),
+    )
+    forced = bool(settings.input_delay or settings.input_lag)
+    found = _Found(dataset, intervals, motion, refined, result, ambiguity, forced)
+    estimate = _estimate(settings, found, best.n_hypotheses, refined.converged, notes, checks)
+    return estimate if lacks is None else replace(estimate, suggestions=lacks.suggestions)
+
+
+@dataclass(frozen=True)
+class _Searched:
+    """The likeliest explanation of the logs, and the motion that its search began with.
+
+    ``reached`` is True if the parameters are those of the fit because others would violate a strict bound.
+    """
+
+    motion: Motion
+    notes: tuple[str, ...]
+    n_hypotheses: int
+    likeliest: Explanation
+    result: ProjectedEstimate
+    reached: bool
+
+    @property
+    def unexplained(self) -> float:
+        """Largest RMS acceleration that the model does not explain, over the spread of its motion."""
+        intervals, motion = self.likeliest.intervals, self.motion
+        first = intervals.model.n_q + intervals.model.n_v
+        left = np.sqrt(np.square(self.result.unexplained[intervals.occupied]).mean(axis=0))
+        return float((left / motion.spread[first : first + intervals.model.n_v]).max())
+
+    @property
+    def is_doubtful(self) -> bool:
+        """True if much is unexplained of a motion of which nothing measures a part: either may be anything.
+
+        The unmeasured states may have begun on wrong trajectories, for which a resonance that smoothing takes for noise
+        is enough.
+        """
+        return bool(unmeasured_states(self.likeliest.intervals)) and self.unexplained > _MUCH
+
+
+def _searched(
+    settings: LoDiransac,
+    dataset: Dataset,
+    seed: int,
+    callback: Callback | None,
+    narrower: int = 1,
+    to_beat: float = np.inf,
+) -> _Searched:
+    """A search that begins with a motion of a time scale that is shorter by a factor; it may end behind another one."""
     report(callback, "smoothing", 0.0)
-    intervals, motion, notes = _prepared(settings, dataset)
+    intervals, motion, notes = _prepared(settings, dataset, narrower)
     if unmeasured_states(intervals):
         report(callback, "unmeasured states", 0.05)
         allowed, measured = len(dataset.model.parameters) - 1, measured_signals(intervals)
@@ -222,27 +296,8 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
     unit = discrepancy_units(intervals, motion, hypotheses[0])
     search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
-    likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
-    intervals, refined = likeliest.intervals, likeliest.refinement
-    report(callback, "estimating parameters", 0.9)
-    result, reached = _parameters(settings, likeliest)
-    if reached:
-        notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
-    if reached or dataset.layout.on_bounds(result.parameters).any():
-        check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
-    changes, lacks = changes_between_halves(likeliest, result), None
-    if settings.suggestions and not likeliest.exact:
-        lacks = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
-    ambiguity = _ambiguity(len(result.parameters), changes, lacks)
-    checks = (
-        *_checks(settings, intervals, motion, refined),
-        *_checks_of_unmeasured(intervals, motion, result),
-        *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), changes),
-    )
-    forced = bool(settings.input_delay or settings.input_lag)
-    found = _Found(dataset, intervals, motion, refined, result, ambiguity, forced)
-    estimate = _estimate(settings, found, len(hypotheses), refined.converged, notes, checks)
-    return estimate if lacks is None else replace(estimate, suggestions=lacks.suggestions)
+    likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None, to_beat=to_beat)
+    return _Searched(motion, notes, len(hypotheses), likeliest, *_parameters(settings, likeliest))
 
 
 def _parameters(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[ProjectedEstimate, bool]:
@@ -307,17 +362,14 @@ def _checks(
         yield Finding("care", f"Local optimisation did not converge within its limit of {settings.max_steps} steps.")
 
 
-def _checks_of_unmeasured(intervals: ShootingIntervals, motion: Motion, result: ProjectedEstimate) -> Iterator[Finding]:
-    """A finding where much is unexplained of a motion of which nothing measures a part: either may be anything."""
-    names, model = unmeasured_by_name(intervals), intervals.model
-    first = model.n_q + model.n_v
-    left = np.sqrt(np.square(result.unexplained[intervals.occupied]).mean(axis=0))
-    share = (left / motion.spread[first : first + model.n_v]).max()
-    if names and share > _MUCH:
+def _checks_of_unmeasured(found: _Searched) -> Iterator[Finding]:
+    """A finding where a search is doubtful."""
+    if found.is_doubtful:
+        names, share = unmeasured_by_name(found.likeliest.intervals), 100.0 * found.unexplained
         yield Finding(
             "bad",
-            f"Nothing measures {names}, and the model leaves {100.0 * share:.2g} % of an acceleration unexplained: the "
-            f"log does not tell one from the other. Measure {names}.",
+            f"Nothing measures {names}, and the model leaves {share:.2g} % of an acceleration unexplained: the log "
+            f"does not tell one from the other. Measure {names}.",
         )
 
 
@@ -337,8 +389,10 @@ def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Ref
 # ---------------------------------------------------------------------- preparation
 
 
-def _prepared(settings: LoDiransac, dataset: Dataset) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
-    """The logs in intervals of the motion's own time scale, and the motion, row by row of the intervals."""
+def _prepared(
+    settings: LoDiransac, dataset: Dataset, narrower: int
+) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
+    """The logs in intervals of the motion's own time scale, or a part of it, and the motion, row by row of them."""
     model, dt = dataset.model, dataset.dt
     screened = [_screened(settings, one, dt) for one in dataset.segments]
     samples, inputs = [x for x, _, _ in screened], [u for _, u, _ in screened]
@@ -349,6 +403,7 @@ def _prepared(settings: LoDiransac, dataset: Dataset) -> tuple[ShootingIntervals
         for note in said
     ]
     half = choose_half_width(model, samples, dt, settings.smoothing_half_width)
+    half = max(half // narrower, min(half, _FEWEST_SAMPLES))
     n_rows, longest = sum(map(len, dataset.segments)), max(map(len, dataset.segments))
     if n_rows < _FEWEST_INTERVALS * half or longest < half:
         raise LogError(
