@@ -69,7 +69,7 @@ def compare(seeds: range, duration: float) -> None:
     print(f"{len(seeds)} flights of {duration:g} s: median and worst error")
     print("\n| | " + " | ".join(methods) + " |\n|---|" + "--:|" * len(methods))
     for parameter in next(iter(errors.values())):
-        unit = " of the noise" if "bias" in parameter else " %"
+        unit = " % of the noise" if "bias" in parameter else " %"
         cells = [_cell(errors[name].get(parameter, []), unit) for name in methods]
         print(f"| {parameter} | {' | '.join(cells)} |")
     print("| processor time, s | " + " | ".join(f"{median(seconds[name]):.0f}" for name in methods) + " |")
