@@ -450,7 +450,8 @@ def _grouped(values: FloatArray, apart: float) -> FloatArray:
     """The values with neighbours that are nearer to each other replaced by their mean; 0 where they are near 0."""
     found = np.where(np.abs(values) > apart, values, 0.0)
     distinct = np.unique(found[found != 0.0])
-    for group in np.split(distinct, np.flatnonzero(np.diff(distinct) > apart) + 1):
+    first = np.flatnonzero(np.diff(distinct, prepend=-np.inf) > apart)
+    for group in np.split(distinct, first)[1:]:
         found[np.isin(found, group)] = group.mean()
     return found
 
