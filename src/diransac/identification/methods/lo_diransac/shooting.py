@@ -24,6 +24,8 @@ __all__ = ["ErrorKind", "ShootingIntervals"]
 
 _DIVERGED = 1e6
 _WELL_CONDITIONED = 1e8
+# Rows times squared unknowns from which on derivatives take longer than threads take to be told (a few milliseconds).
+_WORTH_THREADS = 4e6
 
 
 @dataclass(frozen=True)
@@ -384,7 +386,8 @@ class ShootingIntervals:
         derived = rollouts(self.augmented.model, names, substeps=self.substeps, hold=self.hold)
         measurements = Measurements(self.measured[:, columns], self.measurements.valid)
         batch, unknowns = self.batch(shared, x, d), self.augmented.unknowns
-        return derived.gauss_newton(batch, measurements, weights[:, columns], unknowns=unknowns, threads=self.threads)
+        threads = self.threads if len(self.measured) * len(unknowns) ** 2 > _WORTH_THREADS else 1
+        return derived.gauss_newton(batch, measurements, weights[:, columns], unknowns=unknowns, threads=threads)
 
     @cached_property
     def _derived(self) -> tuple[tuple[str, ...], IntArray]:
