@@ -130,7 +130,6 @@ class _Emitter:
         b, v = self.b, self.v
         with self._vectors(self.padded_k) as column:
             total = v.variable(v.number(0.0))
-            v.set(total, v.number(0.0))
             with self._rows() as j:
                 y = v.splat(b.fneg(self._coupling(w, i, j)))
                 row = v.load(self.blocks, b.add(self._row(after, j), column), NUMBERS)

@@ -218,8 +218,9 @@ class LocalSearch:
 
         Time has no origin: inputs that are late, and some sensors early alike, are the other sensors late.
         """
-        intervals, fit = now.intervals, now.refinement.fit
-        if intervals.sensor_errors is None or intervals.lag or self.settings.input_delay:
+        intervals, fit, settings = now.intervals, now.refinement.fit, self.settings
+        is_asked_for = settings.input_delay or settings.sensor_delays is not None
+        if intervals.sensor_errors is None or intervals.lag or is_asked_for:
             return now
         late = intervals.delay + fit.shared[-1]
         late = late if abs(late) > _SMALL_DELAY else 0.0
