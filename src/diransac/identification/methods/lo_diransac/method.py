@@ -22,7 +22,7 @@ from diransac.data.segment import long_runs, silent_rows
 from diransac.errors import IdentificationError, LogError, ModelError, SettingsError
 from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
-from diransac.identification.method import report
+from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.checks import changes_between_halves, findings_of_fit
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
@@ -217,8 +217,9 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
     best = _searched(settings, dataset, seed, callback)
     for narrower in _NARROWER if best.is_doubtful else ():
-        with suppress(IdentificationError):
-            other = _searched(settings, dataset, seed, callback, narrower, best.likeliest.cost)
+        with suppress(IdentificationError, np.linalg.LinAlgError):
+            further = within(callback, 0.87, 0.9)
+            other = _searched(settings, dataset, seed, further, narrower, best.likeliest.cost)
             best = min(best, other, key=lambda x: x.likeliest.cost)
         if not best.is_doubtful:
             break
