@@ -327,13 +327,13 @@ def test_delays_are_those_of_sensors_in_another_time():
     """Inputs one sample late and velocities one early are coordinates one late."""
     intervals, signals = intervals_of(n_rows=100)
     rates = np.gradient(signals, axis=0)
-    velocities, coordinates = ErrorKind((3, 4, 5), is_delay=True), ErrorKind((0, 1, 2), is_delay=True)
-    bias = {ErrorKind((8,), is_delay=False): 0.25}
+    velocities, coordinates = ErrorKind((3, 4, 5), "delay"), ErrorKind((0, 1, 2), "delay")
+    bias = {ErrorKind((8,), "bias"): 0.25}
     late = replace(intervals, delay=1).corrected({velocities: -1.02, **bias}, rates)
     found = late.with_delays(np.r_[np.full(3, 1.02), np.zeros(6)], rates)
     expected = intervals.corrected({coordinates: 1.02, **bias}, rates)
     assert found.delay == 0
-    assert set(found.sensor_errors.kinds) == {coordinates, *bias}
+    assert set(found.errors.kinds) == {coordinates, *bias}
     assert (found.measured == expected.measured).all()
     assert (found.known == expected.known).all()
 

@@ -34,6 +34,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     fitted_parameters,
     parameter_units,
 )
+from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs
 from diransac.identification.methods.lo_diransac.refinement import make_prior
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
@@ -120,12 +121,13 @@ class LoDiransac(LoDiransacSettings):
         where that is the likelier explanation of the log.
     max_delay_shifts : int, optional
         Rounds in which other delays, a lag and another hold of the inputs are tried after the first optimisations.
-    sensor_delays, sensor_biases : sequence of str, optional
-        Signals whose delay, or bias, is estimated in any case; that of no other is.  None: those that the residuals
-        show clearly.
+    sensor_delays, sensor_biases, gain_drifts : sequence of str, optional
+        Signals, or inputs, whose delay is estimated in any case, signals whose bias is, and inputs whose gain drifts;
+        that of no other is.  An input's delay is its own, besides that of all.  None: those that the residuals show
+        clearly.
     max_sensor_errors : int, optional
-        Largest number of delays and biases of unnamed sensors that are estimated; where the model is exact, only of
-        those with a measurement equation.
+        Largest number of unnamed ones of these that are estimated; where the model is exact, only of groups of sensors
+        and of those with a measurement equation.
     substeps : int, optional
         Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
         samples or links are light.
@@ -186,7 +188,7 @@ class LoDiransac(LoDiransacSettings):
         LogError
             The logs are too short, or sampled at different rates.
         SettingsError
-            A sensor is named that the logs lack.
+            A signal or an input is named that the logs lack.
         IdentificationError
             No sample gives parameters within their bounds.
         """
@@ -321,11 +323,13 @@ def _ambiguity(n: int, changes: Sequence[Change], lacks: MissingTerms | None) ->
 
 
 def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:
-    """Raises SettingsError: a sensor is named that the logs lack."""
-    for setting in ("sensor_delays", "sensor_biases"):
-        unknown = [name for name in getattr(settings, setting) or () if name not in dataset.signals]
+    """Raises SettingsError: a signal or an input is named that the logs lack."""
+    inputs = tuple(dataset.model.inputs)
+    known = {"sensor_delays": (*dataset.signals, *inputs), "sensor_biases": dataset.signals, "gain_drifts": inputs}
+    for setting, names in known.items():
+        unknown = [name for name in getattr(settings, setting) or () if name not in names]
         if unknown:
-            has = ", ".join(dataset.signals)
+            has = ", ".join(names)
             raise SettingsError(f'{setting} names "{unknown[0]}", which {dataset.source} lacks; it has {has}')
 
 
@@ -474,17 +478,23 @@ class _Found:
 
     @property
     def is_late(self) -> bool:
-        """True for a significant delay."""
-        return abs(self.late) > max(_SIGNIFICANT * self.refinement.delay_error, _SMALL_DELAY)
+        """True for a significant delay that all inputs have."""
+        clear = abs(self.late) > max(_SIGNIFICANT * self.refinement.delay_error, _SMALL_DELAY)
+        return clear and (bool(self.intervals.lag) or not self.intervals.all_errors.input_delay.any())
 
     @property
     def timing(self) -> InputTiming:
-        """Delay or lag of the inputs where it is significant, or forced."""
+        """Delay or lag of the inputs where it is significant, or forced, and the inputs' own errors."""
+        dt, errors = self.intervals.dt, self.intervals.all_errors
+        drifts = tuple(errors.gain_drift.tolist()) if errors.gain_drift.any() else ()
+        if errors.input_delay.any():
+            delays, lag = delays_of_inputs(self.intervals, self.refinement.fit) * dt, self.intervals.lag * dt
+            return InputTiming(0.0, lag, tuple(delays.tolist()), drifts)
         if not (self.is_late or self.forced):
-            return InputTiming()
+            return InputTiming(gain_drifts=drifts)
         if self.intervals.lag:
-            return InputTiming(lag=max(self.late, LEAST_LAG) * self.intervals.dt)
-        return InputTiming(delay=self.late * self.intervals.dt)
+            return InputTiming(lag=max(self.late, LEAST_LAG) * dt, gain_drifts=drifts)
+        return InputTiming(self.late * dt, gain_drifts=drifts)
 
 
 def _estimate(

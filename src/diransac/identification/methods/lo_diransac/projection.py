@@ -38,8 +38,8 @@ from scipy.special import ndtri, stdtrit
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.hypotheses import WeakForm
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
+from diransac.identification.methods.lo_diransac.recording_errors import effect_on
 from diransac.identification.methods.lo_diransac.refinement import weights_of
-from diransac.identification.methods.lo_diransac.sensor_errors import effect_on
 from diransac.identification.methods.lo_diransac.smoothing import split_signals
 from diransac.identification.uncertainty import combined
 from diransac.simulation.compiler import compile_map
