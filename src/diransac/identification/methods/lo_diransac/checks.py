@@ -15,6 +15,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     batch_sums,
     least_squares_gains,
     means_of_intervals,
+    means_of_windows,
     residuals_of_motion,
 )
 from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs
@@ -143,12 +144,13 @@ def changes_between_halves(found: Explanation, result: ProjectedEstimate) -> lis
     """
     intervals = found.intervals
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
-    first = place < 0.5 * np.bincount(intervals.log_of)[intervals.log_of]
+    first = (place < 0.5 * np.bincount(intervals.log_of)[intervals.log_of])[result.windows]
     if found.exact or min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
         return []
     _, rows, regressors, _ = residuals_of_motion(intervals, found.refinement.fit, result.parameters)
     W = means_of_intervals(intervals, regressors * intervals.counted[:, None, None])
     residuals = means_of_intervals(intervals, rows * intervals.counted[:, None])
+    W, residuals = (means_of_windows(x, result.windows) for x in (W, residuals))
     moved, variances = zip(*(_change(W[half], residuals[half]) for half in (first, ~first)), strict=True)
     halves, errors = result.parameters[None] + np.array(moved), np.sqrt(sum(variances))
     both = [Change(k, *x) for k, x in enumerate(halves.T.tolist())]
