@@ -13,11 +13,11 @@ from typing import Any, NoReturn, get_type_hints
 import typer
 from typer.core import TyperGroup
 
+from diransac.cli import INTERRUPTED
 from diransac.errors import DiransacError
 
 __all__ = ["Group", "grouped"]
 
-INTERRUPTED = 130
 MAX_LINES = 3
 UsageError: type[Any] = typer.BadParameter.__mro__[1]
 

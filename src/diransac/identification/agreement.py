@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.errors import DiransacError
+from diransac.errors import DiransacError, TimeLimitError
 from diransac.identification.method import fit, within
+from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -52,7 +53,10 @@ def disagreements(
     shared = [name for name, x in dataset.model.parameters.items() if not x.per_log]
     found = {}
     for i in range(n):
-        estimate = _alone(method, dataset, i, seed, within(callback, i / n, (i + 1) / n, f"log {i + 1} alone: "))
+        try:
+            estimate = _alone(method, dataset, i, seed, within(callback, i / n, (i + 1) / n, f"log {i + 1} alone: "))
+        except TimeLimitError:
+            return remarks, ["the time limit was reached before the logs were compared with each other"]
         if not isinstance(estimate, str) and any(np.isfinite(_marginal(estimate, name)[1]) for name in shared):
             found[i] = estimate
         else:
@@ -72,9 +76,16 @@ def disagreements(
 
 
 def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callback | None) -> Estimate | str:
-    """The estimate of one log, or the reason why that log alone gives none."""
+    """The estimate of one log, or the reason why that log alone gives none.
+
+    Raises TimeLimitError: the time limit was reached.
+    """
     try:
-        return fit(method, dataset.subset([i]), seed, callback)
+        found = fit(method, dataset.subset([i]), seed, callback)
+        check_time()
+        return found
+    except TimeLimitError:
+        raise
     except (DiransacError, np.linalg.LinAlgError) as error:
         return str(error)
 
