@@ -8,6 +8,7 @@ import numpy as np
 
 from diransac.errors import DiransacError, TimeLimitError
 from diransac.identification.method import fit, within
+from diransac.identification.uncertainty import student_quantile
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -94,10 +95,8 @@ def _worst(
     found: Mapping[int, Estimate], i: int, parameters: Sequence[str], level: float, dt: float
 ) -> tuple[float, str]:
     """Largest difference of log ``i`` from the others over what is allowed, and a sentence on it."""
-    from scipy.special import stdtrit
-
     worst, sentence = 0.0, ""
-    t = float(stdtrit(min(x.degrees_of_freedom for x in found.values()), 1.0 - level))
+    t = student_quantile(min(x.degrees_of_freedom for x in found.values()), 1.0 - level)
     delays = [_DELAY] if all(x.diagnosis is not None for x in found.values()) else []
     for name in (*parameters, *delays):
         own, variance = _marginal(found[i], name)
