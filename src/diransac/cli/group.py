@@ -48,10 +48,14 @@ class Group(TyperGroup):
             found.name = cmd_name
             self.commands[cmd_name] = found
         command = super().get_command(ctx, cmd_name)
-        for parameter in getattr(command, "params", ()):
-            if hasattr(parameter, "get_runtime_param"):  # of a release of Typer that converts by pydantic
-                parameter.get_runtime_param = functools.partial(_Conversion, parameter.get_runtime_param)
+        if command is not None:
+            _convert_plainly(command, ctx)
         return command
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Arguments that are left for the command."""
+        _convert_plainly(self, ctx)
+        return super().parse_args(ctx, args)
 
     def main(self, args: Sequence[str] | None = None, *positional: Any, **extra: Any) -> NoReturn:
         """Run the command line; ``--debug`` may stand anywhere."""
@@ -72,6 +76,13 @@ class Group(TyperGroup):
         if code == INTERRUPTED:
             typer.echo("interrupted", err=True)
         sys.exit(code or 0)
+
+
+def _convert_plainly(command: Any, ctx: Any) -> None:
+    """Convert the arguments of a command by `_Conversion`."""
+    for parameter in command.get_params(ctx):
+        if hasattr(parameter, "get_runtime_param"):  # of a release of Typer that converts by pydantic
+            parameter.get_runtime_param = functools.partial(_Conversion, parameter.get_runtime_param)
 
 
 @dataclasses.dataclass(frozen=True)
