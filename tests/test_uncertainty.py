@@ -10,7 +10,7 @@ from scipy.stats import t as student
 
 import diransac as dr
 from diransac.data.dataset import Dataset
-from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance
+from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance, student_quantile
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight
 
@@ -129,3 +129,10 @@ def test_fewer_rows_than_stretches_leave_out_one_row_at_a_time(n):
 def test_single_row_has_no_standard_error():
     bound = dr.OrdinaryLeastSquares().bind(Dataset.of(level(), dr.Log.from_arrays([0.0, 0.1], {"x_ddot": [1.0, 2.0]})))
     assert np.isinf(jackknife_covariance(bound, np.array([0]))).all()
+
+
+@pytest.mark.parametrize("degrees_of_freedom", [1, 2, 3, 9, 100, 10_000])
+@pytest.mark.parametrize("probability", [0.5, 0.6, 0.841, 0.975, 0.9999])
+def test_quantiles_of_students_t_are_those_of_scipy(degrees_of_freedom: int, probability: float):
+    expected = student(degrees_of_freedom).ppf(probability)
+    assert student_quantile(degrees_of_freedom, probability) == pytest.approx(expected, rel=1e-11, abs=1e-12)

@@ -16,6 +16,7 @@ from diransac.errors import (
     ResultError,
     SettingsError,
     StudyError,
+    TimeLimitError,
 )
 from diransac.model import Disturbance, Model, Parameter, Plant, Sensor, sensors
 from diransac.model import library as models
@@ -81,6 +82,7 @@ __all__ = [
     "Study",
     "StudyError",
     "Suggestion",
+    "TimeLimitError",
     "TotalLeastSquares",
     "Trajectory",
     "Validation",

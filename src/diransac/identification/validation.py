@@ -23,6 +23,7 @@ from diransac.identification.methods import DEFAULT
 from diransac.identification.result import Result
 from diransac.model.plant import ModelWithParameters, as_plant
 from diransac.text_table import aligned
+from diransac.time_limit import check_time, time_limited
 
 if TYPE_CHECKING:
     from diransac.model import Model
@@ -390,6 +391,7 @@ def cross_validate(
     method: str | Method = DEFAULT,
     *,
     horizon: float | None = None,
+    time_limit: float | None = None,
     progress: Callback | None = None,
     **arguments: Any,
 ) -> CrossValidation:
@@ -406,6 +408,8 @@ def cross_validate(
         As in `identify`.
     horizon : float, optional
         As in `validate`, s.
+    time_limit : float, optional
+        Time after which no further log is left out, s; those that are not say so.
     progress : callable, optional
         Called with a `Progress` at every stage.
     arguments : object
@@ -425,22 +429,38 @@ def cross_validate(
     several = distinct_logs(logs)
     if len(several) < 2:
         raise SettingsError("cross-validation leaves one log out; give at least two logs")
-    results, validations = list[Any](), list[Any]()
-    for i, left_out in enumerate(several):
-        try:
-            others = [*several[:i], *several[i + 1 :]]
-            part = within(progress, i / len(several), (i + 1) / len(several), f"without log {i + 1}: ")
-            results.append(identify(model, others, method, progress=part, **{"compare_logs": False, **arguments}))
-        except SettingsError:
-            raise
-        except DiransacError as error:
-            results.append(str(error))
-            validations.append("no model of the other logs")
-            continue
-        try:
-            if arguments.get("differentiate"):
-                left_out = preprocessing.differentiate(left_out, model, arguments.get("bandwidth"))
-            validations.append(validate(results[-1], left_out, horizon))
-        except DiransacError as error:
-            validations.append(str(error))
-    return CrossValidation(tuple(x.source for x in several), tuple(results), tuple(validations))
+    arguments = {"compare_logs": False, **arguments}
+    with time_limited(time_limit):
+        folds = [_fold(model, several, i, method, horizon, progress, arguments) for i in range(len(several))]
+    results, validations = zip(*folds, strict=True)
+    return CrossValidation(tuple(x.source for x in several), results, validations)
+
+
+def _fold(
+    model: Model,
+    logs: Sequence[Log],
+    i: int,
+    method: str | Method,
+    horizon: float | None,
+    progress: Callback | None,
+    arguments: Mapping[str, Any],
+) -> tuple[Result | str, Validation | str]:
+    """The result of all logs but the i-th and its validation with that log; reasons where there are none.
+
+    Raises SettingsError: an argument is out of range.
+    """
+    left_out, others = logs[i], [*logs[:i], *logs[i + 1 :]]
+    part = within(progress, i / len(logs), (i + 1) / len(logs), f"without log {i + 1}: ")
+    try:
+        result = identify(model, others, method, progress=part, **arguments)
+        check_time()
+    except SettingsError:
+        raise
+    except DiransacError as error:
+        return str(error), "no model of the other logs"
+    try:
+        if arguments.get("differentiate"):
+            left_out = preprocessing.differentiate(left_out, model, arguments.get("bandwidth"))
+        return result, validate(result, left_out, horizon)
+    except DiransacError as error:
+        return result, str(error)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.errors import TimeLimitError
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.missing_terms import clear_errors_of_inputs
@@ -31,9 +32,10 @@ from diransac.identification.methods.lo_diransac.recording_errors import (
 )
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
+from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
@@ -90,12 +92,15 @@ class Explanation:
         Of the fit; without a delay, where its delay is fixed.
     exact : bool
         Whether the fit is one of the model as it is.
+    complete : bool, optional
+        False if the time limit ended the search for a likelier one.
     """
 
     intervals: ShootingIntervals
     refinement: Refinement
     prior: Prior
     exact: bool
+    complete: bool = True
 
     @property
     def cost(self) -> float:
@@ -142,21 +147,48 @@ class LocalSearch:
         Returns
         -------
         Explanation
+
+        Raises
+        ------
+        TimeLimitError
+            The time limit was reached before the first local optimisation had converged.
         """
+        best: Explanation | None = None
+        try:
+            for found in self._ever_likelier(intervals, free_hold=free_hold, to_beat=to_beat):
+                best = found
+        except TimeLimitError:
+            if best is None:
+                raise
+            return replace(best, complete=False)
+        assert best is not None
+        return best
+
+    def _ever_likelier(self, intervals: ShootingIntervals, *, free_hold: bool, to_beat: float) -> Iterator[Explanation]:
+        """The likeliest explanation so far after each stage of the search."""
         report(self.callback, "searching for a delay", 0.1)
         delay = self._likeliest_delay(intervals)
-        shifted = [intervals, *([replace(intervals, delay=delay)] if delay else [])]
-        best, *others = [self._from_hypotheses(x, k) for k, x in enumerate(shifted)]
-        best = self._better(best, others)
+        flexible = self._from_hypotheses(intervals, 0)
+        yield flexible
+        best = self._simplest(flexible, self._prior_of(intervals))
+        yield best
+        if delay:
+            delayed = replace(intervals, delay=delay)
+            other = self._simplest(self._from_hypotheses(delayed, 1), self._prior_of(delayed))
+            best = self._better(best, [other])
+            yield best
         if best.cost > to_beat:
-            return best
+            return
         best = self._with_timing(best, free_hold=free_hold)
+        yield best
         found = self._with_errors_of_recordings(self._with_named_errors(best))
+        yield found
         if found is best:
-            return best
+            return
         # Inputs are late, or early, with respect to sensors that are so themselves.
         found = self._with_refined_errors(self._with_timing(found, free_hold=free_hold))
-        return self._with_refined_errors(self._with_fewest_delays(found))
+        yield found
+        yield self._with_refined_errors(self._with_fewest_delays(found))
 
     def _with_timing(self, best: Explanation, *, free_hold: bool) -> Explanation:
         """The explanation with another timing of the inputs, where that makes it likelier or is required."""
@@ -303,10 +335,9 @@ class LocalSearch:
         return min(others, key=lambda x: x.cost, default=now)
 
     def _from_hypotheses(self, intervals: ShootingIntervals, k: int) -> Explanation:
-        """The likeliest explanation with this timing of the inputs."""
+        """The likeliest explanation with this timing of the inputs and with unmodelled accelerations."""
         part, undelayed = within(self.callback, 0.1 + 0.25 * k, 0.35 + 0.25 * k), self._undelayed
-        flexible = Explanation(intervals, self.best(intervals, undelayed, part), undelayed, exact=False)
-        return self._simplest(flexible, self._prior_of(intervals))
+        return Explanation(intervals, self.best(intervals, undelayed, part), undelayed, exact=False)
 
     @property
     def _undelayed(self) -> Prior:
@@ -449,6 +480,7 @@ class LocalSearch:
 
         def score(rows: int) -> float:
             if rows not in scores:
+                check_time()
                 delayed = replace(intervals, delay=rows)
                 scores[rows] = float(robust_scores(delayed, self.motion, self.hypotheses[:1], every)[0])
             return scores[rows]

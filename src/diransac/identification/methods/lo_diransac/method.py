@@ -19,8 +19,8 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
 from diransac.data.input_timing import InputTiming
 from diransac.data.segment import long_runs, silent_rows
-from diransac.errors import IdentificationError, LogError, ModelError, SettingsError
-from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
+from diransac.errors import IdentificationError, LogError, ModelError, SettingsError, TimeLimitError
+from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.checks import changes_between_halves, findings_of_fit
@@ -56,6 +56,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
 )
 from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
 from diransac.simulation import default_threads
+from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -191,6 +192,8 @@ class LoDiransac(LoDiransacSettings):
             A signal or an input is named that the logs lack.
         IdentificationError
             No sample gives parameters within their bounds.
+        TimeLimitError
+            The time limit was reached before the first local optimisation had converged.
         """
         with single_threaded():  # matrices are small: more threads would only add waiting
             return _fitted(self, dataset, int(seed), callback)
@@ -219,7 +222,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
     best = _searched(settings, dataset, seed, callback)
     for narrower in _NARROWER if best.is_doubtful else ():
-        with suppress(IdentificationError, np.linalg.LinAlgError):
+        with suppress(IdentificationError, TimeLimitError, np.linalg.LinAlgError):
             further = within(callback, 0.87, 0.9)
             other = _searched(settings, dataset, seed, further, narrower, best.likeliest.cost)
             best = min(best, other, key=lambda x: x.likeliest.cost)
@@ -243,7 +246,9 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     )
     forced = bool(settings.input_delay or settings.input_lag)
     found = _Found(dataset, intervals, motion, refined, result, ambiguity, forced)
-    estimate = _estimate(settings, found, best.n_hypotheses, refined.converged, notes, checks)
+    end = "converged" if refined.converged else "limit of steps"
+    end = end if likeliest.complete else TIME_LIMIT
+    estimate = _estimate(settings, found, best.n_hypotheses, end, notes, checks)
     return estimate if lacks is None else replace(estimate, suggestions=lacks.suggestions)
 
 
@@ -296,6 +301,7 @@ def _searched(
         check_structure(dataset.model, dataset.source, allowed, measured)
         motion = _completed(intervals, motion, dataset)
     report(callback, "drawing hypotheses", 0.1)
+    check_time()
     hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
     unit = discrepancy_units(intervals, motion, hypotheses[0])
     search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
@@ -501,7 +507,7 @@ def _estimate(
     settings: LoDiransacSettings,
     found: _Found,
     n_hypotheses: int,
-    converged: bool,
+    end: str,
     notes: tuple[str, ...],
     checks: tuple[Finding, ...],
 ) -> Estimate:
@@ -525,7 +531,7 @@ def _estimate(
         estimator="multiple shooting",
         iterations=settings.n_nonlinear_samples if nonlinear else settings.n_samples,
         n_hypotheses=n_hypotheses,
-        stop_reason="converged" if converged else "limit of steps",
+        stop_reason=end,
         resolution=Resolution("rk4", settings.substeps, intervals.hold, found.timing),
         notes=notes,
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),

@@ -34,7 +34,6 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
-from scipy.special import ndtri, stdtrit
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.hypotheses import WeakForm
@@ -42,7 +41,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import lineari
 from diransac.identification.methods.lo_diransac.recording_errors import effect_on
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.methods.lo_diransac.smoothing import split_signals
-from diransac.identification.uncertainty import combined
+from diransac.identification.uncertainty import combined, student_quantile
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
@@ -69,7 +68,7 @@ __all__ = [
 ]
 
 
-_TINY, _UPPER = 1e-300, 0.975
+_TINY, _UPPER, _NORMAL_UPPER = 1e-300, 0.975, 1.959963984540054
 # Factor of the standard deviations of priors in the covariance that is combined with them.
 _WIDER = 100.0
 # Equations per parameter in the longest windows; difference of estimates, standard errors, and relative, that is none;
@@ -447,7 +446,7 @@ def batch_sums(values: FloatArray) -> FloatArray:
     (n_batches, n) array
     """
     sums = np.add.reduceat(values, np.arange(0, len(values), round(np.sqrt(len(values)))), axis=0)
-    return np.asarray(sums * stdtrit(max(len(sums) - 1, 1), _UPPER) / ndtri(_UPPER))
+    return np.asarray(sums * student_quantile(max(len(sums) - 1, 1), _UPPER) / _NORMAL_UPPER)
 
 
 def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:
