@@ -7,7 +7,9 @@ in the regressor's column space is attributed to the parameters.  Equations are 
 
 Inputs are no instruments: a controller answers disturbances, and its inputs are correlated with them (Forssell, Ljung
 1999).  Nor are any needed: the fitted accelerations are posterior means, whose errors are uncorrelated with themselves,
-so that they do not bias the slopes of a regression on them (Berkson 1950).
+so that they do not bias the slopes of a regression on them (Berkson 1950).  The motion of a state that nothing measures
+follows from the equations and from its unmodelled accelerations: a regression on it would attenuate its parameters, and
+these accelerations are not attributed to them.
 
 The covariance has four parts: that of the fit and of the errors of its sensors, propagated through the projection;
 that of the unmodelled forces outside the regressor's column space, as a sample of forces that differ from log to log;
@@ -41,6 +43,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import lineari
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.methods.lo_diransac.sensor_errors import effect_on
 from diransac.identification.methods.lo_diransac.smoothing import split_signals
+from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.identification.uncertainty import combined
 from diransac.simulation.compiler import compile_map
 
@@ -198,6 +201,8 @@ class _Rows:
     M : (W, n_v, n_v) array
     latent : (W, n_v) array
         ``M d``.
+    attributed : (n_v,) bool array
+        Equations of which ``M d`` is attributed to the parameters: those of measured motion.
     scale : (n_v,) array
         Inertial force of each equation; 1 for one without.
     """
@@ -207,6 +212,7 @@ class _Rows:
     means: FloatArray
     M: FloatArray
     latent: FloatArray
+    attributed: BoolArray
     scale: FloatArray
 
     @classmethod
@@ -220,8 +226,10 @@ class _Rows:
         M = means_of_intervals(intervals, M)
         inertial = np.einsum("wij,wj->wi", M, means_of_intervals(intervals, motion[2]))
         scale = np.sqrt(np.square(inertial).mean(axis=0))
-        latent = np.einsum("wij,wj->wi", M, fit.d)
-        return cls(W, push, means_of_intervals(intervals, W), M, latent, np.where(scale > 0.0, scale, 1.0))
+        latent, hidden = np.einsum("wij,wj->wi", M, fit.d), unmeasured_states(intervals)
+        attributed = np.array([name not in hidden for name in intervals.model.velocities])
+        means = means_of_intervals(intervals, W)
+        return cls(W, push, means, M, latent, attributed, np.where(scale > 0.0, scale, 1.0))
 
 
 def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -240,7 +248,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     level = np.hstack([np.ones((len(rows.push), 1)), intervals.inputs])
     of_s[:n_p] = np.eye(n_p)
     of_s[n_p:-1] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
-    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means, rows.M)
+    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means * rows.attributed, rows.M)
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(of_z, of_s)
     covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s + effect_on(intervals, fit, z, s)
@@ -266,7 +274,7 @@ def _bounded_projection(
     stuck, p = np.zeros(len(now), bool), now
     for _ in range(len(now) + 1):
         free = ~stuck
-        left = rows.latent + rows.means[:, :, stuck] @ (p - now)[stuck]
+        left = rows.latent * rows.attributed + rows.means[:, :, stuck] @ (p - now)[stuck]
         known = rows.means[:, :, free] @ now[free] - left - means_of_intervals(intervals, rows.push)
         weights = _robust_weights(intervals, WeakForm(rows.means[:, :, free], known), rows.scale, reweighted)
         gains = tuple(np.zeros((len(now), *x.shape[:2])) for x in (rows.W, rows.means))
