@@ -305,16 +305,21 @@ def _states(segment: Segment, layout: ParameterLayout, parameters: FloatArray) -
 def _unmeasured(
     segment: Segment, layout: ParameterLayout, parameters: FloatArray, states: FloatArray, hidden: tuple[str, ...]
 ) -> FloatArray:
-    """States ``(N, n)`` that the log lacks, from the initial values that agree best with the other velocities."""
+    """States ``(N, n)`` that the log lacks, whose initial values agree best with the other velocities and sensors."""
     model, rows = segment.model, np.arange(len(segment))
     known = np.column_stack([np.interp(rows, rows[np.isfinite(x)], x[np.isfinite(x)]) for x in states.T])
     observed = [i for i, n in enumerate(model.state) if n in model.velocities and n not in hidden]
-    spread = known[:, observed].std(axis=0)
-    weights = np.where(np.isfinite(states[:, observed]), 1.0 / np.square(np.where(spread > 0.0, spread, 1.0)), 0.0)
+    absent = np.full(len(segment), np.nan)
+    sensors = [segment.column(n) if n in segment.present else absent for n in model.sensors]
+    compared = np.column_stack([states[:, observed], *sensors])
+    seen = np.isfinite(compared)
+    spread = np.array([x[ok].std() if ok.any() else 0.0 for x, ok in zip(compared.T, seen.T, strict=True)])
+    weights = np.where(seen, 1.0 / np.square(np.where(spread > 0.0, spread, 1.0)), 0.0)
+    readings = np.nan_to_num(compared[:, len(observed) :])
     bandwidth = 1.0 / (_MEMORY * len(segment) * segment.log.dt)
     whole, alone = [slice(0, len(segment))], ParameterLayout(layout.parameters)
     problem = DrivenStates(
-        model, alone, hidden, known, segment.inputs, weights, whole, segment.log.dt, bandwidth, parameters
+        model, alone, hidden, known, segment.inputs, readings, weights, whole, segment.log.dt, bandwidth, parameters
     )
     found = problem.trajectories(least_squares(problem, problem.starts(), _N_STEPS)[0][0])
     return np.column_stack([found[n] for n in hidden])

@@ -33,6 +33,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     estimate_parameters,
     fitted_parameters,
     parameter_units,
+    residuals_of_motion,
 )
 from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs
 from diransac.identification.methods.lo_diransac.refinement import make_prior
@@ -72,7 +73,7 @@ if TYPE_CHECKING:
 __all__ = ["LoDiransac", "configured"]
 
 _FEWEST_INTERVALS = 4
-_OUTLIER = 0.5
+_OUTLIER, _TINY = 0.5, 1e-9
 # Fraction of a signal's spread from which on its noise leaves nothing to explain.
 _ALL_OF_IT = 0.8
 # Unexplained part of an acceleration from which on states that nothing measures are doubtful.
@@ -268,11 +269,19 @@ class _Searched:
 
     @property
     def unexplained(self) -> float:
-        """Largest RMS acceleration that the model does not explain, over the spread of its motion."""
-        intervals, motion = self.likeliest.intervals, self.motion
-        first = intervals.model.n_q + intervals.model.n_v
+        """Largest RMS acceleration that the model does not explain, over the spread of its motion.
+
+        That of states which nothing measures is the spread of the fit; their motion before it was that of a hypothesis.
+        """
+        intervals, motion, hidden = self.likeliest.intervals, self.motion, unmeasured_states(self.likeliest.intervals)
+        model, first = intervals.model, intervals.model.n_q + intervals.model.n_v
+        fitted = residuals_of_motion(intervals, self.likeliest.refinement.fit, self.result.parameters)[0][2]
+        measured = np.array([name not in hidden for name in model.velocities])
+        spread = np.where(
+            measured, motion.spread[first : first + model.n_v], fitted[intervals.counted].std(axis=0) + _TINY
+        )
         left = np.sqrt(np.square(self.result.unexplained[intervals.occupied]).mean(axis=0))
-        return float((left / motion.spread[first : first + intervals.model.n_v]).max())
+        return float((left / spread).max())
 
     @property
     def is_doubtful(self) -> bool:

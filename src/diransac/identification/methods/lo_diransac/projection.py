@@ -7,7 +7,9 @@ in the regressor's column space is attributed to the parameters.  Equations are 
 
 Inputs are no instruments: a controller answers disturbances, and its inputs are correlated with them (Forssell, Ljung
 1999).  Nor are any needed: the fitted accelerations are posterior means, whose errors are uncorrelated with themselves,
-so that they do not bias the slopes of a regression on them (Berkson 1950).
+so that they do not bias the slopes of a regression on them (Berkson 1950).  The motion of a state that nothing measures
+follows from the equations and from its unmodelled accelerations: a regression on it would attenuate its parameters, and
+these accelerations are not attributed to them.
 
 The covariance has four parts: that of the fit and of the errors of its sensors, propagated through the projection;
 that of the unmodelled forces outside the regressor's column space, as a sample of forces that differ from log to log;
@@ -41,6 +43,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import lineari
 from diransac.identification.methods.lo_diransac.recording_errors import effect_on
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.methods.lo_diransac.smoothing import split_signals
+from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.identification.uncertainty import combined, student_quantile
 from diransac.simulation.compiler import compile_map
 
@@ -206,6 +209,8 @@ class _Rows:
     M : (W, n_v, n_v) array
     latent : (W, n_v) array
         ``M d``.
+    attributed : (n_v,) bool array
+        Equations of which ``M d`` is attributed to the parameters: those of measured motion.
     inertial : (W, n_v) array
         Mean inertial force of each equation.
     """
@@ -215,6 +220,7 @@ class _Rows:
     means: FloatArray
     M: FloatArray
     latent: FloatArray
+    attributed: BoolArray
     inertial: FloatArray
 
     @classmethod
@@ -227,7 +233,9 @@ class _Rows:
         push = push - np.einsum("nij,nj->ni", M, np.repeat(fit.d, intervals.length, axis=0))
         M = means_of_intervals(intervals, M)
         inertial = np.einsum("wij,wj->wi", M, means_of_intervals(intervals, motion[2]))
-        return cls(W, push, means_of_intervals(intervals, W), M, np.einsum("wij,wj->wi", M, fit.d), inertial)
+        latent, hidden = np.einsum("wij,wj->wi", M, fit.d), unmeasured_states(intervals)
+        attributed = np.array([name not in hidden for name in intervals.model.velocities])
+        return cls(W, push, means_of_intervals(intervals, W), M, latent, attributed, inertial)
 
 
 def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -247,7 +255,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     level = np.hstack([np.ones((len(rows.push), 1)), intervals.inputs])
     of_s[:n_p] = np.eye(n_p)
     of_s[n_p:-1] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
-    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means, rows.M)
+    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means * rows.attributed, rows.M)
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(of_z, of_s)
     covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s + effect_on(intervals, fit, z, s)
@@ -275,7 +283,7 @@ def _bounded_projection(
     stuck, p = np.zeros(len(now), bool), now
     for _ in range(len(now) + 1):
         free = ~stuck
-        left = rows.latent + rows.means[:, :, stuck] @ (p - now)[stuck]
+        left = rows.latent * rows.attributed + rows.means[:, :, stuck] @ (p - now)[stuck]
         known = rows.means[:, :, free] @ now[free] - left - means_of_intervals(intervals, rows.push)
         gains = tuple(np.zeros((len(now), *x.shape[:2])) for x in (rows.W, rows.means))
         for gain, one in zip(gains, _gains(intervals, rows, free, known, windows, reweighted), strict=True):
@@ -380,7 +388,7 @@ def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> IntA
         if tried and len(windows) * rows.latent.shape[1] < _EQUATIONS * len(now):
             break
         p, (_, by_means), _ = _bounded_projection(intervals, now, rows, windows, 0)
-        left = rows.latent + means_of_intervals(intervals, rows.push) + rows.means @ (p - now)
+        left = rows.latent * rows.attributed + means_of_intervals(intervals, rows.push) + rows.means @ (p - now)
         power = np.square(means_of_windows(rows.means, windows) / _rms(rows.inertial)[:, None]).sum(axis=1).mean(axis=0)
         tried.append(_Averaged(windows, p, np.einsum("pwi,wi->wp", by_means, left), power))
         size *= 2
