@@ -207,12 +207,16 @@ def compared_parts(found: Explanation, result: ProjectedEstimate) -> Parts:
     intervals = found.intervals
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
     share = place / np.bincount(intervals.log_of)[intervals.log_of]
-    if found.exact:
-        return Parts(deviation=_deviation(intervals, found.refinement.fit, result.parameters, share))
+    compared = _deviating if found.exact else _changing
+    return compared(intervals, found.refinement.fit, result, share)
+
+
+def _changing(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
+    """Halves and held-out fifths of the logs, where the model is not exact."""
     first = share < 0.5
     if min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
         return Parts()
-    _, rows, regressors, _ = residuals_of_motion(intervals, found.refinement.fit, result.parameters)
+    _, rows, regressors, _ = residuals_of_motion(intervals, fit, result.parameters)
     W = means_of_intervals(intervals, regressors * intervals.counted[:, None, None])
     residuals = means_of_intervals(intervals, rows * intervals.counted[:, None])
     held_out = _held_out(W, residuals, (_HELD_OUT * share).astype(int))
@@ -239,18 +243,18 @@ def _held_out(W: FloatArray, residuals: FloatArray, part: IntArray) -> float:
     return float(np.square(left / scale).sum() / max(np.square(fitted / scale).sum(), _TINY))
 
 
-def _deviation(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray, share: FloatArray) -> Deviation | None:
-    """The part of the logs that deviates most from an exact model; None if all agree, or the effect is negligible.
+def _deviating(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
+    """Tenths of the logs, where the model is exact; no deviation if all agree, or if its effect is negligible.
 
     The measurements of part k change the parameters by ``u_k``, of variance ``V_k`` if the model is exact and the noise
     white.  ``sum u_k V_k^-1 u_k`` then has a chi-squared distribution.
     """
-    n, part = len(parameters), (_STRETCHES * share).astype(int)
+    n, part = len(result.parameters), (_STRETCHES * share).astype(int)
     effect = effect_of_intervals(intervals, fit)
     variances = variances_of_intervals(intervals, fit, weights_of(intervals, fit), effect.z, effect.s)
     unit = np.sqrt(np.diag(effect.covariance)) + _TINY
     if not (np.isfinite(variances).all() and np.isfinite(effect.steps).all()):  # LAPACK would raise
-        return None
+        return Parts()
     u = np.array([effect.steps[part == k].sum(axis=0) for k in range(_STRETCHES)]) / unit
     V = np.array([variances[part == k].sum(axis=0) for k in range(_STRETCHES)]) / np.outer(unit, unit)
     sizes, axes = np.linalg.eigh(V)
@@ -259,13 +263,14 @@ def _deviation(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray, s
     distances = np.divide(np.square(along), sizes, out=np.zeros_like(sizes), where=informed).sum(axis=1)
     freedom = int(informed.sum()) - n
     if freedom < 1 or not chdtrc(freedom, distances.sum()) < _BY_CHANCE:
-        return None
+        return Parts()
     k, scatter = int(np.argmax(distances)), float(np.sqrt(distances.sum() / freedom))
     R = effect.covariance / np.outer(unit, unit)
     without = R @ np.linalg.lstsq(R - V[k], -u[k], rcond=None)[0]
-    changes = np.abs(without) * unit / np.maximum(np.abs(parameters), _TINY)
+    changes = np.abs(without) * unit / np.maximum(np.abs(result.parameters), _TINY)
     worst, edges = int(np.argmax(changes)), (k / _STRETCHES, (k + 1) / _STRETCHES)
-    return Deviation(*edges, scatter, worst, float(changes[worst])) if changes[worst] > _NEGLIGIBLE else None
+    most = Deviation(*edges, scatter, worst, float(changes[worst]))
+    return Parts(deviation=most if most.change > _NEGLIGIBLE else None)
 
 
 def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
