@@ -55,9 +55,11 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler import Map
 
 __all__ = [
+    "EffectOfIntervals",
     "ProjectedEstimate",
     "batch_sums",
     "discrepancy_units",
+    "effect_of_intervals",
     "estimate_parameters",
     "fitted_parameters",
     "inertial_forces",
@@ -159,15 +161,52 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     -------
     ProjectedEstimate
     """
+    effect = effect_of_intervals(intervals, fit)
+    scatter = np.square(batch_sums(effect.steps)).sum(axis=0)
+    more = np.sqrt(np.maximum(1.0, scatter / (np.diag(effect.covariance) + _TINY)))
+    p = fit.shared[: intervals.n_p]
+    covariance = effect.covariance * np.outer(more, more) + effect_on(intervals, fit, effect.z, effect.s)
+    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p), np.arange(len(intervals)))
+
+
+@dataclass(frozen=True)
+class EffectOfIntervals:
+    """What each interval's measurements change of the parameters of a fit, to first order.
+
+    Parameters
+    ----------
+    steps : (W, n) array
+        Changes; zero in sum at the optimum, without priors.
+    covariance : (n, n) array
+        Of the parameters by white noise.
+    z, s : (W, k, n) and (n_s, n) array
+        Result of `Arrowhead.functional` for the parameters.
+    """
+
+    steps: FloatArray
+    covariance: FloatArray
+    z: FloatArray
+    s: FloatArray
+
+
+def effect_of_intervals(intervals: ShootingIntervals, fit: Fit) -> EffectOfIntervals:
+    """Effect of each interval's measurements on the parameters of a fit.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        At its optimum.
+
+    Returns
+    -------
+    EffectOfIntervals
+    """
     n_p, n_s, k = intervals.n_p, len(fit.shared), fit.x.shape[1] + fit.d.shape[1]
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(np.zeros((len(intervals), k, n_p)), np.eye(n_s, n_p))
-    scores = np.einsum("wkp,wk->wp", z, at.data_z) + at.data_s @ s
-    sums = batch_sums(scores)
-    more = np.sqrt(np.maximum(1.0, np.square(sums).sum(axis=0) / (np.diag(s[:n_p]) + _TINY)))
-    p = fit.shared[:n_p]
-    covariance = s[:n_p] * np.outer(more, more) + effect_on(intervals, fit, z, s)
-    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p), np.arange(len(intervals)))
+    steps = np.einsum("wkp,wk->wp", z, at.data_z) + at.data_s @ s
+    return EffectOfIntervals(steps, s[:n_p], z, s)
 
 
 def _with_wide_priors(intervals: ShootingIntervals, fit: Fit) -> Fit:
