@@ -238,7 +238,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
     parts, lacks = compared_parts(likeliest, result), None
     if settings.suggestions and not likeliest.exact:
-        lacks = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
+        lacks = missing_terms(intervals, refined.fit, result, settings.candidate_terms)
     ambiguity = _ambiguity(len(result.parameters), parts.changes, lacks)
     checks = (
         *_checks(settings, intervals, motion, refined),

@@ -143,7 +143,7 @@ def projected_parameters(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
         Within the inclusive bounds.
     """
     now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit)
-    return _bounded_projection(intervals, now, rows, _windows(intervals, now, rows), _REWEIGHTED)[0]
+    return _bounded_projection(intervals, now, rows, _windows(intervals, now, rows)[-1], _REWEIGHTED)[0]
 
 
 def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -286,9 +286,11 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     """
     n_p, n_s, n_x = intervals.n_p, len(fit.shared), fit.x.shape[1]
     now, rows = fit.shared[:n_p], _Rows.of(intervals, fit)
-    windows = _windows(intervals, now, rows)
+    *shorter, windows = _windows(intervals, now, rows)
     p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
-    plain = _bounded_projection(intervals, now, rows, windows, 0)[0]
+    others = [_bounded_projection(intervals, now, rows, windows, 0)[0]]
+    # What windows of half the length change is an upper limit of the attenuation that is left.
+    others += [_bounded_projection(intervals, now, rows, x, _REWEIGHTED)[0] for x in shorter[-1:]]
     by_rows, by_means = gains
     of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + fit.d.shape[1], n_p))
     level = np.hstack([np.ones((len(rows.push), 1)), intervals.inputs])
@@ -302,7 +304,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     unpushed = rows.push - rows.W @ np.einsum("pni,ni->p", by_rows, rows.push)
     of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)
     sums = batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
-    covariance = covariance + sums.T @ sums + np.outer(plain - p, plain - p)
+    covariance = covariance + sums.T @ sums + sum(np.outer(x - p, x - p) for x in others)
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
     left = _over_windows(unexplained(intervals, fit, p), windows)
@@ -412,8 +414,10 @@ class _Averaged:
         return bool(((change <= _CLEAR * error) | (change <= _NEGLIGIBLE * np.abs(longer.parameters))).all())
 
 
-def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> IntArray:
+def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> list[IntArray]:
     """First intervals of the windows over which the equations are averaged: each interval, where that does no harm.
+
+    The last ones are to be taken; before them are windows of half the length, of a quarter, ....
 
     Unmodelled accelerations that vary fast follow the sensors' noise where it is not white.  Fitted accelerations are
     then noise, and least squares attenuates what they multiply.  Means over longer windows have less of it and less
@@ -434,8 +438,8 @@ def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> IntA
     for k, (short, double) in enumerate(pairwise(tried)):
         is_noisy = (double.power < _KEPT * short.power).any()
         if not is_noisy or all(short.agrees_with(longer) for longer in tried[k + 1 :]):
-            return short.windows
-    return tried[-1].windows
+            return [x.windows for x in tried[: k + 1]]
+    return [x.windows for x in tried]
 
 
 def _robust_weights(rows: WeakForm, occupied: BoolArray, scale: FloatArray, steps: int) -> FloatArray:
