@@ -289,6 +289,16 @@ def test_default_weight_of_an_attitude_is_that_of_an_angle():
     assert found[[1, 4]] == pytest.approx([2.0 * one[0], one[1]], rel=1e-6)
 
 
+@pytest.mark.parametrize("sensor", [False, True])
+def test_rates_alone_are_enough_where_no_force_depends_on_the_attitude(sensor):
+    _, w, torques = tumble(0, 0.0)
+    sensors = dr.sensors.gyroscope(RATES, bias=False) if sensor else None
+    columns = dict(zip([*sensors] if sensor else RATES, w.T, strict=True)) | dict(zip(TORQUES, torques.T, strict=True))
+    result = dr.identify(tumbling(sensors=sensors), dr.Log.from_arrays(T, columns), differentiate=True)
+    assert dict(result.parameters) == pytest.approx(INERTIA, rel=0.01)
+    assert result.verdict == "usable"
+
+
 # ---------------------------------------------------------------------- interpolation
 
 
