@@ -288,7 +288,7 @@ def _shared_blocks(
     return wide, whole, total
 
 
-def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
+def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray, jumps: FloatArray | None = None) -> float:
     """Twice the cost of a fit with fixed weights.
 
     Parameters
@@ -297,16 +297,19 @@ def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
     fit : Fit
     weights : (N, n_signals) array
         Weights of the measurements, one over each signal's unit squared.
+    jumps : (W - 1, n_x) array, optional
+        Those of `NormalEquations` at the fit; None: simulated.
 
     Returns
     -------
     float
         Infinite where a rollout diverges.
     """
-    ends = intervals.ends(fit.shared, fit.x, fit.d)
+    if jumps is None:
+        jumps = fit.x[1:] - intervals.ends(fit.shared, fit.x, fit.d)
     terms = (
         (weights * np.square(fit.residuals)).sum(),
-        np.square((fit.x[1:] - ends) / fit.continuity_std).sum(),
+        np.square(jumps / fit.continuity_std).sum(),
         np.square(innovations(intervals, fit)).sum(),
         np.square((fit.shared - fit.prior_mean) / fit.prior).sum(),
     )
