@@ -34,6 +34,7 @@ __all__ = [
     "Fit",
     "NormalEquations",
     "cost",
+    "data_gradient",
     "following",
     "innovation_std",
     "innovations",
@@ -209,6 +210,25 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     system = Arrowhead(*blocks, _FINE_RIDGE) if len(intervals.layout.with_prior) else Arrowhead(*blocks)
     right = right - beforehand * (fit.shared - fit.prior_mean)
     return NormalEquations(system, g[:, :k], right, data_z, data_s, jumps, F, precision)
+
+
+def data_gradient(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Right-hand sides of the measurements alone, `data_z` and `data_s` of `NormalEquations`.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    weights : (N, n_signals) array
+        Weights of the measurements, one over each signal's unit squared.
+
+    Returns
+    -------
+    (W, n_x + n_v) array, (W, n_s) array
+    """
+    gradient = -intervals.gauss_newton(fit.shared, fit.x, fit.d, weights).gradient
+    k = fit.x.shape[1] + fit.d.shape[1]
+    return gradient[:, :k], _in_places(intervals, gradient[:, k:])
 
 
 def _places(intervals: ShootingIntervals) -> IntArray:

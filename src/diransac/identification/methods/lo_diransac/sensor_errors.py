@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.identification.methods.lo_diransac.normal_equations import linearize
+from diransac.identification.methods.lo_diransac.normal_equations import data_gradient, linearize
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 
@@ -189,9 +189,9 @@ class _Scores:
         # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
         measured = self.intervals.measured.copy()
         measured[:, columns] -= own
-        moved = linearize(replace(self.intervals, measured=measured), self.fit, self.weights)
+        z, s = data_gradient(replace(self.intervals, measured=measured), self.fit, self.weights)
         score = float((self.weights[:, columns] * own * self.fit.residuals[:, columns]).sum())
-        return _Slope(kind, own, self.at.data_z - moved.data_z, (self.at.data_s - moved.data_s).sum(axis=0), score)
+        return _Slope(kind, own, self.at.data_z - z, (self.at.data_s - s).sum(axis=0), score)
 
     def tested(self, kind: ErrorKind) -> SensorError | None:
         """Estimate of an error, given all else that is estimated, or None if the log does not determine it."""
