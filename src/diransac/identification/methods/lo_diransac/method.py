@@ -319,7 +319,7 @@ def _searched(
 
 
 def _parameters(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[ProjectedEstimate, tuple[str, ...]]:
-    """Parameters of an explanation; names of those for which they are the fit's, as others would violate strict bounds."""
+    """Parameters of an explanation: the fit's where others would violate strict bounds, with the names of these."""
     intervals, fit = likeliest.intervals, likeliest.refinement.fit
     if likeliest.exact or not settings.projection:
         return fitted_parameters(intervals, fit), ()
