@@ -1,0 +1,446 @@
+"""`robot`: a model of a robot from its description file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from diransac.errors import ModelError
+from diransac.model.derivation import Symbols
+from diransac.model.model import Model
+from diransac.model.parameter import Parameter
+from diransac.model.robots.actuation import Actuation, JointTorques
+from diransac.model.robots.base_parameters import base_parameters
+from diransac.model.robots.description import Coupling, Description, Joint, read_description
+from diransac.model.robots.rigid_body import INERTIAL_NAMES, inverse_dynamics, pseudo_inertia
+
+__all__ = ["UNKNOWN", "robot"]
+
+
+class _Motion(NamedTuple):
+    """Position, velocity and acceleration of a joint, and its velocity per velocity of its coordinate."""
+
+    q: Any
+    v: Any
+    a: Any
+    slope: Any
+    coordinate: str | None
+
+
+_FORCE = ("N m", "N")
+_UNITS = {
+    "armature": ("kg m^2", "kg"),
+    "damping": ("N m s/rad", "N s/m"),
+    "friction": _FORCE,
+    "stribeck": _FORCE,
+    "spring": ("N m/rad", "N/m"),
+    "offset": _FORCE,
+}
+"""Units of the parameters to which forces of a joint are proportional, of hinges and of slides."""
+
+_GAIN, _BIAS = "torque_gain", "encoder_bias"
+UNKNOWN = (*_UNITS, _GAIN, _BIAS)
+"""Parameters of joints that can be unknown."""
+
+_INERTIAL_UNITS = dict(zip(INERTIAL_NAMES, ("kg", *("kg m",) * 3, *("kg m^2",) * 6), strict=True))
+_IN_ORDER = (*INERTIAL_NAMES[1:], INERTIAL_NAMES[0])
+"""Order in which inertial parameters of a body are kept as base parameters: the mass goes first."""
+
+
+def robot(
+    path: str | Path,
+    *,
+    unknown: Collection[str] = ("armature", "damping", "friction"),
+    actuation: Actuation | None = None,
+    bodies: Collection[str] | str = (),
+    joints: Collection[str] | Mapping[str, str] | None = None,
+    passive: Collection[str] = (),
+    friction_speed: float = 0.05,
+    stribeck_speed: float = 0.2,
+    gravity: Sequence[float] | None = None,
+    fix_base: bool = False,
+) -> Model:
+    """Model of a robot with a fixed base from its description: chains and trees of hinges and slides.
+
+    ``tau_i(q, q', q'') + armature q'' + damping q' + friction tanh(q' / s) + spring (q - q_0) = drive``
+
+    with the inverse dynamics tau of the rigid bodies, gravity included. Everything that is not unknown has its value in
+    the file. Contacts, limits of joints, and the file's actuators are no part of the model.
+
+    Parameters
+    ----------
+    path : str or Path
+        MJCF or URDF; read by MuJoCo (``pip install 'diransac[robots]'``).
+    unknown : collection of str, optional
+        Unknown parameters of every joint: "armature", "damping", "friction" (Coulomb), "stribeck" (what friction at
+        rest is more, ``stribeck tanh(q' / s) exp(-(q' / stribeck_speed)^2)``), "spring" (its stiffness), "offset" (a
+        constant force), "torque_gain" (a factor of the drive's force), "encoder_bias" (reading less position).
+        Parameters are named after both: ``armature_elbow``.
+    actuation : Actuation, optional
+        Forces of the drives: `JointTorques` (default: columns ``elbow_torque``), `PositionControl`, `MotorCurrents`.
+    bodies : collection of str or "all", optional
+        Bodies whose ten inertial parameters are unknown, about the origin of the body's frame: ``mass_hand``,
+        ``hx_hand``, ... (first moments), ``Ixx_hand``, ... The model has their base parameters: those that
+        no motion shows are left out, and those that only a combination of is shown are grouped into one,
+        ``Izz_hand_grouped``, whose ``combination`` names them.
+    joints : collection of str, or mapping of str to str, optional
+        Joints to be modelled, by name; or by coordinate, the name that log columns have: ``{"elbow": "joint_4"}``.
+        By default all, and each coordinate has the joint's name. Other joints are locked in the pose of the file;
+        those that an equality constraint couples to a joint move with it.
+    passive : collection of str, optional
+        Coordinates without a drive.
+    friction_speed : float, optional
+        Speed s over which friction changes its sign, rad/s or m/s.
+    stribeck_speed : float, optional
+        Speed at which the Stribeck effect has fallen to 1/e, rad/s or m/s.
+    gravity : sequence of float, optional
+        In the frame of the world, m/s^2; by default the file's.
+    fix_base : bool, optional
+        Whether a body with a free joint is held in the pose of the file: a robot that hangs, or is clamped.
+
+    Returns
+    -------
+    Model
+        One coordinate per joint, the reading of its encoder. Nominal values of its parameters are the file's.
+        `independent_parts` splits it into its limbs.
+
+    Raises
+    ------
+    ModelError
+        MuJoCo is not installed; the file cannot be read, or describes a floating base, a closed loop or a ball joint; a
+        name is unknown; nothing is unknown, or a body with unknown parameters does not move.
+
+    References
+    ----------
+    Luh, Walker, Paul 1980 (recursive Newton-Euler algorithm); Gautier 1991 (base parameters).
+    """
+    description = read_description(path, fix_base=fix_base)
+    if gravity is not None:
+        description = replace(description, gravity=_vector(gravity))
+    label = f'robot "{path}"'
+    coordinates = _coordinates(label, description, joints)
+    moved = set(coordinates.values())
+    for coupling in _in_order(label, description):
+        moved |= {coupling.follower} if coupling.leader in moved else set()
+    mechanism = _Mechanism(
+        label=label,
+        description=description,
+        coordinates=coordinates,
+        unknown=_known_names("unknown", unknown, UNKNOWN),
+        bodies=_bodies(description, bodies, moved),
+        speeds=(_positive("friction_speed", friction_speed), _positive("stribeck_speed", stribeck_speed)),
+    )
+    return mechanism.model(actuation or JointTorques(), _known_names("passive", passive, mechanism.coordinates))
+
+
+@dataclass(frozen=True)
+class _Mechanism:
+    """Joints and bodies of a description with what is unknown of them.
+
+    Parameters
+    ----------
+    label : str
+        Subject of messages.
+    description : Description
+    coordinates : mapping of str to int
+        Index of the joint of each coordinate.
+    unknown, bodies : tuple of str, tuple of int
+        Unknown parameters of joints; indices of the bodies of which inertial parameters are unknown.
+    speeds : (float, float)
+        Of smoothed friction, and of the Stribeck effect.
+    """
+
+    label: str
+    description: Description
+    coordinates: Mapping[str, int]
+    unknown: tuple[str, ...]
+    bodies: tuple[int, ...]
+    speeds: tuple[float, float]
+
+    def model(self, actuation: Actuation, passive: Collection[str]) -> Model:
+        """The model with these drives."""
+        driven = [name for name in self.coordinates if name not in passive]
+
+        def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[Any]:
+            position = {n: q[n] - p[f"{_BIAS}_{n}"] if _BIAS in self.unknown else q[n] for n in self.coordinates}
+            forces = self.forces(position, v, a, self._values(p))
+            for n in driven:
+                drive = actuation.force(n, q[n], v[n], u)
+                forces[n] -= p[f"{_GAIN}_{n}"] * drive if _GAIN in self.unknown else drive
+            return [ca.cse(ca.vertcat(*forces.values()))]
+
+        units = {n: ("rad", "N m") if self._joint(n).turns else ("m", "N") for n in self.coordinates}
+        return Model(
+            name=self.description.name,
+            description=f"robot with {len(units)} joints, from its description",
+            coordinates={n: position for n, (position, _) in units.items()},
+            inputs={key: unit for n in driven for key, unit in actuation.inputs(n, units[n]).items()},
+            parameters=self.parameters(driven),
+            equations=equations,
+        )
+
+    def _joint(self, coordinate: str) -> Joint:
+        return self.description.joints[self.coordinates[coordinate]]
+
+    # ------------------------------------------------------------------ parameters
+
+    @cached_property
+    def nominal(self) -> dict[str, Parameter]:
+        """Parameters to which forces are proportional, before they are grouped, with their values in the file."""
+        found = {}
+        for n in self.coordinates:
+            joint = self._joint(n)
+            for kind in (x for x in self.unknown if x in _UNITS):
+                unit, lower = _UNITS[kind][0 if joint.turns else 1], -np.inf if kind == "offset" else 0.0
+                found[f"{kind}_{n}"] = Parameter(unit, lower=lower, value=_nominal(joint)[kind])
+        for i in self.bodies:
+            body = self.description.bodies[i]
+            values = dict(zip(INERTIAL_NAMES, _inertial_parameters(body.inertial), strict=True))
+            for kind in _IN_ORDER:
+                positive = kind in ("mass", "Ixx", "Iyy", "Izz") and values[kind] > 0.0
+                found[f"{kind}_{_identifier(body.name)}"] = Parameter(
+                    _INERTIAL_UNITS[kind], positive=positive, value=values[kind]
+                )
+        return found
+
+    @cached_property
+    def groups(self) -> dict[str, dict[str, float]]:
+        """Weights of the parameters that each base parameter combines, by the name of the one that stands for it."""
+        names = list(self.nominal)
+        if not self.bodies:
+            return {n: {n: 1.0} for n in names}
+        q, v, a, x = (
+            ca.SX.sym(n, size) for n, size in (*((n, len(self.coordinates)) for n in "qva"), ("x", len(names)))
+        )
+        at = [dict(zip(self.coordinates, ca.vertsplit(y), strict=True)) for y in (q, v, a)]
+        values = dict(zip(names, ca.vertsplit(x), strict=True))
+        forces = ca.vertcat(*self.forces(at[0], at[1], at[2], values).values())
+        found = base_parameters(ca.Function("regressor", [q, v, a], [ca.densify(ca.jacobian(forces, x))]))
+        unseen = {names[k] for k in found.vanishing}
+        for i in self.bodies:
+            body = self.description.bodies[i].name
+            if all(f"{kind}_{_identifier(body)}" in unseen for kind in INERTIAL_NAMES):
+                raise ModelError(f'{self.label}: body "{body}" does not move with the joints; leave it out of bodies')
+        combinations = [found.combination(i) for i in range(len(found.kept))]
+        return {names[k]: {names[l]: w for l, w in x.items()} for k, x in zip(found.kept, combinations, strict=True)}
+
+    def parameters(self, driven: Collection[str]) -> dict[str, Parameter]:
+        """Base parameters, and those of drives and encoders."""
+        found = {}
+        for name, weights in self.groups.items():
+            parameter = self.nominal[name]
+            if len(weights) > 1:
+                value = sum(weight * float(self.nominal[n].value or 0.0) for n, weight in weights.items())
+                parameter = Parameter(parameter.unit, value=value, combination=tuple(weights.items()))
+            found[_base_name(name, weights)] = parameter
+        if _GAIN in self.unknown:
+            found |= {f"{_GAIN}_{n}": Parameter("1", positive=True, value=1.0) for n in driven}
+        if _BIAS in self.unknown:
+            found |= {
+                f"{_BIAS}_{n}": Parameter("rad" if self._joint(n).turns else "m", value=0.0) for n in self.coordinates
+            }
+        if not found:
+            raise ModelError(f"{self.label}: nothing is unknown; name unknown parameters of joints, or bodies")
+        return found
+
+    def _values(self, p: Symbols) -> dict[str, Any]:
+        """Values of all `nominal` parameters by the base parameters: those that these replace have the file's."""
+        values: dict[str, Any] = {n: x.value for n, x in self.nominal.items()}
+        for name, weights in self.groups.items():
+            others = sum(weight * values[n] for n, weight in weights.items() if n != name)
+            values[name] = p[_base_name(name, weights)] - others
+        return values
+
+    # ------------------------------------------------------------------ forces
+
+    def forces(self, q: Any, v: Any, a: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Force that a motion takes, by coordinate, with values of the `nominal` parameters."""
+        motions = self._motions(q, v, a)
+        inertials = [self._inertial(i, values) for i in range(len(self.description.bodies))]
+        of_joints = inverse_dynamics(
+            self.description, [x.q for x in motions], [x.v for x in motions], [x.a for x in motions], inertials
+        )
+        forces: dict[str, Any] = dict.fromkeys(self.coordinates, ca.SX(0))
+        for joint, x, force in zip(self.description.joints, motions, of_joints, strict=True):
+            if x.coordinate is not None:
+                forces[x.coordinate] += x.slope * (force + self._own_force(joint, x, values))
+        return forces
+
+    def _own_force(self, joint: Joint, x: _Motion, values: Mapping[str, Any]) -> Any:
+        """Force of armature, spring, damping and friction of a joint."""
+        unknown: Mapping[str, Any] = values if joint is self._joint(str(x.coordinate)) else {}
+        nominal, force = _nominal(joint), 0.0
+        for kind, signal in _signals(joint, x, self.speeds).items():
+            force += unknown.get(f"{kind}_{x.coordinate}", nominal[kind]) * signal
+        stretch = x.q - joint.spring_reference
+        force += sum(c * ca.fabs(x.v) ** k * x.v for k, c in enumerate(joint.damping[1:], 1))
+        return force + sum(c * ca.fabs(stretch) ** k * stretch for k, c in enumerate(joint.stiffness[1:], 1))
+
+    def _inertial(self, i: int, values: Mapping[str, Any]) -> Any:
+        """Pseudo-inertia of a body."""
+        body = self.description.bodies[i]
+        if i not in self.bodies:
+            return body.inertial
+        return pseudo_inertia([values[f"{kind}_{_identifier(body.name)}"] for kind in INERTIAL_NAMES])
+
+    def _motions(self, q: Any, v: Any, a: Any) -> list[_Motion]:
+        """Motion of every joint of the description: of a coordinate, coupled to one, or none."""
+        found = [_Motion(joint.reference, 0.0, 0.0, 0.0, None) for joint in self.description.joints]
+        for n, k in self.coordinates.items():
+            found[k] = _Motion(q[n], v[n], a[n], 1.0, n)
+        for coupling in _in_order(self.label, self.description):
+            joint = self.description.joints[coupling.follower]
+            found[coupling.follower] = self._followed(coupling, joint, found)
+        return found
+
+    def _followed(self, coupling: Coupling, joint: Joint, found: Sequence[_Motion]) -> _Motion:
+        """Motion of a joint that another determines."""
+        c = coupling.coefficients
+        if coupling.leader is None:
+            return _Motion(joint.reference + c[0], 0.0, 0.0, 0.0, None)
+        leader = found[coupling.leader]
+        x = leader.q - self.description.joints[coupling.leader].reference
+        y = joint.reference + sum(b * x**k for k, b in enumerate(c))
+        slope = sum(k * b * x ** (k - 1) for k, b in enumerate(c) if k > 0)
+        curvature = sum(k * (k - 1) * b * x ** (k - 2) for k, b in enumerate(c) if k > 1)
+        a = slope * leader.a + curvature * leader.v**2
+        return _Motion(y, slope * leader.v, a, slope * leader.slope, leader.coordinate)
+
+
+# ---------------------------------------------------------------------- names
+
+
+def _identifier(name: str) -> str:
+    """A name with letters, digits and underscores alone."""
+    found = re.sub(r"\W", "_", name)
+    return f"_{found}" if found[:1].isdigit() else found
+
+
+def _base_name(name: str, weights: Mapping[str, float]) -> str:
+    return f"{name}_grouped" if len(weights) > 1 else name
+
+
+def _known_names(what: str, given: Collection[str], known: Collection[str]) -> tuple[str, ...]:
+    """The names themselves, each once.  Raises ModelError: one is unknown."""
+    names = (given,) if isinstance(given, str) else tuple(dict.fromkeys(given))
+    for name in names:
+        if name not in known:
+            raise ModelError(f"{what}: there is no {name!r}; choose from {', '.join(known)}")
+    return names
+
+
+def _coordinates(
+    label: str, description: Description, joints: Collection[str] | Mapping[str, str] | None
+) -> dict[str, int]:
+    """Index of the joint of each coordinate.
+
+    Raises ModelError: a name is unknown, a joint is named twice or follows another, or there is none.
+    """
+    names = [joint.name for joint in description.joints]
+    followers = {names[x.follower] for x in description.couplings}
+    if joints is None:
+        joints = [name for name in names if name not in followers]
+    chosen = (
+        joints if isinstance(joints, Mapping) else {_identifier(n): n for n in _known_names("joints", joints, names)}
+    )
+    for name in _known_names("joints", tuple(chosen.values()), names):
+        if name in followers:
+            raise ModelError(
+                f'{label}: joint "{name}" follows another by an equality constraint; leave it out of joints'
+            )
+        if list(chosen.values()).count(name) > 1:
+            raise ModelError(f'{label}: joint "{name}" has several coordinates; give it one')
+    if len(chosen) < len(joints):
+        raise ModelError(f"{label}: names of joints differ only in special characters; give joints as a mapping")
+    if not chosen:
+        raise ModelError(f"{label}: no joint is modelled; there are {', '.join(names)}")
+    return {coordinate: names.index(name) for coordinate, name in chosen.items()}
+
+
+def _bodies(description: Description, bodies: Collection[str] | str, moved: Collection[int]) -> tuple[int, ...]:
+    """Indices of bodies by name; of "all", those with one of the moved joints between them and the world."""
+    if bodies == "all":
+        moving = set[int]()
+        for i, body in enumerate(description.bodies):
+            if body.parent in moving or set(body.joints) & set(moved):
+                moving.add(i)
+        return tuple(sorted(moving))
+    names = [body.name for body in description.bodies]
+    return tuple(names.index(name) for name in _known_names("bodies", bodies, names))
+
+
+def _in_order(label: str, description: Description) -> list[Coupling]:
+    """Couplings, each after that of its leader.  Raises ModelError: they are circular, or contradict each other."""
+    left = {x.follower: x for x in description.couplings}
+    if len(left) < len(description.couplings):
+        raise ModelError(f"{label}: a joint follows two others by equality constraints; remove one of them")
+    ordered = list[Coupling]()
+    while left:
+        ready = [x for x in left.values() if x.leader not in left]
+        if not ready:
+            raise ModelError(f"{label}: equality constraints couple joints in a circle; remove one of them")
+        ordered += ready
+        left = {k: x for k, x in left.items() if x not in ready}
+    return ordered
+
+
+# ---------------------------------------------------------------------- forces of a joint
+
+
+def _nominal(joint: Joint) -> dict[str, float]:
+    """Values of a joint's parameters in the description."""
+    return {
+        "armature": joint.armature,
+        "damping": joint.damping[0],
+        "friction": joint.friction,
+        "stribeck": 0.0,
+        "spring": joint.stiffness[0],
+        "offset": 0.0,
+    }
+
+
+def _signals(joint: Joint, x: _Motion, speeds: tuple[float, float]) -> dict[str, Any]:
+    """Force of a joint per unit of each of its parameters; speeds are those of smoothing and of the Stribeck effect."""
+    friction = ca.tanh(x.v / speeds[0])
+    return {
+        "armature": x.a,
+        "damping": x.v,
+        "friction": friction,
+        "stribeck": friction * ca.exp(-((x.v / speeds[1]) ** 2)),
+        "spring": x.q - joint.spring_reference,
+        "offset": 1.0,
+    }
+
+
+# ---------------------------------------------------------------------- numbers
+
+
+def _inertial_parameters(J: Any) -> tuple[float, ...]:
+    """The ten `INERTIAL_NAMES` of a pseudo-inertia."""
+    S = J[:3, :3]
+    inertia = np.trace(S) * np.eye(3) - S
+    products = inertia[0, 1], inertia[0, 2], inertia[1, 2]
+    return tuple(float(x) for x in (J[3, 3], *J[:3, 3], *np.diag(inertia), *products))
+
+
+def _positive(what: str, value: float) -> float:
+    if not (np.isfinite(value) and value > 0.0):
+        raise ModelError(f"{what} is {value!r}; give a positive number")
+    return float(value)
+
+
+def _vector(gravity: Sequence[float]) -> Any:
+    try:
+        found = np.array(gravity, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"gravity is {gravity!r:.60}; give three numbers") from error
+    if found.shape != (3,) or not np.isfinite(found).all():
+        raise ModelError(f"gravity is {gravity!r:.60}; give three finite numbers")
+    return found
