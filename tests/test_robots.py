@@ -330,7 +330,7 @@ def test_an_encoder_bias_moves_the_mechanism_but_not_the_control(described):
     exact = one_joint(described, actuation=control, unknown=("armature",))
     shifted = required(biased, 0.35, 0.1, 0.2, [0.5, 0.05])
     assert shifted - required(exact, 0.3, 0.1, 0.2, 0.5) == pytest.approx([20.0 * 0.05])
-    assert biased.parameters["encoder_bias_j"] == dr.Parameter("rad", value=0.0)
+    assert (biased.parameters["encoder_bias_j"].unit, biased.parameters["encoder_bias_j"].value) == ("rad", 0.0)
 
 
 @pytest.mark.parametrize(
@@ -372,18 +372,16 @@ def test_limbs_are_independent_parts(described):
 def values_of(model, truth):
     """Base parameters of a model from values of all parameters."""
     return model.parameter_vector(
-        {
-            n: sum(weight * truth[one] for one, weight in x.combination) if x.combination else truth[n]
-            for n, x in model.parameters.items()
-        }
+        {n: sum(weight * truth[place] for place, weight in x.combination) for n, x in model.parameters.items()}
     )
 
 
-def described_values(path, reference, coordinates):
-    """All parameters: inertials of a file's links about the origins of their frames, and MuJoCo's of the joints."""
+def described_values(path, reference):
+    """All values by their places: inertials of a file's links about the origins of their frames, MuJoCo's of joints."""
     found = {}
-    for k, name in enumerate(coordinates):
-        found |= {f"armature_{name}": reference.dof_armature[k], f"damping_{name}": reference.dof_damping[k]}
+    for k in range(reference.njnt):
+        name = reference.joint(k).name
+        found |= {f"armature {name}": reference.dof_armature[k], f"damping {name}": reference.dof_damping[k]}
     for link in ElementTree.parse(path).iter("link"):
         if link.find("inertial") is not None:
             m = float(link.find("inertial/mass").get("value"))
@@ -393,8 +391,8 @@ def described_values(path, reference, coordinates):
             shift = m * (c @ c * np.eye(3) - np.outer(c, c))
             moved = dict(zip(order, (*np.diag(shift), shift[0, 1], shift[0, 2], shift[1, 2]), strict=True))
             name = link.get("name")
-            found |= {f"I{key[1:]}_{name}": entry[key] + moved[key] for key in order}
-            found |= {f"mass_{name}": m, **{f"h{axis}_{name}": m * x for axis, x in zip("xyz", c, strict=True)}}
+            found |= {f"I{key[1:]} {name}": entry[key] + moved[key] for key in order}
+            found |= {f"mass {name}": m, **{f"h{axis} {name}": m * x for axis, x in zip("xyz", c, strict=True)}}
     return found
 
 
@@ -406,7 +404,7 @@ def test_base_parameters_give_the_forces_of_any_inertials(described, parents):
     reference, data = compiled(path)
     reference.dof_armature[:] = np.arange(1, 7)
     reference.dof_damping[:] = np.arange(7, 13)
-    p = values_of(model, described_values(path, reference, model.coordinates))
+    p = values_of(model, described_values(path, reference))
     for q, v, a in motions(6):
         expected = inverse(reference, data, q, v, a) + 0.2 * np.tanh(v / 0.05)
         assert required(model, q, v, a, p) == pytest.approx(expected, abs=EXACT * (1 + np.abs(expected).max()))
@@ -435,12 +433,12 @@ def test_parameters_that_only_a_sum_shows_are_grouped_by_name(described):
     model = dr.models.robot(described(text), unknown=(), bodies=("upper", "lower"))
     combinations = {n: dict(x.combination) for n, x in model.parameters.items()}
     assert combinations == {
-        "hx_upper": {},
-        "hz_upper_grouped": {"hz_upper": 1.0, "mass_lower": -0.3},
-        "Iyy_upper_grouped": {"Iyy_upper": 1.0, "mass_lower": 0.09},
-        "hx_lower": {},
-        "hz_lower": {},
-        "Iyy_lower": {},
+        "hx_upper": {"hx upper": 1.0},
+        "hz_upper_grouped": {"hz upper": 1.0, "mass lower": -0.3},
+        "Iyy_upper_grouped": {"Iyy upper": 1.0, "mass lower": 0.09},
+        "hx_lower": {"hx lower": 1.0},
+        "hz_lower": {"hz lower": 1.0},
+        "Iyy_lower": {"Iyy lower": 1.0},
     }
     assert model.parameters["Iyy_upper_grouped"].value == pytest.approx(0.03 + 0.5 * 0.09)
     assert dr.Model.from_dict(model.to_dict()) == model

@@ -29,8 +29,8 @@ class Parameter:
     value : float, optional
         Nominal value in that unit, at which ``identify(..., fixed=["mass"])`` fixes the parameter.
     combination : tuple of (str, float), optional
-        Constants, with their weights, of whose sum the parameter is the value: those of a robot's bodies, of which its
-        motion shows the sum alone.
+        Quantities of a robot's description, with weights, of whose sum the parameter is the value: one, such as
+        ``"armature elbow"``, or those of which motions show the sum alone.
 
     Raises
     ------

@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from diransac.arrays import FloatArray
 from diransac.model.robots.description import Body, Description, Joint
 
-__all__ = ["INERTIAL_NAMES", "inverse_dynamics", "pseudo_inertia"]
+__all__ = ["INERTIAL_NAMES", "inertial_parameters", "inverse_dynamics", "pseudo_inertia"]
 
 INERTIAL_NAMES = ("mass", "hx", "hy", "hz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 """Inertial parameters of a body about the origin of its frame: mass, kg, first moments, kg m, inertia, kg m^2."""
@@ -67,6 +68,13 @@ def pseudo_inertia(inertial: Sequence[Any]) -> Any:
     return ca.vertcat(*(ca.horzcat(*row) for row in rows))
 
 
+def inertial_parameters(J: FloatArray) -> FloatArray:
+    """The ten `INERTIAL_NAMES` of a pseudo-inertia ``(4, 4)``."""
+    S = J[:3, :3]
+    inertia = np.trace(S) * np.eye(3) - S
+    return np.array([J[3, 3], *J[:3, 3], *np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]])
+
+
 def inverse_dynamics(
     description: Description, q: Sequence[Any], v: Sequence[Any], a: Sequence[Any], inertials: Sequence[Any]
 ) -> list[ca.SX]:
@@ -86,7 +94,7 @@ def inverse_dynamics(
     list of SX, one per joint
         N m of hinges, N of slides.
     """
-    still, gravity = ca.SX.zeros(3), ca.SX(ca.DM(description.gravity))
+    still, gravity = ca.SX.zeros(3), ca.SX(description.gravity)
     world = _Motion(still, still, -gravity, gravity)
     motions = list[_Motion]()
     for body in description.bodies:

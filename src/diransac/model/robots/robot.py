@@ -19,7 +19,7 @@ from diransac.model.parameter import Parameter
 from diransac.model.robots.actuation import Actuation, JointTorques
 from diransac.model.robots.base_parameters import base_parameters
 from diransac.model.robots.description import Coupling, Description, Joint, read_description
-from diransac.model.robots.rigid_body import INERTIAL_NAMES, inverse_dynamics, pseudo_inertia
+from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters, inverse_dynamics, pseudo_inertia
 
 __all__ = ["UNKNOWN", "robot"]
 
@@ -88,8 +88,8 @@ def robot(
     bodies : collection of str or "all", optional
         Bodies whose ten inertial parameters are unknown, about the origin of the body's frame: ``mass_hand``,
         ``hx_hand``, ... (first moments), ``Ixx_hand``, ... The model has their base parameters: those that
-        no motion shows are left out, and those that only a combination of is shown are grouped into one,
-        ``Izz_hand_grouped``, whose ``combination`` names them.
+        no motion shows are left out, and those of which motions show a combination alone are grouped into one,
+        ``Izz_hand_grouped``. ``Parameter.combination`` names its parts, as ``"Izz hand"``, with their weights.
     joints : collection of str, or mapping of str to str, optional
         Joints to be modelled, by name; or by coordinate, the name that log columns have: ``{"elbow": "joint_4"}``.
         By default all, and each coordinate has the joint's name. Other joints are locked in the pose of the file;
@@ -199,14 +199,18 @@ class _Mechanism:
             joint = self._joint(n)
             for kind in (x for x in self.unknown if x in _UNITS):
                 unit, lower = _UNITS[kind][0 if joint.turns else 1], -np.inf if kind == "offset" else 0.0
-                found[f"{kind}_{n}"] = Parameter(unit, lower=lower, value=_nominal(joint)[kind])
-        for i in self.bodies:
-            body = self.description.bodies[i]
-            values = dict(zip(INERTIAL_NAMES, _inertial_parameters(body.inertial), strict=True))
+                place = ((f"{kind} {joint.name}", 1.0),)
+                value = _nominal(joint)[kind]
+                found[f"{kind}_{n}"] = Parameter(unit, lower=lower, value=value, combination=place)
+        for body in (self.description.bodies[i] for i in self.bodies):
+            values = dict(zip(INERTIAL_NAMES, inertial_parameters(body.inertial).tolist(), strict=True))
             for kind in _IN_ORDER:
                 positive = kind in ("mass", "Ixx", "Iyy", "Izz") and values[kind] > 0.0
                 found[f"{kind}_{_identifier(body.name)}"] = Parameter(
-                    _INERTIAL_UNITS[kind], positive=positive, value=values[kind]
+                    _INERTIAL_UNITS[kind],
+                    positive=positive,
+                    value=values[kind],
+                    combination=((f"{kind} {body.name}", 1.0),),
                 )
         return found
 
@@ -238,14 +242,16 @@ class _Mechanism:
             parameter = self.nominal[name]
             if len(weights) > 1:
                 value = sum(weight * float(self.nominal[n].value or 0.0) for n, weight in weights.items())
-                parameter = Parameter(parameter.unit, value=value, combination=tuple(weights.items()))
+                places = tuple((self.nominal[n].combination[0][0], weight) for n, weight in weights.items())
+                parameter = Parameter(parameter.unit, value=value, combination=places)
             found[_base_name(name, weights)] = parameter
-        if _GAIN in self.unknown:
-            found |= {f"{_GAIN}_{n}": Parameter("1", positive=True, value=1.0) for n in driven}
-        if _BIAS in self.unknown:
-            found |= {
-                f"{_BIAS}_{n}": Parameter("rad" if self._joint(n).turns else "m", value=0.0) for n in self.coordinates
-            }
+        for n in driven if _GAIN in self.unknown else ():
+            place = ((f"{_GAIN} {self._joint(n).name}", 1.0),)
+            found[f"{_GAIN}_{n}"] = Parameter("1", positive=True, value=1.0, combination=place)
+        for n in self.coordinates if _BIAS in self.unknown else ():
+            joint = self._joint(n)
+            place = ((f"{_BIAS} {joint.name}", 1.0),)
+            found[f"{_BIAS}_{n}"] = Parameter("rad" if joint.turns else "m", value=0.0, combination=place)
         if not found:
             raise ModelError(f"{self.label}: nothing is unknown; name unknown parameters of joints, or bodies")
         return found
@@ -420,14 +426,6 @@ def _signals(joint: Joint, x: _Motion, speeds: tuple[float, float]) -> dict[str,
 
 
 # ---------------------------------------------------------------------- numbers
-
-
-def _inertial_parameters(J: Any) -> tuple[float, ...]:
-    """The ten `INERTIAL_NAMES` of a pseudo-inertia."""
-    S = J[:3, :3]
-    inertia = np.trace(S) * np.eye(3) - S
-    products = inertia[0, 1], inertia[0, 2], inertia[1, 2]
-    return tuple(float(x) for x in (J[3, 3], *J[:3, 3], *np.diag(inertia), *products))
 
 
 def _positive(what: str, value: float) -> float:
