@@ -60,7 +60,7 @@ def robot(
     unknown: Collection[str] = ("armature", "damping", "friction"),
     actuation: Actuation | None = None,
     bodies: Collection[str] | str = (),
-    joints: Collection[str] | Mapping[str, str] | None = None,
+    joints: Collection[str] | Mapping[str, str] | str | None = None,
     passive: Collection[str] = (),
     friction_speed: float = 0.05,
     stribeck_speed: float = 0.2,
@@ -90,8 +90,9 @@ def robot(
         ``hx_hand``, ... (first moments), ``Ixx_hand``, ... The model has their base parameters: those that
         no motion shows are left out, and those of which motions show a combination alone are grouped into one,
         ``Izz_hand_grouped``. ``Parameter.combination`` names its parts, as ``"Izz hand"``, with their weights.
-    joints : collection of str, or mapping of str to str, optional
-        Joints to be modelled, by name; or by coordinate, the name that log columns have: ``{"elbow": "joint_4"}``.
+    joints : collection of str, mapping of str to str, or str, optional
+        Joints to be modelled, by name; or by coordinate, the name that log columns have: ``{"elbow": "joint_4"}``; or
+        the pattern of their names, ``"{}_joint"``, in which ``{}`` stands for the coordinate.
         By default all, and each coordinate has the joint's name. Other joints are locked in the pose of the file;
         those that an equality constraint couples to a joint move with it.
     passive : collection of str, optional
@@ -343,7 +344,7 @@ def _known_names(what: str, given: Collection[str], known: Collection[str]) -> t
 
 
 def _coordinates(
-    label: str, description: Description, joints: Collection[str] | Mapping[str, str] | None
+    label: str, description: Description, joints: Collection[str] | Mapping[str, str] | str | None
 ) -> dict[str, int]:
     """Index of the joint of each coordinate.
 
@@ -351,8 +352,12 @@ def _coordinates(
     """
     names = [joint.name for joint in description.joints]
     followers = {names[x.follower] for x in description.couplings}
+    leaders = [name for name in names if name not in followers]
     if joints is None:
-        joints = [name for name in names if name not in followers]
+        joints = leaders
+    elif isinstance(joints, str) and "{}" in joints:
+        pattern = re.compile(re.escape(joints).replace(r"\{\}", "(.+)"))
+        joints = {_identifier(found[1]): name for name in leaders if (found := pattern.fullmatch(name))}
     chosen = (
         joints if isinstance(joints, Mapping) else {_identifier(n): n for n in _known_names("joints", joints, names)}
     )
