@@ -147,9 +147,10 @@ def test_inertials_of_mjcf_are_those_of_the_frame_of_the_body(described):
 def test_a_body_of_which_nothing_is_known_stays_as_it_is(described):
     path = described(robots.urdf())
     model = models.robot(path, bodies=("link3",), unknown=("damping",))
-    unknown = np.full((model.n_p, model.n_p), np.inf)
-    text, _ = calibrated(path, model.parameters, nominal(model), unknown)
+    missing = np.full(model.n_p, np.nan)
+    text, left_out = calibrated(path, model.parameters, missing, np.eye(model.n_p))
     assert text == path.read_text()
+    assert left_out == tuple(model.parameters)
 
 
 def test_bodies_are_possible_whatever_was_estimated(described):
@@ -213,6 +214,14 @@ def test_consistent_parameters_are_the_optimum(seed):
         for _ in range(20):
             other = bodies * (1.0 + size * rng.normal(size=bodies.shape))
             assert cost(other, constants * (1.0 + size * rng.normal(size=2)), problem) > least - 1e-9
+
+
+def test_a_combination_without_error_is_met():
+    bodies, constants, B, values, covariance = random_problem(0)
+    covariance[3, :] = covariance[:, 3] = 0.0
+    found = consistent_parameters(bodies, constants, B, values, covariance)
+    size = np.abs(B[3]) @ np.abs([*bodies.ravel(), *constants])
+    assert B[3] @ [*found[0].ravel(), *found[1]] == pytest.approx(values[3], abs=LEAST_ERROR * size)
 
 
 def test_an_impossible_description_is_refused():

@@ -258,7 +258,7 @@ def _export(
             left_out += result.export(written, into=written if k else into)
     typer.echo(f"wrote {output}")
     if left_out:
-        typer.echo(f"without {', '.join(left_out)}, for which the format has no place")
+        typer.echo(f"without {', '.join(left_out)}: not identifiable, or the format has no place for them")
 
 
 @app.command("models")

@@ -247,7 +247,7 @@ class Result:
 
         The file is that of ``into`` but for the values that were identified. Parameters of joints are the estimates;
         inertials are the physically consistent ones nearest to those of the description, of all that explain the
-        estimated base parameters.
+        estimated base parameters. What is not identifiable stays as it is.
 
         Parameters
         ----------
@@ -259,7 +259,8 @@ class Result:
         Returns
         -------
         tuple of str
-            Names of the parameters for which the format has no place, such as the bias of an encoder.
+            Names of the parameters that are not in the file: those that are not identifiable, and those for which the
+            format has no place, such as the bias of an encoder.
 
         Raises
         ------
@@ -270,7 +271,8 @@ class Result:
         """
         from diransac.model.robots.calibration import calibrated
 
-        values = self.model.parameter_vector(self.parameters)
+        found = self.parameters.items()
+        values = np.array([np.nan if name in self.unidentifiable else x for name, x in found])
         text, left_out = calibrated(into, self.model.parameters, values, self.covariance)
         _write(path, text)
         return left_out

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import takewhile
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -14,6 +14,8 @@ from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 
 __all__ = ["independent_parts"]
+
+T = TypeVar("T")
 
 
 def independent_parts(model: Model) -> dict[str, Model]:
@@ -34,11 +36,11 @@ def independent_parts(model: Model) -> dict[str, Model]:
     groups = [] if model.kinematics is not None else _groups(model)
     if len(groups) < 2:
         return {model.name: model}
-    states = [tuple(np.array(model.rate_names)[group]) for group in groups]
+    states = [[model.rate_names[k] for k in group] for group in groups]
     names = [_common_beginning(own) for own in states]
     if "" in names or len(set(names)) < len(names):
         names = [own[0] for own in states]
-    return {name: _part(model, name, own) for name, own in zip(names, states, strict=True)}
+    return {name: _part(model, name, group) for name, group in zip(names, groups, strict=True)}
 
 
 def _common_beginning(names: Collection[str]) -> str:
@@ -49,46 +51,54 @@ def _common_beginning(names: Collection[str]) -> str:
 
 def _groups(model: Model) -> list[list[int]]:
     """Indices of the accelerations of every part, in the order of the first of each."""
-    equations = _arguments(model, model.residual)
-    sensors = np.zeros((0, equations.shape[1]), bool)
-    if model.measurement is not None:
-        sensors = _arguments(model, model.measurement)
-    together = np.vstack([equations, sensors]).astype(int)
+    used = [_dependence(model, function) for function in (model.residual, model.measurement) if function is not None]
+    together = np.vstack([np.hstack([x.states, x.parameters]) for x in used]).astype(int)
     linked = together.T @ together > 0
-    n_v = model.n_v
-    groups, left = list[list[int]](), set(range(n_v))
+    groups, left = list[list[int]](), set(range(model.n_v))
     while left:
         reached = np.zeros(len(linked), bool)
         reached[min(left)] = True
         while (linked[reached].any(axis=0) & ~reached).any():
             reached |= linked[reached].any(axis=0)
-        groups.append(np.flatnonzero(reached[:n_v]).tolist())
+        groups.append(np.flatnonzero(reached[: model.n_v]).tolist())
         left -= {*groups[-1], min(left)}
     return groups
 
 
-def _arguments(model: Model, function: ca.Function) -> BoolArray:
-    """Accelerations of whose states, and parameters, each element of a function depends ``(n, n_v + n_p)``."""
-    q, v, a, u, p = (ca.SX.sym(n, function.size1_in(k)) for k, n in enumerate("qvaup"))
-    values = function(q, v, a, u, p)
+class _Dependence(NamedTuple):
+    """Arguments of each element of a function: states, by their accelerations, inputs and parameters; ``(n, ...)``."""
 
-    def used(x: ca.SX) -> BoolArray:
-        return np.array(ca.DM(ca.jacobian_sparsity(values, x), 1), dtype=bool)
+    states: BoolArray
+    inputs: BoolArray
+    parameters: BoolArray
 
-    states = used(v) | used(a)
-    states[:, : model.n_q] |= used(q)
-    return np.hstack([states, used(p)])
+    def of(self, rows: BoolArray) -> tuple[BoolArray, BoolArray]:
+        """Inputs and parameters on which some elements depend."""
+        return np.logical_or.reduce(self.inputs[rows]), np.logical_or.reduce(self.parameters[rows])
 
 
-def _part(model: Model, name: str, states: Collection[str]) -> Model:
+def _dependence(model: Model, function: ca.Function) -> _Dependence:
+    symbols = [ca.SX.sym(n, function.size1_in(k)) for k, n in enumerate("qvaup")]
+    values = function(*symbols)
+    q, v, a, u, p = (np.array(ca.DM(ca.jacobian_sparsity(values, x), 1), dtype=bool) for x in symbols)
+    states = v | a
+    states[:, : model.n_q] |= q
+    return _Dependence(states, u, p)
+
+
+def _part(model: Model, name: str, group: Sequence[int]) -> Model:
     """The equations, sensors and parameters of some of a model's states."""
-    signals = dict(zip(model.rate_names, zip(model.velocities, model.accelerations, strict=True), strict=True))
-    own = {*states, *(signal for state in states for signal in signals[state])}
-    rows = [i for i in range(model.n_v) if own & set(model._names_in(model.residual, i))]
-    used = {n for i in rows for n in model._names_in(model.residual, i)}
-    sensors = {n: x for n, x in model.sensor_arguments.items() if own & set(x)}
-    used |= {n for arguments in sensors.values() for n in arguments}
-    kept = own | used
+    dynamics = _dependence(model, model.residual)
+    rows: BoolArray = np.logical_or.reduce(dynamics.states[:, group], axis=1)
+    inputs, parameters = dynamics.of(rows)
+    shown = np.zeros(0, bool)
+    if model.measurement is not None:
+        readings = _dependence(model, model.measurement)
+        shown = np.logical_or.reduce(readings.states[:, group], axis=1)
+        more = readings.of(shown)
+        inputs, parameters = inputs | more[0], parameters | more[1]
+    states = {model.rate_names[k] for k in group}
+    kept = {*states, *_selected(model.inputs, inputs), *_selected(model.parameters, parameters)}
 
     def arguments(*vectors: Symbols) -> list[ca.SX]:
         rates = list(model.rate_names)
@@ -97,15 +107,20 @@ def _part(model: Model, name: str, states: Collection[str]) -> Model:
         return [ca.SX(ca.vertcat(*(x[n] if n in kept else ca.SX(0) for n in names))) for x, names in pairs]
 
     def equations(*vectors: Symbols) -> Sequence[Any]:
-        return [model.residual(*arguments(*vectors))[rows]]
+        return [model.residual(*arguments(*vectors))[np.flatnonzero(rows).tolist()]]
 
     return Model(
         f"{model.name} {name}",
-        {n: unit for n, unit in model.coordinates.items() if n in own},
-        {n: unit for n, unit in model.inputs.items() if n in used},
-        {n: x for n, x in model.parameters.items() if n in used},
+        {n: unit for n, unit in model.coordinates.items() if n in states},
+        _selected(model.inputs, inputs),
+        _selected(model.parameters, parameters),
         equations,
-        first_order={n: unit for n, unit in model.first_order.items() if n in own},
-        sensors={n: x for n, x in model.sensors_of(arguments).items() if n in sensors},
+        first_order={n: unit for n, unit in model.first_order.items() if n in states},
+        sensors=_selected(model.sensors_of(arguments), shown),
         description=model.description,
     )
+
+
+def _selected(items: Mapping[str, T], mask: BoolArray) -> dict[str, T]:
+    """Items of a mapping by a mask in its order."""
+    return {n: x for (n, x), is_in in zip(items.items(), mask, strict=True) if is_in}

@@ -28,7 +28,7 @@ _URDF = {"damping": "damping", "friction": "friction"}
 def calibrated(
     path: str | Path, parameters: Mapping[str, Parameter], values: FloatArray, covariance: FloatArray
 ) -> tuple[str, tuple[str, ...]]:
-    """Text of a description with estimates in it, and the parameters for which it has no place.
+    """Text of a description with estimates in it, and the parameters that are not in it.
 
     Parameters of joints replace those of the file. Inertials are the physically consistent ones nearest to those of the
     file, of all that explain the estimated base parameters (`consistent_parameters`).
@@ -40,14 +40,15 @@ def calibrated(
     parameters : mapping of str to Parameter
         Those of the model.
     values, covariance : (n_p,), (n_p, n_p) arrays
-        Estimates of them; a variance may be infinite.
+        Estimates of them; NaN where there is none.
 
     Returns
     -------
     text : str
         The file's, comments and layout included.
     left_out : tuple of str
-        Parameters that the format cannot express, such as the bias of an encoder.
+        Parameters that are not in the text: there is no estimate, or the format cannot express them, such as the bias
+        of an encoder.
 
     Raises
     ------
@@ -68,8 +69,8 @@ def calibrated(
     placed = {f"{kind} {name}" for name, of_joint in found.joints.items() for kind in of_joint if kind in attributes}
     left_out = [
         n
-        for n, x in parameters.items()
-        if not any(place in placed or place.partition(" ")[0] in INERTIAL_NAMES for place, _ in x.combination)
+        for (n, x), value in zip(parameters.items(), values, strict=True)
+        if np.isnan(value) or not (_has_inertials(dict(x.combination)) or x.combination[0][0] in placed)
     ]
     return document.text(), tuple(left_out)
 
@@ -93,12 +94,12 @@ def _estimates(
     if not all(places.values()):
         raise ModelError(f"{next(n for n, x in places.items() if not x)} is no parameter of a robot's description")
     found = _Estimates()
-    names = list(places)
-    combined = [k for k, n in enumerate(names) if _has_inertials(places[n])]
-    for k, n in enumerate(names):
-        if k not in combined:
+    estimated = [(k, n) for k, n in enumerate(places) if not np.isnan(values[k])]
+    for k, n in estimated:
+        if not _has_inertials(places[n]):
             _assign(found, next(iter(places[n])), values[k])
-    known = [k for k in combined if np.isfinite(covariance[k, k]) and covariance[k, k] > 0.0]
+    names = list(places)
+    known = [k for k, n in estimated if _has_inertials(places[n]) and np.isfinite(covariance[k, k])]
     if known:
         of_known = [places[names[k]] for k in known]
         _solve_inertials(found, description, of_known, values[known], covariance[np.ix_(known, known)])

@@ -113,7 +113,8 @@ class _Problem:
         self, bodies: FloatArray, constants: FloatArray, B: FloatArray, values: FloatArray, covariance: FloatArray
     ) -> None:
         spread = np.sqrt(np.diag(covariance))
-        correlation = covariance / np.outer(spread, spread) + _RIDGE * np.eye(len(spread))
+        scale = np.where(spread > 0.0, spread, 1.0)
+        correlation = covariance / np.outer(scale, scale) + np.diag(np.where(spread > 0.0, _RIDGE, 1.0))
         spread = np.maximum(spread, _LEAST_ERROR * np.abs(B) @ np.abs([*bodies.ravel(), *constants]))
         self.weight: FloatArray = np.linalg.inv(correlation) / np.outer(spread, spread)
         self.B, self.b, self.weighted, self.curvature = B, values, B.T @ self.weight, B.T @ self.weight @ B
