@@ -29,6 +29,7 @@ class Fault:
     changed : ``(share of the log, p) -> p``, parameters in the course of the log
     supply : ``share of the log -> gain`` of the inputs
     lag : time constant of each actuator, s
+    later : by input, how much later it acts, s, whole samples of inputs that are held
     late : by signal, how much later it is logged, s
     corrupted : ``(rng, columns, inputs)`` corrupts the columns of a log in place
     """
@@ -37,6 +38,7 @@ class Fault:
     changed: Callable[[float, SimpleNamespace], SimpleNamespace] = lambda _, p: p
     supply: Callable[[float], float] = lambda _: 1.0
     lag: float = 0.0
+    later: Mapping[str, float] = field(default_factory=dict)
     late: Mapping[str, float] = field(default_factory=dict)
     corrupted: Callable[[np.random.Generator, dict[str, Array], Sequence[str]], None] | None = None
 
@@ -113,11 +115,22 @@ def _simulated(regime: Regime, drawn: SimpleNamespace, seeds: Sequence[int]) -> 
     for k in range(n_rows):
         t = k * machine.dt
         u = control(t, x)
-        rows.append((x[: machine.n_q + machine.n_v], acceleration(t, x, u), u))
+        acting = _delayed(regime, [*(row[2] for row in rows), u])
+        rows.append((x[: machine.n_q + machine.n_v], acceleration(t, x, acting), u))
         for i in range(machine.substeps):
-            x = rk4(rate, t + i * h, x, u if regime.held else None, h)
+            x = rk4(rate, t + i * h, x, acting if regime.held else None, h)
     states, accelerations, inputs = (np.stack(parts) for parts in zip(*rows, strict=True))
     return machine.dt * np.arange(n_rows), _named(machine, states, accelerations, inputs)
+
+
+def _delayed(regime: Regime, inputs: Sequence[Array]) -> Array:
+    """The last of all inputs so far; of those that act later, an earlier one."""
+    acting = inputs[-1]
+    for name, time in regime.fault.later.items():
+        k = list(regime.machine.model.inputs).index(name)
+        acting = acting.copy()
+        acting[k] = inputs[max(0, len(inputs) - 1 - round(time / regime.machine.dt))][k]
+    return acting
 
 
 def _plant(
@@ -332,6 +345,7 @@ _ALL = [
     Regime("pendulum Coulomb friction", machines.PENDULUM, exact=False, fault=Fault(force=_coulomb)),
     Regime("rotor payload -30 %", _ROTOR, exact=False, fault=Fault(changed=_payload)),
     Regime("rotor battery sag 15 %", _ROTOR, exact=False, fault=Fault(supply=lambda share: 1.0 - 0.15 * share)),
+    Regime("rotor moment 20 ms later", _ROTOR, exact=False, fault=Fault(later={"moment": 0.02})),
     Regime("rotor wrong inputs", _ROTOR, exact=False, fault=Fault(corrupted=_wrong_inputs)),
 ]
 REGIMES = {regime.name: regime for regime in _ALL}

@@ -1,17 +1,19 @@
-"""Model of a Crazyflie's rotor thrust, identifiable from accelerometer and motor commands alone.
+"""Motor lag and rotor thrust of a Crazyflie from its motor commands and the accelerometer along its z axis alone.
 
-The body-z acceleration times the mass equals the thrust of four rotors, each ``k1 w + k2 w^2`` with the command w (0 to
-1; 0 to 65535 in the log). The equation has no states, so that no position or velocity is needed.
+The thrust of four rotors, each ``k1 w + k2 w^2`` at rest with the command w (0 to 1), follows the commands with a lag.
+The accelerometer shows the thrust over the mass; nothing else is measured.
 """
 
-from diransac import Model, Parameter
+from diransac import Model, Parameter, Sensor
 
 MASS = 0.027
 
 model = Model(
     name="crazyflie-thrust",
-    coordinates={"z": "m"},
+    coordinates={},
+    first_order={"thrust": "N"},
     inputs={f"m{i}": "1" for i in range(1, 5)},
-    parameters={"k1": Parameter("N"), "k2": Parameter("N")},
-    equations=lambda q, v, a, u, p: [MASS * a.z - sum(p.k1 * (w / 65536) + p.k2 * (w / 65536) ** 2 for w in u)],
+    parameters={"k1": Parameter("N"), "k2": Parameter("N"), "lag": Parameter("s", positive=True)},
+    equations=lambda q, v, a, u, p: [p.lag * a.thrust + v.thrust - sum(p.k1 * w + p.k2 * w**2 for w in u)],
+    sensors={"acc": Sensor("m/s^2", lambda q, v, a, u, p: v.thrust / MASS)},
 )

@@ -5,7 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+import diransac as dr
 
 QUIET_MODEL = """
 import numpy as np
@@ -56,3 +59,31 @@ def test_debug_shows_what_a_model_file_prints_on_stderr(tmp_path: Path):
     assert json.loads(done.stdout)["name"] == "chatty"
     for text in ("printed\n", "left in the buffer", "written past Python", "said by a child", "careful", "a line"):
         assert text in done.stderr
+
+
+def test_identify_imports_no_large_library_that_it_does_not_need(tmp_path: Path):
+    """Each takes longer to import than a log to be identified."""
+    t = np.arange(300) * 0.01
+    log = dr.Log.from_arrays(t, {"x": np.sin(t), "x_dot": np.cos(t), "x_ddot": -np.sin(t), "thrust": np.cos(3.0 * t)})
+    log.write(tmp_path / "log.csv")
+    code = """
+import sys
+from diransac.cli import main
+try:
+    main()
+except SystemExit as end:
+    found = {"scipy", "polars", "pydantic", "rich"} & sys.modules.keys()
+    print(end.code, *found, file=sys.__stderr__)
+"""
+    words = ["identify", "log.csv", "--model", "underwater-vehicle", "--seed", "3"]
+    command = [sys.executable, "-c", code, *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stderr == "0\n"
+
+
+@pytest.mark.parametrize(("words", "said"), [(["--seed", "x"], "--seed"), (["--from", "now"], "--from"), ([], "LOG")])
+def test_wrong_values_of_options_are_named(tmp_path: Path, words: list[str], said: str):
+    files = ["log.csv"] if words else []
+    done = run(tmp_path, "identify", *files, "--model", "underwater-vehicle", *words)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert said in done.stderr

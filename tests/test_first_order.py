@@ -4,7 +4,9 @@ Logs are made by LSODA, SciPy's `odeint`, from equations that are written here o
 """
 
 import pickle
+import runpy
 from functools import cache
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -370,3 +372,94 @@ def test_a_plan_names_the_inputs_that_rest_would_take():
     plant = dr.Plant(lagged_thrust(), {n: x for n, x in THRUST.items() if n != "mass"})
     with pytest.raises(dr.PlanningError, match=r"command would have to be 0\.6131"):
         dr.plan(plant, waypoints=[{"z": 0.0}, {"z": 1.0}], input_limits={"command": (0.0, 0.5)})
+
+
+# ---------------------------------------------------------------------- states that only a sensor shows
+
+WEIGHED = {"linear": 0.28, "square": 0.24, "tau": 0.07, "sensor_tau": 0.25}
+
+
+def weighed_thrust(sensor_lag=True):
+    """Thrust behind a lag, shown by an accelerometer alone, which may have a lag of its own."""
+    names = [n for n in WEIGHED if sensor_lag or n != "sensor_tau"]
+
+    def equations(q, v, a, u, p):
+        follows = [p.tau * a.thrust + v.thrust - p.linear * u.command - p.square * u.command**2]
+        return [*follows, p.sensor_tau * a.felt + v.felt - v.thrust] if sensor_lag else follows
+
+    return Model(
+        "weighed thrust",
+        {},
+        {"command": "1"},
+        {n: Parameter("s", positive=True) if n.endswith("tau") else Parameter("N") for n in names},
+        equations,
+        first_order={"thrust": "N", **({"felt": "N"} if sensor_lag else {})},
+        sensors={"acc": dr.Sensor("m/s^2", lambda q, v, a, u, p: (v.felt if sensor_lag else v.thrust) / 0.03)},
+    )
+
+
+def weighed_log(seed, noise, outliers, *, sensor_lag=True, correlated=0.0):
+    """Accelerometer of a thrust whose response to held commands is exact: eigenvectors of one or two lags."""
+    rng, n, dt = np.random.default_rng(seed), 2500, 0.008
+    t = dt * np.arange(n)
+    command = 0.64 + 0.06 * excitation(t, 31, 3.0) + 0.04 * np.sign(np.sin(12.0 * t))
+    static = WEIGHED["linear"] * command + WEIGHED["square"] * command**2
+    tau, late = WEIGHED["tau"], WEIGHED["sensor_tau"]
+    thrust = felt = static[0]
+    acc = np.empty(n)
+    for k in range(n):
+        acc[k] = (felt if sensor_lag else thrust) / 0.03
+        target = static[k]
+        faster = (thrust - target) * tau / (tau - late)
+        felt = target + faster * np.exp(-dt / tau) + (felt - target - faster) * np.exp(-dt / late)
+        thrust = target + (thrust - target) * np.exp(-dt / tau)
+    drift = np.zeros(n)
+    for k in range(1, n):
+        drift[k] = 0.9 * drift[k - 1] + correlated * np.sqrt(0.19) * rng.standard_normal()
+    wild = (rng.random(n) < outliers) * rng.uniform(-30.0, 30.0, n)
+    return dr.Log.from_arrays(t, {"acc": acc + noise * rng.standard_normal(n) + drift + wild, "command": command})
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_an_accelerometer_alone_shows_two_lags(seed):
+    """Nothing but the sensor gives the search of the unmeasured states a direction."""
+    found = dr.identify(weighed_thrust(), weighed_log(seed, 0.1, 0.1), differentiate=True)
+    lags = sorted(found.parameters[n] for n in ("tau", "sensor_tau"))  # they may be exchanged
+    assert [*(found.parameters[n] for n in ("linear", "square")), *lags] == pytest.approx([*WEIGHED.values()], rel=0.15)
+    assert found.verdict == "usable"
+
+
+def test_correlated_errors_of_a_sensor_do_not_attenuate_a_lag():
+    """They look like forces on the state: a regression on its rate, which contains these, would shorten the lag."""
+    log = weighed_log(0, 0.1, 0.02, sensor_lag=False, correlated=0.2)
+    found = dr.identify(weighed_thrust(sensor_lag=False), log, differentiate=True)
+    assert found.parameters["tau"] == pytest.approx(WEIGHED["tau"], rel=0.15)
+    assert found.verdict == "do not rely on this"
+
+
+def test_validation_starts_a_state_that_only_a_sensor_shows_from_its_samples():
+    log = weighed_log(3, 0.0, 0.0, sensor_lag=False)
+    plant = dr.Plant(weighed_thrust(sensor_lag=False), {n: WEIGHED[n] for n in ("linear", "square", "tau")})
+    assert dr.validate(plant, log, horizon=2.0).rmse["acc"] < 1e-3 * log["acc"].std()
+
+
+def test_motor_lag_and_hover_thrust_of_a_crazyflie_follow_from_its_accelerometer(shared_data):
+    """Hover is known from the log: the command at which the accelerometer reads 1 g; no time range is cut out."""
+    example = runpy.run_path(str(Path(__file__).resolve().parents[1] / "examples" / "crazyflie_thrust.py"))
+    commands = {f"m{i}": f"motor.m{i}" for i in range(1, 5)}
+    log = dr.read_log(
+        shared_data / "crazyflie_arpl" / "log15.parquet",
+        rename={"t": "t_ms", "acc": "acc.z", **commands},
+        scale={"t": 0.001, "acc": 9.81, **dict.fromkeys(commands, 1 / 65536)},
+        resample=100.0,
+    )
+    w = np.array([log[name] for name in commands])
+    flying = w.mean(axis=0) > 0.3
+    readings = {"acc": np.where(flying, log["acc"], np.nan)}
+    flight = dr.Log.from_arrays(log.time, {**readings, **dict(zip(commands, w, strict=True))})
+    method = dr.LoDiransac(model_error=False, input_delay=False, input_lag=False, suggestions=False)
+    found = dr.identify(example["model"], flight, method, differentiate=True).parameters
+    hover = max(np.roots([found["k2"], found["k1"], -example["MASS"] * 9.81 / 4]))
+    seen = w.mean(axis=0)[flying & (np.abs(log["acc"] / 9.81 - 1.0) < 0.02)].mean()
+    assert hover == pytest.approx(seen, rel=0.02)
+    assert 0.05 < found["lag"] < 0.1

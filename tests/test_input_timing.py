@@ -79,7 +79,7 @@ def test_inputs_without_delay_and_lag_are_the_recorded_ones():
 def test_whole_samples_of_delay_shift_the_inputs_whose_ends_continue(delay):
     recorded = np.random.default_rng(0).standard_normal((50, 2))
     rows = np.clip(np.arange(50) - delay, 0, 49)
-    np.testing.assert_array_equal(acting_inputs(recorded, delay, 0.0), recorded[rows])
+    np.testing.assert_array_equal(acting_inputs(recorded, np.full(2, delay), 0.0, np.zeros(2)), recorded[rows])
 
 
 @pytest.mark.parametrize("delay", [0.3, 2.7, -1.6])
@@ -88,7 +88,8 @@ def test_a_fraction_of_delay_is_the_mean_of_the_held_signal_over_each_sample(del
     held = np.repeat(recorded, fine, axis=0)
     late = held[np.clip(np.arange(len(held)) - round(delay * fine), 0, len(held) - 1)]
     mean = late.reshape(40, fine, 1).mean(axis=1)
-    np.testing.assert_allclose(acting_inputs(recorded, delay, 0.0)[4:-4], mean[4:-4], rtol=1e-12, atol=1e-14)
+    found = acting_inputs(recorded, np.array([delay]), 0.0, np.zeros(1))
+    np.testing.assert_allclose(found[4:-4], mean[4:-4], rtol=1e-12, atol=1e-14)
 
 
 def test_a_ramp_is_delayed_exactly():
@@ -100,6 +101,21 @@ def test_a_lag_answers_a_step_with_an_exponential():
     step = np.r_[np.zeros(10), np.ones(90)][:, None]
     time = DT * np.maximum(np.arange(100) - 10, 0)
     np.testing.assert_allclose(InputTiming(lag=0.07).acting(step, DT)[:, 0], 1.0 - np.exp(-time / 0.07), atol=1e-12)
+
+
+def test_inputs_have_delays_of_their_own_besides_the_common_one():
+    recorded = np.random.default_rng(0).standard_normal((50, 2))
+    found = acting_inputs(recorded, np.array([2, 5]), 0.0, np.zeros(2))
+    np.testing.assert_array_equal(found[5:], np.column_stack([recorded[3:-2, 0], recorded[:-5, 1]]))
+    own = InputTiming(0.5, own_delays=(0.5, 1.0)).acting(recorded, 0.25)
+    np.testing.assert_array_equal(own, InputTiming(own_delays=(1.0, 1.5)).acting(recorded, 0.25))
+
+
+def test_a_gain_drifts_in_proportion_to_time_and_no_further_than_the_log():
+    recorded = np.ones((8, 2))
+    found = acting_inputs(recorded, np.zeros(2), 0.0, np.array([-0.4, 0.0]), n_rows=4)
+    np.testing.assert_allclose(found[:, 0], [0.95, 0.85, 0.75, 0.65, 0.6, 0.6, 0.6, 0.6], rtol=1e-12)
+    np.testing.assert_array_equal(found[:, 1], 1.0)
 
 
 # ---------------------------------------------------------------------- delay and lag in evaluation and validation
@@ -146,6 +162,94 @@ def test_print_and_page_say_once_that_inputs_act_late(late, tmp_path):
         dr.write_report({"lo": late[what]}, [pendulum_log(**{what: 0.04})], page)
         assert f"Input {what}: " in page.read_text()
         assert page.read_text().count("later than recorded") == 1
+
+
+# ---------------------------------------------------------------------- errors of single inputs
+
+GIMBAL_TRUE = {"inertia": 0.5, "damping": 0.4, "weight": 4.0, "mass": 2.0, "drag": 1.5}
+GIMBAL = dr.Model(
+    "pendulum on a slide of its own",
+    {"angle": "rad", "slide": "m"},
+    {"torque": "N m", "force": "N"},
+    {name: dr.Parameter("1", positive=True) for name in GIMBAL_TRUE},
+    lambda q, v, a, u, p: [
+        p.inertia * a.angle + p.damping * v.angle + p.weight * ca.sin(q.angle) - u.torque,
+        p.mass * a.slide + p.drag * v.slide - u.force,
+    ],
+)
+
+
+def gimbal_log(late=0, drift=0.0, seed=0, n_rows=1000):
+    """A log of both, whose force acts so many rows late, and whose torque loses a part of its gain over the log."""
+    rng, p = np.random.default_rng(seed), GIMBAL_TRUE
+    recorded = np.column_stack([commands(n_rows, seed), 3.0 * commands(n_rows, seed + 50)])
+    gain = 1.0 + drift * (np.arange(n_rows * FINE) + 0.5) / (n_rows * FINE)
+    force = recorded[np.maximum(np.arange(n_rows) - late, 0), 1]
+    states, x = [], np.array([0.2, 0.0, 0.0, 0.0])
+
+    def slope(x, torque, force):
+        turn = (torque - p["damping"] * x[2] - p["weight"] * np.sin(x[0])) / p["inertia"]
+        return np.array([x[2], x[3], turn, (force - p["drag"] * x[3]) / p["mass"]])
+
+    for k, u in enumerate(np.repeat(np.column_stack([recorded[:, 0], force]), FINE, axis=0)):  # the midpoint rule
+        acting, h = (gain[k] * u[0], u[1]), DT / FINE
+        if k % FINE == 0:
+            states.append(x)
+        x = x + h * slope(x + 0.5 * h * slope(x, *acting), *acting)
+    measured = np.array(states) + np.array([1e-3, 1e-3, 5e-3, 5e-3]) * rng.standard_normal((n_rows, 4))
+    columns = dict(zip(("angle", "slide", "angle_dot", "slide_dot"), measured.T, strict=True))
+    columns |= {"torque": recorded[:, 0], "force": recorded[:, 1]}
+    return dr.Log.from_arrays(DT * np.arange(n_rows), columns)
+
+
+def identified(log, **options):
+    return dr.identify(GIMBAL, log, dr.LoDiransac(suggestions=False, **options), differentiate=True)
+
+
+def assert_right(result):
+    for name, true in GIMBAL_TRUE.items():
+        error = abs(result.parameters[name] - true)
+        assert error < 4.0 * result.standard_errors[name], name
+        assert error < 0.01 * true, name
+
+
+def test_an_input_that_is_later_than_the_other_is_found_and_named(tmp_path):
+    result = identified(gimbal_log(late=4))
+    timing = result.estimate.resolution.timing
+    np.testing.assert_allclose(timing.own_delays, [0.0, 0.04], atol=5e-4)
+    assert timing.delay == 0.0
+    assert_right(result)
+    (said,) = [x for x in result.findings if "acts" in x]
+    assert said.startswith("force acts")
+    assert float(said.split()[2]) == pytest.approx(40.0, abs=0.5)
+    result.save(tmp_path / "result.json")
+    assert dr.Result.load(tmp_path / "result.json").estimate.resolution.timing == timing
+    held_out, undelayed = gimbal_log(late=4, seed=1), dr.Plant(GIMBAL, result.parameters)
+    assert dr.validate(result, held_out).rmse["slide_dot"] < 0.3 * dr.validate(undelayed, held_out).rmse["slide_dot"]
+
+
+def test_a_gain_that_drifts_is_found_and_named():
+    result = identified(gimbal_log(drift=-0.15))
+    np.testing.assert_allclose(result.estimate.resolution.timing.gain_drifts, [-0.15, 0.0], atol=0.004)
+    assert_right(result)
+    said = [x for x in result.findings if "gain" in x]
+    assert len(said) == 1
+    assert said[0].startswith("The gain of torque falls by 15 % during the log")
+    assert result.verdict == "usable with care"
+
+
+def test_inputs_without_errors_have_none():
+    assert identified(gimbal_log(seed=2)).estimate.resolution.timing == InputTiming()
+
+
+def test_errors_of_inputs_can_be_named_or_forbidden():
+    named = identified(gimbal_log(), sensor_delays=("force",), gain_drifts=("torque",)).estimate.resolution.timing
+    assert named.own_delays[1] == pytest.approx(0.0, abs=1e-3)
+    assert 0.0 < abs(named.gain_drifts[0]) < 0.01
+    assert named.gain_drifts[1] == 0.0
+    forbidden = identified(gimbal_log(drift=-0.15), gain_drifts=())
+    assert forbidden.estimate.resolution.timing.gain_drifts == ()
+    assert forbidden.verdict == "do not rely on this"
 
 
 # ---------------------------------------------------------------------- gaps
@@ -255,3 +359,5 @@ def test_switches_without_meaning_are_refused(options, says):
 def test_a_sensor_that_the_log_lacks_is_refused_by_name():
     with pytest.raises(SettingsError, match=r'sensor_biases names "x", which .* lacks; it has angle, angle_dot'):
         estimate(pendulum_log(), sensor_biases=("x",))
+    with pytest.raises(SettingsError, match=r'gain_drifts names "angle", which .* lacks; it has torque'):
+        estimate(pendulum_log(), gain_drifts=("angle",))

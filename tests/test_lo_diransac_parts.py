@@ -14,7 +14,13 @@ from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.local_search import fewest_parts
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import Fit, cost, linearize, with_residuals
-from diransac.identification.methods.lo_diransac.projection import unexplained
+from diransac.identification.methods.lo_diransac.projection import (
+    estimate_parameters,
+    means_of_intervals,
+    projected_parameters,
+    residuals_of_motion,
+    unexplained,
+)
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind, ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
     Samples,
@@ -327,15 +333,47 @@ def test_delays_are_those_of_sensors_in_another_time():
     """Inputs one sample late and velocities one early are coordinates one late."""
     intervals, signals = intervals_of(n_rows=100)
     rates = np.gradient(signals, axis=0)
-    velocities, coordinates = ErrorKind((3, 4, 5), is_delay=True), ErrorKind((0, 1, 2), is_delay=True)
-    bias = {ErrorKind((8,), is_delay=False): 0.25}
+    velocities, coordinates = ErrorKind((3, 4, 5), "delay"), ErrorKind((0, 1, 2), "delay")
+    bias = {ErrorKind((8,), "bias"): 0.25}
     late = replace(intervals, delay=1).corrected({velocities: -1.02, **bias}, rates)
     found = late.with_delays(np.r_[np.full(3, 1.02), np.zeros(6)], rates)
     expected = intervals.corrected({coordinates: 1.02, **bias}, rates)
     assert found.delay == 0
-    assert set(found.sensor_errors.kinds) == {coordinates, *bias}
+    assert set(found.errors.kinds) == {coordinates, *bias}
     assert (found.measured == expected.measured).all()
     assert (found.known == expected.known).all()
+
+
+# ---------------------------------------------------------------------- projection
+
+
+def noisy_motion(n_rows, noise, seed=3):
+    """Short intervals of a flight, and a fit whose unmodelled accelerations follow noise of the velocities."""
+    intervals, signals = intervals_of(n_rows=n_rows, length=5)
+    exact = np.append(TRUTH, np.zeros(intervals.n_shared - 3))
+    error = noise * np.random.default_rng(seed).normal(size=(len(intervals) + 1, 3))
+    x = signals[intervals.starts, :6] + np.pad(error[:-1], ((0, 0), (3, 0)))
+    fit = replace(perturbed_fit(intervals, signals), x=x, d=np.diff(error, axis=0) / intervals.duration, shared=exact)
+    return intervals, with_residuals(intervals, replace(fit, prior=np.full(intervals.n_shared, np.inf)))
+
+
+def test_noise_that_unmodelled_accelerations_follow_does_not_attenuate_parameters():
+    """Least squares over every interval does: the fitted accelerations are noise for the most part."""
+    intervals, fit = noisy_motion(2000, 0.15)
+    W = residuals_of_motion(intervals, fit, TRUTH)[2]
+    accelerations = means_of_intervals(intervals, W)[:, 2, 1]
+    moments = means_of_intervals(intervals, 0.177 * intervals.inputs)[:, 1]
+    assert accelerations @ moments / (accelerations @ accelerations) < 0.85 * TRUTH[1]
+    found = estimate_parameters(intervals, fit, 10.0)
+    assert len(found.windows) < 0.3 * len(intervals)
+    assert found.parameters == pytest.approx(TRUTH, rel=0.05)
+    assert (np.abs(found.parameters - TRUTH) < 4.0 * np.sqrt(np.diag(found.covariance))).all()
+    assert found.parameters == pytest.approx(projected_parameters(intervals, fit), rel=1e-6)
+
+
+def test_every_interval_counts_where_unmodelled_accelerations_are_small():
+    intervals, fit = noisy_motion(1000, 1e-4)
+    assert len(estimate_parameters(intervals, fit, 10.0).windows) == len(intervals)
 
 
 # ---------------------------------------------------------------------- hypotheses

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.ndimage
 from hypothesis import given
 from hypothesis import strategies as st
 
+from diransac.data import filters
 from diransac.data import preprocessing as prepare
 from diransac.data.filters import half_length, kernels
 from diransac.data.log import Log
@@ -522,3 +524,16 @@ def test_the_real_axis_agrees_with_what_was_published_at_any_bandwidth():
     for bandwidth in (0.5 * chosen, chosen, 2.0 * chosen):
         parameters, _ = fit_axis(log, bandwidth)
         assert (np.abs(parameters / EMPS - 1) < (0.01, 0.05, 0.05, 0.05)).all(), (bandwidth, parameters)
+
+
+@pytest.mark.parametrize("size", [3, 5, 31])
+@pytest.mark.parametrize("kind", [float, bool, int])
+def test_the_median_filter_is_that_of_scipy_whatever_the_number_of_rows_at_a_time(
+    size: int, kind: type, monkeypatch: pytest.MonkeyPatch
+):
+    values = (3.0 * np.random.default_rng(0).normal(size=(500, 2))).astype(kind)
+    expected = scipy.ndimage.median_filter(values, size=(size, 1), mode="mirror")
+    monkeypatch.setattr(filters, "_ROWS_AT_A_TIME", 64)
+    found = filters.median_filter(values, size)
+    assert found.dtype == expected.dtype
+    np.testing.assert_array_equal(found, expected)

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from diransac.data.log import Log
-from diransac.data.readers import read_log
+from diransac.data.readers import comma_separated, read_log
 from diransac.errors import DiransacError, LogError, SettingsError
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -493,3 +493,17 @@ def test_real_uneven_clocks_are_refused_then_resampled():
 def test_real_autopilot_logs_are_refused_by_their_ending():
     with pytest.raises(DiransacError, match=r"\.ulg"):
         read_log(real("px4_ulog/sample_log_small.ulg"))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_short_file_of_plain_numbers_has_the_same_bits_as_any_other(seed: int, monkeypatch: pytest.MonkeyPatch):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(40, 3)) * 10.0 ** rng.integers(-12, 12, (40, 3))
+    forms = ("{!r}", "{:.3e}", " {:.17g} ", "{:+.6f}")
+    lines = [",".join(rng.choice(forms).format(float(x)) for x in row) for row in values]
+    data = "\n".join(["t,a,b", *lines, "41,nan,NaN"]).encode()
+    plain = comma_separated.read_csv(data, "plain")
+    monkeypatch.setattr(comma_separated, "_FEW_LINES", 0)
+    other = comma_separated.read_csv(data, "other")
+    for name in ("t", "a", "b"):
+        np.testing.assert_array_equal(plain.columns[name], other.columns[name])

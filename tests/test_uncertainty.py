@@ -10,7 +10,7 @@ from scipy.stats import t as student
 
 import diransac as dr
 from diransac.data.dataset import Dataset
-from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance, students_draws
+from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance, student_quantile, students_draws
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight
 
@@ -144,3 +144,10 @@ def test_draws_have_the_joint_distribution_within_bounds():
     assert bounded[1].mean() > -1.0  # moves with the other
     with pytest.raises(dr.ResultError, match="0 of 1000 draws are within the bounds"):
         students_draws(np.array([3.0, -1.0]), covariance, 40, [dr.Parameter(lower=90.0), free[1]], 3, 0)
+
+
+@pytest.mark.parametrize("degrees_of_freedom", [1, 2, 3, 9, 100, 10_000])
+@pytest.mark.parametrize("probability", [0.5, 0.6, 0.841, 0.975, 0.9999])
+def test_quantiles_of_students_t_are_those_of_scipy(degrees_of_freedom: int, probability: float):
+    expected = student(degrees_of_freedom).ppf(probability)
+    assert student_quantile(degrees_of_freedom, probability) == pytest.approx(expected, rel=1e-11, abs=1e-12)

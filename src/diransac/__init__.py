@@ -16,6 +16,7 @@ from diransac.errors import (
     ResultError,
     SettingsError,
     StudyError,
+    TimeLimitError,
 )
 from diransac.model import Disturbance, Model, Parameter, Plant, Sensor, sensors
 from diransac.model import library as models
@@ -86,6 +87,7 @@ __all__ = [
     "Study",
     "StudyError",
     "Suggestion",
+    "TimeLimitError",
     "TotalLeastSquares",
     "Trajectory",
     "Validation",

@@ -9,7 +9,8 @@
     ├── IdentificationError    parameters are not identifiable, or no hypothesis was accepted
     ├── PlanningError          no trajectory or controller satisfies the request
     ├── ResultError            a saved result cannot be read or written, or does not match its use
-    └── StudyError             a study's store cannot be used for it, or its workers are lost
+    ├── StudyError             a study's store cannot be used for it, or its workers are lost
+    └── TimeLimitError         a time limit was reached before an answer was found
 
 Messages state the problem, the value found, and the remedy.
 """
@@ -23,6 +24,7 @@ __all__ = [
     "ResultError",
     "SettingsError",
     "StudyError",
+    "TimeLimitError",
 ]
 
 
@@ -56,3 +58,7 @@ class ResultError(DiransacError):
 
 class StudyError(DiransacError):
     """A study's store cannot be used for it, or its workers are lost."""
+
+
+class TimeLimitError(DiransacError):
+    """A time limit was reached before an answer was found."""

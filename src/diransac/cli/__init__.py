@@ -1,9 +1,14 @@
 """The command line: parse, call, print."""
 
+import os
 import sys
+from contextlib import suppress
 from types import TracebackType
 
-__all__ = ["main"]
+__all__ = ["INTERRUPTED", "main"]
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
 
 
 def main() -> None:
@@ -15,13 +20,25 @@ def main() -> None:
 
     try:
         app()
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            _end_now()
+        raise
     finally:
         leave_stdout()
+
+
+def _end_now() -> None:
+    """End the process without waiting for threads in LLVM or in compiled loops, which no signal reaches."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError, OSError, ValueError):  # absent, broken or closed
+            stream.flush()
+    os._exit(INTERRUPTED)
 
 
 def _report_internal_error(kind: type[BaseException], error: BaseException, _: TracebackType | None) -> None:
     """Print one line for an unexpected error."""
     if issubclass(kind, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)  # noqa: T201  before there is a command line to print with
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
     print(f"internal error: {kind.__name__}: {error}; --debug shows where. Please report it", file=sys.stderr)  # noqa: T201

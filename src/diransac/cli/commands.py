@@ -46,6 +46,7 @@ from diransac.identification.methods import DEFAULT, METHODS
 from diransac.identification.result import Result
 from diransac.identification.validation import cross_validate, validate
 from diransac.simulation.compiler.code_cache import CodeCache
+from diransac.time_limit import time_limited
 
 __all__ = ["app"]
 
@@ -101,7 +102,7 @@ def _identify(
         for k, (limb, plant) in enumerate(limbs.items()):
             saved, page = drafts[2 * k : 2 * k + 2]
             with screen.bar(f"{method} {limb}".rstrip()) as progress:
-                arguments = search.arguments() | derived
+                arguments = search.arguments() | derived | {"time_limit": search.time_limit}
                 found = identify(plant, logs, chosen, with_suggestions=with_suggestions, progress=progress, **arguments)
             results[limb] = found
             if output:
@@ -130,10 +131,11 @@ def _compare(
 ) -> None:
     """Identify by every method from the same logs, side by side."""
     wanted = search.methods(known_methods(methods))
-    arguments = {**search.arguments(), **derivation.arguments()}
+    arguments = search.arguments() | derivation.arguments()
     with staged([report], [*files, model_file(model), search.settings]) as (page,):
         plant, logs = robot.load(model), preparation.read_all(files)
-        comparison = compare_methods(plant, logs, wanted, arguments)
+        with time_limited(search.time_limit):
+            comparison = compare_methods(plant, logs, wanted, arguments)
         if report:
             from diransac.report import write_report
 
@@ -173,8 +175,9 @@ def _cross_validate(
     """Identify from all logs but one, and predict that one, for each in turn."""
     (chosen,), derived = search.methods([method]), derivation.arguments()
     plant, logs = robot.load(model), preparation.read_all(files)
+    arguments = search.arguments() | derived | {"time_limit": search.time_limit}
     with screen.bar(f"{method}, leaving one log out") as progress:
-        found = cross_validate(plant, logs, chosen, horizon=horizon, progress=progress, **search.arguments(), **derived)
+        found = cross_validate(plant, logs, chosen, horizon=horizon, progress=progress, **arguments)
     screen.show(found, as_json)
 
 

@@ -8,19 +8,24 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn, get_type_hints
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NoReturn, get_args, get_type_hints
 
 import typer
 from typer.core import TyperGroup
 
+from diransac.cli import INTERRUPTED
 from diransac.errors import DiransacError
 
 __all__ = ["Group", "grouped"]
 
-INTERRUPTED = 130
 MAX_LINES = 3
 UsageError: type[Any] = typer.BadParameter.__mro__[1]
 
+
+_PLAIN, _CHECKED = (str, Path, int, float), ("parser", "click_type", "min", "max")
+"""Kinds of arguments that are converted by a call, and what makes Typer check or convert an argument otherwise."""
 
 _LATER = {"study": "diransac.cli.study"}
 """Module of each group of commands that is imported on first use."""
@@ -42,7 +47,15 @@ class Group(TyperGroup):
             found = typer.main.get_command(getattr(importlib.import_module(_LATER[cmd_name]), cmd_name))
             found.name = cmd_name
             self.commands[cmd_name] = found
-        return super().get_command(ctx, cmd_name)
+        command = super().get_command(ctx, cmd_name)
+        if command is not None:
+            _convert_plainly(command, ctx)
+        return command
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Arguments that are left for the command."""
+        _convert_plainly(self, ctx)
+        return super().parse_args(ctx, args)
 
     def main(self, args: Sequence[str] | None = None, *positional: Any, **extra: Any) -> NoReturn:
         """Run the command line; ``--debug`` may stand anywhere."""
@@ -63,6 +76,40 @@ class Group(TyperGroup):
         if code == INTERRUPTED:
             typer.echo("interrupted", err=True)
         sys.exit(code or 0)
+
+
+def _convert_plainly(command: Any, ctx: Any) -> None:
+    """Convert the arguments of a command by `_Conversion`."""
+    for parameter in command.get_params(ctx):
+        if hasattr(parameter, "get_runtime_param"):  # of a release of Typer that converts by pydantic
+            parameter.get_runtime_param = functools.partial(_Conversion, parameter.get_runtime_param)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Conversion:
+    """Conversion of an argument; by Typer, and pydantic, only where it is not plain or is wrong.
+
+    Pydantic takes longer to import than NumPy.
+
+    Parameters
+    ----------
+    make : callable
+        Returns Typer's conversion.
+    """
+
+    make: Callable[[], Any]
+
+    def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
+        """The value of an argument, as Typer's own conversion returns it."""
+        several = param.multiple or param.nargs == -1
+        if value is None or (several and not value):
+            return () if several else None
+        kind, about = param.type_descriptor.annotation, param.type_descriptor.parameter_info
+        kind = next(iter(get_args(kind)), None) if several else kind
+        if kind in _PLAIN and not any(getattr(about, name, None) is not None for name in _CHECKED):
+            with suppress(ValueError):
+                return [kind(x) for x in value] if several else kind(value)
+        return self.make().coerce(value, param=param, ctx=ctx)
 
 
 def _message(error: DiransacError | OSError) -> str:

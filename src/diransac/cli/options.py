@@ -34,6 +34,7 @@ __all__ = [
     "ResultFile",
     "Search",
     "StrictFlag",
+    "TimeLimit",
     "known_methods",
     "output_file",
 ]
@@ -109,6 +110,11 @@ StrictFlag = Annotated[
     bool, typer.Option("--strict", help='End with exit code 3 where the verdict is "do not rely on this".')
 ]
 
+TimeLimit = Annotated[
+    float | None,
+    typer.Option("--time-limit", metavar="S", help="End the search after so many seconds, with what it has found."),
+]
+
 
 def _option(*names: str, **about: Any) -> Any:
     """An option on the preparation of the log."""
@@ -145,8 +151,13 @@ class Search:
         typer.Option("--prior", metavar="NAME=MEAN,SD", help="A Gaussian prior of a parameter; repeatable."),
     ] = None
 
+    time_limit: TimeLimit = None
+
     def arguments(self) -> dict[str, Any]:
-        """Arguments of `diransac.identify`, without the method.  Raises typer.BadParameter: they cannot be read."""
+        """Arguments of `diransac.identify`, without method and time limit.
+
+        Raises typer.BadParameter: they cannot be read.
+        """
         known = {
             "fixed": fixed_parameters("--fix", self.fixed or ()),
             "priors": prior_pairs("--prior", self.priors or ()),

@@ -15,7 +15,7 @@ import typer
 
 from diransac.identification.method import Callback, Progress
 
-__all__ = ["bar", "end", "show"]
+__all__ = ["Lines", "bar", "end", "show"]
 
 UNRELIABLE = 3
 """Exit code of `end`."""
@@ -87,7 +87,8 @@ def bar(label: str) -> Iterator[Callback]:
         Takes a `Progress`.
     """
     if sys.stderr is None or not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
-        yield _Lines(label)
+        lines = Lines(label)
+        yield lambda found: lines.show(found.stage, found.fraction)
         return
     from rich import progress
     from rich.console import Console
@@ -108,17 +109,32 @@ def bar(label: str) -> Iterator[Callback]:
         yield update
 
 
-class _Lines:
-    """Progress without a terminal: nothing for the first five seconds, then a line on stderr every ten seconds."""
+class Lines:
+    """Progress without a terminal: nothing for the first five seconds, then a line on stderr every ten seconds.
+
+    Parameters
+    ----------
+    label : str
+        Name of the work.
+    """
 
     def __init__(self, label: str) -> None:
         self._label, self._begin = label, time.monotonic()
         self._next = _FIRST_LINE
 
-    def __call__(self, found: Progress) -> None:
+    def show(self, stage: str, fraction: float) -> None:
+        """Print a line if it is time.
+
+        Parameters
+        ----------
+        stage : str
+            What is done, or how much.
+        fraction : float
+            Completed fraction of the whole work.
+        """
         elapsed = time.monotonic() - self._begin
         if elapsed < self._next or sys.stderr is None:
             return
         self._next = elapsed + _LINE_EVERY
-        left = f", about {elapsed * (1.0 / found.fraction - 1.0):.0f} s left" if found.fraction > 0.0 else ""
-        typer.echo(f"{self._label}: {found.stage}, {found.fraction:.0%} after {elapsed:.0f} s{left}", err=True)
+        left = f", about {elapsed * (1.0 / fraction - 1.0):.0f} s left" if fraction > 0.0 else ""
+        typer.echo(f"{self._label}: {stage}, {fraction:.0%} after {elapsed:.0f} s{left}", err=True)

@@ -73,6 +73,9 @@ def _run(
         str | None,
         typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run the trials: tcp://host:8786."),
     ] = None,
+    time_limit: Annotated[
+        float | None, typer.Option("--time-limit", metavar="S", help="End the run after so many seconds.")
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Run the trials that a store lacks; after an interruption, the same command runs the rest."""
@@ -88,18 +91,20 @@ def _run(
             note(done, asked)
             show(done, asked)
 
-        found = _everywhere(wanted, store, jobs, cluster, progress)
+        found = _everywhere(wanted, store, jobs, cluster, time_limit, progress)
     screen.show(found, as_json)
 
 
-def _everywhere(wanted: Study, store: Path, jobs: int | None, cluster: str | None, progress: Progress) -> Status:
+def _everywhere(
+    wanted: Study, store: Path, jobs: int | None, cluster: str | None, time_limit: float | None, progress: Progress
+) -> Status:
     """Run on this machine or on a cluster."""
     if cluster is None:
-        return run_study(wanted, store=store, jobs=jobs, progress=progress)
+        return run_study(wanted, store=store, jobs=jobs, time_limit=time_limit, progress=progress)
     with connected(cluster) as (executor, tasks):
         for talker in ("distributed", "concurrent.futures"):  # the error itself is one line
             logging.getLogger(talker).setLevel(logging.CRITICAL)
-        return run_study(wanted, store=store, executor=executor, tasks=tasks, progress=progress)
+        return run_study(wanted, store=store, executor=executor, tasks=tasks, time_limit=time_limit, progress=progress)
 
 
 @study.command("new")
@@ -222,9 +227,20 @@ class _Studies:
 
 
 # Progress ---------------------------------------------------------------------------------------------------------
+def _lines(label: str) -> Progress:
+    """Progress callback without a terminal; rows of an earlier run do not count for the time left."""
+    lines, kept = screen.Lines(label), list[int]()
+
+    def update(done: int, asked: int) -> None:
+        kept[:] = kept or [done]
+        lines.show(f"{done} of {asked} rows", (done - kept[0]) / max(1, asked - kept[0]))
+
+    return update
+
+
 @contextmanager
 def _kept(store: Path) -> Iterator[Progress]:
-    """Callback that counts rows; after Ctrl-C a line with the count and how to resume is shown."""
+    """Callback that counts rows; a run that ends before all are done says how many there are, and how to resume."""
     counts = [0, 0]
 
     def update(done: int, asked: int) -> None:
@@ -232,16 +248,17 @@ def _kept(store: Path) -> Iterator[Progress]:
 
     try:
         yield update
-    except KeyboardInterrupt:
-        typer.echo(f"{counts[0]} of {counts[1]} rows are kept in {store}; the same command runs the rest", err=True)
-        raise
+    finally:
+        done, asked = counts
+        if done < asked and isinstance(sys.exception(), KeyboardInterrupt | None):
+            typer.echo(f"{done} of {asked} rows are kept in {store}; the same command runs the rest", err=True)
 
 
 @contextmanager
 def _bar(label: str) -> Iterator[Progress]:
-    """Progress callback: a bar with rate and time left if stderr is a terminal, else nothing."""
+    """Progress callback: a bar with rate and time left if stderr is a terminal, else a line every ten seconds."""
     if sys.stderr is None or not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
-        yield lambda _done, _asked: None
+        yield _lines(label)
         return
     from rich import progress
     from rich.console import Console

@@ -1,8 +1,8 @@
-"""Zero-phase low-pass filters of finite length, their derivatives, and their specification as a field of a log.
+"""Zero-phase low-pass filters of finite length, their specification as a field of a log, and the median filter.
 
-The filter is a windowed sinc, ``h(t) = 2 B sinc(2 B t) w(t)`` with Kaiser's window ``w`` over ``|t| <= 2.5 / B``.  It
-passes half at the bandwidth B, all but 1e-4 below B / 2, and 1e-4 above 3 B / 2.  As it is symmetric, it shifts no
-phase; as it is finite, a filtered sample depends on what lies within 2.5 / B of it and on nothing else.
+The low-pass filter is a windowed sinc, ``h(t) = 2 B sinc(2 B t) w(t)`` with Kaiser's window ``w`` over ``|t| <= 2.5 /
+B``.  It passes half at the bandwidth B, all but 1e-4 below B / 2, and 1e-4 above 3 B / 2.  As it is symmetric, it
+shifts no phase; as it is finite, a filtered sample depends on what lies within 2.5 / B of it and on nothing else.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ from diransac.errors import SettingsError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["REACH", "FilterSpecification", "convolve", "half_length", "kernels"]
+__all__ = ["REACH", "FilterSpecification", "convolve", "half_length", "kernels", "median_filter"]
 
 
 REACH = 2.5
 _KAISER_BETA = 7.857
+_ROWS_AT_A_TIME = 20_000
+"""Rows whose windows are copied together."""
 
 
 @dataclass(frozen=True)
@@ -127,3 +129,27 @@ def convolve(values: FloatArray, kernel: FloatArray) -> FloatArray:
     n = 1 << (N + 2 * L).bit_length()
     response = np.fft.rfft(kernel, n).reshape(-1, *(1,) * (values.ndim - 1))
     return np.asarray(np.fft.irfft(np.fft.rfft(values, n, axis=0) * response, n, axis=0)[L : L + N])
+
+
+def median_filter(values: Any, size: int) -> Any:
+    """Median of the samples around each, mirrored at both ends.
+
+    Parameters
+    ----------
+    values : (N, ...) array
+        Filtered along the first axis; of any kind that can be sorted, without NaN.
+    size : int
+        Number of samples in a window, odd.
+
+    Returns
+    -------
+    (N, ...) array
+        Of the same kind.
+    """
+    reach = size // 2
+    padded = np.pad(values, [(reach, reach), *[(0, 0)] * (values.ndim - 1)], mode="reflect")
+    windows, medians = np.lib.stride_tricks.sliding_window_view(padded, size, axis=0), np.empty_like(values)
+    for first in range(0, len(values), _ROWS_AT_A_TIME):
+        some = slice(first, first + _ROWS_AT_A_TIME)
+        medians[some] = np.partition(windows[some], reach)[..., reach]
+    return medians

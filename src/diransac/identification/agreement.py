@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.errors import DiransacError
+from diransac.errors import DiransacError, TimeLimitError
 from diransac.identification.method import fit, within
+from diransac.identification.uncertainty import student_quantile
+from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -52,7 +54,10 @@ def disagreements(
     shared = [name for name, x in dataset.model.parameters.items() if not x.per_log]
     found = {}
     for i in range(n):
-        estimate = _alone(method, dataset, i, seed, within(callback, i / n, (i + 1) / n, f"log {i + 1} alone: "))
+        try:
+            estimate = _alone(method, dataset, i, seed, within(callback, i / n, (i + 1) / n, f"log {i + 1} alone: "))
+        except TimeLimitError:
+            return remarks, ["the time limit was reached before the logs were compared with each other"]
         if not isinstance(estimate, str) and any(np.isfinite(_marginal(estimate, name)[1]) for name in shared):
             found[i] = estimate
         else:
@@ -72,9 +77,16 @@ def disagreements(
 
 
 def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callback | None) -> Estimate | str:
-    """The estimate of one log, or the reason why that log alone gives none."""
+    """The estimate of one log, or the reason why that log alone gives none.
+
+    Raises TimeLimitError: the time limit was reached.
+    """
     try:
-        return fit(method, dataset.subset([i]), seed, callback)
+        found = fit(method, dataset.subset([i]), seed, callback)
+        check_time()
+        return found
+    except TimeLimitError:
+        raise
     except (DiransacError, np.linalg.LinAlgError) as error:
         return str(error)
 
@@ -83,10 +95,8 @@ def _worst(
     found: Mapping[int, Estimate], i: int, parameters: Sequence[str], level: float, dt: float
 ) -> tuple[float, str]:
     """Largest difference of log ``i`` from the others over what is allowed, and a sentence on it."""
-    from scipy.special import stdtrit
-
     worst, sentence = 0.0, ""
-    t = float(stdtrit(min(x.degrees_of_freedom for x in found.values()), 1.0 - level))
+    t = student_quantile(min(x.degrees_of_freedom for x in found.values()), 1.0 - level)
     delays = [_DELAY] if all(x.diagnosis is not None for x in found.values()) else []
     for name in (*parameters, *delays):
         own, variance = _marginal(found[i], name)

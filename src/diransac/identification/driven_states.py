@@ -2,8 +2,8 @@
 
 An observer compares the accelerations that the equations give to the other velocities with their motion,
 ``e' = a(q, v, u, p) + b (v - e)``: the error ``e - v`` is that of the acceleration, low-pass filtered with bandwidth b.
-Initial values, and parameters where these are unknown, are those of least squares (Levenberg-Marquardt), from many
-starts, which are lanes of one batch.
+Measured sensors are compared with their equations.  Initial values, and parameters where these are unknown, are those
+of least squares (Levenberg-Marquardt), from many starts, which are lanes of one batch.
 
 References
 ----------
@@ -42,21 +42,30 @@ _DAMPING, _DAMPING_BOUNDS, _LESS, _MORE, _CONVERGED = 1e-2, (1e-9, 1e9), 0.2, 6.
 def _driven_model(model: Model, hidden: tuple[str, ...], observed: tuple[str, ...]) -> Model:
     """States that obey a model's equations, driven by the other ones, and an observer of each observed velocity.
 
-    All are states of first order, in this order; inputs are the other states of the model, and its inputs.
+    All are states of first order, in this order; inputs are the other states of the model, and its inputs.  Sensors are
+    those of the model, with the accelerations of its equations.
     """
     names = [f"driven_{i}" for i in range(len(hidden) + len(observed))]
     known = {n: model.units[n] for n in model.state if n not in hidden}
     rows = [model.state.index(n) for n in (*hidden, *observed)]
 
-    def equations(_q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
+    def arguments(v: Symbols, u: Symbols, p: Symbols) -> tuple[ca.SX, ca.SX, ca.SX]:
         of_hidden = dict(zip(hidden, v, strict=False))
         x = ca.vertcat(*(of_hidden[n] if n in of_hidden else u[n] for n in model.state))
         applied, parameters = (
             ca.vertcat(*(z[n] for n in group)) for z, group in ((u, model.inputs), (p, model.parameters))
         )
-        rates = model.dynamics(x, applied, parameters)[0][rows]
+        return x, applied, parameters
+
+    def equations(_q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
+        rates = model.dynamics(*arguments(v, u, p))[0][rows]
         pull = [p.bandwidth_ * (u[n] - e) for n, e in zip(observed, list(v)[len(hidden) :], strict=True)]
         return list(ca.vertsplit(ca.vertcat(*a) - rates - ca.vertcat(ca.SX(len(hidden), 1), *pull)))
+
+    def of_sensors(_q: Symbols, v: Symbols, _a: Symbols, u: Symbols, p: Symbols) -> list[ca.SX]:
+        x, applied, parameters = arguments(v, u, p)
+        accelerations = model.dynamics(x, applied, parameters)[1]
+        return [x[: model.n_q], x[model.n_q :], accelerations, applied, parameters]
 
     return Model(
         f"{model.name}, driven by its measured motion",
@@ -65,12 +74,13 @@ def _driven_model(model: Model, hidden: tuple[str, ...], observed: tuple[str, ..
         {**model.parameters, "bandwidth_": Parameter("1/s", positive=True)},
         equations,
         first_order={name: model.units[n] for name, n in zip(names, (*hidden, *observed), strict=True)},
+        sensors=model.sensors_of(of_sensors),
     )
 
 
 @dataclass(frozen=True)
 class DrivenStates:
-    """Least squares of observers' errors: states that nothing measures, driven by the other states of logs.
+    """Least squares of the errors of observers and sensors: states that nothing measures, driven by those of logs.
 
     Unknown are the parameters, if they are not given, and the unmeasured states at the beginning of every log.
 
@@ -84,8 +94,10 @@ class DrivenStates:
     states : (N, n_x) array
         States of the model in all rows of all logs; those that are hidden are not used.
     inputs : (N, n_u) array
-    weights : (N, n) array
-        Weight of the error of each velocity that is not hidden; one over its unit squared.
+    readings : (N, n_y) array
+        Sensors of the model in all rows; those of weight 0 are not used.
+    weights : (N, n + n_y) array
+        Weight of the error of each velocity that is not hidden, then of each sensor; one over its unit squared.
     rows_of_logs : sequence of slice
         Rows of each log.
     dt : float
@@ -101,6 +113,7 @@ class DrivenStates:
     hidden: tuple[str, ...]
     states: FloatArray
     inputs: FloatArray
+    readings: FloatArray
     weights: FloatArray
     rows_of_logs: Sequence[slice]
     dt: float
@@ -117,7 +130,8 @@ class DrivenStates:
 
     @cached_property
     def _simulator(self) -> Simulator:
-        return rollouts(self._driven, self._driven.state[len(self.hidden) :], substeps=_SUBSTEPS)
+        compared = (*self._driven.state[len(self.hidden) :], *self._driven.sensors)
+        return rollouts(self._driven, compared, substeps=_SUBSTEPS)
 
     @cached_property
     def _inputs(self) -> FloatArray:
@@ -176,7 +190,8 @@ class DrivenStates:
         free = self.model.parameters if self.parameters is None else ()
         unknowns = (*free, *self._driven.state[: len(self.hidden)])
         for i, rows in enumerate(self.rows_of_logs):
-            measured = Measurements(self._velocities[rows], np.ones(rows.stop - rows.start, bool))
+            compared = np.hstack([self._velocities[rows], self.readings[rows]])
+            measured = Measurements(compared, np.ones(len(compared), bool))
             found = self._simulator.gauss_newton(self._batch(z, i), measured, self.weights[rows], unknowns=unknowns)
             places = self._places(i)
             cost += found.cost

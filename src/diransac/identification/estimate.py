@@ -25,7 +25,20 @@ from diransac.identification.serialization import (
 )
 from diransac.identification.suggestions import Suggestion
 
-__all__ = ["Diagnosis", "Estimate", "Evaluation", "Finding", "Level", "LogSummary", "Prediction", "Resolution"]
+__all__ = [
+    "TIME_LIMIT",
+    "Diagnosis",
+    "Estimate",
+    "Evaluation",
+    "Finding",
+    "Level",
+    "LogSummary",
+    "Prediction",
+    "Resolution",
+]
+
+TIME_LIMIT = "time limit reached"
+"""Stop reason of a search that a limit on its time ended."""
 
 Level = Literal["note", "good", "care", "bad"]
 """Levels of findings, the least serious first."""
@@ -252,7 +265,7 @@ class Estimate:
     n_hypotheses : int, optional
         Number of hypotheses evaluated, refits included.
     stop_reason : str, optional
-        Reason why the search ended.
+        Reason why the search ended; `TIME_LIMIT` where a limit on its time ended it.
     rejected : mapping of str to int, optional
         Number of rejected hypotheses by reason.
     resolution : Resolution, optional

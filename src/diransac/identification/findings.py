@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from diransac.identification.estimate import Finding, Level
+from diransac.identification.estimate import TIME_LIMIT, Finding, Level
 from diransac.text_table import number, percent, plural, share
 
 if TYPE_CHECKING:
@@ -352,6 +352,9 @@ def _bandwidth(result: Result) -> Iterator[Finding]:
 
 
 def _search(result: Result) -> Iterator[Finding]:
+    if result.stop_reason == TIME_LIMIT:
+        yield Finding("care", "The time limit ended the search: parameters are the best so far; give a longer one.")
+        return
     wanted = result.settings.stop_inlier_fraction
     if result.iterations and result.diagnosis is None and wanted is not None and result.inlier_fraction < wanted:
         samples = plural(result.iterations, "sample")

@@ -11,7 +11,7 @@ import numpy as np
 from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, distinct_logs, usable_sensors
 from diransac.data.log import Log
-from diransac.errors import DiransacError, SettingsError
+from diransac.errors import DiransacError, SettingsError, TimeLimitError
 from diransac.identification.agreement import disagreements
 from diransac.identification.estimate import Evaluation, LogSummary, Prediction
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
@@ -25,6 +25,7 @@ from diransac.identification.settings import Settings
 from diransac.identification.suggestions import with_terms
 from diransac.model import Model
 from diransac.simulation import HOLDS
+from diransac.time_limit import check_time, time_limited
 
 __all__ = ["METHODS", "checked_hold", "identify"]
 
@@ -44,6 +45,7 @@ def identify(
     priors: Mapping[str, tuple[float, float]] | None = None,
     compare_logs: bool = True,
     with_suggestions: bool = False,
+    time_limit: float | None = None,
     progress: Callback | None = None,
 ) -> Result:
     """Parameters of a model from one log, or from several logs of one machine.
@@ -88,6 +90,9 @@ def identify(
     with_suggestions : bool, optional
         Whether to identify again with the terms that the first identification suggests (`Result.suggestions`), and to
         return that result, whose model has them as further parameters; for lo-diransac.
+    time_limit : float, optional
+        Time after which the search ends, s; the result is then the best that was found, and a finding says so.  What
+        follows the search - intervals, evaluation - takes its time in addition.
     progress : callable, optional
         Called with a `Progress` at every stage.
 
@@ -106,6 +111,8 @@ def identify(
         A linear method is given a model that is not affine in its parameters.
     IdentificationError
         A parameter is not identifiable from the logs, or no hypothesis was accepted.
+    TimeLimitError
+        The time limit was reached before there was an estimate.
 
     References
     ----------
@@ -125,13 +132,14 @@ def identify(
     pointwise = chosen.needs_all_signals or not differentiate
     known = KnownParameters.of(model, fixed, priors)
     task = _Task(known, given, chosen, int(seed), pointwise, hold, compares=compare_logs and len(given) > 1)
-    if with_suggestions:
-        return task.with_suggestions(progress)
-    if not filtered:
-        return task.run(given, progress)
-    derived = tuple(preprocessing.differentiate(log, model, bandwidth) for log in given)
-    result = task.run(derived, within(progress, 0.0, 0.4))
-    return task.with_sensitivity(result, derived, progress)
+    with time_limited(time_limit):
+        if with_suggestions:
+            return task.with_suggestions(progress)
+        if not filtered:
+            return task.run(given, progress)
+        derived = tuple(preprocessing.differentiate(log, model, bandwidth) for log in given)
+        result = task.run(derived, within(progress, 0.0, 0.4))
+        return task.with_sensitivity(result, derived, progress)
 
 
 def _method(method: object, settings: object, estimator: object) -> Method:
@@ -235,10 +243,14 @@ class _Task:
         found = self.run(self.given, within(progress, 0.0, 0.5))
         note = "no terms were suggested; the model is the given one"
         if found.suggestions:
-            note = f"terms were added to the model as suggested: {'; '.join(x.text for x in found.suggestions)}"
+            terms = "; ".join(x.text for x in found.suggestions)
             extended = with_terms(found.model, found.suggestions)
             task = dataclasses.replace(self, known=self.known.of_model(extended))
-            found = task.run(self.given, within(progress, 0.5, 1.0, "with suggested terms: "))
+            try:
+                found = task.run(self.given, within(progress, 0.5, 1.0, "with suggested terms: "))
+                note = f"terms were added to the model as suggested: {terms}"
+            except TimeLimitError:
+                note = f"the time limit was reached before suggested terms could be added: {terms}"
         return dataclasses.replace(found, notes=(note, *found.notes))
 
     def with_sensitivity(self, result: Result, derived: Sequence[Log], progress: Callback | None) -> Result:
@@ -247,18 +259,28 @@ class _Task:
         changes = []
         for k, factor in enumerate((0.5, 2.0)):
             part = within(progress, 0.4 + 0.3 * k, 0.7 + 0.3 * k, f"{factor:g} x bandwidth: ")
-            changes.append(self._change(result, [factor * x for x in chosen], part))
+            try:
+                changes.append(self._change(result, [factor * x for x in chosen], part))
+            except TimeLimitError:
+                note = "the time limit was reached before the bandwidth of the filter was varied"
+                return dataclasses.replace(result, notes=(*result.notes, note))
         report(progress, "done", 1.0)
         pairs = {n: (changes[0][n], changes[1][n]) for n in result.parameters if n not in result.fixed}
         return dataclasses.replace(result, bandwidth_sensitivity=pairs)
 
     def _change(self, result: Result, bandwidths: Sequence[float], progress: Callback | None) -> dict[str, float]:
-        """Relative change of each parameter at other bandwidths; NaN where nothing was identified there."""
+        """Relative change of each parameter at other bandwidths; NaN where nothing was identified there.
+
+        Raises TimeLimitError: the time limit was reached.
+        """
         alone = dataclasses.replace(self, compares=False)
         try:
             pairs = zip(self.given, bandwidths, strict=True)
             derived = [preprocessing.differentiate(log, self.known.model, x) for log, x in pairs]
             other = alone.run(derived, progress).parameters
+            check_time()
+        except TimeLimitError:
+            raise
         except DiransacError:
             return dict.fromkeys(result.parameters, np.nan)
         return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}

@@ -27,6 +27,7 @@ from diransac.identification.estimators import (
 )
 from diransac.identification.identifiability import NullSpace, null_space
 from diransac.identification.uncertainty import score_inflation
+from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -214,6 +215,7 @@ class _BoundNonlinear:
         errors, J = self._errors(rows, free, prior)
         costs = np.square(errors).sum(axis=1)
         for _ in range(self._settings.max_steps):
+            check_time()
             H = np.einsum("bni,bnj->bij", J[active], J[active])
             slope = np.einsum("bni,bn->bi", J[active], errors[active])
             diagonal = np.einsum("bii->bi", H)

@@ -21,7 +21,7 @@ from diransac.identification.findings import Verdict, findings_of, verdict_of
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
 from diransac.identification.suggestions import Suggestion
-from diransac.identification.uncertainty import students_draws
+from diransac.identification.uncertainty import student_quantile, students_draws
 from diransac.model import Model
 from diransac.text_table import aligned, telling_digits
 
@@ -198,9 +198,7 @@ class Result:
         """
         if not 0.0 < level < 1.0:
             raise SettingsError(f"level is {level}; give a number between 0 and 1, such as 0.95")
-        from scipy.special import stdtrit
-
-        width = float(stdtrit(self.degrees_of_freedom, 0.5 + level / 2.0))
+        width = student_quantile(self.degrees_of_freedom, 0.5 + level / 2.0)
         errors = self.standard_errors
         return {n: (x - width * errors[n], x + width * errors[n]) for n, x in self.parameters.items()}
 

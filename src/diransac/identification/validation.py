@@ -23,6 +23,7 @@ from diransac.identification.methods import DEFAULT
 from diransac.identification.result import Result
 from diransac.model.plant import ModelWithParameters, as_plant
 from diransac.text_table import aligned
+from diransac.time_limit import check_time, time_limited
 
 if TYPE_CHECKING:
     from diransac.model import Model
@@ -304,16 +305,21 @@ def _states(segment: Segment, layout: ParameterLayout, parameters: FloatArray) -
 def _unmeasured(
     segment: Segment, layout: ParameterLayout, parameters: FloatArray, states: FloatArray, hidden: tuple[str, ...]
 ) -> FloatArray:
-    """States ``(N, n)`` that the log lacks, from the initial values that agree best with the other velocities."""
+    """States ``(N, n)`` that the log lacks, whose initial values agree best with the other velocities and sensors."""
     model, rows = segment.model, np.arange(len(segment))
     known = np.column_stack([np.interp(rows, rows[np.isfinite(x)], x[np.isfinite(x)]) for x in states.T])
     observed = [i for i, n in enumerate(model.state) if n in model.velocities and n not in hidden]
-    spread = known[:, observed].std(axis=0)
-    weights = np.where(np.isfinite(states[:, observed]), 1.0 / np.square(np.where(spread > 0.0, spread, 1.0)), 0.0)
+    absent = np.full(len(segment), np.nan)
+    sensors = [segment.column(n) if n in segment.present else absent for n in model.sensors]
+    compared = np.column_stack([states[:, observed], *sensors])
+    seen = np.isfinite(compared)
+    spread = np.array([x[ok].std() if ok.any() else 0.0 for x, ok in zip(compared.T, seen.T, strict=True)])
+    weights = np.where(seen, 1.0 / np.square(np.where(spread > 0.0, spread, 1.0)), 0.0)
+    readings = np.nan_to_num(compared[:, len(observed) :])
     bandwidth = 1.0 / (_MEMORY * len(segment) * segment.log.dt)
     whole, alone = [slice(0, len(segment))], ParameterLayout(layout.parameters)
     problem = DrivenStates(
-        model, alone, hidden, known, segment.inputs, weights, whole, segment.log.dt, bandwidth, parameters
+        model, alone, hidden, known, segment.inputs, readings, weights, whole, segment.log.dt, bandwidth, parameters
     )
     found = problem.trajectories(least_squares(problem, problem.starts(), _N_STEPS)[0][0])
     return np.column_stack([found[n] for n in hidden])
@@ -390,6 +396,7 @@ def cross_validate(
     method: str | Method = DEFAULT,
     *,
     horizon: float | None = None,
+    time_limit: float | None = None,
     progress: Callback | None = None,
     **arguments: Any,
 ) -> CrossValidation:
@@ -406,6 +413,8 @@ def cross_validate(
         As in `identify`.
     horizon : float, optional
         As in `validate`, s.
+    time_limit : float, optional
+        Time after which no further log is left out, s; those that are not say so.
     progress : callable, optional
         Called with a `Progress` at every stage.
     arguments : object
@@ -425,22 +434,38 @@ def cross_validate(
     several = distinct_logs(logs)
     if len(several) < 2:
         raise SettingsError("cross-validation leaves one log out; give at least two logs")
-    results, validations = list[Any](), list[Any]()
-    for i, left_out in enumerate(several):
-        try:
-            others = [*several[:i], *several[i + 1 :]]
-            part = within(progress, i / len(several), (i + 1) / len(several), f"without log {i + 1}: ")
-            results.append(identify(model, others, method, progress=part, **{"compare_logs": False, **arguments}))
-        except SettingsError:
-            raise
-        except DiransacError as error:
-            results.append(str(error))
-            validations.append("no model of the other logs")
-            continue
-        try:
-            if arguments.get("differentiate"):
-                left_out = preprocessing.differentiate(left_out, model, arguments.get("bandwidth"))
-            validations.append(validate(results[-1], left_out, horizon))
-        except DiransacError as error:
-            validations.append(str(error))
-    return CrossValidation(tuple(x.source for x in several), tuple(results), tuple(validations))
+    arguments = {"compare_logs": False, **arguments}
+    with time_limited(time_limit):
+        folds = [_fold(model, several, i, method, horizon, progress, arguments) for i in range(len(several))]
+    results, validations = zip(*folds, strict=True)
+    return CrossValidation(tuple(x.source for x in several), results, validations)
+
+
+def _fold(
+    model: Model,
+    logs: Sequence[Log],
+    i: int,
+    method: str | Method,
+    horizon: float | None,
+    progress: Callback | None,
+    arguments: Mapping[str, Any],
+) -> tuple[Result | str, Validation | str]:
+    """The result of all logs but the i-th and its validation with that log; reasons where there are none.
+
+    Raises SettingsError: an argument is out of range.
+    """
+    left_out, others = logs[i], [*logs[:i], *logs[i + 1 :]]
+    part = within(progress, i / len(logs), (i + 1) / len(logs), f"without log {i + 1}: ")
+    try:
+        result = identify(model, others, method, progress=part, **arguments)
+        check_time()
+    except SettingsError:
+        raise
+    except DiransacError as error:
+        return str(error), "no model of the other logs"
+    try:
+        if arguments.get("differentiate"):
+            left_out = preprocessing.differentiate(left_out, model, arguments.get("bandwidth"))
+        return result, validate(result, left_out, horizon)
+    except DiransacError as error:
+        return result, str(error)

@@ -7,6 +7,7 @@ solvers swallow the interrupt and report that there is no plan.
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import os
 import random
@@ -36,6 +37,7 @@ from diransac.study.reading import Status, status
 from diransac.study.specification import Study
 from diransac.study.store import Store
 from diransac.study.trials import run_trials
+from diransac.time_limit import time_left, time_limited
 
 __all__ = ["BATCH_SIZE", "Progress", "connected", "run_study"]
 
@@ -60,6 +62,7 @@ def run_study(
     methods: Sequence[str] | None = None,
     batch_size: int = BATCH_SIZE,
     tasks: int | None = None,
+    time_limit: float | None = None,
     progress: Progress | None = None,
 ) -> Status:
     """Run the rows of a study that a store lacks; a row is a level, trial and method.
@@ -75,6 +78,7 @@ def run_study(
     trials, levels, methods : number of trials, levels, and labels of methods; None: those of the study
     batch_size : trials of a level that are run together
     tasks : batches handed out at a time; None: two per process, 64 to an executor
+    time_limit : time after which the run ends, s; rows that are done are kept, and the same call runs the others
     progress : called with (rows present, rows asked for) at the start and whenever rows are added
 
     Returns
@@ -103,7 +107,8 @@ def run_study(
     workers = workers_of(executor, jobs, tasks)
     with Store(store, study) as kept:
         try:
-            _Work(study, kept, batch_size, progress or (lambda _done, _asked: None)).run(workers)
+            with time_limited(time_limit):
+                _Work(study, kept, batch_size, progress or (lambda _done, _asked: None)).run(workers)
         finally:
             workers.stop()
     return status(store)
@@ -146,11 +151,15 @@ class _Work:
         self._note(())
 
     def run(self, workers: Workers) -> None:
-        """Run all batches.  Raises StudyError: a batch is lost repeatedly, or a worker cannot run the study."""
-        while self._waiting or self._running:
+        """Run all batches, or those that end within the time limit.
+
+        Raises StudyError: a batch is lost repeatedly, or a worker cannot run the study.
+        """
+        while (self._waiting or self._running) and (left := time_left()) > 0.0:
             while self._waiting and len(self._running) < workers.tasks:
                 self._hand_out(workers, self._waiting.popleft())
-            for future in wait(self._running, return_when=FIRST_COMPLETED).done:
+            timeout = left if math.isfinite(left) else None
+            for future in wait(self._running, timeout, return_when=FIRST_COMPLETED).done:
                 self._keep(self._running.pop(future), future)
 
     def _hand_out(self, workers: Workers, batch: _Batch) -> None:

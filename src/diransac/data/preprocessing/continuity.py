@@ -17,9 +17,9 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.filters import median_filter
 from diransac.data.units import one_turn
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def _revolutions(values: FloatArray, turn: float) -> IntArray:
     good = _agreeing(y, motion)
     middle = _middle_of_leaps(y[good], motion[good])
     inside = np.abs(y - middle) <= 0.5 + _MARGIN
-    if not good.any() or median_filter(inside[good], size=_PERSISTS, mode="mirror").mean() < _INSIDE:
+    if not good.any() or median_filter(inside[good], _PERSISTS).mean() < _INSIDE:
         return k
     good &= inside
     angle = _continued(y[good], rows[good])
@@ -152,14 +152,14 @@ def _remainder(turns: FloatArray) -> FloatArray:
 def _motion(y: FloatArray, rows: IntArray) -> FloatArray:
     """Usual size ``(N,)`` of the step on the circle that leads to each sample, in turns; a gap lasts for several."""
     lasting = np.diff(rows)
-    per_row = median_filter(np.abs(_remainder(np.diff(y))) / lasting, size=_WINDOW, mode="mirror")
+    per_row = median_filter(np.abs(_remainder(np.diff(y))) / lasting, _WINDOW)
     return np.concatenate([per_row[:1], per_row * lasting])
 
 
 def _continued(y: FloatArray, rows: IntArray) -> FloatArray:
     """Angles ``(N,)``, in turns, continued by steps that are nearest to those of the usual rate around them."""
     steps, lasting = np.diff(y), np.diff(rows)
-    expected = lasting * median_filter(_remainder(steps) / lasting, size=_WINDOW, mode="mirror")
+    expected = lasting * median_filter(_remainder(steps) / lasting, _WINDOW)
     return np.cumsum(np.r_[y[:1], expected + _remainder(steps - expected)])
 
 
@@ -179,7 +179,7 @@ def _middle_of_leaps(y: FloatArray, motion: FloatArray) -> float:
 
 def _is_wrapped(y: FloatArray, k: IntArray, middle: float) -> bool:
     """True if revolutions ``k`` of good samples, in turns, change for good, or at the ends of a usual turn alone."""
-    usual = median_filter(k, size=_PERSISTS, mode="mirror")
+    usual = median_filter(k, _PERSISTS)
     leaps = np.flatnonzero(np.diff(k))
     beyond = np.abs(np.abs(np.r_[y[leaps], y[leaps + 1]] - middle) - 0.5)
     at_ends = bool(len(leaps)) and middle in _USUAL_MIDDLES and bool((beyond <= _MARGIN).all())

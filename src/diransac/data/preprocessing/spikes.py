@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
+from diransac.data.filters import median_filter
 from diransac.data.preprocessing.continuity import unwrap
 from diransac.errors import SettingsError
 
@@ -123,6 +124,8 @@ def running_deviation(values: FloatArray, median: FloatArray, window: int) -> Fl
 
 def _running_median(values: FloatArray, window: int) -> FloatArray:
     """Median ``(N, ...)`` of the finite samples in each window."""
+    if window // 2 < len(values) and np.isfinite(values).all():
+        return np.asarray(median_filter(values, window))
     return _of_finite(_middle, _windows(values, window))
 
 

@@ -6,6 +6,7 @@ import csv
 import gzip
 import io
 import zlib
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,11 +18,14 @@ from diransac.data.units import split_unit
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import polars as pl
 
 __all__ = ["read_csv", "read_csv_gz"]
 
 _SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
+_FEW_LINES = 20_000
 _MISSING = ("", "na", "n/a", "nan", "null", "none")
 
 
@@ -50,9 +54,8 @@ def read_csv(data: bytes, source: str) -> Table:
         raise LogError(f"{source}: there is a header ({', '.join(headers)[:200]}) but no row")
     named = [split_unit(header) for header in headers]
     check_unique([name for name, _ in named if name], source)
-    frame = _frame(lines[1:], len(headers), separator, source)
-    fields = zip(named, frame.get_columns(), strict=True)
-    columns = {name: _numbers(column, line + 1, separator) for (name, _), column in fields if name}
+    fields = zip(named, _columns(lines[1:], len(headers), line + 1, separator, source), strict=True)
+    columns = {name: column for (name, _), column in fields if name}
     units = {name: unit for name, unit in named if unit is not None}
     table = Table(columns, units, tuple(_notes(named, separator)))
     return table if metadata is None else with_metadata(table, metadata, source, "remove its first line")
@@ -131,6 +134,19 @@ def _quoted_counts(lines: list[str], first: int, separator: str, source: str) ->
     except csv.Error as error:
         raise LogError(f"{source}: line {reader.line_num + first - 1} cannot be read ({error})") from error
     return counts
+
+
+def _columns(lines: list[str], n_columns: int, first: int, separator: str, source: str) -> Iterable[FloatArray | str]:
+    """Numbers of every column from line ``first``, or its first field that is no number.
+
+    A short file of plain numbers is read without Polars, whose import takes longer.
+    """
+    if separator == "," and len(lines) <= _FEW_LINES:
+        with suppress(ValueError):  # some field is no plain number
+            numbers = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
+            return np.ascontiguousarray(numbers.T)
+    frame = _frame(lines, n_columns, separator, source)
+    return [_numbers(column, first, separator) for column in frame.get_columns()]
 
 
 def _frame(lines: list[str], n_columns: int, separator: str, source: str) -> pl.DataFrame:

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
@@ -278,6 +277,8 @@ def random_waypoints(
     check_plane(plant.model)
     _check(seed, duration, speed=speed, reach=reach)
     points, times = _random_points(seed, speed, reach, duration)
+    from scipy.ndimage import uniform_filter1d  # slow to import
+
     planned = _through(plant, points, times, input_limits, options)
     return replace(planned, inputs=uniform_filter1d(planned.inputs, _SMOOTHED_ROWS, axis=0, mode="nearest"))
 

@@ -23,6 +23,7 @@ from diransac.identification.nonlinear import NonlinearLeastSquares
 from diransac.identification.refusal import cause_of_refusal, check_known_terms, motion_rows
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
 from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance
+from diransac.time_limit import time_unlimited
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -179,8 +180,9 @@ def fitted(bound: BoundEstimator, dataset: Dataset, parameters: np.ndarray, rows
     Estimate
     """
     log_sizes = None if dataset.layout.is_shared else [one.n_rows for one in dataset.segments]
-    shifts = bound.prior_shifts(rows)
-    covariance = jackknife_covariance(bound, rows, log_sizes) + shifts.T @ shifts
+    with time_unlimited():
+        shifts = bound.prior_shifts(rows)
+        covariance = jackknife_covariance(bound, rows, log_sizes) + shifts.T @ shifts
     stuck = dataset.layout.on_bounds(parameters)
     covariance[stuck] = covariance[:, stuck] = np.inf
     vague = vague_parameters(dataset.layout.names, parameters, covariance, bound.correlations())

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.errors import IdentificationError, LogError
-from diransac.identification.estimate import Estimate, Resolution
+from diransac.errors import IdentificationError, LogError, TimeLimitError
+from diransac.identification.estimate import TIME_LIMIT, Estimate, Resolution
 from diransac.identification.estimators import Estimator, OrdinaryLeastSquares, as_estimator, name_of
 from diransac.identification.evaluation import (
     Scores,
@@ -34,6 +34,7 @@ from diransac.identification.nonlinear import NonlinearLeastSquares
 from diransac.identification.refusal import cause_of_refusal, motion_rows
 from diransac.identification.sampling import sample_rows
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
+from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -453,23 +454,31 @@ def search(
         No hypothesis was accepted.
     IdentificationError
         The whole log is not well-defined.
+    TimeLimitError
+        The time limit was reached before a hypothesis was accepted.
 
     References
     ----------
     Dimmig et al. 2023, Algorithm 1.
     """
     settings, state = variant.criteria, SearchState()
-    for batch in _batches(settings):
-        drawn = _speculate(batch, settings.sample_size, estimator, evaluator, sampler, seed)
-        for hypothesis in drawn:
+    try:
+        for batch in _batches(settings):
+            drawn = _speculate(batch, settings.sample_size, estimator, evaluator, sampler, seed)
+            for hypothesis in drawn:
+                if variant.is_finished(state.score, settings.stop_inlier_fraction):
+                    break
+                state.iterations += 1
+                _replay(hypothesis, state, variant, estimator, evaluator)
+            fraction = state.iterations / settings.max_iterations
+            report(callback, "searching", fraction, f"{state.score.inlier_fraction:.0%} inliers")
             if variant.is_finished(state.score, settings.stop_inlier_fraction):
                 break
-            state.iterations += 1
-            _replay(hypothesis, state, variant, estimator, evaluator)
-        fraction = state.iterations / settings.max_iterations
-        report(callback, "searching", fraction, f"{state.score.inlier_fraction:.0%} inliers")
-        if variant.is_finished(state.score, settings.stop_inlier_fraction):
-            break
+    except TimeLimitError:
+        if state.best is None:
+            raise
+        state.stop_reason = TIME_LIMIT
+        return state
     if state.best is None:
         raise NothingAcceptedError(state)
     finished = variant.is_finished(state.score, settings.stop_inlier_fraction)
@@ -542,6 +551,7 @@ def _replay(
     settings = variant.criteria
     used: set[bytes] = set()
     while True:
+        check_time()
         state.n_hypotheses += 1
         if hypothesis is None:
             state.rejected[_OUT_OF_BOUNDS] += 1

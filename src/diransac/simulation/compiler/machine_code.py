@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import os
+import time
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
+from itertools import pairwise
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -24,6 +27,12 @@ LANES = 8
 """Lanes of a vector, on every processor: results do not depend on the width of its registers."""
 
 CHUNKS_PER_THREAD = 4
+
+_PATIENCE = 0.2
+"""Longest time, s, for which signals are not noticed, where the work can be interrupted."""
+
+_FIRST_BLOCKS = 8
+"""Blocks of a loop that are run before their time is known."""
 
 PASSES = ("sroa", "simplify_cfg", "loop_rotate")
 """Optimisation passes: variables into registers, tidying. LLVM's default list takes 3 times as long, for no gain."""
@@ -122,12 +131,29 @@ def _object_code(emit: Callable[[], LLVM], key: str, machine: LLVM) -> bytes:
     cache = CodeCache.of_user()
     if cache is not None and (kept := cache.read(key)) is not None:
         return kept
-    parsed = _binding().parse_assembly(str(emit()))
-    _optimise(parsed, machine)
-    code = bytes(machine.emit_object(parsed))
+    code = _awaited(_compiled, str(emit()), machine)
     if cache is not None:
         cache.write(key, code)
     return code
+
+
+def _compiled(assembly: str, machine: LLVM) -> bytes:
+    """Object file of a module in LLVM's intermediate representation."""
+    parsed = _binding().parse_assembly(assembly)
+    _optimise(parsed, machine)
+    return bytes(machine.emit_object(parsed))
+
+
+def _awaited(work: Callable[..., bytes], *arguments: Any) -> bytes:
+    """Result of work that runs in a thread of its own, as no signal reaches a thread in LLVM: Ctrl-C ends the wait."""
+    from concurrent.futures import ThreadPoolExecutor, wait
+
+    pool = ThreadPoolExecutor(1, thread_name_prefix="diransac LLVM")
+    future = pool.submit(work, *arguments)
+    pool.shutdown(wait=False)
+    while not wait([future], _PATIENCE).done:
+        pass
+    return future.result()
 
 
 def _key(target: Target, name: str, definition: Iterable[str]) -> str:
@@ -186,16 +212,38 @@ def default_threads() -> int:
 def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: int, threads: int) -> None:
     """Call a compiled loop for blocks 0 .. n_blocks - 1, on several threads if there are several blocks.
 
+    The loop is left between two blocks after Ctrl-C, which reaches Python only there.
+
     Raises SettingsError: fewer than one thread.
     """
     if threads < 1:
         raise SettingsError(f"threads is {threads}, but at least 1 has to run.")
+    loop = partial(call, *arguments)
     if threads == 1 or n_blocks == 1:
-        call(*arguments, 0, n_blocks)
+        _run_some(loop, 0, n_blocks, Event())
         return
+    from concurrent.futures import Future, wait
+
     edges = np.linspace(0, n_blocks, min(n_blocks, threads * CHUNKS_PER_THREAD) + 1).astype(int).tolist()
-    work = _pool(os.getpid(), threads).map(lambda first, end: call(*arguments, first, end), edges[:-1], edges[1:])
-    list(work)
+    pool, stopped, parts = _pool(os.getpid(), threads), Event(), list[Future[None]]()
+    try:
+        for first, end in pairwise(edges):
+            parts.append(pool.submit(_run_some, loop, first, end, stopped))
+        for part in parts:
+            part.result()
+    finally:  # the loop's arrays live as long as this call
+        stopped.set()
+        wait([part for part in parts if not part.cancel()])
+
+
+def _run_some(loop: Callable[[int, int], None], first: int, end: int, stopped: Event) -> None:
+    """Call a loop for blocks first .. end - 1, a part of a second at a time, until it is stopped."""
+    at_a_time = _FIRST_BLOCKS
+    while first < end and not stopped.is_set():
+        begin, last = time.monotonic(), min(first + at_a_time, end)
+        loop(first, last)
+        first = last
+        at_a_time = 2 * at_a_time if time.monotonic() - begin < 0.5 * _PATIENCE else at_a_time
 
 
 @lru_cache(maxsize=4)

@@ -12,7 +12,7 @@
 | `normal_equations.py`, `arrowhead.py` | all intervals as one quadratic, and its solution in O(N) |
 | `refinement.py` | local optimisation, from easy to exact |
 | `local_search.py` | explanations of a log, of which the likeliest is chosen |
-| `sensor_errors.py` | delays and biases of sensors |
+| `recording_errors.py` | delays and biases of sensors, delays of inputs, gains that drift |
 | `projection.py` | parameters and covariance |
 | `checks.py` | findings of a fit on itself |
 | `missing_terms.py` | terms that explain the unmodelled forces |

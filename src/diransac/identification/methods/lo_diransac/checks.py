@@ -15,12 +15,15 @@ from diransac.identification.methods.lo_diransac.projection import (
     batch_sums,
     least_squares_gains,
     means_of_intervals,
+    means_of_windows,
     residuals_of_motion,
 )
-from diransac.text_table import number
+from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs
+from diransac.text_table import number, percent
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.local_search import Explanation
+    from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
@@ -29,6 +32,8 @@ __all__ = ["Change", "changes_between_halves", "findings_of_fit"]
 
 # A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious.
 _CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
+# Delay of an input that is worth a sentence, samples.
+_SMALL_DELAY = 0.1
 # Residual of an equation over that of the worst, at least.
 _SMALLEST = 1e-6
 _TINY = 1e-300
@@ -86,17 +91,15 @@ def findings_of_fit(
     if found.intervals.hold != "zero-order" and not found.intervals.lag:
         how = {"linear": "linearly", "smooth": "smoothly"}[found.intervals.hold]
         yield Finding("note", f"Inputs that vary {how} between samples explain this log better than held ones.")
-    yield from _of_sensors(found.intervals)
+    yield from _of_recordings(found.intervals, found.refinement.fit)
     yield from (_of_change(found.intervals.layout.names[x.index], x) for x in changes)
     if not found.exact:
         yield from _of_plain_least_squares(found.intervals, motion, result)
 
 
-def _of_sensors(intervals: ShootingIntervals) -> Iterator[Finding]:
-    """Delays and biases of sensors."""
-    errors = intervals.sensor_errors
-    if errors is None:
-        return
+def _of_recordings(intervals: ShootingIntervals, fit: Fit) -> Iterator[Finding]:
+    """Delays and biases of sensors, own delays of inputs, and drifts of their gains."""
+    errors = intervals.all_errors
     signals = np.array(intervals.model.signals)
     for delay in dict.fromkeys(errors.delay[errors.delay != 0.0].tolist()):
         late = signals[errors.delay == delay]
@@ -108,6 +111,15 @@ def _of_sensors(intervals: ShootingIntervals) -> Iterator[Finding]:
         if bias:
             size, unit = number(bias, 3), intervals.model.units[name]
             yield Finding("care", f"{name} has a sensor bias of {size} {unit}, which the estimate includes.")
+    own = delays_of_inputs(intervals, fit) if errors.input_delay.any() else np.zeros(len(intervals.model.inputs))
+    for name, delay, drift in zip(intervals.model.inputs, own, errors.gain_drift, strict=True):
+        if abs(delay) > _SMALL_DELAY:
+            time, sense = number(1e3 * abs(delay) * intervals.dt, 3), "later" if delay > 0.0 else "earlier"
+            yield Finding("care", f"{name} acts {time} ms {sense} than recorded, a delay that the estimate includes.")
+        if drift:
+            moves = f"{'rises' if drift > 0.0 else 'falls'} by {percent(abs(drift))} during the log"
+            holds = "the estimate includes this drift, and its parameters are those of the beginning"
+            yield Finding("care", f"The gain of {name} {moves}, as with a battery that sags: {holds}.")
 
 
 def _of_change(name: str, change: Change) -> Finding:
@@ -132,12 +144,13 @@ def changes_between_halves(found: Explanation, result: ProjectedEstimate) -> lis
     """
     intervals = found.intervals
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
-    first = place < 0.5 * np.bincount(intervals.log_of)[intervals.log_of]
+    first = (place < 0.5 * np.bincount(intervals.log_of)[intervals.log_of])[result.windows]
     if found.exact or min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
         return []
     _, rows, regressors, _ = residuals_of_motion(intervals, found.refinement.fit, result.parameters)
     W = means_of_intervals(intervals, regressors * intervals.counted[:, None, None])
     residuals = means_of_intervals(intervals, rows * intervals.counted[:, None])
+    W, residuals = (means_of_windows(x, result.windows) for x in (W, residuals))
     moved, variances = zip(*(_change(W[half], residuals[half]) for half in (first, ~first)), strict=True)
     halves, errors = result.parameters[None] + np.array(moved), np.sqrt(sum(variances))
     both = [Change(k, *x) for k, x in enumerate(halves.T.tolist())]

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["WeakForm", "equation_scales", "find_hypotheses", "robust_scores", "weak_form"]
 
 _OVERLAP = 5
+# Numbers that are held at a time for several hypotheses: bounds the memory, whatever the length of the logs.
+_NUMBERS_AT_A_TIME = 1_000_000
 # Least residual of an equation over its terms: smoothing is not exact.
 _SMALL_RESIDUAL = 0.01
 # Known terms that are as small beside those of another equation are rounding errors.
@@ -148,9 +150,14 @@ class WeakForm:
         Rows have residuals of order one; the priors of a layout are further rows.
         """
         n, r, n_p = self.W.shape
-        masks = chosen.reshape(len(chosen), -1).astype(np.float64)
-        G = (masks @ np.einsum("nri,nrj->nrij", self.W, self.W).reshape(n * r, -1)).reshape(-1, n_p, n_p)
-        h = masks @ (self.W * self.b[:, :, None]).reshape(n * r, -1)
+        products = np.einsum("nri,nrj->nrij", self.W, self.W).reshape(n * r, -1)
+        known = (self.W * self.b[:, :, None]).reshape(n * r, -1)
+        G, h = np.empty((len(chosen), n_p, n_p)), np.empty((len(chosen), n_p))
+        at_a_time = max(1, _NUMBERS_AT_A_TIME // (n * r))
+        for first in range(0, len(chosen), at_a_time):
+            some = slice(first, first + at_a_time)
+            masks = chosen[some].reshape(-1, n * r).astype(np.float64)
+            G[some], h[some] = (masks @ products).reshape(-1, n_p, n_p), masks @ known
         if layout is not None:
             precision = 1.0 / np.square(layout.prior_std)
             G, h = G + np.diag(precision), h + precision * layout.prior_mean
@@ -164,8 +171,11 @@ def _samples(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArr
     rng = _generator(seed)
     n, r, n_p = weak.W.shape
     sizes = np.r_[n, np.minimum(rng.integers(n_p, settings.largest_sample * n_p + 1, settings.n_samples), n)]
-    ranks = rng.random((len(sizes), n, r)).argsort(axis=1).argsort(axis=1)
-    return np.asarray(ranks < sizes[:, None, None])
+    chosen = np.empty((len(sizes), n, r), bool)
+    for mask, size in zip(chosen, sizes, strict=True):
+        drawn = rng.random((n, r))
+        mask[:] = drawn <= np.partition(drawn, size - 1, axis=0)[size - 1]
+    return chosen
 
 
 def _generator(seed: int) -> np.random.Generator:
@@ -288,6 +298,13 @@ def robust_scores(intervals: ShootingIntervals, motion: Motion, parameters: Floa
     (n_hypotheses,) array
         Lower is better; infinite where the simulation diverges on most samples.
     """
+    at_a_time = max(1, _NUMBERS_AT_A_TIME // (len(chosen) * intervals.length * len(intervals.model.signals)))
+    parts = [parameters[k : k + at_a_time] for k in range(0, len(parameters), at_a_time)]
+    return np.concatenate([_scores(intervals, motion, part, chosen) for part in parts])
+
+
+def _scores(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray, chosen: IntArray) -> FloatArray:
+    """Scores of hypotheses, as `robust_scores`, all at a time."""
     n, n_x = len(parameters), intervals.model.n_q + intervals.model.n_v
     starts, logs = intervals.starts[chosen], np.tile(intervals.log_of[chosen], n)
     seen: BoolArray = np.asarray(intervals.known.any(axis=0))
@@ -303,5 +320,5 @@ def robust_scores(intervals: ShootingIntervals, motion: Motion, parameters: Floa
     errors = rollouts(intervals.model, names, hold=intervals.hold).errors(batch, compared).reshape(n, -1, len(names))
     rows = (starts[:, None] + np.arange(intervals.length)).ravel()
     known = np.broadcast_to(intervals.known[rows][:, seen], errors.shape)
-    scale = lower_scale(np.nan_to_num(errors, nan=np.inf), known)
+    scale = lower_scale(np.nan_to_num(errors, copy=False, nan=np.inf), known)
     return np.asarray(np.log(np.maximum(scale, 1e-4 * motion.spread[seen])).sum(axis=1))

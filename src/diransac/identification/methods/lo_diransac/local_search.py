@@ -17,22 +17,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.errors import TimeLimitError
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
+from diransac.identification.methods.lo_diransac.missing_terms import clear_errors_of_inputs
 from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
+from diransac.identification.methods.lo_diransac.recording_errors import (
+    clear_errors,
+    errors_of,
+    signal_rates,
+    with_errors,
+)
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
-from diransac.identification.methods.lo_diransac.sensor_errors import clear_errors, errors_of, signal_rates, with_errors
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
+from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.methods.lo_diransac.recording_errors import RecordingError
     from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
-    from diransac.identification.methods.lo_diransac.sensor_errors import SensorError
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
@@ -57,13 +65,15 @@ _SIGNIFICANT, _SMALL_DELAY = 3.0, 0.1
 _WHOLE_SAMPLE = 0.5
 # Relative difference of parameters that makes a second start.
 _APART = 0.2
-# Log of the factor by which a delay must lower unmodelled accelerations; prior delay of a fit without one.
-_EXPLAINS, _FIXED = float(np.log(1.25)), 1e-6
+# Log of the factor by which a delay, and a drift, must lower unmodelled accelerations.
+_EXPLAINS, _EXPLAINS_DRIFT = float(np.log(1.25)), float(np.log(4.0))
+# Prior delay of a fit without one.
+_FIXED = 1e-6
 # Decrease of the log residuals of each signal by which a delay is worth to be tried.
 _SMALL_GAIN = 0.03
-# Gain of evidence, nats, that an error of a sensor is worth.
+# Gain of evidence, nats, that an error of a recording is worth.
 _WORTH = 20.0
-# Newton steps of the errors of sensors at most; changes over standard errors that end them.
+# Newton steps of the errors of recordings at most; changes over standard errors that end them.
 _REFINEMENTS, _REFINED = 4, 0.1
 # Inputs that vary between samples act half a sample before held ones.
 _CONTINUOUS = (-0.9, -0.1)
@@ -82,12 +92,15 @@ class Explanation:
         Of the fit; without a delay, where its delay is fixed.
     exact : bool
         Whether the fit is one of the model as it is.
+    complete : bool, optional
+        False if the time limit ended the search for a likelier one.
     """
 
     intervals: ShootingIntervals
     refinement: Refinement
     prior: Prior
     exact: bool
+    complete: bool = True
 
     @property
     def cost(self) -> float:
@@ -134,21 +147,48 @@ class LocalSearch:
         Returns
         -------
         Explanation
+
+        Raises
+        ------
+        TimeLimitError
+            The time limit was reached before the first local optimisation had converged.
         """
+        best: Explanation | None = None
+        try:
+            for found in self._ever_likelier(intervals, free_hold=free_hold, to_beat=to_beat):
+                best = found
+        except TimeLimitError:
+            if best is None:
+                raise
+            return replace(best, complete=False)
+        assert best is not None
+        return best
+
+    def _ever_likelier(self, intervals: ShootingIntervals, *, free_hold: bool, to_beat: float) -> Iterator[Explanation]:
+        """The likeliest explanation so far after each stage of the search."""
         report(self.callback, "searching for a delay", 0.1)
         delay = self._likeliest_delay(intervals)
-        shifted = [intervals, *([replace(intervals, delay=delay)] if delay else [])]
-        best, *others = [self._from_hypotheses(x, k) for k, x in enumerate(shifted)]
-        best = self._better(best, others)
+        flexible = self._from_hypotheses(intervals, 0)
+        yield flexible
+        best = self._simplest(flexible, self._prior_of(intervals))
+        yield best
+        if delay:
+            delayed = replace(intervals, delay=delay)
+            other = self._simplest(self._from_hypotheses(delayed, 1), self._prior_of(delayed))
+            best = self._better(best, [other])
+            yield best
         if best.cost > to_beat:
-            return best
+            return
         best = self._with_timing(best, free_hold=free_hold)
-        found = self._with_sensors(self._with_named_sensors(best))
+        yield best
+        found = self._with_errors_of_recordings(self._with_named_errors(best))
+        yield found
         if found is best:
-            return best
+            return
         # Inputs are late, or early, with respect to sensors that are so themselves.
         found = self._with_refined_errors(self._with_timing(found, free_hold=free_hold))
-        return self._with_refined_errors(self._with_fewest_delays(found))
+        yield found
+        yield self._with_refined_errors(self._with_fewest_delays(found))
 
     def _with_timing(self, best: Explanation, *, free_hold: bool) -> Explanation:
         """The explanation with another timing of the inputs, where that makes it likelier or is required."""
@@ -169,44 +209,61 @@ class LocalSearch:
             best = likelier
         return best
 
-    def _with_named_sensors(self, best: Explanation) -> Explanation:
-        """The explanation with the errors of the sensors that the settings name."""
-        place = best.intervals.model.signals.index
-        named = [ErrorKind((place(name),), is_delay=True) for name in self.settings.sensor_delays or ()]
-        named += [ErrorKind((place(name),), is_delay=False) for name in self.settings.sensor_biases or ()]
+    def _with_named_errors(self, best: Explanation) -> Explanation:
+        """The explanation with the errors of recordings that the settings name."""
+        model, settings = best.intervals.model, self.settings
+        signals, inputs = model.signals.index, list(model.inputs).index
+        delays = settings.sensor_delays or ()
+        named = [ErrorKind((signals(x),), "delay") for x in delays if x not in model.inputs]
+        named += [ErrorKind((inputs(x),), "delay", of_inputs=True) for x in delays if x in model.inputs]
+        named += [ErrorKind((signals(x),), "bias") for x in settings.sensor_biases or ()]
+        named += [ErrorKind((inputs(x),), "drift", of_inputs=True) for x in settings.gain_drifts or ()]
         if not named:
             return best
-        report(self.callback, "errors of the sensors", 0.8)
+        report(self.callback, "errors of the recordings", 0.8)
         return self._simplified(self._with_refined_errors(best, named))
 
-    def _with_sensors(self, best: Explanation) -> Explanation:
-        """The explanation with errors of the sensors, one after the other, as long as they make it likelier.
+    def _with_errors_of_recordings(self, best: Explanation) -> Explanation:
+        """The explanation with errors of the recordings, one after the other, as long as they make it likelier.
 
         Where the model is exact, groups are tested, and single signals of its measurement equations: nothing else
         depends on them, so that the motion is as likely whatever their delay.
         """
-        model = best.intervals.model
+        model, settings = best.intervals.model, self.settings
+        named = {"delay": settings.sensor_delays, "bias": settings.sensor_biases, "drift": settings.gain_drifts}
+        kinds = [kind for kind, names in named.items() if names is None]
         alone = np.full(len(model.signals), not best.exact)
         alone[len(model.signals) - len(model.sensors) :] = True
-        kinds = {"delays": self.settings.sensor_delays is None, "biases": self.settings.sensor_biases is None}
-        for k in range(self.settings.max_sensor_errors):
-            report(self.callback, "errors of the sensors", 0.8 + 0.01 * k)
-            errors = clear_errors(best.intervals, best.refinement.fit, alone, worth=_WORTH, **kinds)
-            likelier = best
+        for k in range(settings.max_sensor_errors):
+            report(self.callback, "errors of the recordings", 0.8 + 0.01 * k)
+            fit, likelier = best.refinement.fit, best
+            errors = clear_errors(best.intervals, fit, alone, kinds, worth=_WORTH)
+            if not best.exact:
+                errors += clear_errors_of_inputs(best.intervals, fit, kinds)
             for error in errors:
                 trial = self._with_errors(best, [error], to_beat=likelier.cost)
-                if trial.cost < likelier.cost and self._better(best, [trial], _WORTH, of_one=True) is trial:
+                share = _EXPLAINS_DRIFT if error.kind.what == "drift" else _EXPLAINS
+                if trial.cost < likelier.cost and self._better(best, [trial], _WORTH, share, of_one=True) is trial:
                     likelier = trial
             if likelier is best:
                 break
-            best = self._simplified(self._with_refined_errors(likelier))
+            best = self._settled(likelier)
         return best
 
+    def _settled(self, found: Explanation) -> Explanation:
+        """The explanation with its errors at their optimum, and without the freedom that is no longer likely.
+
+        Unmodelled accelerations stand for what is left of an error of inputs until there are none: the exact model
+        comes first.
+        """
+        if any(x.of_inputs for x in found.intervals.all_errors.kinds):
+            found = self._simplified(found)
+        return found if found.exact else self._simplified(self._with_refined_errors(found))
+
     def _with_refined_errors(self, best: Explanation, more: Sequence[ErrorKind] = ()) -> Explanation:
-        """The explanation at the optimum of its errors of sensors, and of more, with the same freedom."""
+        """The explanation at the optimum of its errors of recordings, and of more, with the same freedom."""
         for _ in range(_REFINEMENTS):
-            old = best.intervals.sensor_errors
-            kinds = dict.fromkeys([*(old.kinds if old else ()), *more])
+            kinds = dict.fromkeys([*best.intervals.all_errors.kinds, *more])
             errors = errors_of(best.intervals, best.refinement.fit, tuple(kinds))
             if all(x.ratio < _REFINED for x in errors):
                 break
@@ -220,13 +277,13 @@ class LocalSearch:
         """
         intervals, fit, settings = now.intervals, now.refinement.fit, self.settings
         is_asked_for = settings.input_delay or settings.sensor_delays is not None
-        if intervals.sensor_errors is None or intervals.lag or is_asked_for:
+        if intervals.errors is None or intervals.lag or is_asked_for:
             return now
         late = intervals.delay + fit.shared[-1]
         late = late if abs(late) > _SMALL_DELAY else 0.0
-        delays = np.where(intervals.known.any(axis=0), intervals.sensor_errors.delay + late, 0.0)
+        delays = np.where(intervals.known.any(axis=0), intervals.errors.delay + late, 0.0)
         delays = _grouped(delays, _SMALL_DELAY)
-        before = np.count_nonzero(np.unique(intervals.sensor_errors.delay)) + bool(late)
+        before = np.count_nonzero(np.unique(intervals.errors.delay)) + bool(late)
         if np.count_nonzero(np.unique(delays)) >= before:
             return now
         retimed = intervals.with_delays(delays, signal_rates(intervals, fit))
@@ -237,8 +294,10 @@ class LocalSearch:
         as_likely = found.cost / retimed.known.sum() < (now.cost + _AS_LIKELY) / intervals.known.sum()
         return found if as_likely else now
 
-    def _with_errors(self, now: Explanation, errors: Sequence[SensorError], *, to_beat: float = np.inf) -> Explanation:
-        """The explanation with errors of sensors, with the same freedom; given up where it will hardly beat a cost."""
+    def _with_errors(
+        self, now: Explanation, errors: Sequence[RecordingError], *, to_beat: float = np.inf
+    ) -> Explanation:
+        """The explanation with more errors, with the same freedom; given up where it will hardly beat a cost."""
         intervals = with_errors(now.intervals, now.refinement.fit, errors)
         return self._optimised(now, intervals, with_residuals(intervals, now.refinement.fit), to_beat)
 
@@ -253,9 +312,15 @@ class LocalSearch:
         return replace(now, intervals=intervals, refinement=refined)
 
     def _better(
-        self, now: Explanation, others: Sequence[Explanation], worth: float = _AS_LIKELY, *, of_one: bool = False
+        self,
+        now: Explanation,
+        others: Sequence[Explanation],
+        worth: float = _AS_LIKELY,
+        least: float = _EXPLAINS,
+        *,
+        of_one: bool = False,
     ) -> Explanation:
-        """The likeliest explanation of which another timing, or an error of a sensor, is worth to be believed.
+        """The likeliest explanation of which another timing, or an error of a recording, is worth to be believed.
 
         A controller's inputs answer disturbances, so that late inputs predict these, as late sensors do.  Where the
         model is not exact, either must also explain a good part of the accelerations that are otherwise unmodelled:
@@ -264,16 +329,15 @@ class LocalSearch:
 
         def explains(x: Explanation) -> bool:
             lower = _unexplained(now) - _unexplained(x)
-            return bool((lower.max() if of_one else lower.sum()) > _EXPLAINS)
+            return bool((lower.max() if of_one else lower.sum()) > least)
 
         others = [x for x in others if x.cost < now.cost - worth and (x.exact or explains(x))]
         return min(others, key=lambda x: x.cost, default=now)
 
     def _from_hypotheses(self, intervals: ShootingIntervals, k: int) -> Explanation:
-        """The likeliest explanation with this timing of the inputs."""
+        """The likeliest explanation with this timing of the inputs and with unmodelled accelerations."""
         part, undelayed = within(self.callback, 0.1 + 0.25 * k, 0.35 + 0.25 * k), self._undelayed
-        flexible = Explanation(intervals, self.best(intervals, undelayed, part), undelayed, exact=False)
-        return self._simplest(flexible, self._prior_of(intervals))
+        return Explanation(intervals, self.best(intervals, undelayed, part), undelayed, exact=False)
 
     @property
     def _undelayed(self) -> Prior:
@@ -330,8 +394,10 @@ class LocalSearch:
         starts = starts[: 1 + bool((np.abs(starts[1] - starts[0]) > _APART * np.abs(starts[0])).any())]
         for p in starts[intervals.layout.admits(starts)]:
             begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
-            refined = refine_exact(self.settings, intervals, begin, prior, flexible.cost)
+            is_left = any(x.of_inputs for x in intervals.all_errors.kinds)
+            refined = refine_exact(self.settings, intervals, begin, prior, np.inf if is_left else flexible.cost)
             exact = Explanation(intervals, refined, prior, exact=True)
+            exact = self._with_refined_errors(exact) if is_left else exact
             if exact.cost < flexible.cost:
                 return exact
         while self.settings.model_error and (parts := fewest_parts(flexible.intervals.length)):
@@ -414,6 +480,7 @@ class LocalSearch:
 
         def score(rows: int) -> float:
             if rows not in scores:
+                check_time()
                 delayed = replace(intervals, delay=rows)
                 scores[rows] = float(robust_scores(delayed, self.motion, self.hypotheses[:1], every)[0])
             return scores[rows]

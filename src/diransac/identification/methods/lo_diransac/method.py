@@ -19,8 +19,8 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.blas import single_threaded
 from diransac.data.input_timing import InputTiming
 from diransac.data.segment import long_runs, silent_rows
-from diransac.errors import IdentificationError, LogError, ModelError, SettingsError
-from diransac.identification.estimate import Diagnosis, Estimate, Finding, Resolution
+from diransac.errors import IdentificationError, LogError, ModelError, SettingsError, TimeLimitError
+from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.checks import changes_between_halves, findings_of_fit
@@ -33,7 +33,9 @@ from diransac.identification.methods.lo_diransac.projection import (
     estimate_parameters,
     fitted_parameters,
     parameter_units,
+    residuals_of_motion,
 )
+from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs
 from diransac.identification.methods.lo_diransac.refinement import make_prior
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
@@ -55,6 +57,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
 )
 from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
 from diransac.simulation import default_threads
+from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -70,7 +73,7 @@ if TYPE_CHECKING:
 __all__ = ["LoDiransac", "configured"]
 
 _FEWEST_INTERVALS = 4
-_OUTLIER = 0.5
+_OUTLIER, _TINY = 0.5, 1e-9
 # Fraction of a signal's spread from which on its noise leaves nothing to explain.
 _ALL_OF_IT = 0.8
 # Unexplained part of an acceleration from which on states that nothing measures are doubtful.
@@ -120,12 +123,13 @@ class LoDiransac(LoDiransacSettings):
         where that is the likelier explanation of the log.
     max_delay_shifts : int, optional
         Rounds in which other delays, a lag and another hold of the inputs are tried after the first optimisations.
-    sensor_delays, sensor_biases : sequence of str, optional
-        Signals whose delay, or bias, is estimated in any case; that of no other is.  None: those that the residuals
-        show clearly.
+    sensor_delays, sensor_biases, gain_drifts : sequence of str, optional
+        Signals, or inputs, whose delay is estimated in any case, signals whose bias is, and inputs whose gain drifts;
+        that of no other is.  An input's delay is its own, besides that of all.  None: those that the residuals show
+        clearly.
     max_sensor_errors : int, optional
-        Largest number of delays and biases of unnamed sensors that are estimated; where the model is exact, only of
-        those with a measurement equation.
+        Largest number of unnamed ones of these that are estimated; where the model is exact, only of groups of sensors
+        and of those with a measurement equation.
     substeps : int, optional
         Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
         samples or links are light.
@@ -186,9 +190,11 @@ class LoDiransac(LoDiransacSettings):
         LogError
             The logs are too short, or sampled at different rates.
         SettingsError
-            A sensor is named that the logs lack.
+            A signal or an input is named that the logs lack.
         IdentificationError
             No sample gives parameters within their bounds.
+        TimeLimitError
+            The time limit was reached before the first local optimisation had converged.
         """
         with single_threaded():  # matrices are small: more threads would only add waiting
             return _fitted(self, dataset, int(seed), callback)
@@ -217,7 +223,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
     best = _searched(settings, dataset, seed, callback)
     for narrower in _NARROWER if best.is_doubtful else ():
-        with suppress(IdentificationError, np.linalg.LinAlgError):
+        with suppress(IdentificationError, TimeLimitError, np.linalg.LinAlgError):
             further = within(callback, 0.87, 0.9)
             other = _searched(settings, dataset, seed, further, narrower, best.likeliest.cost)
             best = min(best, other, key=lambda x: x.likeliest.cost)
@@ -241,7 +247,9 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     )
     forced = bool(settings.input_delay or settings.input_lag)
     found = _Found(dataset, intervals, motion, refined, result, ambiguity, forced)
-    estimate = _estimate(settings, found, best.n_hypotheses, refined.converged, notes, checks)
+    end = "converged" if refined.converged else "limit of steps"
+    end = end if likeliest.complete else TIME_LIMIT
+    estimate = _estimate(settings, found, best.n_hypotheses, end, notes, checks)
     return estimate if lacks is None else replace(estimate, suggestions=lacks.suggestions)
 
 
@@ -261,11 +269,19 @@ class _Searched:
 
     @property
     def unexplained(self) -> float:
-        """Largest RMS acceleration that the model does not explain, over the spread of its motion."""
-        intervals, motion = self.likeliest.intervals, self.motion
-        first = intervals.model.n_q + intervals.model.n_v
+        """Largest RMS acceleration that the model does not explain, over the spread of its motion.
+
+        That of states which nothing measures is the spread of the fit; their motion before it was that of a hypothesis.
+        """
+        intervals, motion, hidden = self.likeliest.intervals, self.motion, unmeasured_states(self.likeliest.intervals)
+        model, first = intervals.model, intervals.model.n_q + intervals.model.n_v
+        fitted = residuals_of_motion(intervals, self.likeliest.refinement.fit, self.result.parameters)[0][2]
+        measured = np.array([name not in hidden for name in model.velocities])
+        spread = np.where(
+            measured, motion.spread[first : first + model.n_v], fitted[intervals.counted].std(axis=0) + _TINY
+        )
         left = np.sqrt(np.square(self.result.unexplained[intervals.occupied]).mean(axis=0))
-        return float((left / motion.spread[first : first + intervals.model.n_v]).max())
+        return float((left / spread).max())
 
     @property
     def is_doubtful(self) -> bool:
@@ -294,6 +310,7 @@ def _searched(
         check_structure(dataset.model, dataset.source, allowed, measured)
         motion = _completed(intervals, motion, dataset)
     report(callback, "drawing hypotheses", 0.1)
+    check_time()
     hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
     unit = discrepancy_units(intervals, motion, hypotheses[0])
     search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
@@ -321,11 +338,13 @@ def _ambiguity(n: int, changes: Sequence[Change], lacks: MissingTerms | None) ->
 
 
 def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:
-    """Raises SettingsError: a sensor is named that the logs lack."""
-    for setting in ("sensor_delays", "sensor_biases"):
-        unknown = [name for name in getattr(settings, setting) or () if name not in dataset.signals]
+    """Raises SettingsError: a signal or an input is named that the logs lack."""
+    inputs = tuple(dataset.model.inputs)
+    known = {"sensor_delays": (*dataset.signals, *inputs), "sensor_biases": dataset.signals, "gain_drifts": inputs}
+    for setting, names in known.items():
+        unknown = [name for name in getattr(settings, setting) or () if name not in names]
         if unknown:
-            has = ", ".join(dataset.signals)
+            has = ", ".join(names)
             raise SettingsError(f'{setting} names "{unknown[0]}", which {dataset.source} lacks; it has {has}')
 
 
@@ -474,24 +493,30 @@ class _Found:
 
     @property
     def is_late(self) -> bool:
-        """True for a significant delay."""
-        return abs(self.late) > max(_SIGNIFICANT * self.refinement.delay_error, _SMALL_DELAY)
+        """True for a significant delay that all inputs have."""
+        clear = abs(self.late) > max(_SIGNIFICANT * self.refinement.delay_error, _SMALL_DELAY)
+        return clear and (bool(self.intervals.lag) or not self.intervals.all_errors.input_delay.any())
 
     @property
     def timing(self) -> InputTiming:
-        """Delay or lag of the inputs where it is significant, or forced."""
+        """Delay or lag of the inputs where it is significant, or forced, and the inputs' own errors."""
+        dt, errors = self.intervals.dt, self.intervals.all_errors
+        drifts = tuple(errors.gain_drift.tolist()) if errors.gain_drift.any() else ()
+        if errors.input_delay.any():
+            delays, lag = delays_of_inputs(self.intervals, self.refinement.fit) * dt, self.intervals.lag * dt
+            return InputTiming(0.0, lag, tuple(delays.tolist()), drifts)
         if not (self.is_late or self.forced):
-            return InputTiming()
+            return InputTiming(gain_drifts=drifts)
         if self.intervals.lag:
-            return InputTiming(lag=max(self.late, LEAST_LAG) * self.intervals.dt)
-        return InputTiming(delay=self.late * self.intervals.dt)
+            return InputTiming(lag=max(self.late, LEAST_LAG) * dt, gain_drifts=drifts)
+        return InputTiming(self.late * dt, gain_drifts=drifts)
 
 
 def _estimate(
     settings: LoDiransacSettings,
     found: _Found,
     n_hypotheses: int,
-    converged: bool,
+    end: str,
     notes: tuple[str, ...],
     checks: tuple[Finding, ...],
 ) -> Estimate:
@@ -515,7 +540,7 @@ def _estimate(
         estimator="multiple shooting",
         iterations=settings.n_nonlinear_samples if nonlinear else settings.n_samples,
         n_hypotheses=n_hypotheses,
-        stop_reason="converged" if converged else "limit of steps",
+        stop_reason=end,
         resolution=Resolution("rk4", settings.substeps, intervals.hold, found.timing),
         notes=notes,
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),

@@ -1,8 +1,10 @@
-"""Terms that explain the unmodelled forces over the fitted motion."""
+"""What explains the unmodelled forces over the fitted motion: errors of inputs, or terms that the model lacks."""
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -11,7 +13,16 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.identification.candidate_terms import TermLibrary, candidate_terms
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
-from diransac.identification.methods.lo_diransac.projection import residuals_of_motion
+from diransac.identification.methods.lo_diransac.projection import (
+    means_of_intervals,
+    projected_parameters,
+    residuals_of_motion,
+)
+from diransac.identification.methods.lo_diransac.recording_errors import (
+    RecordingError,
+    change_of_inputs,
+    errors_of_inputs,
+)
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.suggestions import (
     MeanForces,
@@ -21,13 +32,22 @@ from diransac.identification.suggestions import (
     spanned,
     suggestions_of,
 )
+from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
     from diransac.identification.candidate_terms import CandidateTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.methods.lo_diransac.shooting import ErrorKind, ShootingIntervals
+    from diransac.model import Model
+    from diransac.simulation.compiler import Map
 
-__all__ = ["MissingTerms", "missing_terms"]
+__all__ = ["MissingTerms", "clear_errors_of_inputs", "missing_terms"]
+
+# Part of the force of an equation that an error of inputs must explain: a payload that is dropped is half a drift.
+_EXPLAINS = {"delay": 0.3, "drift": 0.9}
+# Part of an error's effect that parameters must leave; relative change of a gain that leaves none.
+_INDEPENDENT, _NO_GAIN = 1e-2, 1.0
+_SMALLEST, _TINY = 1e-6, 1e-300
 
 
 @dataclass(frozen=True)
@@ -73,6 +93,58 @@ def missing_terms(
     return MissingTerms(suggestions_of(candidates, selected), changes_beside(means, selected)[: intervals.n_p])
 
 
+def clear_errors_of_inputs(intervals: ShootingIntervals, fit: Fit, kinds: Container[str]) -> list[RecordingError]:
+    """The drift of gains and the delay of inputs that explain most of the unmodelled forces, where that is much.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        With unmodelled accelerations.
+    kinds : container of str
+        Which of "delay" and "drift" are sought.
+
+    Returns
+    -------
+    list of RecordingError
+        At most one of each.
+    """
+    tried = [x for x in errors_of_inputs(intervals) if x.what in kinds]
+    if not tried:
+        return []
+    motion, r, W, _ = residuals_of_motion(intervals, fit, projected_parameters(intervals, fit))
+    slopes = _input_slopes(intervals.model, motion)
+    effects = [np.einsum("nij,nj->ni", slopes, change_of_inputs(intervals, x)) for x in tried]
+    rows = np.concatenate([np.stack([r, *effects], axis=2), W], axis=2) * intervals.counted[:, None, None]
+    means = means_of_intervals(intervals, rows)
+    scale = np.sqrt(np.square(means[:, :, 0]).mean(axis=0))
+    means = means / np.maximum(scale, _SMALLEST * scale.max() + _TINY)[:, None]
+    own = means[:, :, 1 + len(tried) :]
+    found = [_error_of_inputs(x, means[:, :, 0], means[:, :, 1 + k], own) for k, x in enumerate(tried)]
+    likeliest = {x.kind.what: x for x in sorted(filter(None, found), key=lambda x: x.gain)}
+    return list(likeliest.values())
+
+
+def _error_of_inputs(kind: ErrorKind, force: FloatArray, effect: FloatArray, own: FloatArray) -> RecordingError | None:
+    """An error whose effect ``(W, n_v)`` explains much of the force, or None.
+
+    Parameters take up what they can of both: ``own (W, n_v, n)``.
+    """
+    columns = np.stack([force, effect], axis=2).reshape(force.size, 2)
+    W = own.reshape(force.size, -1)
+    W = W / np.maximum(np.sqrt(np.square(W).sum(axis=0)), _TINY)
+    free = columns - W @ np.linalg.lstsq(W, columns, rcond=None)[0]
+    both, alone = free[:, 0], free[:, 1]
+    if not alone @ alone > _INDEPENDENT * (columns[:, 1] @ columns[:, 1]):
+        return None
+    size = -float(alone @ both / (alone @ alone))
+    before, after = (np.square(x.reshape(force.shape)).sum(axis=0) + _TINY for x in (both, both + size * alone))
+    if (after > (1.0 - _EXPLAINS[kind.what]) * before).all() or (kind.what == "drift" and abs(size) > _NO_GAIN):
+        return None
+    gain = 0.5 * len(force) * float(np.log(before / after).sum())
+    return RecordingError(kind, size, float(np.sqrt(2.0 * max(gain, 0.0))), gain)
+
+
 class _Rows:
     """Fitted motion and residuals in the rows of the intervals, and means over those of an interval that count."""
 
@@ -95,12 +167,10 @@ class _Rows:
         sums = weighted.reshape(len(self.intervals), -1, *values.shape[1:]).sum(axis=1)
         return np.asarray(sums[self.intervals.occupied])
 
-    def input_rates(self, candidates: CandidateTerms) -> FloatArray:
+    def input_rates(self) -> FloatArray:
         """``dr/du_j du_j/dt`` (N, n_v, n_u): the effect of a delay of each input."""
-        model, q, v, a, u, p = self.intervals.model, *candidates.symbols
-        slopes = ca.Function("slopes", [q, v, a, u, p], [ca.densify(ca.jacobian(model.residual(q, v, a, u, p), u))])
-        found = np.array(slopes(*(x.T for x in self.motion))).reshape(model.n_v, -1, model.n_u).swapaxes(0, 1)
-        return np.asarray(found * self.intervals.moving_inputs[:, None, model.n_u :])
+        rates = self.intervals.moving_inputs[:, self.intervals.model.n_u :]
+        return _input_slopes(self.intervals.model, self.motion) * rates[:, None, :]
 
 
 def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForces:
@@ -113,7 +183,7 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForce
     of_force = np.einsum("wij,wjk,wik->wi", M, alone[:, n_x:, n_x:], M)
     inertial = np.einsum("nij,nj->ni", rows.M, rows.motion[2])[intervals.counted]
     force = rows.mean(rows.r)
-    own = rows.mean(np.concatenate([rows.W, rows.input_rates(candidates)], axis=2))
+    own = rows.mean(np.concatenate([rows.W, rows.input_rates()], axis=2))
     level = rows.mean(np.hstack([np.ones((len(rows.r), 1)), intervals.inputs]))
     discrepancies = _discrepancies(force, own, level)
     place = slice(n_p, n_p + n_v * (n_u + 1))
@@ -129,6 +199,20 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForce
         groups=candidates.groups,
         log_of=intervals.log_of[intervals.occupied],
     )
+
+
+def _input_slopes(model: Model, motion: tuple[FloatArray, ...]) -> FloatArray:
+    """``dr/du`` (N, n_v, n_u) over a motion."""
+    (columns,) = _input_slope_map(model)(*motion)
+    return np.asarray(columns.reshape(-1, model.n_u, model.n_v).swapaxes(1, 2))
+
+
+@lru_cache(maxsize=64)
+def _input_slope_map(model: Model) -> Map:
+    """Derivatives of the residuals with respect to the inputs, column by column."""
+    symbols = [ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup")]
+    slopes = ca.densify(ca.jacobian(model.residual(*symbols), symbols[3]))
+    return compile_map(ca.Function("input_slopes", symbols, [slopes]))
 
 
 def _discrepancies(force: FloatArray, own: FloatArray, level: FloatArray) -> FloatArray:

@@ -135,17 +135,34 @@ class NormalEquations:
         (W, k) array, (n_s,) array
             Not finite where a rollout diverges.
         """
-        n_x, k = fit.x.shape[1], self.right_z.shape[1]
+        n_x = fit.x.shape[1]
         z = np.hstack([moved.x - fit.x, moved.d - fit.d])
         s = (moved.shared - fit.shared)[_places(intervals)[intervals.log_of]]
         linear = self.jumps + z[1:, :n_x] - np.einsum("wij,wj->wi", self.slopes, np.hstack([z, s])[:-1])
         found = moved.x[1:] - intervals.ends(moved.shared, moved.x, moved.d)
-        excess = self.precision * np.where(intervals.linked[:, None], found - linear, 0.0)
-        pulled = np.einsum("wij,wi->wj", self.slopes, excess)
-        right_z = self.right_z.copy()
-        right_z[:-1] += pulled[:, :k]
-        right_z[1:, :n_x] -= excess
-        return right_z, self.right_s + _in_places(intervals, pulled[:, k:]).sum(axis=0)
+        of_z, of_s = self.by_jumps(intervals, found - linear)
+        return self.right_z - of_z, self.right_s - of_s
+
+    def by_jumps(self, intervals: ShootingIntervals, more: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Change of the gradient by larger jumps.
+
+        Parameters
+        ----------
+        intervals : ShootingIntervals
+        more : (W - 1, n_x) array
+            0 is taken where a log or a gap ends.
+
+        Returns
+        -------
+        (W, k) array, (n_s,) array
+        """
+        n_x, k = more.shape[1], self.right_z.shape[1]
+        force = self.precision * np.where(intervals.linked[:, None], more, 0.0)
+        pulled = -np.einsum("wij,wi->wj", self.slopes, force)
+        of_z = np.zeros_like(self.right_z)
+        of_z[:-1] += pulled[:, :k]
+        of_z[1:, :n_x] += force
+        return of_z, _in_places(intervals, pulled[:, k:]).sum(axis=0)
 
 
 def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:

@@ -7,7 +7,9 @@ in the regressor's column space is attributed to the parameters.  Equations are 
 
 Inputs are no instruments: a controller answers disturbances, and its inputs are correlated with them (Forssell, Ljung
 1999).  Nor are any needed: the fitted accelerations are posterior means, whose errors are uncorrelated with themselves,
-so that they do not bias the slopes of a regression on them (Berkson 1950).
+so that they do not bias the slopes of a regression on them (Berkson 1950).  The motion of a state that nothing measures
+follows from the equations and from its unmodelled accelerations: a regression on it would attenuate its parameters, and
+these accelerations are not attributed to them.
 
 The covariance has four parts: that of the fit and of the errors of its sensors, propagated through the projection;
 that of the unmodelled forces outside the regressor's column space, as a sample of forces that differ from log to log;
@@ -29,19 +31,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
-from scipy.special import ndtri, stdtrit
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.hypotheses import WeakForm
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
+from diransac.identification.methods.lo_diransac.recording_errors import effect_on
 from diransac.identification.methods.lo_diransac.refinement import weights_of
-from diransac.identification.methods.lo_diransac.sensor_errors import effect_on
 from diransac.identification.methods.lo_diransac.smoothing import split_signals
-from diransac.identification.uncertainty import combined
+from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
+from diransac.identification.uncertainty import combined, student_quantile
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
@@ -60,6 +63,7 @@ __all__ = [
     "inertial_forces",
     "least_squares_gains",
     "means_of_intervals",
+    "means_of_windows",
     "parameter_units",
     "projected_parameters",
     "residuals_of_motion",
@@ -67,9 +71,12 @@ __all__ = [
 ]
 
 
-_TINY, _UPPER = 1e-300, 0.975
+_TINY, _UPPER, _NORMAL_UPPER = 1e-300, 0.975, 1.959963984540054
 # Factor of the standard deviations of priors in the covariance that is combined with them.
 _WIDER = 100.0
+# Equations per parameter in the longest windows; difference of estimates, standard errors, and relative, that is none;
+# part of a column's power that windows of twice the length keep where it has no noise.
+_EQUATIONS, _CLEAR, _NEGLIGIBLE, _KEPT = 8, 2.5, 0.05, 0.95
 # Steps of reweighting, the width of Cauchy's loss in standard deviations, and what is rounding of an equation's scale.
 _REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
 
@@ -84,13 +91,16 @@ class ProjectedEstimate:
         Each in its unit, per-log parameters of every log included.
     covariance : (n, n) array
     unexplained : (W, n_v) array
-        Mean over each interval of the accelerations that the model with these parameters does not explain; 0 where an
+        Mean over each window of the accelerations that the model with these parameters does not explain; 0 where an
         interval has no row that counts.
+    windows : (n_windows,) int array
+        First intervals of the windows over which the equations were averaged.
     """
 
     parameters: FloatArray
     covariance: FloatArray
     unexplained: FloatArray
+    windows: IntArray
 
 
 def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation: float) -> ProjectedEstimate:
@@ -130,8 +140,8 @@ def projected_parameters(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     (n,) array
         Within the inclusive bounds.
     """
-    rows = _Rows.of(intervals, fit)
-    return _bounded_projection(intervals, fit.shared[: intervals.n_p], rows, _REWEIGHTED)[0]
+    now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit)
+    return _bounded_projection(intervals, now, rows, _windows(intervals, now, rows), _REWEIGHTED)[0]
 
 
 def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -157,7 +167,7 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     more = np.sqrt(np.maximum(1.0, np.square(sums).sum(axis=0) / (np.diag(s[:n_p]) + _TINY)))
     p = fit.shared[:n_p]
     covariance = s[:n_p] * np.outer(more, more) + effect_on(intervals, fit, z, s)
-    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p))
+    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p), np.arange(len(intervals)))
 
 
 def _with_wide_priors(intervals: ShootingIntervals, fit: Fit) -> Fit:
@@ -172,7 +182,8 @@ def _combined_with_priors(intervals: ShootingIntervals, fit: Fit, found: Project
     variance = np.square(layout.prior_std[layout.with_prior]) / (1.0 - _WIDER**-2)
     mean = layout.prior_mean[layout.with_prior]
     p, covariance = combined(found.parameters, found.covariance, layout.with_prior, mean, variance)
-    return replace(found, parameters=p, covariance=covariance, unexplained=unexplained(intervals, fit, p))
+    left = _over_windows(unexplained(intervals, fit, p), found.windows)
+    return replace(found, parameters=p, covariance=covariance, unexplained=left)
 
 
 def _inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fit:
@@ -198,8 +209,10 @@ class _Rows:
     M : (W, n_v, n_v) array
     latent : (W, n_v) array
         ``M d``.
-    scale : (n_v,) array
-        Inertial force of each equation; 1 for one without.
+    attributed : (n_v,) bool array
+        Equations of which ``M d`` is attributed to the parameters: those of measured motion.
+    inertial : (W, n_v) array
+        Mean inertial force of each equation.
     """
 
     W: FloatArray
@@ -207,7 +220,8 @@ class _Rows:
     means: FloatArray
     M: FloatArray
     latent: FloatArray
-    scale: FloatArray
+    attributed: BoolArray
+    inertial: FloatArray
 
     @classmethod
     def of(cls, intervals: ShootingIntervals, fit: Fit) -> _Rows:
@@ -219,9 +233,9 @@ class _Rows:
         push = push - np.einsum("nij,nj->ni", M, np.repeat(fit.d, intervals.length, axis=0))
         M = means_of_intervals(intervals, M)
         inertial = np.einsum("wij,wj->wi", M, means_of_intervals(intervals, motion[2]))
-        scale = np.sqrt(np.square(inertial).mean(axis=0))
-        latent = np.einsum("wij,wj->wi", M, fit.d)
-        return cls(W, push, means_of_intervals(intervals, W), M, latent, np.where(scale > 0.0, scale, 1.0))
+        latent, hidden = np.einsum("wij,wj->wi", M, fit.d), unmeasured_states(intervals)
+        attributed = np.array([name not in hidden for name in intervals.model.velocities])
+        return cls(W, push, means_of_intervals(intervals, W), M, latent, attributed, inertial)
 
 
 def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -232,15 +246,16 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     interval means.
     """
     n_p, n_s, n_x = intervals.n_p, len(fit.shared), fit.x.shape[1]
-    rows = _Rows.of(intervals, fit)
-    p, gains, stuck = _bounded_projection(intervals, fit.shared[:n_p], rows, _REWEIGHTED)
-    plain = _bounded_projection(intervals, fit.shared[:n_p], rows, 0)[0]
+    now, rows = fit.shared[:n_p], _Rows.of(intervals, fit)
+    windows = _windows(intervals, now, rows)
+    p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
+    plain = _bounded_projection(intervals, now, rows, windows, 0)[0]
     by_rows, by_means = gains
     of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + fit.d.shape[1], n_p))
     level = np.hstack([np.ones((len(rows.push), 1)), intervals.inputs])
     of_s[:n_p] = np.eye(n_p)
     of_s[n_p:-1] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
-    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means, rows.M)
+    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means * rows.attributed, rows.M)
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(of_z, of_s)
     covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s + effect_on(intervals, fit, z, s)
@@ -251,28 +266,28 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     covariance = covariance + sums.T @ sums + np.outer(plain - p, plain - p)
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
-    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p))
+    left = _over_windows(unexplained(intervals, fit, p), windows)
+    return ProjectedEstimate(p, covariance, left, windows)
 
 
 def _bounded_projection(
-    intervals: ShootingIntervals, now: FloatArray, rows: _Rows, reweighted: int
+    intervals: ShootingIntervals, now: FloatArray, rows: _Rows, windows: IntArray, reweighted: int
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], BoolArray]:
     """Parameters within inclusive bounds, gains of rows (n, N, n_v) and of means (n, W, n_v), and those on a bound.
 
-    Arguments are the parameters of the fit, the equations on its motion, and the number of steps of reweighting.
+    Arguments are the parameters of the fit, the equations on its motion, the first intervals of the windows over which
+    these are averaged, and the number of steps of reweighting.
     """
     lower = np.array([-np.inf if x.positive else x.lower for x in intervals.layout.bounds])
     upper = np.array([x.upper for x in intervals.layout.bounds])
     stuck, p = np.zeros(len(now), bool), now
     for _ in range(len(now) + 1):
         free = ~stuck
-        left = rows.latent + rows.means[:, :, stuck] @ (p - now)[stuck]
+        left = rows.latent * rows.attributed + rows.means[:, :, stuck] @ (p - now)[stuck]
         known = rows.means[:, :, free] @ now[free] - left - means_of_intervals(intervals, rows.push)
-        weights = _robust_weights(intervals, WeakForm(rows.means[:, :, free], known), rows.scale, reweighted)
         gains = tuple(np.zeros((len(now), *x.shape[:2])) for x in (rows.W, rows.means))
-        every = np.repeat(weights, intervals.length, axis=0)
-        for gain, W, one in zip(gains, (rows.W, rows.means), (every, weights), strict=True):
-            gain[free] = least_squares_gains(W[:, :, free], one)
+        for gain, one in zip(gains, _gains(intervals, rows, free, known, windows, reweighted), strict=True):
+            gain[free] = one
         found = now - np.einsum("pni,ni->p", gains[0], rows.push) - np.einsum("pwi,wi->p", gains[1], left)
         p = np.where(stuck, p, found)
         outside = (p < lower) | (p > upper)
@@ -282,7 +297,109 @@ def _bounded_projection(
     return p, (gains[0], gains[1]), stuck
 
 
-def _robust_weights(intervals: ShootingIntervals, rows: WeakForm, scale: FloatArray, steps: int) -> FloatArray:
+def _gains(
+    intervals: ShootingIntervals, rows: _Rows, free: BoolArray, known: FloatArray, windows: IntArray, reweighted: int
+) -> tuple[FloatArray, FloatArray]:
+    """Effects on the free parameters of every row (n, N, n_v), and of every interval (n, W, n_v).
+
+    Equations of intervals have the known sides ``known (W, n_v)``.
+    """
+    if len(windows) == len(intervals):
+        weak = WeakForm(rows.means[:, :, free], known)
+        weights = _robust_weights(weak, intervals.occupied, _rms(rows.inertial), reweighted)
+        every = np.repeat(weights, intervals.length, axis=0)
+        return least_squares_gains(rows.W[:, :, free], every), least_squares_gains(weak.W, weights)
+    W, b, inertial = (means_of_windows(x, windows) for x in (rows.means[:, :, free], known, rows.inertial))
+    sizes = np.diff(windows, append=len(intervals))
+    occupied = np.logical_or.reduceat(intervals.occupied, windows)
+    gains = least_squares_gains(W, _robust_weights(WeakForm(W, b), occupied, _rms(inertial), reweighted))
+    of_intervals = np.repeat(gains / sizes[:, None], sizes, axis=1)
+    return np.repeat(of_intervals / intervals.length, intervals.length, axis=1), of_intervals
+
+
+def means_of_windows(values: FloatArray, windows: IntArray) -> FloatArray:
+    """Means over windows of intervals.
+
+    Parameters
+    ----------
+    values : (W, ...) array
+        Of each interval.
+    windows : (n_windows,) int array
+        First interval of each window.
+
+    Returns
+    -------
+    (n_windows, ...) array
+    """
+    sizes = np.diff(windows, append=len(values)).reshape(-1, *(1,) * (values.ndim - 1))
+    return np.asarray(np.add.reduceat(values, windows, axis=0) / sizes)
+
+
+def _over_windows(values: FloatArray, windows: IntArray) -> FloatArray:
+    """The mean of its window in every interval (W, n)."""
+    return np.repeat(means_of_windows(values, windows), np.diff(windows, append=len(values)), axis=0)
+
+
+def _rms(inertial: FloatArray) -> FloatArray:
+    """Inertial force of each equation; 1 for one without."""
+    scale = np.sqrt(np.square(inertial).mean(axis=0))
+    return np.where(scale > 0.0, scale, 1.0)
+
+
+@dataclass(frozen=True)
+class _Averaged:
+    """Least squares of equations that are averaged over windows.
+
+    Parameters
+    ----------
+    windows : (n_windows,) int array
+        First interval of each.
+    parameters : (n,) array
+    parts : (W, n) array
+        What each interval contributes to their error.
+    power : (n,) array
+        Mean square of each parameter's column.
+    """
+
+    windows: IntArray
+    parameters: FloatArray
+    parts: FloatArray
+    power: FloatArray
+
+    def agrees_with(self, longer: _Averaged) -> bool:
+        """False if a parameter clearly differs."""
+        change, parts = np.abs(self.parameters - longer.parameters), self.parts - longer.parts
+        error = np.sqrt(np.square(batch_sums(parts)).sum(axis=0))
+        return bool(((change <= _CLEAR * error) | (change <= _NEGLIGIBLE * np.abs(longer.parameters))).all())
+
+
+def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> IntArray:
+    """First intervals of the windows over which the equations are averaged: each interval, where that does no harm.
+
+    Unmodelled accelerations that vary fast follow the sensors' noise where it is not white.  Fitted accelerations are
+    then noise, and least squares attenuates what they multiply.  Means over longer windows have less of it and less
+    information.  The shortest windows are taken with which the estimates of all longer ones agree (Lepski 1991), or
+    that have no such noise: windows of twice their length keep the power of the regressors.
+    """
+    place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
+    tried, size = list[_Averaged](), 1
+    while True:
+        windows = np.flatnonzero(place % size == 0)
+        if tried and len(windows) * rows.latent.shape[1] < _EQUATIONS * len(now):
+            break
+        p, (_, by_means), _ = _bounded_projection(intervals, now, rows, windows, 0)
+        left = rows.latent * rows.attributed + means_of_intervals(intervals, rows.push) + rows.means @ (p - now)
+        power = np.square(means_of_windows(rows.means, windows) / _rms(rows.inertial)[:, None]).sum(axis=1).mean(axis=0)
+        tried.append(_Averaged(windows, p, np.einsum("pwi,wi->wp", by_means, left), power))
+        size *= 2
+    for k, (short, double) in enumerate(pairwise(tried)):
+        is_noisy = (double.power < _KEPT * short.power).any()
+        if not is_noisy or all(short.agrees_with(longer) for longer in tried[k + 1 :]):
+            return short.windows
+    return tried[-1].windows
+
+
+def _robust_weights(rows: WeakForm, occupied: BoolArray, scale: FloatArray, steps: int) -> FloatArray:
     """Square roots of the weights ``(W, n_v)``: of the equations by their scales, and of intervals by Cauchy's loss.
 
     Scales are inertial forces, so that unmodelled accelerations count by their share of the motion: an equation that is
@@ -293,7 +410,7 @@ def _robust_weights(intervals: ShootingIntervals, rows: WeakForm, scale: FloatAr
     for _ in range(steps):
         gains = least_squares_gains(rows.W, loss / scale)
         left = rows.b - rows.W @ np.einsum("pwi,wi->p", gains, rows.b)
-        spread = 1.4826 * np.median(np.abs(left[intervals.occupied]), axis=0)
+        spread = 1.4826 * np.median(np.abs(left[occupied]), axis=0)
         loss = 1.0 / np.sqrt(1.0 + np.square(left / (_CAUCHY * np.maximum(spread, _ROUNDING * scale))))
     return np.asarray(loss / scale)
 
@@ -337,7 +454,7 @@ def batch_sums(values: FloatArray) -> FloatArray:
     (n_batches, n) array
     """
     sums = np.add.reduceat(values, np.arange(0, len(values), round(np.sqrt(len(values)))), axis=0)
-    return np.asarray(sums * stdtrit(max(len(sums) - 1, 1), _UPPER) / ndtri(_UPPER))
+    return np.asarray(sums * student_quantile(max(len(sums) - 1, 1), _UPPER) / _NORMAL_UPPER)
 
 
 def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:

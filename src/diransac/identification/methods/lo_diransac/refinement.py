@@ -35,6 +35,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
     linearize,
     with_residuals,
 )
+from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.arrowhead import Factored
@@ -267,10 +268,16 @@ def refine(
     Returns
     -------
     Refinement
+
+    Raises
+    ------
+    TimeLimitError
+        The time limit was reached.
     """
     damping, robust, converged, steps = 0.0, settings.robust_model_error and not settled, False, 0
     race = _Race(to_beat)
     while steps < settings.max_steps and (robust or not converged) and not race.is_lost(intervals, fit, steps):
+        check_time()
         steps += 1
         robust = robust and not converged
         moved, solved, damping = _step(intervals, fit, damping)
@@ -299,6 +306,11 @@ def refine_exact(
     Returns
     -------
     Refinement
+
+    Raises
+    ------
+    TimeLimitError
+        The time limit was reached.
     """
     n_p, least = intervals.n_p, _EXACT * prior.tau
     shared, sizes = fit.shared.copy(), fit.prior.copy()
@@ -309,6 +321,7 @@ def refine_exact(
     fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
     damping, converged, steps, jumps, race = 0.0, False, 0, fit.continuity_std, _Race(to_beat)
     while steps < settings.max_steps and not converged and not race.is_lost(intervals, fit, steps):
+        check_time()
         steps += 1
         moved, solved, damping = _step(intervals, fit, damping)
         inlying = moved.noise.inlying(moved.residuals, intervals.known)

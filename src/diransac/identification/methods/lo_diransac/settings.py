@@ -40,6 +40,7 @@ class LoDiransacSettings:
     max_delay_shifts: int = 3
     sensor_delays: tuple[str, ...] | None = None
     sensor_biases: tuple[str, ...] | None = None
+    gain_drifts: tuple[str, ...] | None = None
     max_sensor_errors: int = 8
     substeps: int = 5
     max_starts: int = 5
@@ -69,7 +70,7 @@ class LoDiransacSettings:
             value = getattr(self, f.name)
             if f.name in _SWITCHES and not (value is None or isinstance(value, bool)):
                 raise SettingsError(f"{f.name} is {value!r}; give True, False, or None for the choice by evidence")
-            if f.name in _SENSORS:
+            if f.name in _NAMES:
                 object.__setattr__(self, f.name, _checked_names(f.name, value))
             elif f.name not in (*_OBJECTS, *_SWITCHES):
                 object.__setattr__(self, f.name, _checked(f.name, value, f.default))
@@ -95,7 +96,7 @@ class LoDiransacSettings:
 
 _OBJECTS = ("criteria", "candidate_terms")
 _SWITCHES = ("input_delay", "input_lag")
-_SENSORS = ("sensor_delays", "sensor_biases")
+_NAMES = ("sensor_delays", "sensor_biases", "gain_drifts")
 _MAY_BE_ZERO = (
     "n_samples",
     "max_delay_shifts",
@@ -128,7 +129,7 @@ def _checked(name: str, value: Any, default: Any) -> Any:
 
 
 def _checked_names(name: str, value: Any) -> tuple[str, ...] | None:
-    """Names of signals; one name stands for itself.  Raises SettingsError: a value is no name."""
+    """Names of signals or inputs; one name stands for itself.  Raises SettingsError: a value is no name."""
     names = (value,) if isinstance(value, str) else value
     if names is None:
         return None

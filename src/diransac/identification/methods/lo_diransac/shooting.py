@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -30,22 +30,26 @@ _WORTH_THREADS = 4e6
 
 @dataclass(frozen=True)
 class ErrorKind:
-    """A delay in samples, or a bias in the signal's unit, that one signal has, or a group alike.
+    """What a recording has wrong, that of one signal or input, or of a group alike.
 
     Parameters
     ----------
-    signals : tuple of int
-        Indices of the signals.
-    is_delay : bool
+    columns : tuple of int
+        Indices of the signals, or of the inputs.
+    what : str
+        "delay", in samples; of signals "bias", in their unit; of inputs "drift", the relative change of their gain over
+        a log.
+    of_inputs : bool, optional
     """
 
-    signals: tuple[int, ...]
-    is_delay: bool
+    columns: tuple[int, ...]
+    what: Literal["delay", "bias", "drift"]
+    of_inputs: bool = False
 
 
 @dataclass(frozen=True)
-class SensorErrors:
-    """Systematic errors of the sensors, and what they measured.
+class RecordingErrors:
+    """Systematic errors of the sensors and of the inputs, and what the sensors measured.
 
     Parameters
     ----------
@@ -56,6 +60,10 @@ class SensorErrors:
         Samples by which each signal is recorded late.
     bias : (n_s,) array
         Constant error of each signal, its unit.
+    input_delay : (n_u,) array
+        Samples by which each input acts later than the others.
+    gain_drift : (n_u,) array
+        Relative change of each input's gain over a log.
     kinds : tuple of ErrorKind
         What of these is estimated.
     """
@@ -64,7 +72,26 @@ class SensorErrors:
     sampled: BoolArray
     delay: FloatArray
     bias: FloatArray
+    input_delay: FloatArray
+    gain_drift: FloatArray
     kinds: tuple[ErrorKind, ...]
+
+    def plus(self, more: Mapping[ErrorKind, float]) -> RecordingErrors:
+        """These errors and others.
+
+        Parameters
+        ----------
+        more : mapping from ErrorKind to float
+
+        Returns
+        -------
+        RecordingErrors
+        """
+        names = {("delay", False): "delay", ("bias", False): "bias", ("delay", True): "input_delay"}
+        sizes = {name: getattr(self, name).copy() for name in (*names.values(), "gain_drift")}
+        for kind, size in more.items():
+            sizes[names.get((kind.what, kind.of_inputs), "gain_drift")][list(kind.columns)] += size
+        return replace(self, **sizes, kinds=tuple(dict.fromkeys([*self.kinds, *more])))
 
 
 @dataclass(frozen=True)
@@ -102,8 +129,8 @@ class ShootingIntervals:
         Samples by which the inputs act later than they are recorded.
     lag : float, optional
         Time constant of a first-order lag of the actuators, samples; 0 without one.
-    sensor_errors : SensorErrors, optional
-        Errors of the sensors of which ``measured`` is corrected.
+    errors : RecordingErrors, optional
+        Errors of which ``measured`` is corrected, and with which the inputs act.
     threads : int, optional
         Threads of the simulations with derivatives.
     """
@@ -122,7 +149,7 @@ class ShootingIntervals:
     hold: str = "zero-order"
     delay: int = 0
     lag: float = 0.0
-    sensor_errors: SensorErrors | None = None
+    errors: RecordingErrors | None = None
     threads: int = 1
 
     @classmethod
@@ -256,8 +283,15 @@ class ShootingIntervals:
         return np.hstack([self.inputs, -later])
 
     def _acting(self, lag: float) -> FloatArray:
-        """Recorded inputs of each log after the delay and a lag, in samples."""
-        return np.concatenate([acting_inputs(self.recorded[rows], self.delay, lag) for rows in self.rows_of_logs])
+        """Recorded inputs of each log after their delays and a lag, in samples."""
+        none = np.zeros(self.recorded.shape[1])
+        own, drifts = (self.errors.input_delay, self.errors.gain_drift) if self.errors else (none, none)
+        return np.concatenate(
+            [
+                acting_inputs(self.recorded[rows], self.delay + own, lag, drifts, int(self.is_logged[rows].sum()))
+                for rows in self.rows_of_logs
+            ]
+        )
 
     @cached_property
     def rows_of_logs(self) -> list[slice]:
@@ -265,13 +299,20 @@ class ShootingIntervals:
         edges = [*self.first_of_log.tolist(), len(self.recorded)]
         return [slice(a, b) for a, b in pairwise(edges)]
 
+    @property
+    def all_errors(self) -> RecordingErrors:
+        """Errors of the recordings, none of which may be known."""
+        n_s, n_u = len(self.model.signals), self.recorded.shape[1]
+        of_signals, of_inputs = (np.zeros(n_s), np.zeros(n_s)), (np.zeros(n_u), np.zeros(n_u))
+        return self.errors or RecordingErrors(self.measured, self.sampled, *of_signals, *of_inputs, ())
+
     def corrected(self, more: Mapping[ErrorKind, float], rates: FloatArray) -> ShootingIntervals:
-        """The intervals with measurements that are corrected of further errors of the sensors.
+        """The intervals with recordings that are corrected of further errors.
 
         Parameters
         ----------
         more : mapping from ErrorKind to float
-            Samples by which signals are recorded later, or constant errors that are larger.
+            By how much larger they are.
         rates : (N, n_s) array
             Change of each signal per sample, for the fractions of a sample.
 
@@ -279,24 +320,33 @@ class ShootingIntervals:
         -------
         ShootingIntervals
         """
-        none = np.zeros(len(self.model.signals))
-        old = self.sensor_errors or SensorErrors(self.measured, self.sampled, none, none, ())
-        delay, bias = old.delay.copy(), old.bias.copy()
-        for kind, size in more.items():
-            (delay if kind.is_delay else bias)[list(kind.signals)] += size
-        measured, sampled = old.measured.copy(), old.sampled.copy()
-        for i, whole in enumerate(np.round(delay).astype(int)):
+        errors = self.all_errors.plus(more)
+        measured, sampled = errors.measured.copy(), errors.sampled.copy()
+        for i, whole in enumerate(np.round(errors.delay).astype(int)):
             for rows in self.rows_of_logs:
                 at = np.arange(rows.start, rows.stop) + whole
                 inside = (at >= rows.start) & (at < rows.stop)
                 at = np.clip(at, rows.start, rows.stop - 1)
-                measured[rows, i], sampled[rows, i] = old.measured[at, i], old.sampled[at, i] & inside
-        measured += (delay - np.round(delay)) * rates - bias
-        errors = replace(old, delay=delay, bias=bias, kinds=tuple(dict.fromkeys([*old.kinds, *more])))
-        return replace(self, measured=np.where(sampled, measured, 0.0), sampled=sampled, sensor_errors=errors)
+                measured[rows, i], sampled[rows, i] = errors.measured[at, i], errors.sampled[at, i] & inside
+        measured += (errors.delay - np.round(errors.delay)) * rates - errors.bias
+        return replace(self, measured=np.where(sampled, measured, 0.0), sampled=sampled, errors=errors)
+
+    def with_input_error(self, kind: ErrorKind, size: float) -> ShootingIntervals:
+        """The intervals with another error of an input, and measurements as they are.
+
+        Parameters
+        ----------
+        kind : ErrorKind
+        size : float
+
+        Returns
+        -------
+        ShootingIntervals
+        """
+        return replace(self, errors=self.all_errors.plus({kind: size}))
 
     def with_delays(self, delay: FloatArray, rates: FloatArray) -> ShootingIntervals:
-        """The intervals with other delays of the sensors, and inputs as recorded.
+        """The intervals with other delays of the sensors, and inputs that are not late as a whole.
 
         Parameters
         ----------
@@ -308,17 +358,16 @@ class ShootingIntervals:
         Returns
         -------
         ShootingIntervals
-            With the biases of these.
+            With the other errors of these.
         """
-        old = self.sensor_errors
-        assert old is not None
         late = {
-            ErrorKind(tuple(np.flatnonzero(delay == x).tolist()), True): float(x)
+            ErrorKind(tuple(np.flatnonzero(delay == x).tolist()), "delay"): float(x)
             for x in np.unique(delay[delay != 0.0])
         }
-        bias = {x: float(old.bias[x.signals[0]]) for x in old.kinds if not x.is_delay}
-        recorded = replace(self, measured=old.measured, sampled=old.sampled, sensor_errors=None, delay=0)
-        return recorded.corrected({**late, **bias}, rates)
+        old = self.all_errors
+        others = tuple(x for x in old.kinds if x.of_inputs or x.what != "delay")
+        recorded = replace(self, delay=0, errors=replace(old, delay=np.zeros_like(old.delay), kinds=others))
+        return recorded.corrected(late, rates)
 
     def split(self, parts: int) -> ShootingIntervals:
         """The same rows in intervals of a fraction of the length."""

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
-from scipy.ndimage import maximum_filter1d, median_filter
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
+from diransac.data.filters import median_filter
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.simulation.compiler import compile_map
 
@@ -229,13 +229,19 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
         signals[:, columns], _ = smoother.smoothed(measured[:, columns], known[:, columns], centre[:, columns])
         _integrate(signals, known, columns, dt)
     for k in range(_n_motion(model), len(model.signals)):
-        near = maximum_filter1d(known[:, k], 2 * half + 1, mode="constant")
+        near = _near(known[:, k], half)
         signals[:, [k]] = np.nan
         if near.any():
             smoothed, _ = smoother.smoothed(measured[:, [k]], known[:, [k]], centre[:, [k]])
             signals[near, k] = smoothed[near, 0]
     rows, seen = np.arange(len(signals)), np.flatnonzero(~log.gaps)
     return signals if log.gaps.all() else np.column_stack([np.interp(rows, seen, x[seen]) for x in signals.T])
+
+
+def _near(known: BoolArray, reach: int) -> BoolArray:
+    """Mask ``(N,)`` of the rows with a known sample at most so many rows away."""
+    counts, rows, n = np.concatenate([[0], np.cumsum(known)]), np.arange(len(known)), len(known)
+    return np.asarray(counts[np.minimum(rows + reach + 1, n)] > counts[np.maximum(rows - reach, 0)])
 
 
 def _project(model: Model, signals: FloatArray, rates: FloatArray, known: BoolArray) -> None:
@@ -444,7 +450,7 @@ def running_median(measured: FloatArray, known: BoolArray, window: int) -> Float
     for i in np.flatnonzero(known.any(axis=0)):
         at = rows[known[:, i]]
         size = max(_FEWEST, 2 * (window // rows_per_sample(known[:, i]) // 2) + 1)
-        medians[:, i] = np.interp(rows, at, median_filter(measured[at, i], size=min(size, window), mode="mirror"))
+        medians[:, i] = np.interp(rows, at, median_filter(measured[at, i], min(size, window)))
     return medians
 
 

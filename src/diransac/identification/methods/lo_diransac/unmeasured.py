@@ -1,8 +1,8 @@
 """Trajectories of states that no signal measures, such as the thrust behind the lag of a motor.
 
-Simulations that the smoothed motion of all other states drives give parameters and trajectories
-(`identification.driven_states`).  The best of them simulates the shooting intervals best, by the scores of hypotheses.
-Its trajectories take the place of smoothed signals until shooting estimates these states with all others.
+Simulations that the smoothed motion of all other states drives, and the smoothed sensors, give parameters and
+trajectories (`identification.driven_states`).  The best of them simulates the shooting intervals best, by the scores of
+hypotheses. Its trajectories take the place of smoothed signals until shooting estimates these states with all others.
 """
 
 from __future__ import annotations
@@ -108,18 +108,22 @@ def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Moti
 
 
 def _driven(intervals: ShootingIntervals, motion: Motion) -> DrivenStates:
-    """Least squares with weights of one over the squared spread of the accelerations, as the observers filter them."""
+    """Least squares in units of the spread of the sensors, and of the accelerations as the observers filter them."""
     model, hidden = intervals.model, unmeasured_states(intervals)
     bandwidth = 1.0 / (_MEMORY * intervals.duration)
     others = [i for i, n in enumerate(model.velocities) if n not in hidden]
-    scale = bandwidth / motion.spread[len(model.state) :][others]
+    first = len(model.signals) - len(model.sensors)
+    readings = motion.signals[:, first:]
+    scale = np.append(bandwidth / motion.spread[len(model.state) :][others], 1.0 / motion.spread[first:])
+    used = np.hstack([np.ones((len(readings), len(others)), bool), np.isfinite(readings)])
     return DrivenStates(
         model,
         intervals.layout,
         hidden,
         motion.signals[:, : len(model.state)],
         intervals.inputs,
-        np.where(intervals.counted[:, None], np.square(scale), 0.0),
+        np.nan_to_num(readings),
+        np.where(intervals.counted[:, None] & used, np.square(scale), 0.0),
         intervals.rows_of_logs,
         intervals.dt,
         bandwidth,

@@ -1,11 +1,13 @@
-"""Systematic errors of the sensors: a delay of each signal or group of signals, and a bias.
+"""Systematic errors of recordings: delays and biases of sensors, delays of single inputs, and gains that drift.
 
 A sensor is here whatever measures a signal, with a measurement equation or without.
 
 An error of a sensor that no parameter and no discrepancy explains is in the residuals: a delay in
-proportion to the signal's rate, a bias a constant.  A score test finds the most significant error, given all
-else that is estimated; it costs a call of the simulator, and no fit.  The error is then estimated jointly with all
-other unknowns, by one Newton step and a new fit.
+proportion to the signal's rate, a bias a constant.  One of an input is in them as simulations with it differ: an
+actuator that is later than the others, a battery that sags.  A score test finds the most significant error, given all
+else that is estimated; it costs a call of the simulator, and no fit.  The error is then estimated jointly with
+all other unknowns, by one Newton step and a new fit.  Errors of inputs are explained by unmodelled accelerations just
+as well, and found in these: see `missing_terms`.
 
 References
 ----------
@@ -14,14 +16,14 @@ Rao 1948 (score test); Furgale, Rehder, Siegwart 2013 (delays of sensors).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.identification.methods.lo_diransac.normal_equations import linearize
+from diransac.identification.methods.lo_diransac.normal_equations import linearize, with_residuals
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 
@@ -29,7 +31,17 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["SensorError", "clear_errors", "effect_on", "errors_of", "with_errors"]
+__all__ = [
+    "RecordingError",
+    "change_of_inputs",
+    "clear_errors",
+    "delays_of_inputs",
+    "effect_on",
+    "errors_of",
+    "errors_of_inputs",
+    "signal_rates",
+    "with_errors",
+]
 
 # Standard errors from which on an error of a sensor is tried; its least delay, samples; its largest, over the log.
 _CLEAR, _LEAST_DELAY, _LATEST = 3.0, 0.1, 0.1
@@ -37,21 +49,24 @@ _CLEAR, _LEAST_DELAY, _LATEST = 3.0, 0.1, 0.1
 _GROUPS = 4
 # Signals that are known in fewer rows than this are not tested.
 _FEWEST = 50
-# Part of the information of an error that other unknowns must leave.
-_DETERMINED = 1e-6
+# Part of the information of an error that other unknowns must leave; of an error of inputs, which moves the ends of
+# intervals that continuity holds, more than rounding.
+_DETERMINED, _ROUNDED = 1e-6, 1e-12
+# Errors of inputs by which simulations are compared: samples, relative change of a gain.
+_STEPS = {"delay": 0.5, "drift": 0.01}
 # Change of a signal over its size that is a rounding error.
 _ROUNDING, _TINY = 1e-9, 1e-300
 
 
 @dataclass(frozen=True)
-class SensorError:
-    """An error of one signal or of a group.
+class RecordingError:
+    """An error of one signal or input, or of a group.
 
     Parameters
     ----------
     kind : ErrorKind
     size : float
-        Its estimate, samples or the signal's unit.
+        Its estimate: samples, the signal's unit, or relative to the gain.
     ratio : float
         Its size over its standard error.
     gain : float
@@ -65,8 +80,8 @@ class SensorError:
 
 
 def clear_errors(
-    intervals: ShootingIntervals, fit: Fit, among: BoolArray, *, worth: float, delays: bool, biases: bool
-) -> list[SensorError]:
+    intervals: ShootingIntervals, fit: Fit, among: BoolArray, kinds: Container[str], *, worth: float
+) -> list[RecordingError]:
     """Errors of the sensors that the residuals show most clearly: one of a single signal, and some of groups.
 
     Groups that are late alike show nearly as clearly as others that are early; fits of each tell them apart.  They are
@@ -79,31 +94,31 @@ def clear_errors(
         At its optimum.
     among : (n_s,) bool array
         Signals whose own errors are tested, besides those of groups.
+    kinds : container of str
+        Which of "delay" and "bias" are tested.
     worth : float
         Evidence that a group's error must promise, nats.
-    delays, biases : bool
-        Kinds of errors that are tested.
 
     Returns
     -------
-    list of SensorError
+    list of RecordingError
         Empty if no error is clear.
     """
-    tested = [x for x in _candidates(intervals, among) if (delays if x.is_delay else biases)]
+    tested = [x for x in _candidates(intervals, among) if x.what in kinds]
     if not tested:
         return []
     scores = _Scores(intervals, fit)
-    found = [x for x in map(scores.tested, tested) if x is not None]
     latest = _LATEST * max(x.stop - x.start for x in intervals.rows_of_logs)
-    found = [x for x in found if not x.kind.is_delay or _LEAST_DELAY < abs(x.size) < latest]
-    single = [x for x in found if len(x.kind.signals) == 1 and x.ratio > _CLEAR]
-    groups = [x for x in found if len(x.kind.signals) > 1 and x.gain > worth]
+    found = [x for x in map(scores.tested, tested) if x is not None]
+    found = [x for x in found if x.kind.what != "delay" or _LEAST_DELAY < abs(x.size) < latest]
+    single = [x for x in found if len(x.kind.columns) == 1 and x.ratio > _CLEAR]
+    groups = [x for x in found if len(x.kind.columns) > 1 and x.gain > worth]
     single.sort(key=lambda x: x.ratio, reverse=True)
     groups.sort(key=lambda x: x.gain, reverse=True)
     return [*single[:1], *groups[:_GROUPS]]
 
 
-def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> list[SensorError]:
+def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> list[RecordingError]:
     """Remainders of some errors, estimated together, clear or not.
 
     Parameters
@@ -115,7 +130,7 @@ def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]
 
     Returns
     -------
-    list of SensorError
+    list of RecordingError
         Without those that the log does not determine.
     """
     scores = _Scores(intervals, fit)
@@ -124,7 +139,7 @@ def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]
     sizes = -covariance @ np.array([slopes[k].score for k in determined])
     ratios = np.abs(sizes) / (np.sqrt(np.diag(covariance)) + _TINY)
     return [
-        SensorError(kinds[k], float(x), float(r), float(0.5 * r**2))
+        RecordingError(kinds[k], float(x), float(r), float(0.5 * r**2))
         for k, x, r in zip(determined, sizes, ratios, strict=True)
     ]
 
@@ -145,10 +160,10 @@ def effect_on(intervals: ShootingIntervals, fit: Fit, z: FloatArray, s: FloatArr
     (n, n) array
         0 without such errors.
     """
-    if intervals.sensor_errors is None:
+    if intervals.errors is None:
         return np.zeros((s.shape[1], s.shape[1]))
     scores = _Scores(intervals, fit)
-    _, covariance, of_z, of_s = scores.together([scores.slope(x) for x in intervals.sensor_errors.kinds])
+    _, covariance, of_z, of_s = scores.together([scores.slope(x) for x in intervals.errors.kinds])
     slopes = np.einsum("wkn,wke->ne", z, of_z) + s.T @ of_s
     return np.asarray(slopes @ covariance @ slopes.T)
 
@@ -160,8 +175,10 @@ class _Slope:
     Parameters
     ----------
     kind : ErrorKind
-    sensitivity : (N, n) array
-        Of the residuals of its signals.
+    sensitivity : (N, n_s) array
+        Of the residuals.
+    jumps : (W - 1, n_x) array
+        Of the jumps from interval to interval.
     of_z, of_s : (W, k) and (n_s,) array
         Of the gradient of the fit.
     score : float
@@ -169,6 +186,7 @@ class _Slope:
 
     kind: ErrorKind
     sensitivity: FloatArray
+    jumps: FloatArray
     of_z: FloatArray
     of_s: FloatArray
     score: float
@@ -184,33 +202,49 @@ class _Scores:
 
     def slope(self, kind: ErrorKind) -> _Slope:
         """Derivatives with respect to an error."""
-        columns = list(kind.signals)
-        own = -self.rates[:, columns] if kind.is_delay else np.ones((len(self.rates), len(columns)))
-        # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
-        measured = self.intervals.measured.copy()
-        measured[:, columns] -= own
-        moved = linearize(replace(self.intervals, measured=measured), self.fit, self.weights)
-        score = float((self.weights[:, columns] * own * self.fit.residuals[:, columns]).sum())
-        return _Slope(kind, own, self.at.data_z - moved.data_z, (self.at.data_s - moved.data_s).sum(axis=0), score)
+        return self._of_inputs(kind) if kind.of_inputs else self._of_signals(kind)
 
-    def tested(self, kind: ErrorKind) -> SensorError | None:
+    def _of_signals(self, kind: ErrorKind) -> _Slope:
+        columns = list(kind.columns)
+        own = np.zeros_like(self.rates)
+        own[:, columns] = -self.rates[:, columns] if kind.what == "delay" else 1.0
+        return self._slope(kind, own, np.zeros_like(self.at.jumps))
+
+    def _of_inputs(self, kind: ErrorKind) -> _Slope:
+        """By the difference of simulations, which end elsewhere, too."""
+        step, fit = _STEPS[kind.what], self.fit
+        moved = self.intervals.with_input_error(kind, step)
+        own = (with_residuals(moved, fit).residuals - fit.residuals) / step
+        ends = [x.ends(fit.shared, fit.x, fit.d) for x in (self.intervals, moved)]
+        return self._slope(kind, np.where(self.intervals.known, own, 0.0), (ends[0] - ends[1]) / step)
+
+    def _slope(self, kind: ErrorKind, own: FloatArray, jumps: FloatArray) -> _Slope:
+        """Derivatives, from those of the residuals and of the jumps."""
+        at = self.at
+        # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
+        moved = linearize(replace(self.intervals, measured=self.intervals.measured - own), self.fit, self.weights)
+        of_z, of_s = at.by_jumps(self.intervals, jumps)
+        of_z, of_s = of_z + at.data_z - moved.data_z, of_s + (at.data_s - moved.data_s).sum(axis=0)
+        score = (self.weights * own * self.fit.residuals).sum() + (at.precision * jumps * at.jumps).sum()
+        return _Slope(kind, own, jumps, of_z, of_s, float(score))
+
+    def tested(self, kind: ErrorKind) -> RecordingError | None:
         """Estimate of an error, given all else that is estimated, or None if the log does not determine it."""
         slope, n = self.slope(kind), len(self.intervals)
-        columns = list(kind.signals)
         z, s = (x[..., 0] for x in self.at.system.functional(slope.of_z[:, :, None], slope.of_s[:, None]))
-        weighted = self.weights[:, columns] * slope.sensitivity
+        weighted = self.weights * slope.sensitivity
         share = (weighted * slope.sensitivity).sum(axis=1).reshape(n, -1).sum(axis=1)
         information = float(share.sum() - (slope.of_z * z).sum() - slope.of_s @ s)
-        if information <= 0.0:
+        if information <= _DETERMINED * share.sum():
             return None
-        rows = (weighted * self.fit.residuals[:, columns]).sum(axis=1).reshape(n, -1).sum(axis=1)
+        rows = (weighted * self.fit.residuals).sum(axis=1).reshape(n, -1).sum(axis=1)
         scores = rows + (self.at.data_z * z).sum(axis=1) + self.at.data_s @ s
         # An error that is there has a score of one sign in each batch; only the rest of the scores scatters.
         scores = scores - slope.score * share / max(share.sum(), _TINY)
         batches = np.add.reduceat(scores, np.arange(0, n, max(1, round(np.sqrt(n)))))
         variance = max(information, float(np.square(batches).sum()))
         gain = 0.5 * slope.score**2 / information
-        return SensorError(kind, -slope.score / information, abs(slope.score) / np.sqrt(variance), gain)
+        return RecordingError(kind, -slope.score / information, abs(slope.score) / np.sqrt(variance), gain)
 
     def together(self, slopes: Sequence[_Slope]) -> tuple[list[int], FloatArray, FloatArray, FloatArray]:
         """Errors that the log determines, their covariance, and what they change of the gradient of the fit."""
@@ -218,18 +252,18 @@ class _Scores:
         z, s = self.at.system.functional(of_z, of_s)
         direct = np.array([[self._product(x, y) for y in slopes] for x in slopes])
         information = direct - np.einsum("wke,wkf->ef", of_z, z) - of_s.T @ s
-        found = [k for k in range(len(slopes)) if information[k, k] > _DETERMINED * direct[k, k]]
+        least = [_ROUNDED if x.kind.of_inputs else _DETERMINED for x in slopes]
+        found = [k for k in range(len(slopes)) if information[k, k] > least[k] * direct[k, k]]
         covariance = np.linalg.pinv(information[np.ix_(found, found)], hermitian=True)
         return found, covariance, of_z[..., found], of_s[:, found]
 
     def _product(self, x: _Slope, y: _Slope) -> float:
         """Information that two errors have in common, before other unknowns take theirs."""
-        common = sorted({*x.kind.signals} & {*y.kind.signals})
-        a, b = (one.sensitivity[:, [one.kind.signals.index(k) for k in common]] for one in (x, y))
-        return float((self.weights[:, common] * a * b).sum())
+        of_signals = (self.weights * x.sensitivity * y.sensitivity).sum()
+        return float(of_signals + (self.at.precision * x.jumps * y.jumps).sum())
 
 
-def with_errors(intervals: ShootingIntervals, fit: Fit, errors: Sequence[SensorError]) -> ShootingIntervals:
+def with_errors(intervals: ShootingIntervals, fit: Fit, errors: Sequence[RecordingError]) -> ShootingIntervals:
     """The intervals with measurements that are corrected of errors, too.
 
     Parameters
@@ -237,7 +271,7 @@ def with_errors(intervals: ShootingIntervals, fit: Fit, errors: Sequence[SensorE
     intervals : ShootingIntervals
     fit : Fit
         Of which the rates of signals are taken.
-    errors : sequence of SensorError
+    errors : sequence of RecordingError
 
     Returns
     -------
@@ -285,5 +319,63 @@ def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[ErrorKin
     groups = [mask & seen for mask in masks]
     late = [x for x in (*groups, *single) if x.any() and not (x == seen).all()]
     biased = np.array([n in model.biased_sensors for n in model.signals])
-    kinds = [*((x, True) for x in late), *((x, False) for x in single if not biased[x].any())]
-    return list(dict.fromkeys(ErrorKind(tuple(np.flatnonzero(x).tolist()), is_delay) for x, is_delay in kinds))
+    kinds = [ErrorKind(_places(x), "delay") for x in late]
+    return list(dict.fromkeys([*kinds, *(ErrorKind(_places(x), "bias") for x in single if not biased[x].any())]))
+
+
+def errors_of_inputs(intervals: ShootingIntervals) -> list[ErrorKind]:
+    """Errors that inputs may have: drifts of each gain, of those of one unit, and of all; delays of some but not all.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+
+    Returns
+    -------
+    list of ErrorKind
+    """
+    model = intervals.model
+    unit = np.array(list(model.inputs.values()))
+    moving = np.ptp(intervals.inputs, axis=0) > 0.0
+    masks = [moving, *(moving & (unit == u) for u in dict.fromkeys(unit.tolist())), *np.eye(len(unit), dtype=bool)]
+    some = [x for x in masks if (x & moving).any()]
+    drifts = [ErrorKind(_places(x), "drift", of_inputs=True) for x in some]
+    delays = [ErrorKind(_places(x), "delay", of_inputs=True) for x in some if not (x == moving).all()]
+    return list(dict.fromkeys([*drifts, *delays]))
+
+
+def change_of_inputs(intervals: ShootingIntervals, kind: ErrorKind) -> FloatArray:
+    """Derivatives ``(N, n_u)`` of the inputs that act with respect to an error.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    kind : ErrorKind
+        Of inputs.
+
+    Returns
+    -------
+    (N, n_u) array
+    """
+    moved = intervals.with_input_error(kind, _STEPS[kind.what])
+    return np.asarray((moved.inputs - intervals.inputs) / _STEPS[kind.what])
+
+
+def delays_of_inputs(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+    """Samples ``(n_u,)`` after which each input acts: its own delay, and that of all unless they have a lag.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    (n_u,) array
+    """
+    common = 0.0 if intervals.lag else intervals.delay + fit.shared[-1]
+    return np.asarray(intervals.all_errors.input_delay + common)
+
+
+def _places(mask: BoolArray) -> tuple[int, ...]:
+    return tuple(np.flatnonzero(mask).tolist())
