@@ -172,10 +172,31 @@ def test_joints_that_are_not_named_are_locked(described):
 
 def test_a_base_that_was_held_is_fixed_on_request(described):
     floating = described(robots.quadruped(base="<freejoint/>"))
-    with pytest.raises(ModelError, match=r"the base floats.*fix_base=True"):
+    with pytest.raises(ModelError, match=r"the base floats.*base=\"held\""):
         dr.models.robot(floating)
-    held = dr.models.robot(floating, fix_base=True)
+    held = dr.models.robot(floating, base="held")
     assert held == dr.models.robot(described(robots.quadruped()))
+
+
+def test_a_base_whose_motion_is_measured_carries_its_limbs(described):
+    path = described(robots.quadruped(base="<freejoint/>"))
+    model, (reference, data) = dr.models.robot(path, base="measured", bodies="all"), compiled(path)
+    assert list(model.inputs)[12:15] == ["base_wx", "base_wy", "base_wz"]
+    p, rng, R = without_friction(model), np.random.default_rng(1), np.zeros(9)
+    for q, v, a in motions(12):
+        data.qpos[:3], data.qpos[3:7] = rng.normal(size=3), rng.normal(size=4)
+        data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
+        data.qpos[7:], data.qvel[:], data.qacc[:] = q, [*rng.normal(size=6), *v], [*rng.normal(size=6), *a]
+        mujoco.mj_inverse(reference, data)
+        mujoco.mju_quat2Mat(R, data.qpos[3:7])
+        f = R.reshape(3, 3).T @ (data.qacc[:3] - reference.opt.gravity)
+        u = [*np.zeros(12), *data.qvel[3:6], *data.qacc[3:6], *f]
+        found = np.array(model.residual(q, v, a, u, p)).ravel()
+        assert found == pytest.approx(data.qfrc_inverse[6:], abs=1e-9)
+    with pytest.raises(ModelError, match="0 bodies have a free joint"):
+        dr.models.robot(described(robots.quadruped()), base="measured")
+    with pytest.raises(ModelError, match="base is 'clamped'"):
+        dr.models.robot(path, base="clamped")
 
 
 def test_gravity_can_be_another(described):

@@ -50,7 +50,9 @@ class RobotOptions:
         str | None,
         _option("--joints", metavar="NAME,...|{}_joint", help="Joints, as column=joint if names differ; or a pattern."),
     ] = None
-    fix_base: Annotated[bool, _option("--fix-base", help="The floating base was held.")] = False
+    base: Annotated[
+        str | None, _option("--base", metavar="held|measured", help="A floating base: held, or with a measured motion.")
+    ] = None
 
     def load(self, model: str) -> Model:
         """The model that ``--model`` names.
@@ -59,8 +61,8 @@ class RobotOptions:
         """
         if is_description(model):
             return robot(model, **self._arguments())
-        for given in (x.name for x in fields(self) if getattr(self, x.name) not in (None, False)):
-            raise typer.BadParameter(f"--{given.replace('_', '-')} is for the description of a robot (.xml, .urdf)")
+        for given in (x.name for x in fields(self) if getattr(self, x.name) is not None):
+            raise typer.BadParameter(f"--{given} is for the description of a robot (.xml, .urdf)")
         return load_model(model)
 
     def load_limbs(self, model: str) -> dict[str, Model]:
@@ -70,7 +72,7 @@ class RobotOptions:
         return limbs if len(limbs) > 1 else {"": whole}
 
     def _arguments(self) -> dict[str, Any]:
-        found: dict[str, Any] = {"actuation": self._actuation(), "fix_base": self.fix_base}
+        found: dict[str, Any] = {"actuation": self._actuation(), "base": self.base}
         if self.unknown is not None:
             found["unknown"] = names(self.unknown)
         if self.bodies is not None:

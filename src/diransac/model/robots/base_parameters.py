@@ -27,7 +27,8 @@ _ZERO = 1e-9
 _DIGITS = 10
 """Decimal digits of weights, which are products of lengths in m."""
 _ROWS_PER_PARAMETER = 3
-_LARGEST_SPEED, _LARGEST_ACCELERATION = 3.0, 10.0
+_LARGEST = (np.pi, 3.0, 10.0, 3.0, 10.0, 15.0)
+"""Of random motions: position, velocity, acceleration; angular velocity and acceleration of a base, specific force."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ def base_parameters(regressor: ca.Function, seed: int = 0) -> Grouping:
     Parameters
     ----------
     regressor : casadi.Function
-        ``(q, v, a) -> Y (n, n_x)``.
+        ``(q, v, a) -> Y (n, n_x)``, or ``(q, v, a, w, dw, f) -> Y`` with the motion of a base.
     seed : int, optional
         Seed of the random motions.
 
@@ -75,7 +76,8 @@ def base_parameters(regressor: ca.Function, seed: int = 0) -> Grouping:
     n, n_x = regressor.size1_in(0), regressor.size2_out(0)
     rng = np.random.default_rng(seed)
     n_points = _ROWS_PER_PARAMETER * n_x // n + 10
-    motion = [rng.uniform(-size, size, (n, n_points)) for size in (np.pi, _LARGEST_SPEED, _LARGEST_ACCELERATION)]
+    sizes = [regressor.size1_in(k) for k in range(regressor.n_in())]
+    motion = [rng.uniform(-x, x, (size, n_points)) for x, size in zip(_LARGEST, sizes, strict=False)]
     stacked = np.hsplit(np.array(ca.densify(regressor(*motion))), n_points)
     Y = np.vstack(stacked)
     lengths = np.linalg.norm(Y, axis=0)

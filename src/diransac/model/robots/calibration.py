@@ -56,7 +56,7 @@ def calibrated(
         The file cannot be read; a joint or body is not in it, but in one that it includes; the parameters are not those
         of a robot.
     """
-    description = read_description(path, fix_base=True)
+    description = read_description(path, "held")
     source = Path(path).read_bytes()
     found = _estimates(description, parameters, values, covariance)
     document = _Document(source, f'robot description "{path}"')

@@ -7,7 +7,7 @@ here.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -123,6 +123,8 @@ class Description:
     couplings : tuple of Coupling
     gravity : (3,) array
         In the world frame, m/s^2.
+    base : int, optional
+        Index of a body whose motion is measured; by default no body of those on the world moves by itself.
     """
 
     name: str
@@ -130,6 +132,7 @@ class Description:
     joints: tuple[Joint, ...]
     couplings: tuple[Coupling, ...]
     gravity: FloatArray
+    base: int | None = None
 
 
 def mujoco_module() -> ModuleType:
@@ -175,15 +178,16 @@ def parsed(path: str | Path) -> Any:
         raise _unreadable(path, error) from error
 
 
-def read_description(path: str | Path, *, fix_base: bool = False) -> Description:
+def read_description(path: str | Path, base: str | None = None) -> Description:
     """Bodies, joints and couplings of a robot's description.
 
     Parameters
     ----------
     path : str or Path
         MJCF or URDF.
-    fix_base : bool, optional
-        Whether bodies with a free joint are held in the pose of the file.
+    base : str, optional
+        A body with a free joint: "held" in the pose of the file, or "measured", so that its motion is known. None:
+        there is none.
 
     Returns
     -------
@@ -192,13 +196,14 @@ def read_description(path: str | Path, *, fix_base: bool = False) -> Description
     Raises
     ------
     ModelError
-        The file cannot be read; or it has a free or ball joint, a closed loop, a tendon that exerts forces, or a
-        surrounding fluid.
+        The file cannot be read; or it has a free joint whose base is neither, a ball joint, a closed loop, a tendon
+        that exerts forces, or a surrounding fluid.
     """
     spec = parsed(path)
-    for joint in list(spec.joints) if fix_base else ():
-        if joint.type == mujoco_module().mjtJoint.mjJNT_FREE:
-            spec.delete(joint)
+    floating = [x for x in spec.joints if x.type == mujoco_module().mjtJoint.mjJNT_FREE] if base else []
+    names = [joint.parent.name for joint in floating]
+    for joint in floating:
+        spec.delete(joint)
     _drop_shapes(spec)
     try:
         spec.compiler.fusestatic = False
@@ -212,7 +217,17 @@ def read_description(path: str | Path, *, fix_base: bool = False) -> Description
         raise ModelError(f"{label}: there are no joints, and nothing can move")
     bodies = tuple(_body(model, i) for i in range(1, model.nbody))
     name = re.sub(r"\W+", "-", spec.modelname) or Path(path).stem
-    return Description(name, bodies, joints, tuple(_couplings(label, model)), np.array(model.opt.gravity))
+    measured = _measured_base(label, bodies, names) if base == "measured" else None
+    return Description(name, bodies, joints, tuple(_couplings(label, model)), np.array(model.opt.gravity), measured)
+
+
+def _measured_base(label: str, bodies: Sequence[Body], floating: Sequence[str]) -> int:
+    """Index of the body with a free joint.  Raises ModelError: there is not one, or weights are compensated."""
+    if len(floating) != 1:
+        raise ModelError(f"{label}: {len(floating)} bodies have a free joint; a measured base takes one")
+    if any(body.gravity_compensation for body in bodies):
+        raise ModelError(f"{label}: gravity compensation on a base whose attitude is not known is not modelled")
+    return [body.name for body in bodies].index(floating[0])
 
 
 def _unreadable(path: str | Path, error: ValueError) -> ModelError:
@@ -243,8 +258,8 @@ def _check_supported(label: str, model: Any) -> None:
         name = model.joint(k).name
         if model.jnt_type[k] == kinds.mjJNT_FREE:
             raise ModelError(
-                f'{label}: the base floats (free joint "{name}"), and only fixed bases are modelled; give '
-                "fix_base=True if it was held while the log was recorded"
+                f'{label}: the base floats (free joint "{name}"); give base="held" if it was held while the '
+                'log was recorded, or base="measured" if its motion was'
             )
         if model.jnt_type[k] == kinds.mjJNT_BALL:
             raise ModelError(f'{label}: joint "{name}" is a ball joint; replace it by three hinges')

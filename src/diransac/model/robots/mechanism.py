@@ -48,6 +48,9 @@ _GAIN, _BIAS = "torque_gain", "encoder_bias"
 UNKNOWN = (*_UNITS, _GAIN, _BIAS)
 """Parameters of joints that can be unknown."""
 
+_BASE = {"base_w{}": "rad/s", "base_w{}_dot": "rad/s^2", "base_f{}": "m/s^2"}
+"""Inputs of a measured base."""
+
 _INERTIAL_UNITS = dict(zip(INERTIAL_NAMES, ("kg", *("kg m",) * 3, *("kg m^2",) * 6), strict=True))
 _IN_ORDER = (*INERTIAL_NAMES[1:], INERTIAL_NAMES[0])
 """Order in which inertial parameters of a body are kept as base parameters: the mass goes first."""
@@ -83,7 +86,8 @@ class Mechanism:
 
         def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[Any]:
             position = {n: q[n] - p[f"{_BIAS}_{n}"] if _BIAS in self.unknown else q[n] for n in self.coordinates}
-            forces = self.forces(position, v, a, self._values(p))
+            base = [ca.vertcat(*(u[n] for n in names)) for names in self._base_inputs]
+            forces = self.forces(position, v, a, self._values(p), base)
             for n in driven:
                 drive = actuation.force(n, q[n], v[n], u)
                 forces[n] -= p[f"{_GAIN}_{n}"] * drive if _GAIN in self.unknown else drive
@@ -94,10 +98,16 @@ class Mechanism:
             name=self.description.name,
             description=f"robot with {len(units)} joints, from its description",
             coordinates={n: position for n, (position, _) in units.items()},
-            inputs={key: unit for n in driven for key, unit in actuation.inputs(n, units[n]).items()},
+            inputs={key: unit for n in driven for key, unit in actuation.inputs(n, units[n]).items()}
+            | {n: unit for names, unit in zip(self._base_inputs, _BASE.values(), strict=False) for n in names},
             parameters=self.parameters(driven),
             equations=equations,
         )
+
+    @property
+    def _base_inputs(self) -> list[list[str]]:
+        """Names of the inputs of angular velocity, angular acceleration and specific force of a measured base."""
+        return [] if self.description.base is None else [[key.format(axis) for axis in "xyz"] for key in _BASE]
 
     def _joint(self, coordinate: str) -> Joint:
         return self.description.joints[self.coordinates[coordinate]]
@@ -138,8 +148,9 @@ class Mechanism:
         )
         at = [dict(zip(self.coordinates, ca.vertsplit(y), strict=True)) for y in (q, v, a)]
         values = dict(zip(names, ca.vertsplit(x), strict=True))
-        forces = ca.vertcat(*self.forces(at[0], at[1], at[2], values).values())
-        found = base_parameters(ca.Function("regressor", [q, v, a], [ca.densify(ca.jacobian(forces, x))]))
+        base = [ca.SX.sym("base", 3) for _ in self._base_inputs]
+        forces = ca.vertcat(*self.forces(at[0], at[1], at[2], values, base).values())
+        found = base_parameters(ca.Function("regressor", [q, v, a, *base], [ca.densify(ca.jacobian(forces, x))]))
         unseen = {names[k] for k in found.vanishing}
         for i in self.bodies:
             body = self.description.bodies[i].name
@@ -179,12 +190,12 @@ class Mechanism:
 
     # ------------------------------------------------------------------ forces
 
-    def forces(self, q: Any, v: Any, a: Any, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Force that a motion takes, by coordinate, with values of the `nominal` parameters."""
+    def forces(self, q: Any, v: Any, a: Any, values: Mapping[str, Any], base: Sequence[ca.SX]) -> dict[str, Any]:
+        """Force that a motion takes, by coordinate, with values of the `nominal` parameters, and of a measured base."""
         motions = self._motions(q, v, a)
         inertials = [self._inertial(i, values) for i in range(len(self.description.bodies))]
         of_joints = inverse_dynamics(
-            self.description, [x.q for x in motions], [x.v for x in motions], [x.a for x in motions], inertials
+            self.description, [x.q for x in motions], [x.v for x in motions], [x.a for x in motions], inertials, base
         )
         forces: dict[str, Any] = dict.fromkeys(self.coordinates, ca.SX(0))
         for joint, x, force in zip(self.description.joints, motions, of_joints, strict=True):

@@ -76,7 +76,12 @@ def inertial_parameters(J: FloatArray) -> FloatArray:
 
 
 def inverse_dynamics(
-    description: Description, q: Sequence[Any], v: Sequence[Any], a: Sequence[Any], inertials: Sequence[Any]
+    description: Description,
+    q: Sequence[Any],
+    v: Sequence[Any],
+    a: Sequence[Any],
+    inertials: Sequence[Any],
+    base: Sequence[ca.SX] = (),
 ) -> list[ca.SX]:
     """Force of each joint for a motion, without those of armatures, springs, damping and friction.
 
@@ -88,6 +93,9 @@ def inverse_dynamics(
         Positions, velocities and accelerations, rad or m.
     inertials : sequence of (4, 4) SX or array, one per body
         Pseudo-inertias about the origins of the body frames.
+    base : sequence of three (3,) SX, optional
+        Angular velocity and acceleration of the base whose motion is measured, and acceleration of its origin less
+        gravity (what an accelerometer shows), in its frame.
 
     Returns
     -------
@@ -97,9 +105,11 @@ def inverse_dynamics(
     still, gravity = ca.SX.zeros(3), ca.SX(description.gravity)
     world = _Motion(still, still, -gravity, gravity)
     motions = list[_Motion]()
-    for body in description.bodies:
+    for i, body in enumerate(description.bodies):
         motion = world if body.parent < 0 else motions[body.parent]
         motion = motion.turned(ca.DM(body.rotation), ca.DM(body.position))
+        if i == description.base:
+            motion = _Motion(base[0], base[1], base[2], still)
         for k in body.joints:
             motion = _moved(motion, description.joints[k], q[k], v[k], a[k])
         motions.append(motion)

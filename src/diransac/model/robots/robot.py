@@ -30,9 +30,9 @@ def robot(
     friction_speed: float = 0.05,
     stribeck_speed: float = 0.2,
     gravity: Sequence[float] | None = None,
-    fix_base: bool = False,
+    base: str | None = None,
 ) -> Model:
-    """Model of a robot with a fixed base from its description: chains and trees of hinges and slides.
+    """Model of a robot from its description: chains and trees of hinges and slides on a base that is fixed or measured.
 
     ``tau_i(q, q', q'') + armature q'' + damping q' + friction tanh(q' / s) + spring (q - q_0) = drive``
 
@@ -68,8 +68,10 @@ def robot(
         Speed at which the Stribeck effect has fallen to 1/e, rad/s or m/s.
     gravity : sequence of float, optional
         In the frame of the world, m/s^2; by default the file's.
-    fix_base : bool, optional
-        Whether a body with a free joint is held in the pose of the file: a robot that hangs, or is clamped.
+    base : str, optional
+        A base with a free joint: "held" in the pose of the file, of a robot that hangs or is clamped; or "measured",
+        with further inputs ``base_wx``, ... (angular velocity), ``base_wx_dot``, ... (angular acceleration) and
+        ``base_fx``, ... (acceleration of its origin less gravity, which an accelerometer shows), all in its frame.
 
     Returns
     -------
@@ -80,14 +82,15 @@ def robot(
     Raises
     ------
     ModelError
-        MuJoCo is not installed; the file cannot be read, or describes a floating base, a closed loop or a ball joint; a
-        name is unknown; nothing is unknown, or a body with unknown parameters does not move.
+        MuJoCo is not installed; the file cannot be read, or describes a closed loop or a ball joint; a name is unknown; nothing is unknown, or a body with unknown parameters does not move.
 
     References
     ----------
     Luh, Walker, Paul 1980 (recursive Newton-Euler algorithm); Gautier 1991 (base parameters).
     """
-    description = read_description(path, fix_base=fix_base)
+    if base not in (None, "held", "measured"):
+        raise ModelError(f'base is {base!r}; give "held" or "measured", or None')
+    description = read_description(path, base)
     if gravity is not None:
         description = replace(description, gravity=_vector(gravity))
     label = f'robot "{path}"'
