@@ -40,6 +40,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_limbs_are_identified_side_by_side_and_written_into_the_description(folder):
     done = run("identify", "run.csv", *ROBOT, "--method", "ols", "-o", "dog.json", "--report", "dog.html")
     assert done.exit_code == 0, done.stderr

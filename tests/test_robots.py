@@ -480,6 +480,7 @@ def moved(path, n_q, duration=8.0, dt=0.01, seed=0, friction=0.0):
     return t, q, v, a, tau
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bodies", [(), "all"])
 def test_least_squares_of_exact_motion_returns_the_robot(described, bodies):
     path = described(robots.urdf(parents=(0, 1, 2)))

@@ -82,7 +82,8 @@ def robot(
     Raises
     ------
     ModelError
-        MuJoCo is not installed; the file cannot be read, or describes a closed loop or a ball joint; a name is unknown; nothing is unknown, or a body with unknown parameters does not move.
+        MuJoCo is not installed; the file cannot be read, or describes a closed loop or a ball joint; a name is unknown;
+        nothing is unknown, or a body with unknown parameters does not move.
 
     References
     ----------
