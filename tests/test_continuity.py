@@ -287,3 +287,49 @@ def test_default_weight_of_an_attitude_is_that_of_an_angle():
     one = dr.tvlqr(dr.Plant(axis, {"J": INERTIA["Jx"]}), still).gains[0, 0]
     found = dr.tvlqr(body, rest).gains[0, 0]
     assert found[[1, 4]] == pytest.approx([2.0 * one[0], one[1]], rel=1e-6)
+
+
+@pytest.mark.parametrize("sensor", [False, True])
+def test_rates_alone_are_enough_where_no_force_depends_on_the_attitude(sensor):
+    _, w, torques = tumble(0, 0.0)
+    sensors = dr.sensors.gyroscope(RATES, bias=False) if sensor else None
+    columns = dict(zip([*sensors] if sensor else RATES, w.T, strict=True)) | dict(zip(TORQUES, torques.T, strict=True))
+    result = dr.identify(tumbling(sensors=sensors), dr.Log.from_arrays(T, columns), differentiate=True)
+    assert dict(result.parameters) == pytest.approx(INERTIA, rel=0.01)
+    assert result.verdict == "usable"
+
+
+# ---------------------------------------------------------------------- interpolation
+
+
+@pytest.mark.parametrize(("turn", "low"), [(TURN, -0.5), (TURN, 0.0), (360.0, -0.5)])
+def test_resampling_and_shifting_a_wrapped_angle_interpolate_along_the_shorter_way(turn, low):
+    def angle(t):
+        return turn * (0.7 * t + 0.3 * np.sin(2.0 * t))
+
+    rate, log = 130.0, dr.Log.from_arrays(T, {"x": wrapped(angle(T), turn, low)})
+    for found, true in (
+        (dr.resample(log, rate), lambda t: angle(t)),
+        (dr.shift(log, {"x": 0.4 * DT}), lambda t: angle(t - 0.4 * DT)),
+    ):
+        off = (found["x"] - true(found.time)) / turn
+        np.testing.assert_allclose(off, np.round(off), atol=1e-4)
+        assert np.ptp(found["x"]) < 1.02 * turn
+
+
+def test_resampling_and_shifting_a_quaternion_of_either_sign_interpolate_one_attitude():
+    rng, half = np.random.default_rng(3), 0.9 * np.sin(2.0 * T)
+    q = np.array([np.cos(half), np.sin(half), np.zeros(N), np.zeros(N)])
+    log = dr.Log.from_arrays(T, {"m": np.ones(N), **dict(zip(QUATERNION, q * rng.choice([-1.0, 1.0], N), strict=True))})
+    shifted = dr.shift(log, dict.fromkeys(QUATERNION, 0.4 * DT))
+    for found, late in ((dr.resample(log, 130.0), 0.0), (shifted, 0.4 * DT)):
+        half = 0.9 * np.sin(2.0 * (found.time - late))
+        true = np.array([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half])
+        same = np.abs((np.array([found[name] for name in QUATERNION]) * true).sum(axis=0))
+        np.testing.assert_allclose(same, 1.0, atol=1e-3)
+
+
+def test_a_leap_that_is_no_wrap_is_interpolated_as_before():
+    steps = np.where(T < 2.0, 0.0, 10.0)
+    found = dr.resample(dr.Log.from_arrays(T, {"x": steps}), 2.0 / DT)
+    assert found["x"][np.searchsorted(found.time, 1.995)] == pytest.approx(5.0)

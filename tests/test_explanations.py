@@ -1,6 +1,7 @@
 """What lo-diransac takes a log to be: exact or not, late, lagging, with gaps, with sensors that err, with a payload."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -95,6 +96,55 @@ def test_a_battery_that_sags_is_named_and_leaves_the_parameters_exact():
         "The gain of moment falls by 15 % during ",
     ]
     assert found.verdict == "usable with care"
+
+
+def fresh(regime, seed=SEED):
+    """The record of one log of a regime that is not in the table."""
+    return METHODS["lo"](regime, seed, flights.recordings(regime, [seed])[0])
+
+
+def test_a_drift_in_noise_is_found_because_held_out_parts_of_the_log_are_predicted_worse():
+    def worn(share, p):
+        return SimpleNamespace(**{**vars(p), "fc": (1.0 - 0.2 * share) * p.fc})
+
+    machine = flights.REGIMES["motor noisy"].machine
+    regimes = [
+        flights.Regime("drift", machine, exact=False, noise=10.0, fault=flights.Fault(changed=worn)),
+        flights.Regime("none", machine, noise=10.0),
+    ]
+    drifting, steady = (fresh(x) for x in regimes)
+    assert drifting.verdict == "do not rely on this"
+    assert any(x.startswith("fc changes during the log") for x in drifting.findings)
+    assert any(x.startswith("Fifths of the log that are held out have") for x in drifting.findings)
+    assert not any("held out" in x or "changes" in x for x in steady.findings)
+
+
+def test_parts_of_a_log_that_disagree_are_named_though_no_unmodelled_force_is_likely():
+    """A spring that hardens a little: the exact model is the likeliest, with an interval that misses the truth."""
+
+    def harder(rngs):
+        return lambda t, q, v, u, p: np.stack([-1.0, 1.0])[:, None] * 20.0 * p.k * (q[0] - q[1]) ** 3
+
+    machine, seed = flights.REGIMES["flexible joint both angles"].machine, 1002
+    found = fresh(flights.Regime("x joint hard spring", machine, exact=False, fault=flights.Fault(force=harder)), seed)
+    assert found.off or not all(found.inside.values())
+    assert found.verdict == "usable with care"
+    assert [x for x in found.findings if x.startswith("Parts of the log disagree on the parameters")]
+    assert fresh(flights.Regime("exact joint", machine), seed).verdict == "usable"
+
+
+@pytest.mark.parametrize("name", ["rotor noise 1x", "car all measured"])
+def test_a_vibration_of_the_sensors_far_above_the_motion_is_no_reason_against_the_parameters(name):
+    """Residuals that are far from white: five times the noise at an eighth of the sampling rate."""
+
+    def shake(rng, columns, inputs):
+        for signal, std in machine.noise.items():
+            columns[signal] += 5.0 * std * np.sin(0.25 * np.pi * np.arange(len(columns[signal])))
+
+    machine = flights.REGIMES[name].machine
+    found = fresh(flights.Regime(f"{name} shaken", machine, fault=flights.Fault(corrupted=shake)))
+    assert found.verdict == "usable"
+    assert all(found.inside.values())
 
 
 def test_a_controller_that_answers_gusts_is_no_delay():

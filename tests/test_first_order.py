@@ -263,6 +263,10 @@ def test_inspection_names_what_excites_a_model_without_coordinates():
     assert {x.verdict for x in found.excitation.values()} == {"well"}
 
 
+def test_inspection_names_the_method_that_needs_no_other_signal():
+    assert "lo-diransac estimates them" in inspect(recorded(thrust_signals(), ["z"]), lagged_thrust()).fitness.reason
+
+
 # ---------------------------------------------------------------------- states that nothing measures
 
 KNOWN = {"inertia": MOTOR["inertia"], "friction": MOTOR["friction"]}

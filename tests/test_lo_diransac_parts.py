@@ -13,7 +13,13 @@ from diransac.identification.methods.lo_diransac.augmented_model import augmente
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
 from diransac.identification.methods.lo_diransac.local_search import fewest_parts
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
-from diransac.identification.methods.lo_diransac.normal_equations import Fit, cost, linearize, with_residuals
+from diransac.identification.methods.lo_diransac.normal_equations import (
+    Fit,
+    cost,
+    linearize,
+    variances_of_intervals,
+    with_residuals,
+)
 from diransac.identification.methods.lo_diransac.projection import (
     estimate_parameters,
     means_of_intervals,
@@ -278,6 +284,27 @@ def test_right_hand_side_is_minus_half_the_slope_of_the_cost():
         h = 1e-5
         ahead, behind = (cost(intervals, moved(intervals, fit, s * h * dz, s * h * ds), weights) for s in (1, -1))
         assert (ahead - behind) / (4 * h) == pytest.approx(-(at.right_z * dz).sum() - at.right_s @ ds, rel=1e-5)
+
+
+def test_variances_of_intervals_are_those_of_their_steps_under_noise():
+    intervals, signals = intervals_of(n_rows=200)
+    fit = perturbed_fit(intervals, signals)
+    sigma = np.linspace(0.5, 2.0, signals.shape[1])
+    weights = np.broadcast_to(1.0 / np.square(sigma), signals.shape)
+    z, s = linearize(intervals, fit, weights).system.functional(
+        np.zeros((len(intervals), 9, 3)), np.eye(len(fit.shared), 3)
+    )
+
+    def steps(noise):
+        at = linearize(replace(intervals, measured=intervals.measured + noise), fit, weights)
+        return np.einsum("wkp,wk->wp", z, at.data_z) + at.data_s @ s
+
+    rng, still = np.random.default_rng(14), steps(np.zeros(signals.shape))
+    drawn = np.array([steps(sigma * rng.standard_normal(signals.shape)) - still for _ in range(400)])
+    found = variances_of_intervals(intervals, fit, weights, z, s)
+    exact = np.einsum("wii->wi", found)
+    assert np.abs(np.square(drawn).mean(axis=0) / exact - 1.0).max() < 5.0 * np.sqrt(2.0 / len(drawn))
+    assert np.linalg.eigvalsh(s[:3] - found.sum(axis=0)).min() > -1e-9 * s[:3].max()  # priors have a part in it
 
 
 def test_a_gauss_newton_step_solves_a_linear_problem_at_once():

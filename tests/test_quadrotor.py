@@ -184,3 +184,29 @@ def test_parameters_are_within_their_intervals_with_noise_and_outliers():
         error = abs(value - TRUTH[name])
         assert error <= 0.01 * TRUTH[name], name
         assert error <= 4.0 * result.standard_errors[name], name
+
+
+@pytest.mark.slow
+def test_imu_and_attitude_determine_all_parameters_without_a_position():
+    """The rotors' drag is what the accelerometer sees of the velocity, which nothing measures."""
+    time, columns = flight(n_rows=300)
+    rng = np.random.default_rng(2)
+    readings = [f"{sensor}_{axis}" for sensor in BIASES for axis in "xyz"]
+    noise = {
+        **dict.fromkeys(QUATERNION, 0.002),
+        **dict.fromkeys(readings[:3], 0.1),
+        **dict.fromkeys(readings[3:], 0.02),
+    }
+    measured = {name: columns[name] for name in MOTORS}
+    for name, scale in noise.items():
+        hit = rng.random(len(time)) < 0.05
+        measured[name] = columns[name] + rng.normal(0.0, scale, len(time)) + hit * 50.0 * scale * rng.uniform(-1, 1)
+    log = dr.Log.from_arrays(time, measured)
+    result = dr.identify(dr.models.quadrotor(arm_length=ARM, imu=True), log, fixed=MASS, differentiate=True)
+    assert result.verdict != "do not rely on this"
+    assert not result.diagnosis.unidentifiable
+    for name, true in TRUTH.items():
+        assert result.parameters[name] == pytest.approx(true, rel=0.1), name
+        assert abs(result.parameters[name] - true) <= 4.0 * result.standard_errors[name], name
+    ratio = result.parameters["inertia_x"] / result.parameters["thrust_coefficient"]
+    assert ratio == pytest.approx(TRUTH["inertia_x"] / TRUTH["thrust_coefficient"], rel=0.02)

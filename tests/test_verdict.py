@@ -30,17 +30,17 @@ def sledge(**parameters):
     return dr.Model("sledge", {"s": "m"}, {"force": "N"}, known | parameters, equations)
 
 
-def slide(push=0.0, noise=0.0, late=0, seed=0, source="sledge"):
-    """A log of the sledge, exact where force and push are held; ``push`` N act that are not recorded."""
+def slide(push=0.0, noise=0.0, late=0, drift=0.0, seed=0, source="sledge"):
+    """A log of the sledge, exact where forces are held; ``push`` N are not recorded, drag grows by ``drift`` of it."""
     rng = np.random.default_rng(seed)
     t = DT * np.arange(N + late)
     force = 3.0 * np.sin(1.1 * t) + 2.0 * np.sin(3.7 * t + 0.5) + np.sin(7.9 * t)
     total = np.r_[np.zeros(late), force][: N + late] + push * np.sign(np.sin(0.6 * t))
-    state, decay = np.zeros((N + late + 1, 2)), np.exp(-DRAG / MASS * DT)
-    for k, final in enumerate(total / DRAG):
-        gap = state[k, 1] - final
-        state[k + 1] = state[k, 0] + final * DT + gap * (1.0 - decay) * MASS / DRAG, final + gap * decay
-    columns = {"s": state[:-1, 0], "s_dot": state[:-1, 1], "s_ddot": (total - DRAG * state[:-1, 1]) / MASS}
+    state, drag = np.zeros((N + late + 1, 2)), DRAG * (1.0 + drift * np.arange(N + late) / (N + late))
+    for k, final in enumerate(total / drag):
+        gap, decay = state[k, 1] - final, np.exp(-drag[k] / MASS * DT)
+        state[k + 1] = state[k, 0] + final * DT + gap * (1.0 - decay) * MASS / drag[k], final + gap * decay
+    columns = {"s": state[:-1, 0], "s_dot": state[:-1, 1], "s_ddot": (total - drag * state[:-1, 1]) / MASS}
     columns = {n: x[late:] + noise * rng.normal(size=N) for n, x in columns.items()}
     return dr.Log.from_arrays(t[:N], {**columns, "force": force[late:]}, source=source)
 
@@ -70,6 +70,7 @@ def inverted(seed):
 def cases():
     """Results of every verdict with the logs that they were identified from."""
     good, late, pushed, wrong = slide(noise=0.002), slide(late=6), slide(push=1.0), slide(noise=0.002)
+    drifting = slide(drift=0.3, noise=0.002)
     reversed_ = dr.Log.from_arrays(wrong.time, {**wrong.signals, "force": -wrong["force"]}, source="reversed")
     ols = dr.identify(sledge(), good, "ols")
     bounded = dr.identify(sledge(drag=dr.Parameter("N s/m", lower=3.0)), good, "ols")
@@ -79,6 +80,7 @@ def cases():
         "lo-diransac": (dr.identify(sledge(), good), good),
         "a delay": (dr.identify(sledge(), late), late),
         "a push": (dr.identify(sledge(), pushed), pushed),
+        "a drift": (dr.identify(sledge(), drifting), drifting),
         "a wrong sign": (dr.identify(sledge(), reversed_, "ols"), reversed_),
         "a violated bound": (bounded, good),
         "logs that disagree": (dr.identify(sledge(), [others[0], others[1], _heavy()], "ols"), others[:2]),
@@ -103,6 +105,7 @@ CASES = pytest.mark.parametrize(
         "lo-diransac",
         "a delay",
         "a push",
+        "a drift",
         "a wrong sign",
         "a violated bound",
         "logs that disagree",
@@ -159,6 +162,7 @@ def test_every_finding_is_a_sentence_and_the_most_serious_stand_first(cases, nam
         ("lo-diransac", "usable", ""),
         ("a delay", "usable with care", "Inputs act 60 ms later than recorded: the estimate includes this delay"),
         ("a push", "usable with care", "of s_ddot unexplained"),
+        ("a drift", "do not rely on this", "Fifths of the log that are held out have"),
         ("a wrong sign", "do not rely on this", "mass = −1.5 kg is outside its bounds"),
         ("a violated bound", "do not rely on this", "is outside its bounds (≥ 3)"),
         ("logs that disagree", "do not rely on this", "heavy disagrees with the other logs"),

@@ -153,12 +153,16 @@ class DrivenStates:
         return len(self.layout) if self.parameters is None else 0
 
     def starts(self) -> FloatArray:
-        """Unknowns (n_starts, n) to start from: parameters over the bounds or six decades, states zero."""
-        n_states = self.layout.n_logs * len(self.hidden)
+        """Unknowns (n_starts, n) to start from: parameters over the bounds or six decades, states zero.
+
+        A quaternion starts at (1, 0, 0, 0).
+        """
+        scalars = [self.model.state[four[0]] for four in self.model.quaternions]
+        states = np.tile([float(name in scalars) for name in self.hidden], self.layout.n_logs)
         if self.parameters is not None:
-            return np.zeros((1, n_states))
+            return states[None]
         chart = ParameterChart(self.layout.bounds)
-        return np.hstack([chart.to_parameters(chart.starts(_N_STARTS)), np.zeros((_N_STARTS, n_states))])
+        return np.hstack([chart.to_parameters(chart.starts(_N_STARTS)), np.tile(states, (_N_STARTS, 1))])
 
     def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
         """Unknowns (n_starts, n) after a step within the bounds, in which positive parameters change by a factor."""

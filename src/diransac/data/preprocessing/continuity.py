@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from diransac.data.log import Log
     from diransac.model import Model
 
-__all__ = ["continuous", "continuous_quaternions", "unit_quaternions", "unwrap", "whole_quaternions"]
+__all__ = ["continuous", "continuous_quaternions", "interpolated", "unit_quaternions", "unwrap", "whole_quaternions"]
 
 
 # Samples to either side of the one whose medoid is sought, at most; samples of the running medians.
@@ -45,6 +45,8 @@ _MAD_TO_STD = 1.4826
 _CAP, _TIE = 1.0, 1e-9
 # Relative deviations of a quaternion's norm that are its own, and those that are rounding errors.
 _OWN_NORM, _ROUNDING = 0.1, 1e-9
+# Turns of angles whose unit is unknown; fraction of unit norms of a quaternion; distance from a row, in rows.
+_TURNS, _MOSTLY, _AT_A_ROW = (2.0 * math.pi, 360.0), 0.8, 1e-6
 
 
 def continuous(log: Log, model: Model) -> Log:
@@ -67,6 +69,60 @@ def continuous(log: Log, model: Model) -> Log:
     for names in whole_quaternions(log.signals, model):
         log = _with_one_sign(log, names)
     return log
+
+
+# ---------------------------------------------------------------------- interpolation
+
+
+def interpolated(signals: Mapping[str, FloatArray], left: IntArray, weight: FloatArray) -> dict[str, FloatArray]:
+    """Signals between rows, by linear interpolation; wrapped angles and quaternions along the shorter way.
+
+    Names and units need not be known: an angle is a signal that `unwrap` would change, in rad or deg, and four
+    neighbouring columns of unit norm are a quaternion.
+
+    Parameters
+    ----------
+    signals : mapping of str to (N,) array
+    left : (M,) int array
+        Row before each new one; at most N - 2.
+    weight : (M,) array
+        Part of the way to the next row, from 0 to 1.
+
+    Returns
+    -------
+    dict of str to (M,) array
+        On the turn, and of the sign, of the nearer row.  A neighbour of zero weight is left out, so that NaN does not
+        spread.
+    """
+    nearest = left + (weight > 0.5)
+    found = {}
+    for name, values in signals.items():
+        turns = sum((turn * _revolutions(values, turn) for turn in _TURNS), np.zeros(len(values)))
+        found[name] = _between(values + turns, left, weight) - turns[nearest]
+    for names in _quaternions_of(signals):
+        q = np.column_stack([signals[name] for name in names])
+        signs = np.where(np.nansum(continuous_quaternions(q) * q, axis=1) < 0.0, -1.0, 1.0)
+        for name in names:
+            found[name] = _between(signals[name] * signs, left, weight) * signs[nearest]
+    return found
+
+
+def _between(values: FloatArray, left: IntArray, weight: FloatArray) -> FloatArray:
+    """Linear interpolation without neighbours of zero weight."""
+    mixed = (1.0 - weight) * values[left] + weight * values[left + 1]
+    return np.where(weight < _AT_A_ROW, values[left], np.where(weight > 1.0 - _AT_A_ROW, values[left + 1], mixed))
+
+
+def _quaternions_of(signals: Mapping[str, FloatArray]) -> list[list[str]]:
+    """Names of each four neighbouring columns that are a unit quaternion in nearly all rows in which they are known."""
+    names, found = list(signals), list[list[str]]()
+    while len(names) >= 4:
+        norms = np.linalg.norm([signals[name] for name in names[:4]], axis=0)
+        known = np.isfinite(norms)
+        is_one = known.any() and (np.abs(norms[known] - 1.0) <= _OWN_NORM).mean() >= _MOSTLY
+        found += [names[:4]] if is_one else []
+        names = names[4 if is_one else 1 :]
+    return found
 
 
 # ---------------------------------------------------------------------- angles

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray
+from diransac.data.preprocessing.continuity import interpolated
 from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
@@ -124,7 +125,7 @@ def check_factor(name: str, factor: float) -> None:
 
 
 def resample(log: Log, rate: float | str = "median") -> Log:
-    """Log at a uniform rate, by linear interpolation.
+    """Log at a uniform rate, by linear interpolation; wrapped angles and quaternions along the shorter way.
 
     Parameters
     ----------
@@ -169,7 +170,7 @@ def resample_columns(
     weight = np.clip((grid - time[left]) / steps[left], 0.0, 1.0)
     gaps = steps > max(_BRIDGED_INTERVALS * usual, 1.0 / hertz)
     blank = gaps[left] & (weight > _ROUNDING) & (weight < 1.0 - _ROUNDING)
-    resampled = {name: np.where(blank, np.nan, _between(values, left, weight)) for name, values in signals.items()}
+    resampled = {name: np.where(blank, np.nan, x) for name, x in interpolated(signals, left, weight).items()}
     step = {"step": "resample", "rate": hertz, "method": "linear", "rows": [len(time), n], "gaps": int(gaps.sum())}
     return grid, resampled, step, _resampling_notes(time, gaps, blank, hertz)
 
@@ -193,12 +194,6 @@ def _new_rows(seconds: float, hertz: float, source: str) -> int:
             f"{_MOST_ROWS:,} are made: give a lower rate, or --scale t=FACTOR if t is not in seconds"
         )
     return math.floor(rows) + 1
-
-
-def _between(values: FloatArray, left: npt.NDArray[np.intp], weight: FloatArray) -> FloatArray:
-    """Linear interpolation without neighbours of zero weight, so that NaN does not spread."""
-    mixed = (1.0 - weight) * values[left] + weight * values[left + 1]
-    return np.where(weight < _ROUNDING, values[left], np.where(weight > 1.0 - _ROUNDING, values[left + 1], mixed))
 
 
 def _resampling_notes(
@@ -240,18 +235,21 @@ def shift(log: Log, delays: Mapping[str, float]) -> Log:
 
     Notes
     -----
-    Fractions of a sample are interpolated linearly.
+    Fractions of a sample are interpolated linearly; wrapped angles, and quaternions whose components have one delay,
+    along the shorter way.
     """
     n = np.arange(len(log), dtype=float)
     signals, covered = dict(log.signals), np.ones(len(log), dtype=bool)
     for name, delay in delays.items():
         if not math.isfinite(delay):
             raise SettingsError(f'the delay of "{name}" is {delay}; give seconds')
+    for delay in dict.fromkeys(delays.values()):
         rows = n - delay / log.dt
         covered &= (rows >= -_ROUNDING) & (rows <= n[-1] + _ROUNDING)
         rows = np.clip(rows, 0.0, n[-1])
         left = np.minimum(rows.astype(np.intp), len(log) - 2)
-        signals[name] = _between(log[name], left, rows - left)
+        late = {name: log[name] for name, x in delays.items() if x == delay}
+        signals |= interpolated(late, left, rows - left)
     if covered.sum() < 2:
         raise LogError(f"{log.source}: delays of {dict(delays)} s leave no row of {len(log) * log.dt:.6g} s")
     step = {"step": "shift", "delays": {name: float(delay) for name, delay in delays.items()}}

@@ -1,4 +1,13 @@
-"""Findings of a fit on itself: errors of sensors, parameters that change, methods that disagree."""
+"""Findings of a fit on itself: errors of sensors, parameters that change, methods that disagree.
+
+Parts of the logs are compared without another fit.  Where the model is not exact, parameters are projected again from a
+part of the intervals, and the others are predicted with them.  Where it is exact, each interval has a contribution to
+the parameters and an information, so that those of a part follow from sums: Cochran's test of homogeneity.
+
+References
+----------
+Chow 1960 (parameters of parts of a sample); Cochran 1954 (homogeneity of estimates).
+"""
 
 from __future__ import annotations
 
@@ -7,18 +16,22 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import chdtrc
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.estimate import Finding
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
+from diransac.identification.methods.lo_diransac.normal_equations import variances_of_intervals
 from diransac.identification.methods.lo_diransac.projection import (
     batch_sums,
+    effect_of_intervals,
     least_squares_gains,
     means_of_intervals,
     means_of_windows,
     residuals_of_motion,
 )
 from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs
+from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.text_table import number, percent
 
 if TYPE_CHECKING:
@@ -28,12 +41,18 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["Change", "changes_between_halves", "findings_of_fit"]
+__all__ = ["Change", "Parts", "compared_parts", "findings_of_fit"]
 
 # A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious.
 _CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
 # Delay of an input that is worth a sentence, samples.
 _SMALL_DELAY = 0.1
+# Parts of the logs that are predicted by the rest; mean square of what the model leaves of them, over that of the fit,
+# from which on it is no chance; standard errors of a parameter that differs then.
+_HELD_OUT, _WORSE, _LIKELY = 5, 1.25, 2.0
+# Parts whose parameters an exact model must have in common; probability of a difference as large by chance; part of a
+# parameter that is negligible; information about a direction of the parameters, over the largest, that is rounding.
+_STRETCHES, _BY_CHANCE, _NEGLIGIBLE, _ROUNDING = 10, 1e-4, 2e-4, 1e-9
 # Residual of an equation over that of the worst, at least.
 _SMALLEST = 1e-6
 _TINY = 1e-300
@@ -70,9 +89,50 @@ class Change:
         return (self.first - self.second) ** 2 / 3.0
 
 
-def findings_of_fit(
-    found: Explanation, motion: Motion, result: ProjectedEstimate, changes: Sequence[Change]
-) -> Iterator[Finding]:
+@dataclass(frozen=True)
+class Deviation:
+    """The part of the logs that agrees least with the others, where the model is exact.
+
+    Parameters
+    ----------
+    begin, end : float
+        The part, over the duration of each log.
+    scatter : float
+        Scatter of the parameters of all parts, over that by noise (RMS).
+    index : int
+        Parameter that changes most, over its value, if this part is left out.
+    change : float
+        That change.
+    """
+
+    begin: float
+    end: float
+    scatter: float
+    index: int
+    change: float
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Parameters that are estimated again from parts of the logs.
+
+    Parameters
+    ----------
+    changes : sequence of Change, optional
+        Parameters that clearly differ between the halves; none where the model is exact.
+    held_out : float, optional
+        Mean square of what the model leaves of fifths of the logs whose parameters are those of the rest, over that of
+        the fit.
+    deviation : Deviation, optional
+        Of the part that deviates most from an exact model, if parts differ by more than noise explains.
+    """
+
+    changes: Sequence[Change] = ()
+    held_out: float = 1.0
+    deviation: Deviation | None = None
+
+
+def findings_of_fit(found: Explanation, motion: Motion, result: ProjectedEstimate, parts: Parts) -> Iterator[Finding]:
     """Findings for and against an estimate.
 
     Parameters
@@ -81,8 +141,8 @@ def findings_of_fit(
     motion : Motion
         Smoothed motion over the rows of the intervals.
     result : ProjectedEstimate
-    changes : sequence of Change
-        Result of `changes_between_halves`.
+    parts : Parts
+        Result of `compared_parts`.
 
     Returns
     -------
@@ -92,7 +152,7 @@ def findings_of_fit(
         how = {"linear": "linearly", "smooth": "smoothly"}[found.intervals.hold]
         yield Finding("note", f"Inputs that vary {how} between samples explain this log better than held ones.")
     yield from _of_recordings(found.intervals, found.refinement.fit)
-    yield from (_of_change(found.intervals.layout.names[x.index], x) for x in changes)
+    yield from _of_parts(found.intervals.layout.names, parts)
     if not found.exact:
         yield from _of_plain_least_squares(found.intervals, motion, result)
 
@@ -122,15 +182,29 @@ def _of_recordings(intervals: ShootingIntervals, fit: Fit) -> Iterator[Finding]:
             yield Finding("care", f"The gain of {name} {moves}, as with a battery that sags: {holds}.")
 
 
-def _of_change(name: str, change: Change) -> Finding:
-    first, second = number(change.first, 3), number(change.second, 3)
-    text = f"{name} changes during the log, from {first} in its first half to {second} in its second"
-    advice = "a payload, a drifting gain or another regime; identify stretches of the log one by one"
-    return Finding("bad" if change.apart > _SERIOUS else "care", f"{text}: {advice}.")
+def _of_parts(names: Sequence[str], parts: Parts) -> Iterator[Finding]:
+    """Parameters that change during the log, and parts of it that the others do not predict."""
+    for change in parts.changes:
+        first, second = number(change.first, 3), number(change.second, 3)
+        text = f"{names[change.index]} changes during the log, from {first} in its first half to {second} in its second"
+        advice = "a payload, a drifting gain or another regime; identify stretches of the log one by one"
+        yield Finding("bad" if change.apart > _SERIOUS else "care", f"{text}: {advice}.")
+    if parts.held_out > _WORSE:
+        more = percent(np.sqrt(parts.held_out) - 1.0)
+        text = f"Fifths of the log that are held out have {more} more unmodelled force (RMS) than in the fit of all"
+        yield Finding("care" if parts.changes else "note", f"{text}: what is estimated from one part fails in another.")
+    found = parts.deviation
+    if found is not None:
+        where = f"most between {percent(found.begin)} and {percent(found.end)} of its duration"
+        text = (
+            f"Parts of the log disagree on the parameters {number(found.scatter, 2)} times as much as by noise, {where}"
+        )
+        effect = f"without that part {names[found.index]} changes by {percent(found.change)}"
+        yield Finding("care", f"{text}: {effect}. Intervals are too narrow, or the model lacks an effect.")
 
 
-def changes_between_halves(found: Explanation, result: ProjectedEstimate) -> list[Change]:
-    """Parameters that clearly differ between the halves of the logs.
+def compared_parts(found: Explanation, result: ProjectedEstimate) -> Parts:
+    """Parameters of parts of the logs, compared with each other.
 
     Parameters
     ----------
@@ -139,37 +213,92 @@ def changes_between_halves(found: Explanation, result: ProjectedEstimate) -> lis
 
     Returns
     -------
-    list of Change
-        Empty where the model is exact.
+    Parts
     """
     intervals = found.intervals
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
-    first = (place < 0.5 * np.bincount(intervals.log_of)[intervals.log_of])[result.windows]
-    if found.exact or min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
-        return []
-    _, rows, regressors, _ = residuals_of_motion(intervals, found.refinement.fit, result.parameters)
+    share = place / np.bincount(intervals.log_of)[intervals.log_of]
+    compared = _deviating if found.exact else _changing
+    return compared(intervals, found.refinement.fit, result, share)
+
+
+def _changing(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
+    """Halves and held-out fifths of the logs, where the model is not exact."""
+    share = share[result.windows]
+    first = share < 0.5
+    if min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
+        return Parts()
+    _, rows, regressors, _ = residuals_of_motion(intervals, fit, result.parameters)
     W = means_of_intervals(intervals, regressors * intervals.counted[:, None, None])
     residuals = means_of_intervals(intervals, rows * intervals.counted[:, None])
     W, residuals = (means_of_windows(x, result.windows) for x in (W, residuals))
+    held_out = _held_out(W, residuals, (_HELD_OUT * share).astype(int))
     moved, variances = zip(*(_change(W[half], residuals[half]) for half in (first, ~first)), strict=True)
     halves, errors = result.parameters[None] + np.array(moved), np.sqrt(sum(variances))
     both = [Change(k, *x) for k, x in enumerate(halves.T.tolist())]
-    determined = np.isfinite(np.diag(result.covariance))
-    return [
+    determined, clear = np.isfinite(np.diag(result.covariance)), _LIKELY if held_out > _WORSE else _CLEAR
+    changes = [
         x
         for x, s, ok in zip(both, errors, determined, strict=True)
-        if ok and abs(x.first - x.second) > _CLEAR * s and x.apart > _DIFFERENT
+        if ok and abs(x.first - x.second) > clear * s and x.apart > _DIFFERENT
     ]
+    return Parts(changes, held_out)
+
+
+def _held_out(W: FloatArray, residuals: FloatArray, part: IntArray) -> float:
+    """Mean square of the residuals of each part with the parameters of the others, over that with those of all."""
+    scale = _scales(residuals)
+    fitted = residuals + W @ _change(W, residuals)[0]
+    left = np.zeros_like(residuals)
+    for k in np.unique(part):
+        held = part == k
+        left[held] = residuals[held] + W[held] @ _change(W[~held], residuals[~held])[0]
+    return float(np.square(left / scale).sum() / max(np.square(fitted / scale).sum(), _TINY))
+
+
+def _deviating(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
+    """Tenths of the logs, where the model is exact; no deviation if all agree, or if its effect is negligible.
+
+    The measurements of part k change the parameters by ``u_k``, of variance ``V_k`` if the model is exact and the noise
+    white.  ``sum u_k V_k^-1 u_k`` then has a chi-squared distribution.
+    """
+    n, part = len(result.parameters), (_STRETCHES * share).astype(int)
+    effect = effect_of_intervals(intervals, fit)
+    variances = variances_of_intervals(intervals, fit, weights_of(intervals, fit), effect.z, effect.s)
+    unit = np.sqrt(np.diag(effect.covariance)) + _TINY
+    if not (np.isfinite(variances).all() and np.isfinite(effect.steps).all()):  # LAPACK would raise
+        return Parts()
+    u = np.array([effect.steps[part == k].sum(axis=0) for k in range(_STRETCHES)]) / unit
+    V = np.array([variances[part == k].sum(axis=0) for k in range(_STRETCHES)]) / np.outer(unit, unit)
+    sizes, axes = np.linalg.eigh(V)
+    informed = sizes > _ROUNDING * sizes[:, -1:]
+    along = np.einsum("kij,ki->kj", axes, u)
+    distances = np.divide(np.square(along), sizes, out=np.zeros_like(sizes), where=informed).sum(axis=1)
+    freedom = int(informed.sum()) - n
+    if freedom < 1 or not chdtrc(freedom, distances.sum()) < _BY_CHANCE:
+        return Parts()
+    k, scatter = int(np.argmax(distances)), float(np.sqrt(distances.sum() / freedom))
+    R = effect.covariance / np.outer(unit, unit)
+    without = R @ np.linalg.lstsq(R - V[k], -u[k], rcond=None)[0]
+    changes = np.abs(without) * unit / np.maximum(np.abs(result.parameters), _TINY)
+    worst, edges = int(np.argmax(changes)), (k / _STRETCHES, (k + 1) / _STRETCHES)
+    most = Deviation(*edges, scatter, worst, float(changes[worst]))
+    return Parts(deviation=most if most.change > _NEGLIGIBLE else None)
 
 
 def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Change ``(n,)`` of parameters by least squares of some rows, and its variance by batches of them."""
-    scale = np.sqrt(np.square(residuals).mean(axis=0))
-    gains = least_squares_gains(W, 1.0 / np.maximum(scale, _SMALLEST * scale.max() + 1e-300))
+    gains = least_squares_gains(W, 1.0 / _scales(residuals))
     change = -np.einsum("pwi,wi->p", gains, residuals)
     left = residuals + W @ change
     sums = batch_sums(np.einsum("pwi,wi->wp", gains, left))
     return change, np.square(sums).sum(axis=0)
+
+
+def _scales(residuals: FloatArray) -> FloatArray:
+    """Size ``(n_v,)`` of the residuals of each equation."""
+    scale = np.sqrt(np.square(residuals).mean(axis=0))
+    return np.asarray(np.maximum(scale, _SMALLEST * scale.max() + _TINY))
 
 
 def _of_plain_least_squares(

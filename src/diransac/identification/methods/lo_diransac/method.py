@@ -23,7 +23,7 @@ from diransac.errors import IdentificationError, LogError, ModelError, SettingsE
 from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report, within
-from diransac.identification.methods.lo_diransac.checks import changes_between_halves, findings_of_fit
+from diransac.identification.methods.lo_diransac.checks import compared_parts, findings_of_fit
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
 from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
@@ -236,14 +236,14 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
     if best.reached or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
-    changes, lacks = changes_between_halves(likeliest, result), None
+    parts, lacks = compared_parts(likeliest, result), None
     if settings.suggestions and not likeliest.exact:
-        lacks = missing_terms(intervals, refined.fit, result.parameters, settings.candidate_terms)
-    ambiguity = _ambiguity(len(result.parameters), changes, lacks)
+        lacks = missing_terms(intervals, refined.fit, result, settings.candidate_terms)
+    ambiguity = _ambiguity(len(result.parameters), parts.changes, lacks)
     checks = (
         *_checks(settings, intervals, motion, refined),
         *_checks_of_unmeasured(best),
-        *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), changes),
+        *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), parts),
     )
     forced = bool(settings.input_delay or settings.input_lag)
     found = _Found(dataset, intervals, motion, refined, result, ambiguity, forced)

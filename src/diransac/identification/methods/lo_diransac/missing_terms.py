@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, IntArray
 from diransac.identification.candidate_terms import TermLibrary, candidate_terms
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.projection import (
     means_of_intervals,
+    means_of_windows,
     projected_parameters,
     residuals_of_motion,
 )
@@ -37,6 +38,7 @@ from diransac.simulation.compiler import compile_map
 if TYPE_CHECKING:
     from diransac.identification.candidate_terms import CandidateTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.methods.lo_diransac.shooting import ErrorKind, ShootingIntervals
     from diransac.model import Model
     from diransac.simulation.compiler import Map
@@ -67,7 +69,7 @@ class MissingTerms:
 
 
 def missing_terms(
-    intervals: ShootingIntervals, fit: Fit, parameters: FloatArray, library: TermLibrary | None = None
+    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, library: TermLibrary | None = None
 ) -> MissingTerms:
     """Terms that explain the unmodelled forces, each supported by the logs.
 
@@ -76,8 +78,8 @@ def missing_terms(
     intervals : ShootingIntervals
     fit : Fit
         Most probable motion.
-    parameters : (n,) array
-        Estimate, per-log parameters of every log included.
+    result : ProjectedEstimate
+        With the windows over which forces are averaged.
     library : callable, optional
         The user's candidates.
 
@@ -85,7 +87,7 @@ def missing_terms(
     -------
     MissingTerms
     """
-    rows = _Rows(intervals, *residuals_of_motion(intervals, fit, parameters))
+    rows = _Rows(intervals, result.windows, *residuals_of_motion(intervals, fit, result.parameters))
     speeds = np.sqrt(np.square(rows.motion[1][intervals.counted]).mean(axis=0))
     candidates = candidate_terms(intervals.model, speeds, library)
     means = _mean_forces(rows, fit, candidates)
@@ -146,11 +148,12 @@ def _error_of_inputs(kind: ErrorKind, force: FloatArray, effect: FloatArray, own
 
 
 class _Rows:
-    """Fitted motion and residuals in the rows of the intervals, and means over those of an interval that count."""
+    """Fitted motion and residuals in the rows of the intervals, and means over those of a window that count."""
 
     def __init__(
         self,
         intervals: ShootingIntervals,
+        windows: IntArray,
         motion: tuple[FloatArray, ...],
         r: FloatArray,
         W: FloatArray,
@@ -160,12 +163,18 @@ class _Rows:
         counted = intervals.counted.astype(float)
         counts = np.maximum(counted.reshape(len(intervals), -1).sum(axis=1), 1.0)
         self.weights = counted / np.repeat(counts, intervals.length)
+        window = np.searchsorted(windows, np.flatnonzero(intervals.occupied), side="right")
+        self.windows = np.flatnonzero(np.diff(window, prepend=-1))
 
     def mean(self, values: FloatArray) -> FloatArray:
-        """Mean of each interval that has any, (n, ...)."""
+        """Mean of each window that has any, (n, ...)."""
         weighted = values * self.weights.reshape(-1, *(1,) * (values.ndim - 1))
         sums = weighted.reshape(len(self.intervals), -1, *values.shape[1:]).sum(axis=1)
-        return np.asarray(sums[self.intervals.occupied])
+        return self.over_windows(sums)
+
+    def over_windows(self, values: FloatArray) -> FloatArray:
+        """Means of values of intervals ``(W, ...)``."""
+        return means_of_windows(values[self.intervals.occupied], self.windows)
 
     def input_rates(self) -> FloatArray:
         """``dr/du_j du_j/dt`` (N, n_v, n_u): the effect of a delay of each input."""
@@ -178,9 +187,9 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForce
     n_p, n_v, n_u = intervals.n_p, intervals.model.n_v, intervals.model.n_u
     at = linearize(intervals, fit, weights_of(intervals, fit))
     found = at.system.solve(at.right_z, at.right_s)
-    alone = (found.var_z - found.gain @ found.var_p @ found.gain.swapaxes(1, 2))[intervals.occupied]
-    M = rows.mean(rows.M)
-    of_force = np.einsum("wij,wjk,wik->wi", M, alone[:, n_x:, n_x:], M)
+    alone = found.var_z - found.gain @ found.var_p @ found.gain.swapaxes(1, 2)
+    M, sizes = rows.mean(rows.M), np.diff(rows.windows, append=intervals.occupied.sum())
+    of_force = np.einsum("wij,wjk,wik->wi", M, rows.over_windows(alone[:, n_x:, n_x:]), M) / sizes[:, None]
     inertial = np.einsum("nij,nj->ni", rows.M, rows.motion[2])[intervals.counted]
     force = rows.mean(rows.r)
     own = rows.mean(np.concatenate([rows.W, rows.input_rates()], axis=2))
@@ -194,10 +203,10 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForce
         own=own,
         discrepancies=discrepancies,
         discrepancy_covariance=found.var_p[place, place],
-        terms=candidates.means(rows.motion, rows.weights, intervals.length)[intervals.occupied],
+        terms=rows.over_windows(candidates.means(rows.motion, rows.weights, intervals.length)),
         is_input_gain=candidates.is_input_gain,
         groups=candidates.groups,
-        log_of=intervals.log_of[intervals.occupied],
+        log_of=intervals.log_of[intervals.occupied][rows.windows],
     )
 
 

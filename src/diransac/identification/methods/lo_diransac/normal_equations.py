@@ -38,6 +38,7 @@ __all__ = [
     "innovation_std",
     "innovations",
     "linearize",
+    "variances_of_intervals",
     "with_residuals",
 ]
 
@@ -226,6 +227,29 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     system = Arrowhead(*blocks, _FINE_RIDGE) if len(intervals.layout.with_prior) else Arrowhead(*blocks)
     right = right - beforehand * (fit.shared - fit.prior_mean)
     return NormalEquations(system, g[:, :k], right, data_z, data_s, jumps, F, precision)
+
+
+def variances_of_intervals(
+    intervals: ShootingIntervals, fit: Fit, weights: FloatArray, z: FloatArray, s: FloatArray
+) -> FloatArray:
+    """Variances of functions of a fit by the noise of each interval's measurements alone.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    weights : (N, n_signals) array
+        Weights of the measurements, one over the variance of each.
+    z, s : (W, k, n) and (n_s, n) array
+        Result of `Arrowhead.functional` for the functions' gradients.
+
+    Returns
+    -------
+    (W, n, n) array
+    """
+    sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights)
+    own = np.concatenate([z, s[_places(intervals)[intervals.log_of]]], axis=1)
+    return np.asarray(own.swapaxes(1, 2) @ sums.normal_matrix @ own)
 
 
 def _places(intervals: ShootingIntervals) -> IntArray:

@@ -55,9 +55,11 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler import Map
 
 __all__ = [
+    "EffectOfIntervals",
     "ProjectedEstimate",
     "batch_sums",
     "discrepancy_units",
+    "effect_of_intervals",
     "estimate_parameters",
     "fitted_parameters",
     "inertial_forces",
@@ -141,7 +143,7 @@ def projected_parameters(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
         Within the inclusive bounds.
     """
     now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit)
-    return _bounded_projection(intervals, now, rows, _windows(intervals, now, rows), _REWEIGHTED)[0]
+    return _bounded_projection(intervals, now, rows, _windows(intervals, now, rows)[-1], _REWEIGHTED)[0]
 
 
 def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -159,15 +161,52 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     -------
     ProjectedEstimate
     """
+    effect = effect_of_intervals(intervals, fit)
+    scatter = np.square(batch_sums(effect.steps)).sum(axis=0)
+    more = np.sqrt(np.maximum(1.0, scatter / (np.diag(effect.covariance) + _TINY)))
+    p = fit.shared[: intervals.n_p]
+    covariance = effect.covariance * np.outer(more, more) + effect_on(intervals, fit, effect.z, effect.s)
+    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p), np.arange(len(intervals)))
+
+
+@dataclass(frozen=True)
+class EffectOfIntervals:
+    """What each interval's measurements change of the parameters of a fit, to first order.
+
+    Parameters
+    ----------
+    steps : (W, n) array
+        Changes; zero in sum at the optimum, without priors.
+    covariance : (n, n) array
+        Of the parameters by white noise.
+    z, s : (W, k, n) and (n_s, n) array
+        Result of `Arrowhead.functional` for the parameters.
+    """
+
+    steps: FloatArray
+    covariance: FloatArray
+    z: FloatArray
+    s: FloatArray
+
+
+def effect_of_intervals(intervals: ShootingIntervals, fit: Fit) -> EffectOfIntervals:
+    """Effect of each interval's measurements on the parameters of a fit.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        At its optimum.
+
+    Returns
+    -------
+    EffectOfIntervals
+    """
     n_p, n_s, k = intervals.n_p, len(fit.shared), fit.x.shape[1] + fit.d.shape[1]
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(np.zeros((len(intervals), k, n_p)), np.eye(n_s, n_p))
-    scores = np.einsum("wkp,wk->wp", z, at.data_z) + at.data_s @ s
-    sums = batch_sums(scores)
-    more = np.sqrt(np.maximum(1.0, np.square(sums).sum(axis=0) / (np.diag(s[:n_p]) + _TINY)))
-    p = fit.shared[:n_p]
-    covariance = s[:n_p] * np.outer(more, more) + effect_on(intervals, fit, z, s)
-    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p), np.arange(len(intervals)))
+    steps = np.einsum("wkp,wk->wp", z, at.data_z) + at.data_s @ s
+    return EffectOfIntervals(steps, s[:n_p], z, s)
 
 
 def _with_wide_priors(intervals: ShootingIntervals, fit: Fit) -> Fit:
@@ -247,9 +286,11 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     """
     n_p, n_s, n_x = intervals.n_p, len(fit.shared), fit.x.shape[1]
     now, rows = fit.shared[:n_p], _Rows.of(intervals, fit)
-    windows = _windows(intervals, now, rows)
+    *shorter, windows = _windows(intervals, now, rows)
     p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
-    plain = _bounded_projection(intervals, now, rows, windows, 0)[0]
+    others = [_bounded_projection(intervals, now, rows, windows, 0)[0]]
+    # What windows of half the length change is an upper limit of the attenuation that is left.
+    others += [_bounded_projection(intervals, now, rows, x, _REWEIGHTED)[0] for x in shorter[-1:]]
     by_rows, by_means = gains
     of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + fit.d.shape[1], n_p))
     level = np.hstack([np.ones((len(rows.push), 1)), intervals.inputs])
@@ -263,7 +304,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     unpushed = rows.push - rows.W @ np.einsum("pni,ni->p", by_rows, rows.push)
     of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)
     sums = batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
-    covariance = covariance + sums.T @ sums + np.outer(plain - p, plain - p)
+    covariance = covariance + sums.T @ sums + sum(np.outer(x - p, x - p) for x in others)
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
     left = _over_windows(unexplained(intervals, fit, p), windows)
@@ -373,8 +414,10 @@ class _Averaged:
         return bool(((change <= _CLEAR * error) | (change <= _NEGLIGIBLE * np.abs(longer.parameters))).all())
 
 
-def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> IntArray:
+def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> list[IntArray]:
     """First intervals of the windows over which the equations are averaged: each interval, where that does no harm.
+
+    The last ones are to be taken; before them are windows of half the length, of a quarter, ....
 
     Unmodelled accelerations that vary fast follow the sensors' noise where it is not white.  Fitted accelerations are
     then noise, and least squares attenuates what they multiply.  Means over longer windows have less of it and less
@@ -395,8 +438,8 @@ def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> IntA
     for k, (short, double) in enumerate(pairwise(tried)):
         is_noisy = (double.power < _KEPT * short.power).any()
         if not is_noisy or all(short.agrees_with(longer) for longer in tried[k + 1 :]):
-            return short.windows
-    return tried[-1].windows
+            return [x.windows for x in tried[: k + 1]]
+    return [x.windows for x in tried]
 
 
 def _robust_weights(rows: WeakForm, occupied: BoolArray, scale: FloatArray, steps: int) -> FloatArray:

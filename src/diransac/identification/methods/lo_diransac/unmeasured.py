@@ -7,8 +7,10 @@ hypotheses. Its trajectories take the place of smoothed signals until shooting e
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
+import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray
@@ -18,6 +20,7 @@ from diransac.identification.methods.lo_diransac.smoothing import Motion
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.model import Model
 
 __all__ = ["measured_signals", "unmeasured_by_name", "unmeasured_states", "with_unmeasured_states"]
 
@@ -31,7 +34,7 @@ _TINY = 1e-9
 def unmeasured_states(intervals: ShootingIntervals) -> tuple[str, ...]:
     """Names of the states of which no signal, and no derivative of one, is measured.
 
-    Velocities of a model with kinematics follow from its coordinates, where any of these is measured.
+    Velocities of a model with kinematics follow from the measured coordinates whose rates depend on them.
 
     Parameters
     ----------
@@ -46,9 +49,18 @@ def unmeasured_states(intervals: ShootingIntervals) -> tuple[str, ...]:
     seen = set(measured_signals(intervals))
     lost = {name for chain in model.chains if seen.isdisjoint(chain) for name in chain}
     if model.kinematics is not None:
-        inferred = () if seen.isdisjoint(model.coordinates) else model.velocities_of_motion
-        lost -= {*model.coordinates, *inferred}
+        lost -= _velocities_behind(model, tuple(n for n in model.coordinates if n in seen))
     return tuple(n for n in model.state if n in lost)
+
+
+@lru_cache(maxsize=64)
+def _velocities_behind(model: Model, coordinates: tuple[str, ...]) -> set[str]:
+    """Names of the velocities on which the rates of some coordinates depend, by the kinematics."""
+    assert model.kinematics is not None
+    q, v = (ca.SX.sym(name, n) for name, n in (("q", model.n_q), ("v", model.n_v)))
+    rates = model.kinematics(q, v)[[list(model.coordinates).index(n) for n in coordinates]]
+    depends = ca.which_depends(rates, v, 1, False) if coordinates else [False] * model.n_v
+    return {n for n, d in zip(model.velocities, depends, strict=True) if d}
 
 
 def unmeasured_by_name(intervals: ShootingIntervals) -> str:
