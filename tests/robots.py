@@ -59,17 +59,6 @@ def quadruped(seed=0, base=""):
     return "".join([*parts, "</body></worldbody></mujoco>"])
 
 
-def leg(seed=0):
-    """One leg of the quadruped, without its trunk: MJCF."""
-    rng = np.random.default_rng(seed)
-    parts = ['<mujoco model="leg"><compiler angle="radian"/><worldbody>']
-    places = [(0, 0, 0), (0, 0.09, 0), (0, 0, -0.21)]
-    for part, place, axis in zip(("hip", "thigh", "calf"), places, ("1 0 0", "0 1 0", "0 1 0"), strict=True):
-        parts.append(f'<body name="{part}" pos="{text(place)}">{mjcf_inertial(rng, 0.3)}')
-        parts.append(f'<joint name="{part}_joint" axis="{axis}" armature="0.01" damping="0.1" frictionloss="0.1"/>')
-    return "".join([*parts, "</body>" * 3, "</worldbody></mujoco>"])
-
-
 def unusual(seed=0):
     """Several joints on a body, anchors, references, springs, polynomials, compensated weight, tilted gravity: MJCF."""
     rng = np.random.default_rng(seed)
