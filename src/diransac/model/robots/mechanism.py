@@ -175,7 +175,8 @@ class Mechanism:
         for n in self.coordinates if _BIAS in self.unknown else ():
             joint = self._joint(n)
             place = ((f"{_BIAS} {joint.name}", 1.0),)
-            found[f"{_BIAS}_{n}"] = Parameter("rad" if joint.turns else "m", value=0.0, combination=place)
+            unit, turn = ("rad", np.pi) if joint.turns else ("m", np.inf)  # a whole turn more is the same bias
+            found[f"{_BIAS}_{n}"] = Parameter(unit, lower=-turn, upper=turn, value=0.0, combination=place)
         if not found:
             raise ModelError(f"{self.label}: nothing is unknown; name unknown parameters of joints, or bodies")
         return found
