@@ -46,8 +46,8 @@ def robot(
     unknown : collection of str, optional
         Unknown parameters of every joint: "armature", "damping", "friction" (Coulomb), "stribeck" (what friction at
         rest is more, ``stribeck tanh(q' / s) exp(-(q' / stribeck_speed)^2)``), "spring" (its stiffness), "offset" (a
-        constant force), "torque_gain" (a factor of the drive's force), "encoder_bias" (reading less position, within half a turn).
-        Parameters are named after both: ``armature_elbow``.
+        constant force), "torque_gain" (a factor of the drive's force), "encoder_bias" (reading less position,
+        within half a turn). Parameters are named after both: ``armature_elbow``.
     actuation : Actuation, optional
         Forces of the drives: `JointTorques` (default: columns ``elbow_torque``), `PositionControl`, `MotorCurrents`.
     bodies : collection of str or "all", optional
