@@ -169,10 +169,10 @@ def compare_lengths(bench: Bench) -> None:
     row("    with refits", found["long refits"] / found["short refits"], "", note)
 
 
-def hour_log() -> dr.Log:
+def hour_log(n_rows: int = HOUR_ROWS) -> dr.Log:
     """A wiggle of attitude and height whose inputs follow from the equations, with outliers."""
     model, true = dr.models.planar_rotorcraft(), dr.models.TABLE_I
-    t = HOUR_DT * np.arange(HOUR_ROWS)
+    t = HOUR_DT * np.arange(n_rows)
     theta, theta_dot, theta_ddot = _sines(t + HOUR_DT / 2, {0.35: 0.4, 0.9: 0.15, 2.1: 0.06})
     _, _, z_ddot = _sines(t + HOUR_DT / 2, {0.2: 1.0, 0.55: 0.3})
     inputs = np.column_stack([true["mass"] * (9.81 + z_ddot) / np.cos(theta), true["inertia"] * theta_ddot / 0.177])

@@ -264,6 +264,8 @@ class LocalSearch:
         """The explanation at the optimum of its errors of recordings, and of more, with the same freedom."""
         for _ in range(_REFINEMENTS):
             kinds = dict.fromkeys([*best.intervals.all_errors.kinds, *more])
+            if not kinds:
+                break
             errors = errors_of(best.intervals, best.refinement.fit, tuple(kinds))
             if all(x.ratio < _REFINED for x in errors):
                 break

@@ -232,9 +232,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
     notes, refined = best.notes, likeliest.refinement
     report(callback, "estimating parameters", 0.9)
-    if best.reached:
-        notes = (*notes, "a bound of the parameters is reached; they are those of the most probable motion")
-    if best.reached or dataset.layout.on_bounds(result.parameters).any():
+    if best.impossible or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
     parts, lacks = compared_parts(likeliest, result), None
     if settings.suggestions and not likeliest.exact:
@@ -242,6 +240,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     ambiguity = _ambiguity(len(result.parameters), parts.changes, lacks)
     checks = (
         *_checks(settings, intervals, motion, refined),
+        *_checks_of_bounds(best),
         *_checks_of_unmeasured(best),
         *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), parts),
     )
@@ -257,7 +256,8 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
 class _Searched:
     """The likeliest explanation of the logs, and the motion that its search began with.
 
-    ``reached`` is True if the parameters are those of the fit because others would violate a strict bound.
+    ``impossible`` names parameters that would violate a strict bound by least squares of the whole motion; the
+    result is that of the fit then.
     """
 
     motion: Motion
@@ -265,7 +265,7 @@ class _Searched:
     n_hypotheses: int
     likeliest: Explanation
     result: ProjectedEstimate
-    reached: bool
+    impossible: tuple[str, ...]
 
     @property
     def unexplained(self) -> float:
@@ -318,15 +318,14 @@ def _searched(
     return _Searched(motion, notes, len(hypotheses), likeliest, *_parameters(settings, likeliest))
 
 
-def _parameters(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[ProjectedEstimate, bool]:
-    """Parameters of an explanation; True if they are those of the fit because others would violate a strict bound."""
+def _parameters(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[ProjectedEstimate, tuple[str, ...]]:
+    """Parameters of an explanation: the fit's where others would violate strict bounds, with the names of these."""
     intervals, fit = likeliest.intervals, likeliest.refinement.fit
     if likeliest.exact or not settings.projection:
-        return fitted_parameters(intervals, fit), False
-    result = estimate_parameters(intervals, fit, settings.prior_inflation)
-    if intervals.layout.admits(result.parameters[None])[0]:
-        return result, False
-    return fitted_parameters(intervals, fit), True
+        return fitted_parameters(intervals, fit), ()
+    result, layout = estimate_parameters(intervals, fit, settings.prior_inflation), intervals.layout
+    impossible = layout.violations(result.parameters)
+    return (fitted_parameters(intervals, fit) if impossible else result), impossible
 
 
 def _ambiguity(n: int, changes: Sequence[Change], lacks: MissingTerms | None) -> FloatArray:
@@ -380,6 +379,18 @@ def _checks(
         yield Finding("bad", f"The model explains almost nothing of this log: {advice}.")
     if not refined.converged and settings.max_steps:
         yield Finding("care", f"Local optimisation did not converge within its limit of {settings.max_steps} steps.")
+
+
+def _checks_of_bounds(found: _Searched) -> Iterator[Finding]:
+    """A finding where the fitted motion and the bounds contradict each other."""
+    if found.impossible:
+        names = ", ".join(found.impossible)
+        yield Finding(
+            "bad",
+            f"Least squares of the whole motion leaves the bounds of {names}, which is physically impossible; the "
+            "parameters are those of the most probable motion: a term is missing, an input acts late, or a sign or a "
+            "unit is wrong.",
+        )
 
 
 def _checks_of_unmeasured(found: _Searched) -> Iterator[Finding]:

@@ -34,6 +34,7 @@ __all__ = [
     "Fit",
     "NormalEquations",
     "cost",
+    "data_gradient",
     "following",
     "innovation_std",
     "innovations",
@@ -252,6 +253,25 @@ def variances_of_intervals(
     return np.asarray(own.swapaxes(1, 2) @ sums.normal_matrix @ own)
 
 
+def data_gradient(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Right-hand sides of the measurements alone, `data_z` and `data_s` of `NormalEquations`.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    weights : (N, n_signals) array
+        Weights of the measurements, one over each signal's unit squared.
+
+    Returns
+    -------
+    (W, n_x + n_v) array, (W, n_s) array
+    """
+    gradient = -intervals.gauss_newton(fit.shared, fit.x, fit.d, weights).gradient
+    k = fit.x.shape[1] + fit.d.shape[1]
+    return gradient[:, :k], _in_places(intervals, gradient[:, k:])
+
+
 def _places(intervals: ShootingIntervals) -> IntArray:
     """Places of the shared unknowns of each log, (n_logs, n)."""
     rest = np.arange(intervals.n_p, intervals.n_shared)
@@ -329,7 +349,7 @@ def _shared_blocks(
     return wide, whole, total
 
 
-def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
+def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray, jumps: FloatArray | None = None) -> float:
     """Twice the cost of a fit with fixed weights.
 
     Parameters
@@ -338,16 +358,19 @@ def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
     fit : Fit
     weights : (N, n_signals) array
         Weights of the measurements, one over each signal's unit squared.
+    jumps : (W - 1, n_x) array, optional
+        Those of `NormalEquations` at the fit; None: simulated.
 
     Returns
     -------
     float
         Infinite where a rollout diverges.
     """
-    ends = intervals.ends(fit.shared, fit.x, fit.d)
+    if jumps is None:
+        jumps = fit.x[1:] - intervals.ends(fit.shared, fit.x, fit.d)
     terms = (
         (weights * np.square(fit.residuals)).sum(),
-        np.square((fit.x[1:] - ends) / fit.continuity_std).sum(),
+        np.square(jumps / fit.continuity_std).sum(),
         np.square(innovations(intervals, fit)).sum(),
         np.square((fit.shared - fit.prior_mean) / fit.prior).sum(),
     )

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.identification.methods.lo_diransac.normal_equations import linearize, with_residuals
+from diransac.identification.methods.lo_diransac.normal_equations import data_gradient, linearize, with_residuals
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 
@@ -222,9 +222,9 @@ class _Scores:
         """Derivatives, from those of the residuals and of the jumps."""
         at = self.at
         # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
-        moved = linearize(replace(self.intervals, measured=self.intervals.measured - own), self.fit, self.weights)
+        z, s = data_gradient(replace(self.intervals, measured=self.intervals.measured - own), self.fit, self.weights)
         of_z, of_s = at.by_jumps(self.intervals, jumps)
-        of_z, of_s = of_z + at.data_z - moved.data_z, of_s + (at.data_s - moved.data_s).sum(axis=0)
+        of_z, of_s = of_z + at.data_z - z, of_s + (at.data_s - s).sum(axis=0)
         score = (self.weights * own * self.fit.residuals).sum() + (at.precision * jumps * at.jumps).sum()
         return _Slope(kind, own, jumps, of_z, of_s, float(score))
 

@@ -373,7 +373,8 @@ def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
 def _step(intervals: ShootingIntervals, fit: Fit, damping: float) -> tuple[Fit, Factored, float]:
     """One Gauss-Newton step within the bounds, corrected or damped until the cost falls; damping of the next one."""
     weights = weights_of(intervals, fit)
-    at, before = linearize(intervals, fit, weights), cost(intervals, fit, weights)
+    at = linearize(intervals, fit, weights)
+    before = cost(intervals, fit, weights, at.jumps)
     for _ in range(_MAX_TRIALS):
         right, excess = (at.right_z, at.right_s), np.inf
         while True:

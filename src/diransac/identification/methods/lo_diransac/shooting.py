@@ -423,7 +423,9 @@ class ShootingIntervals:
     def residuals(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
         """Simulated less measured signals ``(N, n_s)``, huge from a divergence on; arguments as `batch`."""
         errors = self.rollouts.errors(self.batch(shared, x, d), self.measurements).reshape(self.measured.shape)
-        return np.nan_to_num(errors, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
+        if not np.isfinite(errors).all():
+            np.nan_to_num(errors, copy=False, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
+        return errors
 
     def gauss_newton(self, shared: FloatArray, x: FloatArray, d: FloatArray, weights: FloatArray) -> GaussNewtonBatch:
         """Least-squares sums of every interval with ``weights (N, n_s)``; other arguments as `batch`.
