@@ -28,6 +28,8 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED = REPOSITORY.parent / "shared"
 PAGES = [page for page in (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))) if page.is_file()]
 NOT_RUN = {"cd", "git", "make", "pip"}
+NEEDS = {"robots.md": "mujoco"}
+"""Package without which a page is not run."""
 LANGUAGES = {"", "python", "console", "text", "toml", "json", "yaml", "csv", "mermaid"}
 
 
@@ -99,6 +101,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trials_in_this_proce
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_page_runs_as_it_is_shown(page: Path, folder: Path):
     namespace: dict[str, object] = {"__name__": "__page__"}
+    if page.name in NEEDS:
+        pytest.importorskip(NEEDS[page.name], reason=f"{page.name} NOT CHECKED: {NEEDS[page.name]} is missing")
     for block in blocks(page.read_text()):
         if "../shared/" in block.body and block.info in {"python", "console"} and not SHARED.is_dir():
             pytest.skip(f"{page.name} NOT CHECKED from line {block.line} on: {SHARED} is missing")

@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import t as student_t
 
 import diransac as dr
+import results as replacing
 from diransac.errors import ResultError, SettingsError
 from simulated import MACHINES, as_log, flight, with_outliers
 
@@ -312,3 +313,35 @@ def test_printed_result_warns_of_a_fit_that_explains_little_of_the_log(result):
 def test_arrays_of_a_result_cannot_be_changed(result):
     assert not result.inliers.flags.writeable
     assert not result.covariance.flags.writeable
+
+
+def test_samples_are_within_intervals_as_often_as_these_say(result):
+    spread = 1e-3 * np.array(list(result.parameters.values()))  # far from all bounds
+    n, narrow = 20_000, replacing.changed(result, covariance=np.outer(spread, spread) * (0.5 + 0.5 * np.eye(3)))
+    draws = narrow.sample(n, seed=1)
+    assert list(draws) == list(result.parameters)
+    for name, (low, high) in narrow.intervals(0.9).items():
+        inside = (draws[name] > low) & (draws[name] < high)
+        assert inside.mean() == pytest.approx(0.9, abs=4.0 * np.sqrt(0.09 / n)), name
+    again = narrow.sample(10, seed=1)
+    assert all((again[name] == draws[name][:10]).all() for name in draws)
+
+
+def test_samples_are_within_bounds_and_fixed_parameters_are_constant(result):
+    name, *others = result.parameters
+    places = [list(result.parameters).index(n) for n in others]
+    covariance = np.zeros_like(result.covariance)
+    covariance[np.ix_(places, places)] = np.diag([4.0 * result.parameters[n] ** 2 for n in others])
+    wide = replacing.changed(result, fixed=(name,), covariance=covariance)
+    draws = wide.sample(500)
+    assert (draws[name] == result.parameters[name]).all()
+    for n, values in draws.items():
+        assert result.model.parameters[n].admits(values).all()
+
+
+def test_nothing_is_drawn_where_no_interval_is_known(result):
+    unknown = replacing.changed(result, covariance=np.full_like(result.covariance, np.inf))
+    with pytest.raises(dr.ResultError, match="no interval is known"):
+        unknown.sample(3)
+    with pytest.raises(dr.SettingsError, match="n is 0"):
+        result.sample(0)

@@ -10,7 +10,7 @@ from scipy.stats import t as student
 
 import diransac as dr
 from diransac.data.dataset import Dataset
-from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance, student_quantile
+from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance, student_quantile, students_draws
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight
 
@@ -129,6 +129,21 @@ def test_fewer_rows_than_stretches_leave_out_one_row_at_a_time(n):
 def test_single_row_has_no_standard_error():
     bound = dr.OrdinaryLeastSquares().bind(Dataset.of(level(), dr.Log.from_arrays([0.0, 0.1], {"x_ddot": [1.0, 2.0]})))
     assert np.isinf(jackknife_covariance(bound, np.array([0]))).all()
+
+
+def test_draws_have_the_joint_distribution_within_bounds():
+    covariance = np.array([[4.0, 1.2], [1.2, 1.0]])
+    free = [dr.Parameter(), dr.Parameter()]
+    draws = students_draws(np.array([3.0, -1.0]), covariance, 40, free, 40_000, 0)
+    # The variance of Student's t is n / (n - 2) times the squared scale.
+    assert np.cov(draws) == pytest.approx(covariance * 40 / 38, rel=0.04)
+    assert draws.mean(axis=1) == pytest.approx([3.0, -1.0], abs=0.05)
+    bounded = students_draws(np.array([3.0, -1.0]), covariance, 40, [dr.Parameter(lower=4.0), free[1]], 5_000, 0)
+    assert bounded.shape == (2, 5_000)
+    assert bounded[0].min() >= 4.0
+    assert bounded[1].mean() > -1.0  # moves with the other
+    with pytest.raises(dr.ResultError, match="0 of 1000 draws are within the bounds"):
+        students_draws(np.array([3.0, -1.0]), covariance, 40, [dr.Parameter(lower=90.0), free[1]], 3, 0)
 
 
 @pytest.mark.parametrize("degrees_of_freedom", [1, 2, 3, 9, 100, 10_000])

@@ -20,6 +20,8 @@ from diransac.errors import (
 )
 from diransac.model import Disturbance, Model, Parameter, Plant, Sensor, sensors
 from diransac.model import library as models
+from diransac.model.parts import independent_parts
+from diransac.model.robots import JointTorques, MotorCurrents, PositionControl
 
 if TYPE_CHECKING:
     from diransac.data.filters import FilterSpecification
@@ -60,18 +62,21 @@ __all__ = [
     "Finding",
     "IDiransac",
     "IdentificationError",
+    "JointTorques",
     "LeastSquares",
     "LoDiransac",
     "Log",
     "LogError",
     "Model",
     "ModelError",
+    "MotorCurrents",
     "Noise",
     "NonlinearLeastSquares",
     "OrdinaryLeastSquares",
     "Parameter",
     "PlanningError",
     "Plant",
+    "PositionControl",
     "Progress",
     "Result",
     "ResultError",
@@ -93,6 +98,7 @@ __all__ = [
     "fly",
     "fly_batch",
     "identify",
+    "independent_parts",
     "models",
     "multisine",
     "plan",

@@ -19,6 +19,7 @@ from diransac.user_files import definitions, file_and_name
 
 __all__ = [
     "fixed_parameters",
+    "is_description",
     "load_methods",
     "load_model",
     "load_settings",
@@ -275,8 +276,22 @@ def _none_where_meant(key: str, value: object) -> object:
 # ---------------------------------------------------------------------- models
 
 
+def is_description(text: str) -> bool:
+    """True for the name of a robot's description, ``.xml``, ``.mjcf`` or ``.urdf``.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    bool
+    """
+    return Path(text).suffix.lower() in (".xml", ".mjcf", ".urdf")
+
+
 def model_file(text: str) -> Path | None:
-    """The file of ``file.py[:name]``; None for a built-in model's name.
+    """The file of ``file.py[:name]``, or of a robot's description; None for a built-in model's name.
 
     Parameters
     ----------
@@ -286,6 +301,8 @@ def model_file(text: str) -> Path | None:
     -------
     Path or None
     """
+    if is_description(text):
+        return Path(text)
     found = file_and_name(text, "model")
     return None if found is None else found[0]
 

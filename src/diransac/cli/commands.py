@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -34,8 +35,10 @@ from diransac.cli.options import (
     Search,
     StrictFlag,
     known_methods,
+    output_file,
 )
 from diransac.cli.outputs import staged
+from diransac.cli.robot_options import LimbResults, RobotOptions, of_limb
 from diransac.cli.views import CacheState, Equations, ModelList, compare_methods
 from diransac.identification.identify import identify
 from diransac.identification.inspection import inspect
@@ -80,6 +83,7 @@ def _identify(
     search: Search,
     derivation: Derivation,
     preparation: Preparation,
+    robot: RobotOptions,
     method: MethodName = DEFAULT,
     with_suggestions: Annotated[
         bool, typer.Option("--with-suggestions", help="Identify again with the terms that the model seems to lack.")
@@ -91,19 +95,25 @@ def _identify(
 ) -> None:
     """Identify the parameters of a model from one log, or from several logs of one machine."""
     (chosen,), derived = search.methods([method]), derivation.arguments()
-    with staged([output, report], [*files, model_file(model), search.settings]) as (saved, page):
-        plant, logs = load_model(model), preparation.read_all(files)
-        with screen.bar(method) as progress:
-            arguments = search.arguments() | derived | {"time_limit": search.time_limit}
-            result = identify(plant, logs, chosen, with_suggestions=with_suggestions, progress=progress, **arguments)
-        if output:
-            result.save(saved)
-        if report:
-            from diransac.report import write_report
+    limbs, results = robot.load_limbs(model), dict[str, Result]()
+    outputs = [of_limb(path, limb) for limb in limbs for path in (output, report)]
+    with staged(outputs, [*files, model_file(model), search.settings]) as drafts:
+        logs = preparation.read_all(files)
+        for k, (limb, plant) in enumerate(limbs.items()):
+            saved, page = drafts[2 * k : 2 * k + 2]
+            with screen.bar(f"{method} {limb}".rstrip()) as progress:
+                arguments = search.arguments() | derived | {"time_limit": search.time_limit}
+                found = identify(plant, logs, chosen, with_suggestions=with_suggestions, progress=progress, **arguments)
+            results[limb] = found
+            if output:
+                found.save(saved)
+            if report:
+                from diransac.report import write_report
 
-            write_report(result, logs, page)
-        screen.show(result, as_json)
-    screen.end(result.verdict, strict)
+                write_report(found, logs, page)
+        screen.show(LimbResults(results) if len(results) > 1 else results[""], as_json)
+    for found in results.values():
+        screen.end(found.verdict, strict)
 
 
 @app.command("compare")
@@ -114,6 +124,7 @@ def _compare(
     search: Search,
     derivation: Derivation,
     preparation: Preparation,
+    robot: RobotOptions,
     methods: Annotated[str, typer.Option(metavar="NAME,...", help="Which, in this order.")] = ",".join(METHODS),
     report: Report = None,
     as_json: JsonFlag = False,
@@ -122,7 +133,7 @@ def _compare(
     wanted = search.methods(known_methods(methods))
     arguments = search.arguments() | derivation.arguments()
     with staged([report], [*files, model_file(model), search.settings]) as (page,):
-        plant, logs = load_model(model), preparation.read_all(files)
+        plant, logs = robot.load(model), preparation.read_all(files)
         with time_limited(search.time_limit):
             comparison = compare_methods(plant, logs, wanted, arguments)
         if report:
@@ -156,13 +167,14 @@ def _cross_validate(
     search: Search,
     derivation: Derivation,
     preparation: Preparation,
+    robot: RobotOptions,
     method: MethodName = DEFAULT,
     horizon: Annotated[float | None, typer.Option(metavar="S", help="Restart the simulation after so long.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Identify from all logs but one, and predict that one, for each in turn."""
     (chosen,), derived = search.methods([method]), derivation.arguments()
-    plant, logs = load_model(model), preparation.read_all(files)
+    plant, logs = robot.load(model), preparation.read_all(files)
     arguments = search.arguments() | derived | {"time_limit": search.time_limit}
     with screen.bar(f"{method}, leaving one log out") as progress:
         found = cross_validate(plant, logs, chosen, horizon=horizon, progress=progress, **arguments)
@@ -174,11 +186,12 @@ def _cross_validate(
 def _inspect(
     file: LogFile,
     preparation: Preparation,
+    robot: RobotOptions,
     model: OptionalModelName = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Show what a log holds, what is odd about it, and what is missing for a model."""
-    plant = None if model is None else load_model(model)
+    plant = None if model is None else robot.load(model)
     screen.show(inspect(preparation.read_uneven(file), plant), as_json)
 
 
@@ -231,15 +244,38 @@ def _fly(
         screen.show(test, as_json)
 
 
+@app.command("export")
+def _export(
+    models: Annotated[list[Path], typer.Argument(metavar="MODEL.json...", help="What identify saved, of each limb.")],
+    into: Annotated[Path, typer.Option("--into", metavar="FILE.xml|FILE.urdf", help="The robot's description.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", parser=output_file, metavar="FILE", help="Where to write the calibrated one."),
+    ],
+) -> None:
+    """Write a robot's description with the identified values in it."""
+    with staged([output], [*models, into]) as (written,):
+        results = [Result.load(path) for path in models]
+        left_out = list[str]()
+        for k, result in enumerate(results):
+            left_out += result.export(written, into=written if k else into)
+    typer.echo(f"wrote {output}")
+    if left_out:
+        typer.echo(f"without {', '.join(left_out)}: not identifiable, or the format has no place for them")
+
+
 @app.command("models")
+@grouped
 def _models(
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME|FILE.py[:NAME]", help="Show the equations of one.")
+        str | None, typer.Argument(metavar="NAME|FILE.py[:NAME]|FILE.xml", help="Show the equations of one.")
     ] = None,
+    *,
+    robot: RobotOptions,
     as_json: JsonFlag = False,
 ) -> None:
     """List the built-in models, or show the equations of one."""
-    screen.show(ModelList() if name is None else Equations(load_model(name)), as_json)
+    screen.show(ModelList() if name is None else Equations(robot.load(name)), as_json)
 
 
 @app.command("cache")

@@ -87,7 +87,9 @@ def _moment(seconds: float | None) -> float | None:
 
 
 _LOG_HELP = "CSV(.gz), Parquet, NPZ or MAT: time t in seconds and one column a signal."
-_MODEL = typer.Option("--model", metavar="NAME|FILE.py[:NAME]", help="A built-in model, or one of yours.")
+_MODEL = typer.Option(
+    "--model", metavar="NAME|FILE.py[:NAME]|FILE.xml", help="A built-in model, one of yours, or a robot's MJCF or URDF."
+)
 
 LogFile = Annotated[Path, typer.Argument(metavar="LOG", help=_LOG_HELP)]
 LogFiles = Annotated[list[Path], typer.Argument(metavar="LOG...", help=f"{_LOG_HELP} Several are used together.")]

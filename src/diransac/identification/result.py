@@ -21,7 +21,7 @@ from diransac.identification.findings import Verdict, findings_of, verdict_of
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
 from diransac.identification.suggestions import Suggestion
-from diransac.identification.uncertainty import student_quantile
+from diransac.identification.uncertainty import student_quantile, students_draws
 from diransac.model import Model
 from diransac.text_table import aligned, telling_digits
 
@@ -32,6 +32,14 @@ _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
 MARKS = {"bad": "!", "care": "·"}
 """Marks of the findings that are printed."""
+
+
+def _write(path: str | Path, text: str) -> None:
+    """Write a file, atomically.  Raises ResultError: it cannot be written."""
+    try:
+        write_text(path, text)
+    except OSError as error:
+        raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 @dataclass(frozen=True)
@@ -193,6 +201,79 @@ class Result:
         width = student_quantile(self.degrees_of_freedom, 0.5 + level / 2.0)
         errors = self.standard_errors
         return {n: (x - width * errors[n], x + width * errors[n]) for n, x in self.parameters.items()}
+
+    def sample(self, n: int, seed: int = 0) -> dict[str, FloatArray]:
+        """Draws from the joint distribution of the parameters, for simulations with random parameters.
+
+        It is that of `intervals`, Student's t with the covariance of the estimate, within the bounds of the parameters.
+
+        Parameters
+        ----------
+        n : int
+            Number of draws.
+        seed : int, optional
+            Seed of the draws.
+
+        Returns
+        -------
+        dict of str to (n,) array
+            Values of each parameter in its unit; draw k is the k-th value of all.
+
+        Raises
+        ------
+        SettingsError
+            The number is not positive.
+        ResultError
+            A parameter has no finite variance, or next to no draws are within the bounds.
+        """
+        if n < 1:
+            raise SettingsError(f"n is {n}; give a positive number of draws")
+        mean, bounds = np.array(list(self.parameters.values())), list(self.model.parameters.values())
+        unknown = [name for name, error in self.standard_errors.items() if not np.isfinite(error)]
+        if unknown:
+            raise ResultError(f"{', '.join(unknown)}: no interval is known, and nothing can be drawn; fix it")
+        free = [name for name in self.parameters if name not in self.fixed]
+        own = np.array([list(self.parameters).index(name) for name in free], np.int64)
+        draws = np.tile(mean[:, None], n)
+        draws[own] = students_draws(
+            mean[own], self.covariance[np.ix_(own, own)], self.degrees_of_freedom, [bounds[k] for k in own], n, seed
+        )
+        return dict(zip(self.parameters, draws, strict=True))
+
+    def export(self, path: str | Path, *, into: str | Path) -> tuple[str, ...]:
+        """Write a robot's description with the estimates in it, atomically.
+
+        The file is that of ``into`` but for the values that were identified. Parameters of joints are the estimates;
+        inertials are the physically consistent ones nearest to those of the description, of all that explain the
+        estimated base parameters. What is not identifiable stays as it is.
+
+        Parameters
+        ----------
+        path : str or Path
+            File to be written.
+        into : str or Path
+            MJCF or URDF file from which `diransac.models.robot` made the model.
+
+        Returns
+        -------
+        tuple of str
+            Names of the parameters that are not in the file: those that are not identifiable, and those for which the
+            format has no place, such as the bias of an encoder.
+
+        Raises
+        ------
+        ModelError
+            The description cannot be read, or is not that of the model.
+        ResultError
+            The file cannot be written.
+        """
+        from diransac.model.robots.calibration import calibrated
+
+        found = self.parameters.items()
+        values = np.array([np.nan if name in self.unidentifiable else x for name, x in found])
+        text, left_out = calibrated(into, self.model.parameters, values, self.covariance)
+        _write(path, text)
+        return left_out
 
     @property
     def violations(self) -> tuple[str, ...]:
@@ -379,10 +460,7 @@ class Result:
         ResultError
             The file cannot be written.
         """
-        try:
-            write_text(path, self._text())
-        except OSError as error:
-            raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
+        _write(path, self._text())
 
     @classmethod
     def load(cls, path: str | Path) -> Result:

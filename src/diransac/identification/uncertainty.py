@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
+from diransac.errors import ResultError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from diransac.identification.estimators import BoundEstimator
+    from diransac.model import Parameter
 
-__all__ = ["N_BLOCKS", "combined", "jackknife_covariance", "score_inflation", "student_quantile"]
+__all__ = ["N_BLOCKS", "combined", "jackknife_covariance", "score_inflation", "student_quantile", "students_draws"]
 
 
 # Few and long: intervals have their nominal coverage while residuals are correlated over up to an eighth of a stretch
@@ -24,6 +26,8 @@ N_BLOCKS = 10
 _FAR, _N_POINTS = 9.0, 100
 # Ridge that makes the information of an undetermined parameter definite, over the number of rows.
 _RIDGE = 1e-10
+# Draws at a time, and the least fraction of them that is within the bounds.
+_N_DRAWS, _LEAST_INSIDE = 1000, 1e-3
 
 
 def jackknife_covariance(
@@ -128,6 +132,48 @@ def combined(
     K = np.linalg.solve(inner, C[places] / scale[:, None]).T / scale
     less = C - K @ C[places]
     return p + K @ (mean - p[places]), np.where(np.outer(finite, finite), 0.5 * (less + less.T), covariance)
+
+
+def students_draws(
+    mean: FloatArray,
+    covariance: FloatArray,
+    degrees_of_freedom: int,
+    bounds: Sequence[Parameter],
+    n: int,
+    seed: int,
+) -> FloatArray:
+    """Draws ``(n_p, n)`` from Student's t within bounds, the first of which do not depend on their number.
+
+    Parameters
+    ----------
+    mean : (n_p,) array
+    covariance : (n_p, n_p) array
+        Of the estimate, finite: the squared scale of the distribution.
+    degrees_of_freedom : int
+    bounds : sequence of Parameter
+    n, seed : int
+
+    Returns
+    -------
+    (n_p, n) array
+
+    Raises
+    ------
+    ResultError
+        Next to no draws are within the bounds.
+    """
+    rng, kept, n_drawn = np.random.default_rng(seed), np.zeros((len(mean), 0)), 0
+    while kept.shape[1] < n:
+        normal = rng.multivariate_normal(np.zeros(len(mean)), covariance, _N_DRAWS, method="eigh").T
+        draws = mean[:, None] + normal / np.sqrt(rng.chisquare(degrees_of_freedom, _N_DRAWS) / degrees_of_freedom)
+        inside = np.all([x.admits(own) for x, own in zip(bounds, draws, strict=True)], axis=0)
+        kept, n_drawn = np.hstack([kept, draws[:, inside]]), n_drawn + _N_DRAWS
+        if kept.shape[1] < _LEAST_INSIDE * n_drawn:
+            raise ResultError(
+                f"{kept.shape[1]} of {n_drawn} draws are within the bounds of the parameters; identify from more data, "
+                "or fix the parameters that are uncertain"
+            )
+    return kept[:, :n]
 
 
 def student_quantile(degrees_of_freedom: float, probability: float) -> float:

@@ -26,6 +26,7 @@ __all__ = ["Probe", "Symbols"]
 _N_POINTS = 40
 _SINGULAR = 1e-10
 _TOLERANCE = 1e-8
+_NEAR_NOMINAL = 1e-3
 _ARGUMENTS = "qvaup"
 # Errors of a user's function that gets a symbol instead of a number, or a wrong number of arguments.
 _USER_ERRORS = (RuntimeError, TypeError, ValueError, ArithmeticError, LookupError, NameError, AttributeError)
@@ -239,9 +240,15 @@ class Probe:
 
 
 def _within(parameter: Parameter, rng: np.random.Generator) -> FloatArray:
-    """Random values ``(n_points,)`` within a parameter's bounds, away from a strict zero."""
+    """Random values ``(n_points,)`` near a parameter's nominal value, or within its bounds, away from a strict zero.
+
+    Bounds of single parameters do not keep the mass matrix of a robot definite; values near those of a machine do.
+    """
     lower = max(parameter.lower, 0.0) if parameter.positive else parameter.lower
     draw = rng.uniform(0.1, 0.9, _N_POINTS)
+    if parameter.value is not None:
+        near = parameter.value + _NEAR_NOMINAL * (abs(parameter.value) or _NEAR_NOMINAL) * (draw - 0.5)
+        return np.where(parameter.admits(near), near, parameter.value)
     if np.isfinite(lower) and np.isfinite(parameter.upper):
         return lower + draw * (parameter.upper - lower)
     if np.isfinite(lower):

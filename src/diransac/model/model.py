@@ -639,14 +639,16 @@ def _parameter_to_dict(parameter: Parameter) -> dict[str, Any]:
     stored = {"unit": parameter.unit, "lower": lower, "upper": upper, "positive": parameter.positive}
     own_values = {"per_log": True} if parameter.per_log else {}
     nominal = {} if parameter.value is None else {"value": float(parameter.value)}
-    return {**stored, **own_values, **nominal}
+    combination = {"combination": [list(x) for x in parameter.combination]} if parameter.combination else {}
+    return {**stored, **own_values, **nominal, **combination}
 
 
 def _parameter_from_dict(data: Mapping[str, Any]) -> Parameter:
     lower = -np.inf if data["lower"] is None else data["lower"]
     upper = np.inf if data["upper"] is None else data["upper"]
     own_values, nominal = bool(data.get("per_log", False)), data.get("value")
-    return Parameter(data["unit"], lower, upper, data["positive"], own_values, nominal)
+    combination = tuple((str(name), float(weight)) for name, weight in data.get("combination", ()))
+    return Parameter(data["unit"], lower, upper, data["positive"], own_values, nominal, combination)
 
 
 def _checksum(data: Mapping[str, Any]) -> str:

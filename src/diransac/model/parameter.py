@@ -28,6 +28,9 @@ class Parameter:
         One value per log (the bias of a sensor, a payload) where several logs are identified together.
     value : float, optional
         Nominal value in that unit, at which ``identify(..., fixed=["mass"])`` fixes the parameter.
+    combination : tuple of (str, float), optional
+        Quantities of a robot's description, with weights, of whose sum the parameter is the value: one, such as
+        ``"armature elbow"``, or those of which motions show the sum alone.
 
     Raises
     ------
@@ -41,6 +44,7 @@ class Parameter:
     positive: bool = False
     per_log: bool = False
     value: float | None = None
+    combination: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.lower <= self.upper or (self.positive and self.upper <= 0.0):

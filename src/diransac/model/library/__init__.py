@@ -1,4 +1,4 @@
-"""Built-in models, and `builtin`, which returns one by name."""
+"""Built-in models, `robot` for models from description files, and `builtin`, which returns a model by name."""
 
 from collections.abc import Callable
 
@@ -15,6 +15,7 @@ from diransac.model.library.servo_axis import servo_axis
 from diransac.model.library.single_track_vehicle import single_track_vehicle
 from diransac.model.library.underwater_vehicle import underwater_vehicle
 from diransac.model.model import Model
+from diransac.model.robots import robot
 
 __all__ = [
     "BLADE_FLAPPING",
@@ -29,6 +30,7 @@ __all__ = [
     "flexible_joint",
     "planar_rotorcraft",
     "quadrotor",
+    "robot",
     "servo_axis",
     "single_track_vehicle",
     "underwater_vehicle",

@@ -1,0 +1,151 @@
+"""Options for models from descriptions of robots, and the results of their limbs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from diransac.cli.arguments import is_description, load_model, names, pairs
+from diransac.identification.result import Result
+from diransac.model import Model
+from diransac.model.library import robot
+from diransac.model.parts import independent_parts
+from diransac.model.robots import Actuation, MotorCurrents, PositionControl
+from diransac.text_table import aligned, telling_digits
+
+__all__ = ["LimbResults", "RobotOptions", "of_limb"]
+
+_NUMBERS = {"kp", "kd", "limit", "constant", "gear"}
+
+
+def _option(*declarations: str, **about: Any) -> Any:
+    """An option on the model of a robot."""
+    return typer.Option(*declarations, rich_help_panel="Robot, for --model FILE.xml or FILE.urdf", **about)
+
+
+@dataclass(frozen=True)
+class RobotOptions:
+    """Options of `diransac.models.robot`."""
+
+    unknown: Annotated[
+        str | None,
+        _option("--unknown", metavar="NAME,...", help="Unknown parameters of joints: armature,damping,friction, ..."),
+    ] = None
+    control: Annotated[
+        str | None,
+        _option("--control", metavar="kp=20,kd=1.5,...", help="Position control; target=des_{} names columns."),
+    ] = None
+    motor: Annotated[
+        str | None,
+        _option("--motor", metavar="constant=0.1,gear=9,...", help="Motors with measured currents, current=i_{}."),
+    ] = None
+    bodies: Annotated[
+        str | None, _option("--bodies", metavar="all|NAME,...", help="Bodies with unknown inertial parameters.")
+    ] = None
+    joints: Annotated[
+        str | None,
+        _option("--joints", metavar="NAME,...|{}_joint", help="Joints, as column=joint if names differ; or a pattern."),
+    ] = None
+    base: Annotated[
+        str | None, _option("--base", metavar="held|measured", help="A floating base: held, or with a measured motion.")
+    ] = None
+
+    def load(self, model: str) -> Model:
+        """The model that ``--model`` names.
+
+        Raises typer.BadParameter: options for a robot belong to no other model; ModelError: as `load_model`.
+        """
+        if is_description(model):
+            return robot(model, **self._arguments())
+        for given in (x.name for x in fields(self) if getattr(self, x.name) is not None):
+            raise typer.BadParameter(f"--{given} is for the description of a robot (.xml, .urdf)")
+        return load_model(model)
+
+    def load_limbs(self, model: str) -> dict[str, Model]:
+        """Models of a robot's limbs by name; of another model, itself under an empty name."""
+        whole = self.load(model)
+        limbs = independent_parts(whole) if is_description(model) else {}
+        return limbs if len(limbs) > 1 else {"": whole}
+
+    def _arguments(self) -> dict[str, Any]:
+        found: dict[str, Any] = {"actuation": self._actuation(), "base": self.base}
+        if self.unknown is not None:
+            found["unknown"] = names(self.unknown)
+        if self.bodies is not None:
+            found["bodies"] = "all" if self.bodies == "all" else names(self.bodies)
+        if self.joints is not None:
+            listed = names(self.joints)
+            found["joints"] = self.joints if "{}" in self.joints else listed
+            if any("=" in x for x in listed):
+                found["joints"] = pairs("--joints", [self.joints])
+        return found
+
+    def _actuation(self) -> Actuation | None:
+        if self.control is not None and self.motor is not None:
+            raise typer.BadParameter("--control and --motor are two kinds of drives; give one")
+        if self.control is not None:
+            return _made(PositionControl, "--control", self.control)
+        return None if self.motor is None else _made(MotorCurrents, "--motor", self.motor)
+
+
+def _made(kind: type[PositionControl | MotorCurrents], option: str, text: str) -> Actuation:
+    """A drive from ``key=value`` pairs.  Raises typer.BadParameter: a key is unknown, or a value is no number."""
+    given, known = pairs(option, [text]), [x.name for x in fields(kind)]
+    for key in given:
+        if key not in known:
+            raise typer.BadParameter(f"{option}: there is no {key!r}; there are {', '.join(known)}")
+    needed = "kp" if kind is PositionControl else "constant"
+    if needed not in given:
+        raise typer.BadParameter(f"{option}: {needed} is missing; give {needed}=number")
+    try:
+        arguments: dict[str, Any] = {key: float(x) if key in _NUMBERS else x for key, x in given.items()}
+        return kind(**arguments)
+    except ValueError as error:
+        raise typer.BadParameter(
+            f"{option}: {error}; give {', '.join(sorted(_NUMBERS & set(known)))} as numbers"
+        ) from error
+
+
+def of_limb(path: Path | None, limb: str) -> Path | None:
+    """File of a limb, ``model-FL.json`` beside ``model.json``; the file itself for a model that is in one part."""
+    return path if path is None or not limb else path.with_stem(f"{path.stem}-{limb}")
+
+
+@dataclass(frozen=True)
+class LimbResults:
+    """Results of the limbs of a robot, side by side.
+
+    Parameters
+    ----------
+    results : mapping of str to Result
+        By the name of the limb.
+    """
+
+    results: Mapping[str, Result]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Results by limb."""
+        return {"limbs": {limb: result.to_dict() for limb, result in self.results.items()}}
+
+    def __str__(self) -> str:
+        rows: list[Sequence[str]] = [("parameter ± 95 %", *self.results, "unit")]
+        of_limbs = [_without_limb(limb, result) for limb, result in self.results.items()]
+        for name in dict.fromkeys(name for own in of_limbs for name in own):
+            units = [own[name][1] for own in of_limbs if name in own]
+            rows.append((name, *(own[name][0] if name in own else "" for own in of_limbs), units[0]))
+        texts = (f"{limb}: {result}" for limb, result in self.results.items())
+        return "\n".join([*aligned(rows), "", *texts])
+
+
+def _without_limb(limb: str, result: Result) -> dict[str, tuple[str, str]]:
+    """Estimate with half of its interval, and unit, of each parameter, by its name without that of the limb."""
+    found = {}
+    for name, (low, high) in result.intervals().items():
+        value, digits = result.parameters[name], telling_digits(low, high)
+        text = "?" if name in result.unidentifiable else f"{value:.{digits}g} ± {0.5 * (high - low):.2g}"
+        found[name.replace(f"_{limb}_", "_")] = text, result.units[name]
+    return found

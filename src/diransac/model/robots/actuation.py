@@ -1,0 +1,195 @@
+"""Forces of a robot's drives: measured torques, position control, motor currents.
+
+Names of columns are patterns in which ``{}`` stands for the joint's coordinate, such as ``des_{}`` for ``des_elbow``.
+A setting is one number for all joints, or a mapping from the joint's coordinate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeAlias
+
+import casadi as ca
+import numpy as np
+
+from diransac.errors import ModelError
+
+__all__ = ["Actuation", "JointTorques", "MotorCurrents", "PositionControl"]
+
+PerJoint: TypeAlias = float | Mapping[str, float]
+
+
+class Actuation(Protocol):
+    """Drives of a robot."""
+
+    def inputs(self, joint: str, units: tuple[str, str]) -> dict[str, str]:
+        """Columns of the log on which the force of a joint depends, with units, from those of position and force."""
+
+    def force(self, joint: str, q: Any, v: Any, u: Any) -> Any:
+        """Force of a joint, N m or N, by its position and velocity, and by the inputs."""
+
+
+@dataclass(frozen=True)
+class JointTorques:
+    """Measured forces of the joints.
+
+    Parameters
+    ----------
+    torque : str, optional
+        Pattern of the columns, N m of hinges, N of slides.
+    limit : float or mapping of str to float, optional
+        Largest magnitude, at which the force saturates.
+
+    Raises
+    ------
+    ModelError
+        A limit is not positive, or the pattern lacks ``{}``.
+    """
+
+    torque: str = "{}_torque"
+    limit: PerJoint | None = None
+
+    def __post_init__(self) -> None:
+        _check(self, patterns=("torque",), positive=("limit",))
+
+    def inputs(self, joint: str, units: tuple[str, str]) -> dict[str, str]:
+        """Column of the force."""
+        return {self.torque.format(joint): units[1]}
+
+    def force(self, joint: str, q: Any, v: Any, u: Any) -> Any:
+        """``clip(torque)``."""
+        return _saturated(u[self.torque.format(joint)], self.limit, joint)
+
+
+@dataclass(frozen=True)
+class PositionControl:
+    """Position control of every joint: ``kp (target - q) + kd (target' - q') + feedforward``.
+
+    Parameters
+    ----------
+    kp : float or mapping of str to float
+        Stiffness, N m/rad or N/m.
+    kd : float or mapping of str to float, optional
+        Damping, N m s/rad or N s/m.
+    target : str, optional
+        Pattern of the columns with the targets, rad or m.
+    velocity : str, optional
+        Pattern of the columns with the targets' velocities; None: zero.
+    feedforward : str, optional
+        Pattern of the columns with further forces; None: zero.
+    limit : float or mapping of str to float, optional
+        Largest magnitude, at which the force saturates.
+
+    Raises
+    ------
+    ModelError
+        A gain is negative or not finite, a limit is not positive, or a pattern lacks ``{}``.
+    """
+
+    kp: PerJoint
+    kd: PerJoint = 0.0
+    target: str = "{}_target"
+    velocity: str | None = None
+    feedforward: str | None = None
+    limit: PerJoint | None = None
+
+    def __post_init__(self) -> None:
+        _check(self, patterns=("target", "velocity", "feedforward"), positive=("limit",), non_negative=("kp", "kd"))
+
+    def inputs(self, joint: str, units: tuple[str, str]) -> dict[str, str]:
+        """Columns of target, its velocity and the feedforward."""
+        position, force = units
+        patterns = {self.target: position, self.velocity: f"{position}/s", self.feedforward: force}
+        return {pattern.format(joint): unit for pattern, unit in patterns.items() if pattern is not None}
+
+    def force(self, joint: str, q: Any, v: Any, u: Any) -> Any:
+        """``clip(kp (target - q) + kd (target' - q') + feedforward)``."""
+        v_target = 0.0 if self.velocity is None else u[self.velocity.format(joint)]
+        further = 0.0 if self.feedforward is None else u[self.feedforward.format(joint)]
+        kp, kd = _of_joint("kp", self.kp, joint), _of_joint("kd", self.kd, joint)
+        return _saturated(kp * (u[self.target.format(joint)] - q) + kd * (v_target - v) + further, self.limit, joint)
+
+
+@dataclass(frozen=True)
+class MotorCurrents:
+    """Measured currents of the motors: ``gear constant current``.
+
+    Parameters
+    ----------
+    constant : float or mapping of str to float
+        Torque constant of the motor, N m/A.
+    gear : float or mapping of str to float, optional
+        Revolutions of the motor per revolution of the joint; rad/m of a slide.
+    current : str, optional
+        Pattern of the columns, A.
+    limit : float or mapping of str to float, optional
+        Largest magnitude, at which the force of the joint saturates.
+
+    Raises
+    ------
+    ModelError
+        A number is not finite, a constant or limit is not positive, or the pattern lacks ``{}``.
+    """
+
+    constant: PerJoint
+    gear: PerJoint = 1.0
+    current: str = "{}_current"
+    limit: PerJoint | None = None
+
+    def __post_init__(self) -> None:
+        _check(self, patterns=("current",), positive=("constant", "limit"), finite=("gear",))
+
+    def inputs(self, joint: str, units: tuple[str, str]) -> dict[str, str]:
+        """Column of the current."""
+        return {self.current.format(joint): "A"}
+
+    def force(self, joint: str, q: Any, v: Any, u: Any) -> Any:
+        """``clip(gear constant current)``."""
+        gain = _of_joint("gear", self.gear, joint) * _of_joint("constant", self.constant, joint)
+        return _saturated(gain * u[self.current.format(joint)], self.limit, joint)
+
+
+def _of_joint(what: str, value: PerJoint, joint: str) -> float:
+    """Value of a setting for a joint.  Raises ModelError: there is none."""
+    if not isinstance(value, Mapping):
+        return float(value)
+    if joint not in value:
+        raise ModelError(f"{what} is given for {', '.join(value) or 'no joint'}, but not for {joint}; give it, too")
+    return float(value[joint])
+
+
+def _saturated(force: Any, limit: PerJoint | None, joint: str) -> Any:
+    if limit is None:
+        return force
+    largest = _of_joint("limit", limit, joint)
+    return ca.fmin(ca.fmax(force, -largest), largest)
+
+
+def _check(
+    actuation: object,
+    patterns: tuple[str, ...],
+    positive: tuple[str, ...] = (),
+    non_negative: tuple[str, ...] = (),
+    finite: tuple[str, ...] = (),
+) -> None:
+    """Raises ModelError: a pattern or a number is none, or a number is out of range."""
+    label = type(actuation).__name__
+    for name in patterns:
+        pattern = getattr(actuation, name)
+        if pattern is not None and not (isinstance(pattern, str) and pattern.count("{}") == 1):
+            raise ModelError(f'{label}: {name} is {pattern!r}; give a pattern of columns, such as "{{}}_{name}"')
+    for name in (*positive, *non_negative, *finite):
+        value = getattr(actuation, name)
+        for number in value.values() if isinstance(value, Mapping) else [value] * (value is not None):
+            if not _is_number(number):
+                raise ModelError(f"{label}: {name} is {number!r}; give a number, or one for each joint by name")
+            if (name in positive and number <= 0.0) or (name in non_negative and number < 0.0):
+                raise ModelError(
+                    f"{label}: {name} is {number:g}; give a {'positive' if name in positive else 'non-negative'} number"
+                )
+
+
+def _is_number(value: object) -> bool:
+    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return bool(is_number and np.isfinite(value))  # type: ignore[call-overload]  # a number

@@ -1,0 +1,104 @@
+"""Base parameters: the combinations of parameters that any motion can show.
+
+Forces are linear in the parameters, ``F = Y(q, v, a) x``.  Columns of Y that vanish, or that are combinations of others
+for every motion, are found numerically, from many random motions (Gautier 1991, "Numerical calculation of the base
+inertial parameters of robots", Journal of Robotic Systems 8(4)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from diransac.arrays import FloatArray
+
+__all__ = ["Grouping", "base_parameters"]
+
+_DEPENDENT = 1e-4
+"""Share of a column, at most, that is left of it beside the others where it is their combination.
+
+Angles in descriptions are rounded: 1.5708 is a right angle. What such an error shows of a parameter is nothing.
+"""
+_ZERO = 1e-9
+"""Size of a column relative to the largest, and of weights between columns of unit length, that is a rounding error."""
+
+_DIGITS = 10
+"""Decimal digits of weights, which are products of lengths in m."""
+_ROWS_PER_PARAMETER = 3
+_LARGEST = (np.pi, 3.0, 10.0, 3.0, 10.0, 15.0)
+"""Of random motions: position, velocity, acceleration; angular velocity and acceleration of a base, specific force."""
+
+
+@dataclass(frozen=True)
+class Grouping:
+    """Base parameters ``b = x[kept] + weights x[dropped]``.
+
+    Parameters
+    ----------
+    kept : tuple of int
+        Indices of the parameters after which the base parameters are named.
+    dropped : tuple of int
+        Indices of the others.
+    weights : (n_kept, n_dropped) array
+    """
+
+    kept: tuple[int, ...]
+    dropped: tuple[int, ...]
+    weights: FloatArray
+
+    def combination(self, i: int) -> dict[int, float]:
+        """Weight of every parameter in a base parameter, by index."""
+        others = zip(self.dropped, self.weights[i].tolist(), strict=True)
+        return {self.kept[i]: 1.0, **{k: weight for k, weight in others if weight != 0.0}}
+
+    @property
+    def vanishing(self) -> tuple[int, ...]:
+        """Indices of the parameters that are in no base parameter: no motion shows them."""
+        return tuple(k for k, column in zip(self.dropped, self.weights.T, strict=True) if not column.any())
+
+
+def base_parameters(regressor: ca.Function, seed: int = 0) -> Grouping:
+    """Base parameters of forces that are linear in parameters, the first of dependent ones kept.
+
+    Parameters
+    ----------
+    regressor : casadi.Function
+        ``(q, v, a) -> Y (n, n_x)``, or ``(q, v, a, w, dw, f) -> Y`` with the motion of a base.
+    seed : int, optional
+        Seed of the random motions.
+
+    Returns
+    -------
+    Grouping
+    """
+    n, n_x = regressor.size1_in(0), regressor.size2_out(0)
+    rng = np.random.default_rng(seed)
+    n_points = _ROWS_PER_PARAMETER * n_x // n + 10
+    sizes = [regressor.size1_in(k) for k in range(regressor.n_in())]
+    motion = [rng.uniform(-x, x, (size, n_points)) for x, size in zip(_LARGEST, sizes, strict=False)]
+    stacked = np.hsplit(np.array(ca.densify(regressor(*motion))), n_points)
+    Y = np.vstack(stacked)
+    lengths = np.linalg.norm(Y, axis=0)
+    seen = lengths > _ZERO * lengths.max()
+    Y, lengths = np.where(seen, Y / np.where(seen, lengths, 1.0), 0.0), np.where(seen, lengths, 1.0)
+    kept = _independent_columns(Y)
+    dropped = tuple(k for k in range(n_x) if k not in kept)
+    weights = np.linalg.lstsq(Y[:, kept], Y[:, dropped])[0] if kept and dropped else np.zeros((len(kept), len(dropped)))
+    weights[np.abs(weights) < _ZERO] = 0.0
+    weights *= lengths[list(dropped)] / lengths[kept, None]
+    return Grouping(tuple(kept), dropped, np.round(weights, _DIGITS))
+
+
+def _independent_columns(Y: FloatArray) -> list[int]:
+    """Indices of the columns of unit length that are no combination of those before them, by Gram-Schmidt, twice."""
+    kept, basis = list[int](), np.zeros((len(Y), 0))
+    for k, column in enumerate(Y.T):
+        rest = column - basis @ (basis.T @ column)
+        rest = rest - basis @ (basis.T @ rest)
+        size = float(np.linalg.norm(rest))
+        if size > _DEPENDENT:
+            kept.append(k)
+            basis = np.column_stack([basis, rest / size])
+    return kept

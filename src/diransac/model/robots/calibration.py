@@ -1,0 +1,290 @@
+"""Estimates in a robot's description file: the same text but for the values that were identified."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.errors import ModelError
+from diransac.model.parameter import Parameter
+from diransac.model.robots.consistency import consistent_parameters
+from diransac.model.robots.description import Description, Joint, read_description
+from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters
+
+__all__ = ["calibrated"]
+
+_MJCF = {"armature": "armature", "damping": "damping", "friction": "frictionloss", "spring": "stiffness"}
+_URDF = {"damping": "damping", "friction": "friction"}
+"""Attributes of a joint, and of a URDF joint's dynamics, by parameter."""
+
+
+def calibrated(
+    path: str | Path, parameters: Mapping[str, Parameter], values: FloatArray, covariance: FloatArray
+) -> tuple[str, tuple[str, ...]]:
+    """Text of a description with estimates in it, and the parameters that are not in it.
+
+    Parameters of joints replace those of the file. Inertials are the physically consistent ones nearest to those of the
+    file, of all that explain the estimated base parameters (`consistent_parameters`).
+
+    Parameters
+    ----------
+    path : str or Path
+        MJCF or URDF file, for which `robot` made the model.
+    parameters : mapping of str to Parameter
+        Those of the model.
+    values, covariance : (n_p,), (n_p, n_p) arrays
+        Estimates of them; NaN where there is none.
+
+    Returns
+    -------
+    text : str
+        The file's, comments and layout included.
+    left_out : tuple of str
+        Parameters that are not in the text: there is no estimate, or the format cannot express them, such as the bias
+        of an encoder.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read; a joint or body is not in it, but in one that it includes; the parameters are not those
+        of a robot.
+    """
+    description = read_description(path, "held")
+    source = Path(path).read_bytes()
+    found = _estimates(description, parameters, values, covariance)
+    document = _Document(source, f'robot description "{path}"')
+    attributes = _URDF if document.is_urdf else _MJCF
+    for name, of_joint in found.joints.items():
+        joint = next(x for x in description.joints if x.name == name)
+        document.set_joint(joint, {attributes[kind]: x for kind, x in of_joint.items() if kind in attributes})
+    for name, inertial in found.bodies.items():
+        document.set_body(name, inertial)
+    placed = {f"{kind} {name}" for name, of_joint in found.joints.items() for kind in of_joint if kind in attributes}
+    left_out = [
+        n
+        for (n, x), value in zip(parameters.items(), values, strict=True)
+        if np.isnan(value) or not (_has_inertials(dict(x.combination)) or x.combination[0][0] in placed)
+    ]
+    return document.text(), tuple(left_out)
+
+
+# ---------------------------------------------------------------------- values
+
+
+@dataclass(frozen=True)
+class _Estimates:
+    """New values: of each joint by parameter, and the ten inertial parameters of each body."""
+
+    joints: dict[str, dict[str, float]] = field(default_factory=dict)
+    bodies: dict[str, FloatArray] = field(default_factory=dict)
+
+
+def _estimates(
+    description: Description, parameters: Mapping[str, Parameter], values: FloatArray, covariance: FloatArray
+) -> _Estimates:
+    """Values of everything that a parameter stands for, or is a part of."""
+    places = {n: dict(x.combination) for n, x in parameters.items()}
+    if not all(places.values()):
+        raise ModelError(f"{next(n for n, x in places.items() if not x)} is no parameter of a robot's description")
+    found = _Estimates()
+    estimated = [(k, n) for k, n in enumerate(places) if not np.isnan(values[k])]
+    for k, n in estimated:
+        if not _has_inertials(places[n]):
+            _assign(found, next(iter(places[n])), values[k])
+    names = list(places)
+    known = [k for k, n in estimated if _has_inertials(places[n]) and np.isfinite(covariance[k, k])]
+    if known:
+        of_known = [places[names[k]] for k in known]
+        _solve_inertials(found, description, of_known, values[known], covariance[np.ix_(known, known)])
+    return found
+
+
+def _has_inertials(places: Mapping[str, float]) -> bool:
+    return any(place.partition(" ")[0] in INERTIAL_NAMES for place in places)
+
+
+def _assign(found: _Estimates, place: str, value: float) -> None:
+    kind, _, name = place.partition(" ")
+    found.joints.setdefault(name, {})[kind] = float(value)
+
+
+def _solve_inertials(
+    found: _Estimates,
+    description: Description,
+    places: list[dict[str, float]],
+    values: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Bodies and constants of joints that explain base parameters."""
+    every = list(dict.fromkeys(place for own in places for place in own))
+    bodies = [x for x in description.bodies if any(f"{kind} {x.name}" in every for kind in INERTIAL_NAMES)]
+    constants = [place for place in every if place.partition(" ")[0] not in INERTIAL_NAMES]
+    columns = [f"{kind} {body.name}" for body in bodies for kind in INERTIAL_NAMES] + constants
+    missing = [place for place in every if place not in columns]
+    if missing:
+        raise ModelError(f'there is no body "{missing[0].partition(" ")[2]}" in the description')
+    joints = {x.name: x for x in description.joints}
+    inertials, others = consistent_parameters(
+        np.array([inertial_parameters(x.inertial) for x in bodies]),
+        np.array([joints[place.partition(" ")[2]].armature for place in constants]),
+        np.array([[own.get(column, 0.0) for column in columns] for own in places]),
+        values,
+        covariance,
+    )
+    found.bodies.update({body.name: x for body, x in zip(bodies, inertials, strict=True)})
+    for place, value in zip(constants, others, strict=True):
+        _assign(found, place, value)
+
+
+# ---------------------------------------------------------------------- text
+
+
+@dataclass
+class _Element:
+    """Place of an element in the text, in bytes: of its start tag, and of the element."""
+
+    tag: str
+    attributes: dict[str, str]
+    begin: int
+    inside: int
+    end: int
+    children: list[_Element]
+
+
+class _Document:
+    """Text of a description, in which elements are replaced."""
+
+    def __init__(self, source: bytes, label: str) -> None:
+        self.source, self.label = source, label
+        self.root = _elements(source)
+        self.is_urdf = self.root.tag == "robot"
+        self.changes = dict[tuple[int, int], str]()
+
+    def text(self) -> str:
+        """The text with all changes."""
+        parts, at = list[bytes](), 0
+        for (begin, end), new in sorted(self.changes.items()):
+            parts += [self.source[at:begin], new.encode()]
+            at = end
+        return b"".join([*parts, self.source[at:]]).decode()
+
+    def set_joint(self, joint: Joint, values: Mapping[str, float]) -> None:
+        """Give a joint these attributes; those of a URDF belong to its dynamics."""
+        element = self._named("joint", joint.name)
+        texts = {key: repr(value) for key, value in values.items()}
+        for key, polynomial in (("damping", joint.damping), ("stiffness", joint.stiffness)):
+            if key in texts and len(polynomial) > 1:
+                texts[key] = " ".join([texts[key], *map(repr, polynomial[1:])])
+        if not self.is_urdf:
+            self._rewrite(element, texts)
+        elif dynamics := [x for x in element.children if x.tag == "dynamics"]:
+            self._rewrite(dynamics[0], texts)
+        elif texts:
+            self._insert(element, f"<dynamics {_attributes(texts)}/>")
+
+    def set_body(self, name: str, inertial: FloatArray) -> None:
+        """Give a body these inertial parameters about the origin of its frame."""
+        element = self._named("link" if self.is_urdf else "body", name)
+        mass, h = inertial[0], inertial[1:4]
+        centre = h / mass
+        shift = mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+        about_centre = inertial[4:] - np.array([*np.diag(shift), shift[0, 1], shift[0, 2], shift[1, 2]])
+        new = (_urdf_inertial if self.is_urdf else _mjcf_inertial)(float(mass), centre, about_centre)
+        if old := [x for x in element.children if x.tag == "inertial"]:
+            self.changes[old[0].begin, old[0].end] = new
+        else:
+            self._insert(element, new)
+
+    def _named(self, tag: str, name: str) -> _Element:
+        """The body, link or joint of that name.  Raises ModelError: it is in another file."""
+        parents = [self.root] if self.is_urdf else [x for x in self.root.children if x.tag == "worldbody"]
+        for element in (x for parent in parents for x in _below(parent)):
+            if element.tag == tag and element.attributes.get("name") == name:
+                return element
+        raise ModelError(
+            f'{self.label}: {tag} "{name}" is not in this file by name; write the files that it includes into one'
+        )
+
+    def _rewrite(self, element: _Element, texts: Mapping[str, str]) -> None:
+        """Replace or add attributes in a start tag."""
+        place = element.begin, element.inside
+        tag = self.changes.get(place, self.source[slice(*place)].decode())
+        for key, text in texts.items():
+            tag, count = re.subn(rf"(\s{key}\s*=\s*)(\"[^\"]*\"|'[^']*')", rf'\g<1>"{text}"', tag, count=1)
+            if not count:
+                tag = re.sub(r"\s*(/?>)$", rf' {key}="{text}"\g<1>', tag)
+        self.changes[place] = tag
+
+    def _insert(self, element: _Element, new: str) -> None:
+        """Add a first child."""
+        start = self.source[element.begin : element.inside].decode()
+        if start.endswith("/>"):
+            place = element.begin, element.inside
+            self.changes[place] = f"{self.changes.get(place, start)[:-2].rstrip()}>{new}</{element.tag}>"
+        else:
+            place = element.inside, element.inside
+            self.changes[place] = self.changes.get(place, "") + new
+
+
+def _elements(source: bytes) -> _Element:
+    """The root element, with all below it."""
+    parser, open_elements, roots = expat.ParserCreate(), list[_Element](), list[_Element]()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        begin = parser.CurrentByteIndex
+        inside = _end_of_tag(source, begin)
+        element = _Element(tag, attributes, begin, inside, inside, [])
+        (open_elements[-1].children if open_elements else roots).append(element)
+        open_elements.append(element)
+
+    def end(_tag: str) -> None:
+        element, at = open_elements.pop(), parser.CurrentByteIndex
+        if source[element.inside - 2 : element.inside] != b"/>":
+            element.end = source.index(b">", at) + 1
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.Parse(source, True)
+    return roots[0]
+
+
+def _end_of_tag(source: bytes, begin: int) -> int:
+    """Index behind a start tag, whose attributes may contain ``>``."""
+    match = re.compile(rb"<[^\s/>]+(?:\s+[^\s=]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*\s*/?>").match(source, begin)
+    assert match is not None
+    return match.end()
+
+
+def _below(element: _Element) -> Iterator[_Element]:
+    """Elements below one, in order."""
+    for child in element.children:
+        yield child
+        yield from _below(child)
+
+
+def _attributes(texts: Mapping[str, str]) -> str:
+    return " ".join(f"{key}={quoteattr(text)}" for key, text in texts.items())
+
+
+def _numbers(values: FloatArray) -> str:
+    return " ".join(repr(float(x)) for x in values)
+
+
+def _mjcf_inertial(mass: float, centre: FloatArray, inertia: FloatArray) -> str:
+    """Element of a body, with the inertia about the centre of mass, xx yy zz xy xz yz."""
+    return f'<inertial pos="{_numbers(centre)}" mass="{mass!r}" fullinertia="{_numbers(inertia)}"/>'
+
+
+def _urdf_inertial(mass: float, centre: FloatArray, inertia: FloatArray) -> str:
+    """Element of a link, with the inertia about the centre of mass, xx yy zz xy xz yz."""
+    entries = zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), inertia.tolist(), strict=True)
+    return (
+        f'<inertial><origin xyz="{_numbers(centre)}" rpy="0 0 0"/><mass value="{mass!r}"/>'
+        f"<inertia {_attributes({key: repr(x) for key, x in entries})}/></inertial>"
+    )

@@ -1,0 +1,343 @@
+"""A robot's bodies, joints and couplings, read from its MJCF or URDF file by MuJoCo.
+
+MuJoCo's compiler resolves frames, default classes, units and inertials, so that nothing of either format is parsed
+here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.errors import ModelError
+
+__all__ = ["Body", "Coupling", "Description", "Joint", "mujoco_module", "parsed", "read_description"]
+
+_ROUNDING = 1e-15
+"""Entries of rotations that differ from 0, 1 or -1 by less are these: rounding of quarter turns' quaternions."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Joint with one degree of freedom.
+
+    Parameters
+    ----------
+    name : str
+        Name in the file.
+    turns : bool
+        Whether it is a hinge, in rad and N m; else a slide, in m and N.
+    axis, anchor : (3,) arrays
+        Unit axis, and a point of it, m, in the frame of the moved body.
+    reference : float
+        Position in which the moved body has the pose of the file.
+    armature : float
+        Inertia of the rotor behind the gear, kg m^2 or kg.
+    damping, stiffness : tuple of float
+        Coefficients of ``d_0 v + d_1 |v| v + ...`` and of ``k_0 x + k_1 |x| x + ...``.
+    friction : float
+        Coulomb friction, N m or N.
+    spring_reference : float
+        Position in which the spring is relaxed.
+    """
+
+    name: str
+    turns: bool
+    axis: FloatArray
+    anchor: FloatArray
+    reference: float
+    armature: float
+    damping: tuple[float, ...]
+    friction: float
+    stiffness: tuple[float, ...]
+    spring_reference: float
+
+
+@dataclass(frozen=True)
+class Body:
+    """Rigid body.
+
+    Parameters
+    ----------
+    name : str
+        Name in the file.
+    parent : int
+        Index of the body on which it is mounted, smaller than its own; -1: the world.
+    rotation, position : (3, 3) and (3,) arrays
+        Pose in the frame of the parent, with all joints in their reference positions; m.
+    joints : tuple of int
+        Indices of the joints between it and its parent, in their order.
+    inertial : (4, 4) array
+        Pseudo-inertia about the origin of the body frame, ``[[S, h], [h', m]]`` with the first moments h, kg m, and
+        ``S = tr(I) / 2 - I``, kg m^2.
+    gravity_compensation : float
+        Fraction of the weight that the robot compensates by itself.
+    """
+
+    name: str
+    parent: int
+    rotation: FloatArray
+    position: FloatArray
+    joints: tuple[int, ...]
+    inertial: FloatArray
+    gravity_compensation: float
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """Position of a joint as a polynomial of another's: ``y = y_0 + sum c_k (x - x_0)^k``.
+
+    Parameters
+    ----------
+    follower : int
+        Index of the joint y.
+    leader : int or None
+        Index of the joint x; None: y is constant.
+    coefficients : tuple of float
+        c_0, c_1, ...
+    """
+
+    follower: int
+    leader: int | None
+    coefficients: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Description:
+    """Fixed-base tree of bodies.
+
+    Parameters
+    ----------
+    name : str
+        Name of the robot.
+    bodies : tuple of Body
+        Parents before their children.
+    joints : tuple of Joint
+    couplings : tuple of Coupling
+    gravity : (3,) array
+        In the world frame, m/s^2.
+    base : int, optional
+        Index of a body whose motion is measured; by default no body of those on the world moves by itself.
+    """
+
+    name: str
+    bodies: tuple[Body, ...]
+    joints: tuple[Joint, ...]
+    couplings: tuple[Coupling, ...]
+    gravity: FloatArray
+    base: int | None = None
+
+
+def mujoco_module() -> ModuleType:
+    """The package `mujoco`, which is imported here alone.
+
+    Raises
+    ------
+    ModelError
+        It is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError as error:
+        raise ModelError(
+            "descriptions of robots are read by MuJoCo, which is not installed: pip install 'diransac[robots]'"
+        ) from error
+    return mujoco  # type: ignore[no-any-return]  # without annotations
+
+
+def parsed(path: str | Path) -> Any:
+    """MuJoCo's editable form (``MjSpec``) of a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        MJCF or URDF.
+
+    Returns
+    -------
+    mujoco.MjSpec
+
+    Raises
+    ------
+    ModelError
+        There is no such file, or it is neither MJCF nor URDF.
+    """
+    mujoco = mujoco_module()
+    if not Path(path).is_file():
+        raise ModelError(f'robot description "{path}" does not exist; give an MJCF (.xml) or URDF file')
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise _unreadable(path, error) from error
+
+
+def read_description(path: str | Path, base: str | None = None) -> Description:
+    """Bodies, joints and couplings of a robot's description.
+
+    Parameters
+    ----------
+    path : str or Path
+        MJCF or URDF.
+    base : str, optional
+        A body with a free joint: "held" in the pose of the file, or "measured", so that its motion is known. None:
+        there is none.
+
+    Returns
+    -------
+    Description
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read; or it has a free joint whose base is neither, a ball joint, a closed loop, a tendon
+        that exerts forces, or a surrounding fluid.
+    """
+    spec = parsed(path)
+    floating = [x for x in spec.joints if x.type == mujoco_module().mjtJoint.mjJNT_FREE] if base else []
+    names = [joint.parent.name for joint in floating]
+    for joint in floating:
+        spec.delete(joint)
+    _drop_shapes(spec)
+    try:
+        spec.compiler.fusestatic = False
+        model = spec.compile()
+    except ValueError as error:
+        raise _unreadable(path, error) from error
+    label = f'robot description "{path}"'
+    _check_supported(label, model)
+    joints = tuple(_joint(model, k) for k in range(model.njnt))
+    if not joints:
+        raise ModelError(f"{label}: there are no joints, and nothing can move")
+    bodies = tuple(_body(model, i) for i in range(1, model.nbody))
+    name = re.sub(r"\W+", "-", spec.modelname) or Path(path).stem
+    measured = _measured_base(label, bodies, names) if base == "measured" else None
+    return Description(name, bodies, joints, tuple(_couplings(label, model)), np.array(model.opt.gravity), measured)
+
+
+def _measured_base(label: str, bodies: Sequence[Body], floating: Sequence[str]) -> int:
+    """Index of the body with a free joint.  Raises ModelError: there is not one, or weights are compensated."""
+    if len(floating) != 1:
+        raise ModelError(f"{label}: {len(floating)} bodies have a free joint; a measured base takes one")
+    if any(body.gravity_compensation for body in bodies):
+        raise ModelError(f"{label}: gravity compensation on a base whose attitude is not known is not modelled")
+    return [body.name for body in bodies].index(floating[0])
+
+
+def _unreadable(path: str | Path, error: ValueError) -> ModelError:
+    return ModelError(f'robot description "{path}" cannot be read: {" ".join(str(error).split())}')
+
+
+def _drop_shapes(spec: Any) -> None:
+    """Remove shapes that give no inertia, and what refers to shapes: files of meshes need not be there."""
+    mujoco = mujoco_module()
+    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        return
+    for referring in (spec.pairs, spec.sensors, spec.actuators, spec.keys, spec.skins):
+        for element in list(referring):
+            spec.delete(element)
+    for shape in list(spec.geoms):
+        if shape.parent.explicitinertial or shape.parent.name == "world":
+            spec.delete(shape)
+    if not list(spec.geoms):
+        for unused in (spec.meshes, spec.hfields, spec.materials, spec.textures):
+            for element in list(unused):
+                spec.delete(element)
+
+
+def _check_supported(label: str, model: Any) -> None:
+    """Raises ModelError: the robot has parts for which there are no equations here."""
+    kinds = mujoco_module().mjtJoint
+    for k in range(model.njnt):
+        name = model.joint(k).name
+        if model.jnt_type[k] == kinds.mjJNT_FREE:
+            raise ModelError(
+                f'{label}: the base floats (free joint "{name}"); give base="held" if it was held while the '
+                'log was recorded, or base="measured" if its motion was'
+            )
+        if model.jnt_type[k] == kinds.mjJNT_BALL:
+            raise ModelError(f'{label}: joint "{name}" is a ball joint; replace it by three hinges')
+    forces = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss)
+    if model.ntendon and any(np.any(x) for x in (*forces, getattr(model, "tendon_armature", 0.0))):
+        raise ModelError(
+            f"{label}: tendons with stiffness, damping, friction or armature are not modelled; remove them"
+        )
+    if model.opt.density or model.opt.viscosity:
+        raise ModelError(f"{label}: forces of a surrounding fluid are not modelled; remove density and viscosity")
+
+
+def _couplings(label: str, model: Any) -> Iterator[Coupling]:
+    """Active equality constraints.  Raises ModelError: one is not between joints, which closes a kinematic loop."""
+    mujoco = mujoco_module()
+    for k in np.flatnonzero(model.eq_active0):
+        if model.eq_type[k] != mujoco.mjtEq.mjEQ_JOINT:
+            kind = mujoco.mjtEq(model.eq_type[k]).name.removeprefix("mjEQ_").lower()
+            raise ModelError(
+                f'{label}: the equality constraint "{model.equality(k).name or k}" ({kind}) closes a kinematic loop, '
+                "and only chains and trees are modelled; cut the loop, or couple its joints by polynomials"
+            )
+        leader = int(model.eq_obj2id[k])
+        yield Coupling(int(model.eq_obj1id[k]), None if leader < 0 else leader, tuple(model.eq_data[k, :5].tolist()))
+
+
+def _joint(model: Any, k: int) -> Joint:
+    dof = model.jnt_dofadr[k]
+    return Joint(
+        name=model.joint(k).name or f"joint{k}",
+        turns=bool(model.jnt_type[k] == mujoco_module().mjtJoint.mjJNT_HINGE),
+        axis=_snapped(model.jnt_axis[k]),
+        anchor=np.array(model.jnt_pos[k]),
+        reference=float(model.qpos0[model.jnt_qposadr[k]]),
+        armature=float(model.dof_armature[dof]),
+        damping=_polynomial(model.dof_damping[dof], getattr(model, "dof_dampingpoly", None), dof),
+        friction=float(model.dof_frictionloss[dof]),
+        stiffness=_polynomial(model.jnt_stiffness[k], getattr(model, "jnt_stiffnesspoly", None), k),
+        spring_reference=float(model.qpos_spring[model.jnt_qposadr[k]]),
+    )
+
+
+def _polynomial(first: float, others: FloatArray | None, k: int) -> tuple[float, ...]:
+    """Coefficients without zeros at the end; versions of MuJoCo before 3.5 have the first alone."""
+    found = [float(first), *([] if others is None else others[k].tolist())]
+    while len(found) > 1 and found[-1] == 0.0:
+        found.pop()
+    return tuple(found)
+
+
+def _body(model: Any, i: int) -> Body:
+    centre, mass = np.array(model.body_ipos[i]), float(model.body_mass[i])
+    axes = _rotation(model.body_iquat[i])
+    about_centre = axes @ np.diag(0.5 * model.body_inertia[i].sum() - model.body_inertia[i]) @ axes.T
+    inertial = np.zeros((4, 4))
+    inertial[:3, :3] = about_centre + mass * np.outer(centre, centre)
+    inertial[:3, 3] = inertial[3, :3] = mass * centre
+    inertial[3, 3] = mass
+    first = int(model.body_jntadr[i])
+    return Body(
+        name=model.body(i).name or f"body{i}",
+        parent=int(model.body_parentid[i]) - 1,
+        rotation=_rotation(model.body_quat[i]),
+        position=np.array(model.body_pos[i]),
+        joints=tuple(range(first, first + int(model.body_jntnum[i]))),
+        inertial=inertial,
+        gravity_compensation=float(model.body_gravcomp[i]),
+    )
+
+
+def _rotation(quaternion: FloatArray) -> FloatArray:
+    """Rotation matrix of a unit quaternion, w first."""
+    matrix = np.zeros(9)
+    mujoco_module().mju_quat2Mat(matrix, np.array(quaternion))
+    return _snapped(matrix.reshape(3, 3))
+
+
+def _snapped(values: FloatArray) -> FloatArray:
+    """Values with those that are 0, 1 or -1 but for rounding exactly so, for which expressions have no terms."""
+    whole = np.round(values)
+    return np.where(np.abs(values - whole) < _ROUNDING, whole, values)

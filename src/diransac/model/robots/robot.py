@@ -1,0 +1,182 @@
+"""`robot`: a model of a robot from its description file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.errors import ModelError
+from diransac.model.model import Model
+from diransac.model.robots.actuation import Actuation, JointTorques
+from diransac.model.robots.description import Description, read_description
+from diransac.model.robots.mechanism import UNKNOWN, Mechanism, identifier, ordered_couplings
+
+__all__ = ["robot"]
+
+
+def robot(
+    path: str | Path,
+    *,
+    unknown: Collection[str] = ("armature", "damping", "friction"),
+    actuation: Actuation | None = None,
+    bodies: Collection[str] | str = (),
+    joints: Collection[str] | Mapping[str, str] | str | None = None,
+    passive: Collection[str] = (),
+    friction_speed: float = 0.05,
+    stribeck_speed: float = 0.2,
+    gravity: Sequence[float] | None = None,
+    base: str | None = None,
+) -> Model:
+    """Model of a robot from its description: chains and trees of hinges and slides on a base that is fixed or measured.
+
+    ``tau_i(q, q', q'') + armature q'' + damping q' + friction tanh(q' / s) + spring (q - q_0) = drive``
+
+    with the inverse dynamics tau of the rigid bodies, gravity included. Everything that is not unknown has its value in
+    the file. Contacts, limits of joints, and the file's actuators are no part of the model.
+
+    Parameters
+    ----------
+    path : str or Path
+        MJCF or URDF; read by MuJoCo (``pip install 'diransac[robots]'``).
+    unknown : collection of str, optional
+        Unknown parameters of every joint: "armature", "damping", "friction" (Coulomb), "stribeck" (what friction at
+        rest is more, ``stribeck tanh(q' / s) exp(-(q' / stribeck_speed)^2)``), "spring" (its stiffness), "offset" (a
+        constant force), "torque_gain" (a factor of the drive's force), "encoder_bias" (reading less position,
+        within half a turn). Parameters are named after both: ``armature_elbow``.
+    actuation : Actuation, optional
+        Forces of the drives: `JointTorques` (default: columns ``elbow_torque``), `PositionControl`, `MotorCurrents`.
+    bodies : collection of str or "all", optional
+        Bodies whose ten inertial parameters are unknown, about the origin of the body's frame: ``mass_hand``,
+        ``hx_hand``, ... (first moments), ``Ixx_hand``, ... The model has their base parameters: those that
+        no motion shows are left out, and those of which motions show a combination alone are grouped into one,
+        ``Izz_hand_grouped``. ``Parameter.combination`` names its parts, as ``"Izz hand"``, with their weights.
+    joints : collection of str, mapping of str to str, or str, optional
+        Joints to be modelled, by name; or by coordinate, the name that log columns have: ``{"elbow": "joint_4"}``; or
+        the pattern of their names, ``"{}_joint"``, in which ``{}`` stands for the coordinate.
+        By default all, and each coordinate has the joint's name. Other joints are locked in the pose of the file;
+        those that an equality constraint couples to a joint move with it.
+    passive : collection of str, optional
+        Coordinates without a drive.
+    friction_speed : float, optional
+        Speed s over which friction changes its sign, rad/s or m/s.
+    stribeck_speed : float, optional
+        Speed at which the Stribeck effect has fallen to 1/e, rad/s or m/s.
+    gravity : sequence of float, optional
+        In the frame of the world, m/s^2; by default the file's.
+    base : str, optional
+        A base with a free joint: "held" in the pose of the file, of a robot that hangs or is clamped; or "measured",
+        with further inputs ``base_wx``, ... (angular velocity), ``base_wx_dot``, ... (angular acceleration) and
+        ``base_fx``, ... (acceleration of its origin less gravity, which an accelerometer shows), all in its frame.
+
+    Returns
+    -------
+    Model
+        One coordinate per joint, the reading of its encoder. Nominal values of its parameters are the file's.
+        `independent_parts` splits it into its limbs.
+
+    Raises
+    ------
+    ModelError
+        MuJoCo is not installed; the file cannot be read, or describes a closed loop or a ball joint; a name is unknown;
+        nothing is unknown, or a body with unknown parameters does not move.
+
+    References
+    ----------
+    Luh, Walker, Paul 1980 (recursive Newton-Euler algorithm); Gautier 1991 (base parameters).
+    """
+    if base not in (None, "held", "measured"):
+        raise ModelError(f'base is {base!r}; give "held" or "measured", or None')
+    description = read_description(path, base)
+    if gravity is not None:
+        description = replace(description, gravity=_vector(gravity))
+    label = f'robot "{path}"'
+    coordinates = _coordinates(label, description, joints)
+    moved = set(coordinates.values())
+    for coupling in ordered_couplings(label, description):
+        moved |= {coupling.follower} if coupling.leader in moved else set()
+    mechanism = Mechanism(
+        label=label,
+        description=description,
+        coordinates=coordinates,
+        unknown=_known_names("unknown", unknown, UNKNOWN),
+        bodies=_bodies(description, bodies, moved),
+        speeds=(_positive("friction_speed", friction_speed), _positive("stribeck_speed", stribeck_speed)),
+    )
+    return mechanism.model(actuation or JointTorques(), _known_names("passive", passive, mechanism.coordinates))
+
+
+# ---------------------------------------------------------------------- arguments
+
+
+def _known_names(what: str, given: Collection[str], known: Collection[str]) -> tuple[str, ...]:
+    """The names themselves, each once.  Raises ModelError: one is unknown."""
+    names = (given,) if isinstance(given, str) else tuple(dict.fromkeys(given))
+    for name in names:
+        if name not in known:
+            raise ModelError(f"{what}: there is no {name!r}; choose from {', '.join(known)}")
+    return names
+
+
+def _coordinates(
+    label: str, description: Description, joints: Collection[str] | Mapping[str, str] | str | None
+) -> dict[str, int]:
+    """Index of the joint of each coordinate.
+
+    Raises ModelError: a name is unknown, a joint is named twice or follows another, or there is none.
+    """
+    names = [joint.name for joint in description.joints]
+    followers = {names[x.follower] for x in description.couplings}
+    leaders = [name for name in names if name not in followers]
+    if joints is None:
+        joints = leaders
+    elif isinstance(joints, str) and "{}" in joints:
+        pattern = re.compile(re.escape(joints).replace(r"\{\}", "(.+)"))
+        joints = {identifier(found[1]): name for name in leaders if (found := pattern.fullmatch(name))}
+    chosen = (
+        joints if isinstance(joints, Mapping) else {identifier(n): n for n in _known_names("joints", joints, names)}
+    )
+    for name in _known_names("joints", tuple(chosen.values()), names):
+        if name in followers:
+            raise ModelError(
+                f'{label}: joint "{name}" follows another by an equality constraint; leave it out of joints'
+            )
+        if list(chosen.values()).count(name) > 1:
+            raise ModelError(f'{label}: joint "{name}" has several coordinates; give it one')
+    if len(chosen) < len(joints):
+        raise ModelError(f"{label}: names of joints differ only in special characters; give joints as a mapping")
+    if not chosen:
+        raise ModelError(f"{label}: no joint is modelled; there are {', '.join(names)}")
+    return {coordinate: names.index(name) for coordinate, name in chosen.items()}
+
+
+def _bodies(description: Description, bodies: Collection[str] | str, moved: Collection[int]) -> tuple[int, ...]:
+    """Indices of bodies by name; of "all", those with one of the moved joints between them and the world."""
+    if bodies == "all":
+        moving = set[int]()
+        for i, body in enumerate(description.bodies):
+            if body.parent in moving or set(body.joints) & set(moved):
+                moving.add(i)
+        return tuple(sorted(moving))
+    names = [body.name for body in description.bodies]
+    return tuple(names.index(name) for name in _known_names("bodies", bodies, names))
+
+
+def _positive(what: str, value: float) -> float:
+    if not (np.isfinite(value) and value > 0.0):
+        raise ModelError(f"{what} is {value!r}; give a positive number")
+    return float(value)
+
+
+def _vector(gravity: Sequence[float]) -> FloatArray:
+    try:
+        found = np.array(gravity, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"gravity is {gravity!r:.60}; give three numbers") from error
+    if found.shape != (3,) or not np.isfinite(found).all():
+        raise ModelError(f"gravity is {gravity!r:.60}; give three finite numbers")
+    return found

@@ -1,0 +1,97 @@
+"""Command line with descriptions of robots: limbs side by side, options, calibrated files."""
+
+import json
+
+import numpy as np
+import pytest
+
+import diransac as dr
+import robots
+from command_line import run
+
+pytest.importorskip("mujoco", reason="ROBOTS ON THE COMMAND LINE NOT CHECKED: mujoco is missing")
+
+CONTROL = ["--control", "kp=20,kd=1.5,target=des_{}"]
+ROBOT = ["--model", "dog.xml", "--joints", "{}_joint", *CONTROL]
+TRUTH = {"armature": 0.03, "damping": 0.4, "friction": 0.2}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Working directory with ``dog.xml`` and ``run.csv``, an exact motion under position control with other joints."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dog.xml").write_text(robots.quadruped())
+    model = dr.models.robot("dog.xml", joints="{}_joint", actuation=dr.JointTorques())
+    rng, t = np.random.default_rng(0), np.arange(0.0, 3.0, 0.01)
+    w, phase = rng.uniform(2.0, 8.0, 12), rng.uniform(0.0, 6.0, 12)
+    q, v, a = (x(t[:, None] * w + phase) for x in (np.sin, np.cos, np.sin))
+    v, a = w * v, -(w**2) * a
+    p = [TRUTH[n.partition("_")[0]] for n in model.parameters]
+    tau = np.array(model.residual(q.T, v.T, a.T, np.zeros((12, len(t))), np.tile(p, (len(t), 1)).T)).T
+    columns = {"t": t}
+    for k, n in enumerate(model.coordinates):
+        columns |= {
+            n: q[:, k],
+            f"{n}_dot": v[:, k],
+            f"{n}_ddot": a[:, k],
+            f"des_{n}": q[:, k] + (tau + 1.5 * v)[:, k] / 20,
+        }
+    np.savetxt("run.csv", np.column_stack(list(columns.values())), delimiter=",", header=",".join(columns), comments="")
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_limbs_are_identified_side_by_side_and_written_into_the_description(folder):
+    done = run("identify", "run.csv", *ROBOT, "--method", "ols", "-o", "dog.json", "--report", "dog.html")
+    assert done.exit_code == 0, done.stderr
+    header, first = done.stdout.splitlines()[:2]
+    assert header.split() == ["parameter", "±", "95", "%", "FL", "FR", "RL", "RR", "unit"]
+    assert first.split()[0] == "armature_hip"
+    assert {x.name for x in folder.glob("dog-*")} == {
+        f"dog-{x}.{y}" for x in ("FL", "FR", "RL", "RR") for y in ("json", "html")
+    }
+    for leg in ("FL", "FR", "RL", "RR"):
+        found = dr.Result.load(f"dog-{leg}.json").parameters
+        assert found == pytest.approx({n: TRUTH[n.partition("_")[0]] for n in found}, rel=1e-6)
+    done = run("export", *sorted(folder.glob("dog-*.json")), "--into", "dog.xml", "-o", "calibrated.xml")
+    assert (done.exit_code, done.stdout) == (0, "wrote calibrated.xml\n")
+    values = {n: x.value for n, x in dr.models.robot("calibrated.xml").parameters.items()}
+    assert values == pytest.approx({n: TRUTH[n.partition("_")[0]] for n in values}, rel=1e-6)
+
+
+def test_chosen_joints_and_unknowns_are_one_result(folder):
+    words = ["--model", "dog.xml", "--joints", "FL_thigh=FL_thigh_joint", *CONTROL, "--unknown", "damping,torque_gain"]
+    shown = json.loads(run("models", "dog.xml", *words[2:], "--json").stdout)
+    assert list(shown["parameters"]) == ["damping_FL_thigh", "torque_gain_FL_thigh"]
+    assert run("identify", "run.csv", *words, "--method", "ols").exit_code == 0
+    both = run("compare", "run.csv", *words, "--methods", "ols,tls")
+    assert both.exit_code == 0, both.stderr
+
+
+def test_json_has_every_limb(folder):
+    done = run("identify", "run.csv", *ROBOT, "--method", "ols", "--json")
+    assert list(json.loads(done.stdout)["limbs"]) == ["FL", "FR", "RL", "RR"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--model", "underwater-vehicle", "--unknown", "damping"], "--unknown is for the description of a robot"),
+        (["--model", "dog.xml", "--control", "kd=3"], "--control: kp is missing"),
+        (["--model", "dog.xml", "--control", "kp=3,ki=4"], "--control: there is no 'ki'"),
+        (["--model", "dog.xml", "--motor", "constant=much"], "--motor: could not convert"),
+        (["--model", "dog.xml", "--motor", "constant=1", "--control", "kp=2"], "give one"),
+    ],
+)
+def test_options_without_meaning_are_wrong_usage(folder, words, message):
+    done = run("identify", "run.csv", *words)
+    assert done.exit_code == 2
+    assert message in done.stderr
+
+
+def test_a_description_is_never_overwritten(folder):
+    before = (folder / "dog.xml").read_bytes()
+    done = run("identify", "run.csv", *ROBOT, "-o", "dog.json", "--joints", "FL_hip_joint", "--report", "dog.xml")
+    assert done.exit_code == 1
+    assert "is a file that this command reads" in done.stderr
+    assert (folder / "dog.xml").read_bytes() == before
