@@ -407,11 +407,11 @@ class _Averaged:
     parts: FloatArray
     power: FloatArray
 
-    def agrees_with(self, longer: _Averaged) -> bool:
-        """False if a parameter clearly differs."""
-        change, parts = np.abs(self.parameters - longer.parameters), self.parts - longer.parts
+    def is_attenuated(self, longer: _Averaged) -> BoolArray:
+        """Mask ``(n,)`` of parameters that are clearly smaller than by longer windows."""
+        missing, parts = np.abs(longer.parameters) - np.abs(self.parameters), self.parts - longer.parts
         error = np.sqrt(np.square(batch_sums(parts)).sum(axis=0))
-        return bool(((change <= _CLEAR * error) | (change <= _NEGLIGIBLE * np.abs(longer.parameters))).all())
+        return np.asarray(missing > np.maximum(_CLEAR * error, _NEGLIGIBLE * np.abs(longer.parameters)))
 
 
 def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> list[IntArray]:
@@ -421,8 +421,8 @@ def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> list
 
     Unmodelled accelerations that vary fast follow the sensors' noise where it is not white.  Fitted accelerations are
     then noise, and least squares attenuates what they multiply.  Means over longer windows have less of it and less
-    information.  The shortest windows are taken with which the estimates of all longer ones agree (Lepski 1991), or
-    that have no such noise: windows of twice their length keep the power of the regressors.
+    information.  The shortest windows are taken that attenuate no parameter, in comparison with all longer ones (Lepski
+    1991), whose regressor has such noise: windows of twice the length take a part of its power.
     """
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
     tried, size = list[_Averaged](), 1
@@ -436,8 +436,8 @@ def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> list
         tried.append(_Averaged(windows, p, np.einsum("pwi,wi->wp", by_means, left), power))
         size *= 2
     for k, (short, double) in enumerate(pairwise(tried)):
-        is_noisy = (double.power < _KEPT * short.power).any()
-        if not is_noisy or all(short.agrees_with(longer) for longer in tried[k + 1 :]):
+        noisy = double.power < _KEPT * short.power
+        if not any((noisy & short.is_attenuated(longer)).any() for longer in tried[k + 1 :]):
             return [x.windows for x in tried[: k + 1]]
     return [x.windows for x in tried]
 
