@@ -37,7 +37,7 @@ from diransac.cli.options import (
     known_methods,
     output_file,
 )
-from diransac.cli.outputs import staged
+from diransac.cli.outputs import checked, staged
 from diransac.cli.robot_options import LimbResults, RobotOptions, of_limb
 from diransac.cli.views import CacheState, Equations, ModelList, compare_methods
 from diransac.identification.identify import identify
@@ -95,9 +95,11 @@ def _identify(
 ) -> None:
     """Identify the parameters of a model from one log, or from several logs of one machine."""
     (chosen,), derived = search.methods([method]), derivation.arguments()
+    read = [*files, model_file(model), search.settings]
+    checked([output, report], read)
     limbs, results = robot.load_limbs(model), dict[str, Result]()
     outputs = [of_limb(path, limb) for limb in limbs for path in (output, report)]
-    with staged(outputs, [*files, model_file(model), search.settings]) as drafts:
+    with staged(outputs, read) as drafts:
         logs = preparation.read_all(files)
         for k, (limb, plant) in enumerate(limbs.items()):
             saved, page = drafts[2 * k : 2 * k + 2]

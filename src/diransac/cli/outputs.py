@@ -9,7 +9,34 @@ from pathlib import Path
 
 from diransac.errors import ResultError
 
-__all__ = ["staged"]
+__all__ = ["checked", "staged"]
+
+
+def checked(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -> list[Path | None]:
+    """The outputs' places, where each can be written.
+
+    Parameters
+    ----------
+    outputs : sequence of Path or None
+        Files to write; None where an output is not requested.
+    inputs : sequence of Path or None, optional
+        Files that the command reads, none of which may be an output.
+
+    Returns
+    -------
+    list of Path or None
+
+    Raises
+    ------
+    ResultError
+        An output's folder is missing or not writable, or an output is not an ordinary file, or is an input.
+    """
+    sources = {path.resolve() for path in inputs if path is not None}
+    targets = [None if path is None else _place(path, sources) for path in outputs]
+    named = [path for path in targets if path is not None]
+    if len(set(named)) < len(named):
+        raise ResultError(f'two outputs go to "{named[0]}"; give each a file of its own')
+    return targets
 
 
 @contextmanager
@@ -31,13 +58,9 @@ def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -
     Raises
     ------
     ResultError
-        An output's folder is missing or not writable, or an output is not an ordinary file, or is an input.
+        As `checked`.
     """
-    sources = {path.resolve() for path in inputs if path is not None}
-    targets = [None if path is None else _checked(path, sources) for path in outputs]
-    named = [path for path in targets if path is not None]
-    if len(set(named)) < len(named):
-        raise ResultError(f'two outputs go to "{named[0]}"; give each a file of its own')
+    targets = checked(outputs, inputs)
     drafts = [Path() if path is None else _draft(path) for path in targets]
     try:
         for draft, target in zip(drafts, targets, strict=True):
@@ -68,7 +91,7 @@ def _make(draft: Path, target: Path) -> None:
         raise ResultError(f'output "{target}" cannot be written: {error.strerror}; choose another place') from error
 
 
-def _checked(path: Path, sources: Set[Path]) -> Path:
+def _place(path: Path, sources: Set[Path]) -> Path:
     target = path.resolve()
     if target.exists() and not target.is_file():
         raise ResultError(f'output "{path}" is not an ordinary file; give the name of a file')

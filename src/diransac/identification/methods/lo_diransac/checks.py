@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import chdtrc
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.estimate import Finding
@@ -50,9 +49,10 @@ _SMALL_DELAY = 0.1
 # Parts of the logs that are predicted by the rest; mean square of what the model leaves of them, over that of the fit,
 # from which on it is no chance; standard errors of a parameter that differs then.
 _HELD_OUT, _WORSE, _LIKELY = 5, 1.25, 2.0
-# Parts whose parameters an exact model must have in common; probability of a difference as large by chance; part of a
-# parameter that is negligible; information about a direction of the parameters, over the largest, that is rounding.
-_STRETCHES, _BY_CHANCE, _NEGLIGIBLE, _ROUNDING = 10, 1e-4, 2e-4, 1e-9
+# Parts whose parameters an exact model must have in common; normal deviation of a difference that is no chance, of a
+# probability of 1e-4; part of a parameter that is negligible; information about a direction of the parameters, over the
+# largest, that is rounding.
+_STRETCHES, _BY_CHANCE, _NEGLIGIBLE, _ROUNDING = 10, 3.72, 2e-4, 1e-9
 # Residual of an equation over that of the worst, at least.
 _SMALLEST = 1e-6
 _TINY = 1e-300
@@ -275,7 +275,7 @@ def _deviating(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate
     along = np.einsum("kij,ki->kj", axes, u)
     distances = np.divide(np.square(along), sizes, out=np.zeros_like(sizes), where=informed).sum(axis=1)
     freedom = int(informed.sum()) - n
-    if freedom < 1 or not chdtrc(freedom, distances.sum()) < _BY_CHANCE:
+    if freedom < 1 or not _is_no_chance(float(distances.sum()), freedom):
         return Parts()
     k, scatter = int(np.argmax(distances)), float(np.sqrt(distances.sum() / freedom))
     R = effect.covariance / np.outer(unit, unit)
@@ -284,6 +284,12 @@ def _deviating(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate
     worst, edges = int(np.argmax(changes)), (k / _STRETCHES, (k + 1) / _STRETCHES)
     most = Deviation(*edges, scatter, worst, float(changes[worst]))
     return Parts(deviation=most if most.change > _NEGLIGIBLE else None)
+
+
+def _is_no_chance(distance: float, freedom: int) -> bool:
+    """True if chi squared is hardly ever as large, by its cube root, which is nearly normal (Wilson, Hilferty 1931)."""
+    spread = 2.0 / (9.0 * freedom)
+    return bool(np.cbrt(distance / freedom) - (1.0 - spread) > _BY_CHANCE * np.sqrt(spread))
 
 
 def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
