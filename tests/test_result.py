@@ -291,6 +291,16 @@ def test_printed_result_shows_every_parameter_with_its_unit_and_how_it_came_abou
         assert part in text
 
 
+def test_a_notebook_shows_the_verdict_and_every_parameter_and_nothing_that_is_markup_of_a_log(result):
+    named = dataclasses.replace(result, logs=(dataclasses.replace(result.logs[0], source="<script>a</script>"),))
+    page = named._repr_html_()
+    assert "<script>" not in page
+    assert "&lt;script&gt;" in page
+    assert f"<strong>{result.verdict}</strong>" in page
+    assert all(f"<td>{name}</td>" in page for name in result.parameters)
+    assert len(repr(result)) < 200
+
+
 def test_printed_result_says_what_is_not_as_it_should_be(results):
     text = str(results["odd"])
     assert "mass" in text.split("!", 1)[1].splitlines()[0]

@@ -37,7 +37,7 @@ from diransac.cli.options import (
     known_methods,
     output_file,
 )
-from diransac.cli.outputs import checked, staged
+from diransac.cli.outputs import PAGE, RESULT, check_ending, checked, staged
 from diransac.cli.robot_options import LimbResults, RobotOptions, of_limb
 from diransac.cli.views import CacheState, Equations, ModelList, compare_methods
 from diransac.identification.identify import identify
@@ -97,6 +97,8 @@ def _identify(
     (chosen,), derived = search.methods([method]), derivation.arguments()
     read = [*files, model_file(model), search.settings]
     checked([output, report], read)
+    check_ending(output, RESULT)
+    check_ending(report, PAGE)
     limbs, results = robot.load_limbs(model), dict[str, Result]()
     outputs = [of_limb(path, limb) for limb in limbs for path in (output, report)]
     with staged(outputs, read) as drafts:
@@ -134,7 +136,10 @@ def _compare(
     """Identify by every method from the same logs, side by side."""
     wanted = search.methods(known_methods(methods))
     arguments = search.arguments() | derivation.arguments()
-    with staged([report], [*files, model_file(model), search.settings]) as (page,):
+    read = [*files, model_file(model), search.settings]
+    checked([report], read)
+    check_ending(report, PAGE)
+    with staged([report], read) as (page,):
         plant, logs = robot.load(model), preparation.read_all(files)
         with time_limited(search.time_limit):
             comparison = compare_methods(plant, logs, wanted, arguments)

@@ -9,7 +9,11 @@ from pathlib import Path
 
 from diransac.errors import ResultError
 
-__all__ = ["checked", "staged"]
+__all__ = ["PAGE", "RESULT", "check_ending", "checked", "staged"]
+
+RESULT = (".json",)
+PAGE = (".html", ".htm")
+"""Endings of results and of pages."""
 
 
 def checked(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -> list[Path | None]:
@@ -37,6 +41,19 @@ def checked(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) 
     if len(set(named)) < len(named):
         raise ResultError(f'two outputs go to "{named[0]}"; give each a file of its own')
     return targets
+
+
+def check_ending(output: Path | None, endings: Sequence[str]) -> None:
+    """Raise ResultError: the ending of an output is not that of the format in which it is written.
+
+    Parameters
+    ----------
+    output : Path or None
+    endings : sequence of str
+        Of this format.
+    """
+    if output is not None and output.suffix.lower() not in endings:
+        raise ResultError(f'output "{output}" does not end in {" or ".join(endings)}, the format that is written')
 
 
 @contextmanager

@@ -501,8 +501,22 @@ class Result:
         values = ", ".join(f"{name}={value:.4g}" for name, value in self.parameters.items())
         return f"<Result of {self.method} for {self.model.name}: {values}; {self.verdict}>"
 
+    def _repr_html_(self) -> str:
+        """Parameters, verdict and the findings against the result, as a notebook shows them."""
+        from html import escape
+
+        header, *rows = ([escape(cell) for cell in row] for row in self._cells())
+        table = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+        against = [x for x in self.findings if x.level in MARKS]
+        findings = "".join(f"<li>{escape(f'{MARKS[x.level]} {x}')}</li>" for x in against)
+        return (
+            f"<p>{escape(self._headline())}: <strong>{self.verdict}</strong></p>"
+            f"<table><tr>{''.join(f'<th>{cell}</th>' for cell in header)}</tr>{table}</table>"
+            + (f"<ul>{findings}</ul>" if findings else "")
+        )
+
     def __str__(self) -> str:
-        parts = (self._headline(), *self._table(), *self._prior_lines(), self._summary())
+        parts = (self._headline(), *aligned(self._cells()), *self._prior_lines(), self._summary())
         return "\n".join([*parts, *self._diagnosed(), *self._assessed()])
 
     def _headline(self) -> str:
@@ -513,7 +527,8 @@ class Result:
         rate = rates[0] if len(rates) == 1 else f"{rates[0]} to {rates[-1]}"
         return f"{self.model.name} by {self.method} from {source} ({seconds:.4g} s at {rate} Hz)"
 
-    def _table(self) -> list[str]:
+    def _cells(self) -> list[tuple[str, str, str, str]]:
+        """Header and rows of the table of parameters."""
         rows = [("parameter", "estimate", "95 % interval", "unit")]
         for name, (low, high) in self.intervals().items():
             digits = telling_digits(low, high)
@@ -523,7 +538,7 @@ class Result:
             varies = not self.layout.is_shared and self.model.parameters[name].per_log
             averaged = varies and name not in self.fixed
             rows.append((f"{name} (mean of logs)" if averaged else name, estimate, interval, self.units[name]))
-        return aligned(rows)
+        return rows
 
     def _prior_lines(self) -> list[str]:
         """The priors, in a line; none without them."""
