@@ -39,7 +39,9 @@ from diransac.cli.options import (
 )
 from diransac.cli.outputs import checked, staged
 from diransac.cli.robot_options import LimbResults, RobotOptions, of_limb
-from diransac.cli.views import CacheState, Equations, ModelList, compare_methods
+from diransac.cli.views import CacheState, Equations, ModelList, Recorded, compare_methods
+from diransac.data.readers import read_fields, read_topics
+from diransac.data.suggested_mapping import suggest_mapping
 from diransac.identification.identify import identify
 from diransac.identification.inspection import inspect
 from diransac.identification.methods import DEFAULT, METHODS
@@ -194,7 +196,35 @@ def _inspect(
 ) -> None:
     """Show what a log holds, what is odd about it, and what is missing for a model."""
     plant = None if model is None else robot.load(model)
-    screen.show(inspect(preparation.read_uneven(file), plant), as_json)
+    topics = read_topics(file)
+    if topics is None or preparation.names_signals:
+        screen.show(inspect(preparation.read_uneven(file), plant), as_json)
+    else:
+        screen.show(Recorded.of(topics, plant), as_json)
+
+
+@app.command("map")
+@grouped
+def _map(
+    file: LogFile,
+    model: ModelName,
+    robot: RobotOptions,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", parser=output_file, metavar="FILE.toml", help="Where to write the mapping."),
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Write a first guess of a mapping from a log's topics or columns to a model's signals."""
+    with staged([output], [file, model_file(model)]) as (written,):
+        fields, elements = read_fields(file)
+        found = suggest_mapping(fields, elements, robot.load(model), f'log "{file}"')
+        if output is None and not as_json:
+            typer.echo(found.toml(), nl=False)
+            return
+        if output is not None:
+            written.write_text(found.toml(), encoding="utf-8")
+        screen.show(found, as_json)
 
 
 @app.command("simulate")

@@ -121,6 +121,15 @@ class MappedSignals:
             rows = [np.where(valid, x, np.nan) for x in rows]
         return dict(zip(self.names, rows, strict=True))
 
+    def invalid(self, columns: Mapping[str, FloatArray]) -> str:
+        """Reason why no sample of the topic counts; empty where one does."""
+        for x in self.where:
+            if not x.holds(columns[x.field]).any():
+                limits = [f"above {x.above:g}"] if x.above > -math.inf else []
+                limits += [f"below {x.below:g}"] if x.below < math.inf else []
+                return f"has no valid sample: {x.field} is never {' and '.join(limits)}"
+        return ""
+
     def known_units(self) -> dict[str, str]:
         """Units of the signals that have one."""
         return {name: unit for name, unit in zip(self.names, self.units, strict=False) if unit is not None}

@@ -34,7 +34,7 @@ from diransac.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-__all__ = ["TopicTable", "read_log", "read_topics"]
+__all__ = ["TopicTable", "read_fields", "read_log", "read_topics"]
 
 _TABLES: dict[str, Callable[[bytes, str], Table]] = {
     ".parquet": read_parquet,
@@ -135,9 +135,23 @@ def read_topics(path: str | Path) -> TopicTable | None:
 
     Raises LogError: as `read_log`.
     """
-    source = f'log "{path}"'
-    opened = _opened(Path(path), source, None, Repairs())
+    path = Path(path)
+    is_folder_of_tables = path.is_dir() and not (path / "metadata.yaml").exists()
+    if is_folder_of_tables or _ending(path) in (*_TEXTS, *_TABLES):
+        return None
+    opened = _opened(path, f'log "{path}"', None, Repairs())
     return None if isinstance(opened, Table) else list_topics(opened)
+
+
+def read_fields(path: str | Path) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
+    """Fields of each topic of a file, and the names of the elements of its arrays; a table has the topic ``""``.
+
+    Raises LogError: as `read_log`.
+    """
+    opened = _opened(Path(path), f'log "{path}"', None, Repairs())
+    if isinstance(opened, Table):
+        return {"": tuple(name for name in opened.columns if name != "t")}, {}
+    return dict(opened.fields), opened.elements
 
 
 def _given(value: Any, mapping: LogMapping | None, name: str) -> Any:
@@ -204,8 +218,7 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
     """Contents of a file, or of a folder.  Raises LogError: it cannot be read."""
     if path.is_dir():
         return _opened_folder(path, source, repairs)
-    name = path.name.lower()
-    ending = next((x for x in sorted(_ENDINGS, key=len, reverse=True) if name.endswith(x)), None)
+    ending = _ending(path)
     if ending in _RECORDINGS:
         _check_content(path, source)
         return _RECORDINGS[ending](path, source)
@@ -219,6 +232,11 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
     if data.startswith(crazyflie.MAGIC):
         return CrazyflieRecording(data, source)
     raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}')
+
+
+def _ending(path: Path) -> str | None:
+    """The longest known ending of a file's name; None where it has none."""
+    return max((x for x in _ENDINGS if path.name.lower().endswith(x)), key=len, default=None)
 
 
 def _opened_folder(path: Path, source: str, repairs: Repairs) -> Table | Recording:

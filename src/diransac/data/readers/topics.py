@@ -100,7 +100,10 @@ def wired_topics(
     step |= {"log": {name: information[name] for name in _KEPT if name in information}} if information else {}
     history = (step,) if made.step is None else (step, made.step)
     said = (*recording.notes, *notes, *(made.notes if len(parts) > 1 else ()))
-    return Table({"t": made.time, **made.signals}, units, said, history), None if len(parts) > 1 else resample
+    unusable = {name: why for samples in parts.values() for name, why in samples.unusable.items()}
+    return Table({"t": made.time, **made.signals, **unusable}, units, said, history), None if len(
+        parts
+    ) > 1 else resample
 
 
 _KEPT = ("sys_name", "ver_hw", "ver_sw", "ver_sw_branch", "sys_uuid")
@@ -112,13 +115,16 @@ def _signals_of(
 ) -> Samples:
     """The mapped signals of one topic."""
     signals: dict[str, FloatArray] = {}
+    unusable: dict[str, str] = {}
     for entry in entries:
         if entry.topic == topic:
-            for label in entry.fields:
+            for label in entry.needs:
                 if label in samples.unusable:
                     raise LogError(f'{source}: field "{label}" of topic "{topic}" {samples.unusable[label]}')
-            signals |= entry.apply(samples.columns)
-    return repairs.ordered(Samples(samples.time, signals), topic)
+            why = entry.invalid(samples.columns)
+            unusable |= dict.fromkeys(entry.names, why) if why else {}
+            signals |= {} if why else entry.apply(samples.columns)
+    return repairs.ordered(Samples(samples.time, signals, unusable), topic)
 
 
 def _is_even(parts: Mapping[str, Samples]) -> bool:
