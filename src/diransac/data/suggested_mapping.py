@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Coverage", "suggest_mapping"]
 
-_LEAST, _LISTED = 0.35, 3
+_LEAST, _LISTED = 0.5, 3
 _WORD = re.compile(r"[a-z]+|\d+")
 _ALIKE = {
     **dict.fromkeys(("pos", "position", "q", "angle", "pose"), "position"),
@@ -51,6 +51,8 @@ class Coverage:
         Unit of each signal of the model.
     built_in : str, optional
         Built-in mapping that serves most of the signals.
+    clock : str
+        Line of the mapping file about the time.
     """
 
     model: str
@@ -60,6 +62,7 @@ class Coverage:
     missing: Mapping[str, tuple[str, ...]]
     units: Mapping[str, str]
     built_in: str | None = None
+    clock: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON."""
@@ -81,7 +84,7 @@ class Coverage:
         """The mapping as a commented file."""
         start = f'# A first guess for the model "{self.model}" from {self.source}, by the names of its fields.\n'
         start += "# Check topics, units, signs and frames: value = sign * scale * field + offset.\n"
-        start += 'time = "header" # time of the sample; "message" for that of its recording\n'
+        start += self.clock
         start += '# resample = "median" # or a rate in Hz; without it the rows are those of the fastest topic\n'
         parts = [start]
         parts += [_toml(entry, self.units) for entry in dict.fromkeys(self.entries.values())]
@@ -140,7 +143,18 @@ def suggest_mapping(
             near = [x for x in _nearest(name, fields) if x[0] > 0.0][:_LISTED]
             missing[name] = tuple(f"{topic}.{label}" if topic else label for _, (topic, label) in near)
     ordered = {name: entries[name] for name in needed if name in entries}
-    return Coverage(model.name, source, ordered, derivable, missing, model.units, built_in)
+    return Coverage(model.name, source, ordered, derivable, missing, model.units, built_in, _clock(fields))
+
+
+def _clock(fields: Mapping[str, Sequence[str]]) -> str:
+    """Line about the time: the likeliest column of a table, or the choice that a recording has."""
+    if list(fields) != [""]:
+        return 'time = "header" # time of the sample; "message" for that of its recording\n'
+    likely = next((x for x in fields[""] if x.lower().startswith(("t_", "time", "stamp"))), None)
+    if likely is None:
+        return '# time = { column = "t_ms", scale = 0.001 } # where it is not the column t, in seconds\n'
+    factor = 0.001 if likely.lower().endswith(("_ms", "millis")) else 1.0
+    return f"time = {{ column = {json.dumps(likely)}, scale = {factor:g} }} # to seconds\n"
 
 
 def _needed(model: Model) -> list[str]:
@@ -218,7 +232,7 @@ def _toml(entry: MappedSignals, units: Mapping[str, str]) -> str:
     lines.append(f"field = {json.dumps(pick(iter(entry.fields)))}")
     for key, numbers, neutral in (("scale", entry.factors, 1.0), ("offset", entry.offsets, 0.0)):
         if any(x != neutral for x in numbers):
-            lines.append(f"{key} = {json.dumps(pick(iter(numbers)))}")
+            lines.append(f"{key} = {json.dumps(numbers[0] if len(set(numbers)) == 1 else list(numbers))}")
     if entry.frame is not None:
         lines += ['order = "wxyz"'] if len(entry.names) == 4 else []
         lines.append(f"frame = {json.dumps(entry.frame)}")

@@ -26,7 +26,7 @@ from diransac.data.readers.parquet import read_parquet
 from diransac.data.readers.recording import Recording, Samples
 from diransac.data.readers.repair import Repairs
 from diransac.data.readers.table import Table
-from diransac.data.readers.topics import TopicTable, list_topics, mapped_table, whole_topic, wired_topics
+from diransac.data.readers.topics import TopicTable, is_one_table, list_topics, mapped_table, whole_topic, wired_topics
 from diransac.data.readers.ulog import UlogRecording
 from diransac.data.units import conversion, split_unit
 from diransac.errors import LogError, SettingsError
@@ -117,7 +117,7 @@ def read_log(
     if isinstance(opened, Table):
         table = repairs.in_si(_with_clock(opened, rate, source))
         rename = _stripped(rename, table)
-    elif len(opened.fields) == 1 and chosen is None:
+    elif chosen is None and is_one_table(opened, rename or {}):
         table = whole_topic(opened, repairs)
     else:
         table, resample = wired_topics(opened, chosen, rename or {}, resample, repairs)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from diransac.data.readers.repair import Repairs
 
-__all__ = ["TopicFacts", "TopicTable", "list_topics", "mapped_table", "whole_topic", "wired_topics"]
+__all__ = ["TopicFacts", "TopicTable", "is_one_table", "list_topics", "mapped_table", "whole_topic", "wired_topics"]
 
 _GAP = 3.5
 _FIELDS_SHOWN = 6
@@ -52,6 +52,11 @@ def mapped_table(table: Table, mapping: LogMapping, source: str) -> Table:
     step = {"step": "map", "mapping": mapping.source, "signals": _origins(entries)}
     history = (*table.history, step)
     return replace(table, columns=mapped, units=units, notes=(*table.notes, *notes), history=history, filter=None)
+
+
+def is_one_table(recording: Recording, rename: Mapping[str, str]) -> bool:
+    """True for a recording of one topic whose fields are called by their names alone."""
+    return len(recording.fields) == 1 and set(rename.values()) <= set(next(iter(recording.fields.values())))
 
 
 def whole_topic(recording: Recording, repairs: Repairs) -> Table:

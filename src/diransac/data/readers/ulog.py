@@ -77,6 +77,7 @@ class UlogRecording:
         self._subscriptions: dict[int, _Topic] = {}
         self._found: list[_Topic] = []
         self._skipped = 0
+        self._last: _Topic | None = None
         with path.open("rb") as file:
             head = file.read(16)
             if head[:7] != _MAGIC:
@@ -107,6 +108,7 @@ class UlogRecording:
                 continue
             if kind not in _KNOWN or (kind == ord("D") and not self._fits(at + 3, size)):
                 damages += 1
+                self._doubt_last()
                 at = self._resume(at + 1)
                 if damages > _MOST_DAMAGES or at < 0:
                     return
@@ -120,6 +122,12 @@ class UlogRecording:
             at = after
         if at < end:
             self._notes.append(f"the file is cut off in the middle of a message: {end - at} bytes left out")
+
+    def _doubt_last(self) -> None:
+        """Leave out the record before a damage, in which the damage may have begun."""
+        if self._last is not None:
+            self._last.places.pop()
+            self._last = None
 
     def _fits(self, at: int, size: int) -> bool:
         """True for a record of a known topic and of that topic's size."""
@@ -150,6 +158,7 @@ class UlogRecording:
             topic = self._subscriptions.get(int.from_bytes(self._data[at : at + 2], "little"))
             if topic is not None:
                 topic.places.append(at + 2)
+                self._last = topic
             return
         content = self._data[at : at + size]
         try:
