@@ -96,7 +96,7 @@ def _identify(
     strict: StrictFlag = False,
 ) -> None:
     """Identify the parameters of a model from one log, or from several logs of one machine."""
-    (chosen,), derived = search.methods([method]), derivation.arguments()
+    (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
     read = [*files, model_file(model), search.settings]
     checked([output, report], read)
     limbs, results = robot.load_limbs(model), dict[str, Result]()
@@ -135,7 +135,7 @@ def _compare(
 ) -> None:
     """Identify by every method from the same logs, side by side."""
     wanted = search.methods(known_methods(methods))
-    arguments = search.arguments() | derivation.arguments()
+    arguments = search.arguments() | preparation.completed(derivation).arguments()
     with staged([report], [*files, model_file(model), search.settings]) as (page,):
         plant, logs = robot.load(model), preparation.read_all(files)
         with time_limited(search.time_limit):
@@ -158,7 +158,7 @@ def _validate(
     as_json: JsonFlag = False,
 ) -> None:
     """Predict other logs with an identified model, open loop."""
-    result = Result.load(model)
+    result, derivation = Result.load(model), preparation.completed(derivation)
     logs = [derivation.derive(log, result.model) for log in preparation.read_all(files)]
     screen.show(validate(result, logs, horizon), as_json)
 
@@ -177,7 +177,7 @@ def _cross_validate(
     as_json: JsonFlag = False,
 ) -> None:
     """Identify from all logs but one, and predict that one, for each in turn."""
-    (chosen,), derived = search.methods([method]), derivation.arguments()
+    (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
     plant, logs = robot.load(model), preparation.read_all(files)
     arguments = search.arguments() | derived | {"time_limit": search.time_limit}
     with screen.bar(f"{method}, leaving one log out") as progress:

@@ -13,7 +13,7 @@ import typer
 from diransac.cli.arguments import fixed_parameters, load_methods, load_settings, names, numbers, pairs, prior_pairs
 from diransac.data import preprocessing
 from diransac.data.log import Log
-from diransac.data.mapping import BUILT_IN
+from diransac.data.mapping import BUILT_IN, load_mapping
 from diransac.data.readers import read_log
 from diransac.data.readers.repair import REPAIRS
 from diransac.errors import LogError, SettingsError
@@ -263,6 +263,17 @@ class Preparation:
         if self.despike is not None:
             log = preprocessing.despike(log, None if self.despike == "all" else names(self.despike))
         return preprocessing.shift(log, delays) if delays else log
+
+    def completed(self, derivation: Derivation) -> Derivation:
+        """The derivation with what the mapping file says of it and the command line does not.
+
+        Raises LogError: the mapping is not valid.
+        """
+        if self.mapping is None:
+            return derivation
+        mapping = load_mapping(self.mapping)
+        bandwidth = derivation.bandwidth if derivation.bandwidth is not None else mapping.option("bandwidth")
+        return Derivation(derivation.differentiate or bool(mapping.option("differentiate")), bandwidth)
 
     @property
     def names_signals(self) -> bool:

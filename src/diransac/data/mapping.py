@@ -46,7 +46,8 @@ _ATTITUDES = ("ned-frd-to-enu-flu", "enu-flu-to-ned-frd")
 _ORDERS = ("wxyz", "xyzw")
 
 _KEYS = {"name", "topic", "field", "unit", "scale", "sign", "offset", "frame", "order", "optional", "where"}
-_TOP = {"description", "time", "resample", "repair", "from", "until", "despike", "shift", "signals"}
+_STEPS = {"resample", "repair", "from", "until", "despike", "shift", "differentiate", "bandwidth"}
+_TOP = {"description", "time", "signals", *_STEPS}
 _LARGEST_FILE = 1_000_000
 _ANY = "{joint}"
 _FOLDER = Path(__file__).parent / "mappings"
@@ -165,8 +166,8 @@ class LogMapping:
     time_column : str, optional
         Column of the time of a table, times ``time_scale`` in seconds.
     preparation : mapping
-        ``resample``, ``repair``, ``from``, ``until``, ``despike``, ``shift``, as `read_log` and the command line have
-        them.
+        ``resample``, ``repair``, ``from``, ``until``, ``despike``, ``shift``, which `read_log` does, and
+        ``differentiate``, ``bandwidth``, which the command line does.
     """
 
     source: str
@@ -320,7 +321,7 @@ def _parse(content: Mapping[str, Any], source: str) -> LogMapping:
         raise LogError(
             f'{source}: time is {time!r}; write "header", "message", or {{ column = "t_ms", scale = 0.001 }}'
         )
-    preparation = {name: content[name] for name in _TOP - {"description", "time", "signals"} if name in content}
+    preparation = {name: content[name] for name in sorted(_STEPS) if name in content}
     _check_preparation(preparation, source)
     return LogMapping(
         source,
@@ -339,7 +340,9 @@ def _check_keys(table: Mapping[str, Any], known: set[str], source: str) -> None:
 
 
 def _check_preparation(steps: Mapping[str, Any], source: str) -> None:
-    for name in ("from", "until"):
+    if not isinstance(steps.get("differentiate", False), bool):
+        raise LogError(f"{source}: differentiate is {steps['differentiate']!r:.60}; it is true or false")
+    for name in ("from", "until", "bandwidth"):
         if name in steps:
             _number(steps[name], name, source)
     if "resample" in steps and steps["resample"] != "median":
