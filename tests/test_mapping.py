@@ -85,7 +85,7 @@ ENTRY = '[[signals]]\nname = "x"\nfield = "a"\n'
 WRONG = {
     "not TOML": ("x = ", "it is not TOML"),
     "empty": ("", "it maps no signal"),
-    "unknown key": (f"frme = 1\n{ENTRY}", 'has "frme", which is not known; it may have description, '),
+    "unknown key": (f"frme = 1\n{ENTRY}", 'has "frme", which is not known; it may have bandwidth, description, '),
     "unknown key of a signal": (f"{ENTRY}scal = 2", r'signal 1 has "scal", which is not known'),
     "signals are no tables": ("signals = 3", r"write \[\[signals\]\] before each"),
     "no name": ('[[signals]]\nfield = "a"', "signal 1: name is missing"),

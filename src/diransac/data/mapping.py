@@ -219,7 +219,14 @@ class LogMapping:
         if not found:
             raise LogError(f"{source}: {self.source} fits none of its topics; found {_some(fields)}")
         notes = [f"{self.source}: no {', '.join(n for n in absent if absent[n] == w)}: {w}" for w in _unique(absent)]
-        entries = [entry for entry in dict.fromkeys(found.values()) if all(found[n] == entry for n in entry.names)]
+        entries = list(dict.fromkeys(found.values()))
+        for entry in entries:
+            other = next((name for name in entry.names if found[name] != entry), None)
+            if other is not None:
+                listed = ", ".join(entry.names)
+                raise LogError(
+                    f'{self.source}: two entries have "{other}", one of them {listed}; give both all of these'
+                )
         return entries, notes
 
 
@@ -364,6 +371,8 @@ def _entry(table: Mapping[str, Any], source: str) -> MappedSignals:
     fields = _strings(table.get("field"), "field", source)
     if len(fields) != len(names):
         raise LogError(f"{source} has {len(names)} names and {len(fields)} fields; give as many")
+    if "t" in names:
+        raise LogError(f'{source}: "t" is the time of every log; it needs no entry')
     if len(set(names)) < len(names):
         raise LogError(f"{source} names a signal twice")
     fields, frame = _ordered(table, fields, source)

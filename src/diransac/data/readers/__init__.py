@@ -228,9 +228,11 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
         return _TEXTS[ending](_content(path, source), source, columns, repairs)
     if ending is not None:
         return _TABLES[ending](_content(path, source), source)
-    data = _content(path, source)
-    if data.startswith(crazyflie.MAGIC):
-        return CrazyflieRecording(data, source)
+    _check_content(path, source)
+    with path.open("rb") as file:
+        is_crazyflie = file.read(1) == crazyflie.MAGIC
+    if is_crazyflie:
+        return CrazyflieRecording(_content(path, source), source)
     raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}')
 
 
@@ -244,8 +246,8 @@ def _opened_folder(path: Path, source: str, repairs: Repairs) -> Table | Recordi
     if (path / "metadata.yaml").exists():
         return open_bag(path, source)
     files = sorted(x for x in path.iterdir() if x.name.lower().endswith(tuple(_TEXTS)))
-    if not files:
-        raise LogError(f"{source}: it is a folder without a bag or CSV files; name a file in it")
+    if len(files) < 2:  # one file is a log of its own
+        raise LogError(f"{source}: it is a folder without a bag or several CSV files; name a file in it")
     return joined([(x.name.split(".")[0], _content(x, f'log "{x}"')) for x in files], source, repairs)
 
 

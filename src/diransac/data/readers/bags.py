@@ -32,7 +32,7 @@ INSTALL = 'install them with pip install "diransac[logs]"'
 _LARGEST_CHUNK, _MAGIC_SIZE = 1 << 29, 8
 _MOST_FIELDS, _MOST_ELEMENTS = 2000, 64
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\]]*)\]")
-_OTHER_CLOCK = 3600.0
+_OTHER_CLOCK = 3600 * 10**9
 
 
 class Raw(NamedTuple):
@@ -98,30 +98,32 @@ class BagRecording:
             into = columns[raw.topic]
             message = _decoded(raw, self.source) if into.values or stamps == "header" else None
             into.add(raw.time, message, stamps)
-        self._check_clocks(columns)
-        return {topic: self._samples(topic, found) for topic, found in columns.items()}
+        origin = self._origin_of(columns)
+        return {topic: self._samples(topic, found, origin) for topic, found in columns.items()}
 
-    def _check_clocks(self, columns: Mapping[str, _Columns]) -> None:
-        """Raise LogError if only some topics have times of their own, and these are not those of the recorder."""
-        stamped = {topic: x for topic, x in columns.items() if x.is_stamped}
-        for topic, found in stamped.items():
+    def _origin_of(self, columns: Mapping[str, _Columns]) -> int:
+        """Origin of the times, ns: the recorder's first, or the messages' own where theirs is another clock.
+
+        Raises LogError: some topics have times of another clock, and others have not.
+        """
+        origin = self._origin or 0
+        far = {n: x for n, x in columns.items() if x.is_stamped and abs(x.stamps[0] - x.times[0]) > _OTHER_CLOCK}
+        near = [name for name, x in columns.items() if name not in far and x.times]
+        if far and near:
+            topic, found = next(iter(far.items()))
             late = abs(found.stamps[0] - found.times[0]) / 1e9
-            if late > _OTHER_CLOCK and len(stamped) < len(columns):
-                other = next(name for name in columns if name not in stamped)
-                raise LogError(
-                    f'{self.source}: messages of "{topic}" have times of another clock ({late:.3g} s from the '
-                    f'recorder\'s) and those of "{other}" have none; take the recorder\'s: time = "message"'
-                )
+            raise LogError(
+                f'{self.source}: messages of "{topic}" have times of another clock ({late:.3g} s from the recorder\'s) '
+                f'and those of "{near[0]}" have not; take the recorder\'s: time = "message"'
+            )
+        return min((min(x.stamps) for x in far.values()), default=origin)
 
-    def _samples(self, topic: str, found: _Columns) -> Samples:
+    def _samples(self, topic: str, found: _Columns, origin: int) -> Samples:
         for label, values in found.values.items():
             if label in found.missing and np.isnan(np.frombuffer(values)).all():
                 known = ", ".join(self._fields[topic])
                 raise LogError(f'{self.source}: topic "{topic}" has no field "{label}"; it has {known}')
         times = np.frombuffer(found.stamps if found.is_stamped else found.times, dtype=np.int64)
-        origin = self._origin or 0
-        if found.is_stamped and abs(int(times[0]) - found.times[0]) / 1e9 > _OTHER_CLOCK:
-            origin = int(times[0])
         columns = {label: np.frombuffer(x, dtype=np.float64) for label, x in found.values.items()}
         return Samples(seconds_since(origin, times), columns, dict.fromkeys(found.texts, "is not numeric"))
 
@@ -418,19 +420,18 @@ class RosBag:
 
     def __init__(self, path: Path, source: str) -> None:
         try:
-            from rosbags.highlevel import AnyReader, AnyReaderError
+            from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
             raise LogError(f"{source}: bags need the package rosbags; {INSTALL}") from error
         self.notes: list[str] = []
         self._source = source
-        self._errors = (AnyReaderError, *_DAMAGES, AttributeError, AssertionError)
+        self._open = partial(AnyReader, [path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         try:
-            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-            self._reader.open()
+            with self._open() as reader:
+                self.topics: Collection[str] | None = {x.topic for x in reader.connections if x.msgcount}
         except Exception as error:
             raise self._damaged(error) from error
-        self.topics: Collection[str] | None = {x.topic for x in self._reader.connections if x.msgcount}
 
     def _damaged(self, error: Exception) -> LogError:
         why = f"{type(error).__name__}: {' '.join(str(error).split())}"
@@ -438,16 +439,14 @@ class RosBag:
 
     def messages(self, wanted: Collection[str] | None) -> Iterator[Raw]:
         """Messages of some topics, in the order of their recording."""
-        chosen = [x for x in self._reader.connections if wanted is None or x.topic in wanted]
-        if not chosen:
-            return
-        messages = self._reader.messages(chosen)
-        while True:
-            try:
-                connection, time, data = next(messages)
-            except StopIteration:
-                return
-            except Exception as error:
-                raise self._damaged(error) from error
-            kind = connection.msgtype
-            yield Raw(connection.topic, time, partial(self._reader.deserialize, data, kind))
+        with self._open() as reader:
+            chosen = [x for x in reader.connections if wanted is None or x.topic in wanted]
+            messages = reader.messages(chosen) if chosen else iter(())
+            while True:
+                try:
+                    connection, time, data = next(messages)
+                except StopIteration:
+                    return
+                except Exception as error:
+                    raise self._damaged(error) from error
+                yield Raw(connection.topic, time, partial(reader.deserialize, data, connection.msgtype))

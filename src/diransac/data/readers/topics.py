@@ -82,6 +82,8 @@ def wired_topics(
     source, fields = recording.source, recording.fields
     entries, notes = ([], []) if mapping is None else mapping.chosen(fields, recording.elements, source)
     for name, path in rename.items():
+        if name == "t":
+            raise LogError(f'{source}: each topic has its own time; leave out "t", and give the signals')
         topic, label = find_field(path, fields, source)
         entries.append(MappedSignals((name,), (label,), topic))
     if not entries:
