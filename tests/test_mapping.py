@@ -1,6 +1,7 @@
 """Mapping files, repairs, and tables in other shapes: what is done, what is said, and what is refused."""
 
 import gzip
+import struct
 
 import h5py
 import numpy as np
@@ -283,6 +284,29 @@ def test_structures_and_groups_have_dotted_names(tmp_path):
         np.testing.assert_array_equal(log.time, T)
         first = "log.arm.q_1" if name == "b.mat" else "log.arm.q"
         np.testing.assert_array_equal(log[first], Q)
+
+
+def test_an_array_that_declares_more_than_it_holds_is_refused(tmp_path):
+    scipy.io.savemat(tmp_path / "a.mat", {"t": T})
+    data = bytearray((tmp_path / "a.mat").read_bytes())
+    data[128 + 32 : 128 + 40] = struct.pack("<ii", 1, 900_000_000)  # its dimensions
+    (tmp_path / "a.mat").write_bytes(data)
+    with pytest.raises(LogError, match=r'"t" has 300 numbers for the size \(1, 900000000\)'):
+        dr.read_log(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize("do_compression", [True, False])
+def test_mat_files_have_the_arrays_that_scipy_reads(tmp_path, do_compression):
+    kinds = {kind: np.arange(-3, 9).astype(kind) for kind in ("f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8")}
+    arrays = {"t": np.arange(12.0), "flag": np.arange(12) > 5, **{f"x_{kind}": x for kind, x in kinds.items()}}
+    others = {"q": np.arange(24.0).reshape(12, 2), "note": "text", "cells": np.array([1, "a"], dtype=object), "z": 1j}
+    scipy.io.savemat(tmp_path / "a.mat", arrays | others, do_compression=do_compression)
+    log = dr.read_log(tmp_path / "a.mat")
+    found = scipy.io.loadmat(tmp_path / "a.mat")
+    for name in arrays:
+        np.testing.assert_array_equal(log[name], found[name].ravel())
+    np.testing.assert_array_equal(np.column_stack([log["q_1"], log["q_2"]]), found["q"])
+    assert set(log.unusable) == {"note", "cells", "z"}
 
 
 def test_an_hdf5_file_that_declares_more_than_it_holds_is_refused(tmp_path):

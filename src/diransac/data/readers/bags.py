@@ -32,7 +32,7 @@ INSTALL = 'install them with pip install "diransac[logs]"'
 _LARGEST_CHUNK, _MAGIC_SIZE = 1 << 29, 8
 _MOST_FIELDS, _MOST_ELEMENTS = 2000, 64
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\]]*)\]")
-_OTHER_CLOCK = 3600 * 10**9
+_OTHER_CLOCK, _LATEST = 3600 * 10**9, 1 << 62
 
 
 class Raw(NamedTuple):
@@ -150,7 +150,7 @@ class _Columns:
 
     def add(self, time: int, message: Any, stamps: Stamps) -> None:
         """Append a message."""
-        self.times.append(time)
+        self.times.append(min(time, _LATEST))
         if stamps == "header":
             stamp = _stamp(message)
             if stamp:
