@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from diransac.data.filters import FilterSpecification
     from diransac.data.log import Log
     from diransac.data.preprocessing import despike, differentiate, rename, resample, scale, shift
-    from diransac.data.readers import read_log
+    from diransac.data.readers import read_log, read_topics
     from diransac.flight.closed_loop import fly, fly_batch, tracking_error
     from diransac.flight.corruption import CorruptedLog, corrupt
     from diransac.flight.noise import Noise
@@ -105,6 +105,7 @@ __all__ = [
     "plot_flight",
     "random_waypoints",
     "read_log",
+    "read_topics",
     "rename",
     "resample",
     "run_study",
@@ -125,7 +126,7 @@ _FOUND_IN = {
     "data.filters": ("FilterSpecification",),
     "data.log": ("Log",),
     "data.preprocessing": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
-    "data.readers": ("read_log",),
+    "data.readers": ("read_log", "read_topics"),
     "flight.closed_loop": ("fly", "fly_batch", "tracking_error"),
     "flight.corruption": ("CorruptedLog", "corrupt"),
     "flight.noise": ("Noise",),

@@ -39,7 +39,9 @@ from diransac.cli.options import (
 )
 from diransac.cli.outputs import PAGE, RESULT, check_ending, checked, staged
 from diransac.cli.robot_options import LimbResults, RobotOptions, of_limb
-from diransac.cli.views import CacheState, Equations, ModelList, compare_methods
+from diransac.cli.views import CacheState, Equations, ModelList, Recorded, compare_methods
+from diransac.data.readers import read_fields, read_topics
+from diransac.data.suggested_mapping import suggest_mapping
 from diransac.identification.identify import identify
 from diransac.identification.inspection import inspect
 from diransac.identification.methods import DEFAULT, METHODS
@@ -94,7 +96,7 @@ def _identify(
     strict: StrictFlag = False,
 ) -> None:
     """Identify the parameters of a model from one log, or from several logs of one machine."""
-    (chosen,), derived = search.methods([method]), derivation.arguments()
+    (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
     read = [*files, model_file(model), search.settings]
     checked([output, report], read)
     check_ending(output, RESULT)
@@ -135,7 +137,7 @@ def _compare(
 ) -> None:
     """Identify by every method from the same logs, side by side."""
     wanted = search.methods(known_methods(methods))
-    arguments = search.arguments() | derivation.arguments()
+    arguments = search.arguments() | preparation.completed(derivation).arguments()
     read = [*files, model_file(model), search.settings]
     checked([report], read)
     check_ending(report, PAGE)
@@ -161,7 +163,7 @@ def _validate(
     as_json: JsonFlag = False,
 ) -> None:
     """Predict other logs with an identified model, open loop."""
-    result = Result.load(model)
+    result, derivation = Result.load(model), preparation.completed(derivation)
     logs = [derivation.derive(log, result.model) for log in preparation.read_all(files)]
     screen.show(validate(result, logs, horizon), as_json)
 
@@ -180,7 +182,7 @@ def _cross_validate(
     as_json: JsonFlag = False,
 ) -> None:
     """Identify from all logs but one, and predict that one, for each in turn."""
-    (chosen,), derived = search.methods([method]), derivation.arguments()
+    (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
     plant, logs = robot.load(model), preparation.read_all(files)
     arguments = search.arguments() | derived | {"time_limit": search.time_limit}
     with screen.bar(f"{method}, leaving one log out") as progress:
@@ -199,7 +201,35 @@ def _inspect(
 ) -> None:
     """Show what a log holds, what is odd about it, and what is missing for a model."""
     plant = None if model is None else robot.load(model)
-    screen.show(inspect(preparation.read_uneven(file), plant), as_json)
+    topics = read_topics(file)
+    if topics is None or preparation.names_signals:
+        screen.show(inspect(preparation.read_uneven(file), plant), as_json)
+    else:
+        screen.show(Recorded.of(topics, plant), as_json)
+
+
+@app.command("map")
+@grouped
+def _map(
+    file: LogFile,
+    model: ModelName,
+    robot: RobotOptions,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", parser=output_file, metavar="FILE.toml", help="Where to write the mapping."),
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Write a first guess of a mapping from a log's topics or columns to a model's signals."""
+    with staged([output], [file, model_file(model)]) as (written,):
+        fields, elements = read_fields(file)
+        found = suggest_mapping(fields, elements, robot.load(model), f'log "{file}"')
+        if output is None and not as_json:
+            typer.echo(found.toml(), nl=False)
+            return
+        if output is not None:
+            written.write_text(found.toml(), encoding="utf-8")
+        screen.show(found, as_json)
 
 
 @app.command("simulate")
