@@ -91,7 +91,7 @@ def check_set_points(dataset: Dataset, names: Sequence[str]) -> None:
     Raises
     ------
     SettingsError
-        A log lacks a column, or has NaN in it; it is a measured signal; it is constant in all logs.
+        A log lacks a column, or samples of it; it is a measured signal; all columns are constant in all logs.
     """
     for name in names:
         if name in dataset.model.signals:
@@ -100,18 +100,14 @@ def check_set_points(dataset: Dataset, names: Sequence[str]) -> None:
             if name not in one.log:
                 found = ", ".join(one.log.names)
                 raise SettingsError(f'set_points names "{name}", which {one.log.source} lacks; it has {found}')
-        columns = _columns(dataset, [name])
-        for one, values in zip(dataset.segments, columns, strict=True):
-            missing = int((~np.isfinite(values)).sum())
+            missing = int((~np.isfinite(one.log[name][one.offset :])).sum())
             if missing:
+                where = f"{missing} rows of {one.log.source}"
                 raise SettingsError(
-                    f'set_points names "{name}", which lacks {missing} samples in {one.log.source}; give them, '
-                    "or leave it out"
+                    f'set_points names "{name}", which has no value in {where}; give it, or leave it out'
                 )
-        if all(np.ptp(values) == 0.0 for values in columns):
-            raise SettingsError(
-                f'set_points names "{name}", which is constant in {dataset.source} and moves nothing; leave it out'
-            )
+    if names and not any(np.ptp(x, axis=0).any() for x in _columns(dataset, names)):
+        raise SettingsError(f"set_points names {listed(names)}: constant in {dataset.source}; leave set_points out")
 
 
 def instrumented_estimate(
