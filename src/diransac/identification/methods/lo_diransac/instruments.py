@@ -24,7 +24,7 @@ instruments).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,7 +52,7 @@ __all__ = ["Instrumented", "check_set_points", "instrumented_estimate"]
 
 # First-stage F below which instruments are weak (Staiger, Stock 1997); levels of Hausman's test from which on the
 # estimate is the instrumented one, and from which on the difference widens the interval.
-_STRONG, _REJECTED, _SIGNIFICANT = 10.0, 1e-3, 0.05
+_STRONG, _REJECTED, _SIGNIFICANT = 10.0, 0.01, 0.05
 # Difference of two estimates over the parameter that is none.
 _NEGLIGIBLE, _TINY = 1e-3, 1e-300
 # Folds of a cross-fit; shortest time constant of the filter, samples, and longest, over the log.
@@ -69,12 +69,15 @@ class Instrumented:
     ----------
     result : ProjectedEstimate
         The plain one where Hausman's test does not reject it.
+    ambiguity : (n,) array
+        Difference of both estimates, where it is significant and the plain one stays; 0 elsewhere.
     tests : tuple of HausmanTest, optional
         One per parameter that the equations of motion depend on, and that is not on a bound.
     findings : tuple of Finding, optional
     """
 
     result: ProjectedEstimate
+    ambiguity: FloatArray
     tests: tuple[HausmanTest, ...] = ()
     findings: tuple[Finding, ...] = ()
 
@@ -151,10 +154,9 @@ def instrumented_estimate(
         result = plain if intervals.layout.violations(found.parameters) else found
     if result is plain:
         replaced = np.zeros(len(tests), bool)
-    wider = np.where(differs & ~replaced, contrast.instrumented - contrast.plain, 0.0)
-    result = replace(result, covariance=result.covariance + np.diag(np.square(wider)))
+    left = np.where(differs & ~replaced, contrast.instrumented - contrast.plain, 0.0)
     findings = tuple(_findings(tests, names, replaced))
-    return Instrumented(result, tuple(x for x in tests if x.outcome != "untested"), findings)
+    return Instrumented(result, left, tuple(x for x in tests if x.outcome != "untested"), findings)
 
 
 def _columns(dataset: Dataset, names: Sequence[str]) -> list[FloatArray]:
@@ -193,19 +195,21 @@ def _lagged(set_points: FloatArray, times: FloatArray) -> FloatArray:
     return np.hstack([set_points, *(acting_inputs(set_points, none, float(time), none) for time in times)])
 
 
-def _cross_fitted(columns: FloatArray, signals: FloatArray, folds: IntArray) -> FloatArray:
+def _cross_fitted(
+    columns: FloatArray, signals: FloatArray, folds: IntArray, ridges: FloatArray = _RIDGES
+) -> FloatArray:
     """Predictions of signals (N, m) from columns (N, k), each fold from the others.
 
     Of each signal, the ridge is the one that predicts it best.
     """
-    found = np.zeros((len(_RIDGES), *signals.shape))
+    found = np.zeros((len(ridges), *signals.shape))
     for fold in np.unique(folds):
         others = folds != fold
         centre, mean, scale = columns[others].mean(axis=0), signals[others].mean(axis=0), columns[others].std(axis=0)
         normal = (columns - centre) / np.where(scale > 0.0, scale, 1.0)
         U, S, Vt = np.linalg.svd(normal[others], full_matrices=False)
         scores, slopes = normal[~others] @ Vt.T, U.T @ (signals[others] - mean)
-        for predicted, ridge in zip(found, _RIDGES, strict=True):
+        for predicted, ridge in zip(found, ridges, strict=True):
             predicted[~others] = mean + scores @ ((S / (S**2 + ridge * S[0] ** 2))[:, None] * slopes)
     best = np.square(found - signals).sum(axis=1).argmin(axis=0)
     return np.stack([found[k, :, j] for j, k in enumerate(best)], axis=1)

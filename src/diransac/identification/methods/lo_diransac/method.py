@@ -242,7 +242,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
     notes, refined = best.notes, likeliest.refinement
     report(callback, "estimating parameters", 0.9)
-    instrumented = Instrumented(result)
+    instrumented = Instrumented(result, np.zeros(len(result.parameters)))
     if settings.set_points and settings.projection and not (likeliest.exact or best.impossible):
         instrumented = instrumented_estimate(
             intervals, refined.fit, result, dataset, settings.set_points, settings.prior_inflation
@@ -253,7 +253,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     parts, lacks = compared_parts(likeliest, result), None
     if settings.suggestions and not likeliest.exact:
         lacks = missing_terms(intervals, refined.fit, result, settings.candidate_terms)
-    ambiguity = _ambiguity(len(result.parameters), parts.changes, lacks)
+    ambiguity = _ambiguity(parts.changes, lacks, instrumented)
     checks = (
         *_checks(settings, intervals, motion, refined),
         *_checks_of_bounds(best),
@@ -345,9 +345,11 @@ def _parameters(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[P
     return (fitted_parameters(intervals, fit) if impossible else result), impossible
 
 
-def _ambiguity(n: int, changes: Sequence[Change], lacks: MissingTerms | None) -> FloatArray:
-    """Covariance of parameters that change during the log, or with terms that the model lacks."""
-    found = np.zeros((n, n)) if lacks is None else np.outer(lacks.change, lacks.change)
+def _ambiguity(changes: Sequence[Change], lacks: MissingTerms | None, instrumented: Instrumented) -> FloatArray:
+    """Covariance of parameters that change during the log, with terms that the model lacks, or with instruments."""
+    found = np.diag(np.square(instrumented.ambiguity))
+    if lacks is not None:
+        found += np.outer(lacks.change, lacks.change)
     for one in changes:
         found[one.index, one.index] += one.variance
     return found

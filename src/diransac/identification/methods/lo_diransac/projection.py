@@ -209,7 +209,7 @@ def projected_parameters(intervals: ShootingIntervals, fit: Fit, instruments: In
 
 
 def instrumented_contrast(intervals: ShootingIntervals, fit: Fit, instruments: Instruments) -> Contrast:
-    """Difference between instrumented and plain least squares of the same equations, with the same weights.
+    """Difference between instrumented and plain least squares of the same equations.
 
     Both are linear in the unmodelled forces, so that the covariance of their difference follows as that of an estimate
     does: from the fit, and by sums over neighbouring intervals.
@@ -483,11 +483,8 @@ def _gains(
     W, b, inertial = (means_of_windows(x, windows) for x in (rows.means[:, :, free], known, rows.inertial))
     sizes = np.diff(windows, append=len(intervals))
     occupied = np.logical_or.reduceat(intervals.occupied, windows)
-    weights = _robust_weights(WeakForm(W, b), occupied, _rms(inertial), reweighted)
-    if rows.instruments is None:
-        gains = least_squares_gains(W, weights)
-    else:
-        gains = _instrumented_gains(W, means_of_windows(rows.instruments[:, :, free], windows), weights)
+    Z = None if rows.instruments is None else means_of_windows(rows.instruments[:, :, free], windows)
+    gains = _gains_of(W, Z, _robust_weights(WeakForm(W, b), occupied, _rms(inertial), reweighted, Z))
     of_intervals = np.repeat(gains / sizes[:, None], sizes, axis=1)
     return np.repeat(of_intervals / intervals.length, intervals.length, axis=1), of_intervals
 
@@ -577,20 +574,30 @@ def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> list
     return [x.windows for x in tried]
 
 
-def _robust_weights(rows: WeakForm, occupied: BoolArray, scale: FloatArray, steps: int) -> FloatArray:
+def _robust_weights(
+    rows: WeakForm, occupied: BoolArray, scale: FloatArray, steps: int, instruments: FloatArray | None = None
+) -> FloatArray:
     """Square roots of the weights ``(W, n_v)``: of the equations by their scales, and of intervals by Cauchy's loss.
 
     Scales are inertial forces, so that unmodelled accelerations count by their share of the motion: an equation that is
     wrong throughout, as by the gain of its input, has its say on the parameters that it shares with others.  A gust of
-    a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.
+    a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.  With
+    instruments, residuals are those of the instrumented estimate: weights by other ones would be correlated with them.
     """
     loss = np.ones(rows.b.shape)
     for _ in range(steps):
-        gains = least_squares_gains(rows.W, loss / scale)
+        gains = _gains_of(rows.W, instruments, loss / scale)
         left = rows.b - rows.W @ np.einsum("pwi,wi->p", gains, rows.b)
         spread = 1.4826 * np.median(np.abs(left[occupied]), axis=0)
         loss = 1.0 / np.sqrt(1.0 + np.square(left / (_CAUCHY * np.maximum(spread, _ROUNDING * scale))))
     return np.asarray(loss / scale)
+
+
+def _gains_of(W: FloatArray, instruments: FloatArray | None, weights: FloatArray) -> FloatArray:
+    """Gains ``(n, N, r)`` of least squares, or with instruments."""
+    if instruments is None:
+        return least_squares_gains(W, weights)
+    return _instrumented_gains(W, instruments, weights)
 
 
 def least_squares_gains(W: FloatArray, weights: FloatArray) -> FloatArray:
