@@ -57,7 +57,7 @@ _ROOM = 1e-3
 _CHECKED_PER_SINE = 64
 """Rows of the check per period of the fastest sine, at least."""
 
-_BARRIERS = (3e-2, 1e-3, 1e-3)
+_BARRIERS = (3e-2, 1e-3, 1e-3, 1e-3)
 """First barrier parameters of the optimisation, and of those that follow with the times at which limits are exceeded.
 
 They are also the fractions of the limits that the first motions leave.
