@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from robot_intervals import JOINTS, LEG, TRUTH
 
 import diransac as dr
-from robot_intervals import JOINTS, LEG, TRUTH
 
 TORQUE, ENCODER, OUTLIERS = 0.05, 1e-4, 0.02
 """Standard deviations, N m and rad, and share of torques that are outliers of up to 5 N m."""

@@ -171,13 +171,17 @@ def designed(model: str, robot: RobotOptions, options: DesignOptions) -> Designs
     """
     from diransac.flight.planning import design_experiment
 
-    known, machine = numbers("--parameter", options.assignments or ()), UnsaturatedRobot({}, {}, None)
+    assumed, known = numbers("--parameter", options.assignments or ()), dict[str, float]()
     if _is_result(model):
         result = Result.load(model)
-        limbs, known = {"": result.model}, dict(result.parameters) | known
+        machine, known = UnsaturatedRobot({"": result.model}, {}, None), dict(result.parameters)
     else:
         machine = robot.load_unsaturated(model)
-        limbs = dict(machine.limbs)
+    limbs = machine.limbs
+    every = [n for own in limbs.values() for n in own.parameters]
+    for name in assumed:
+        if name not in every:
+            raise typer.BadParameter(f"--parameter: there is no {name!r}; there are {', '.join(every)}")
     given = {name: _range(name, text) for name, text in pairs("--limit", options.limits or ()).items()}
     limits = {**machine.limits, **_of_joints(given, limbs)}
     noise = _of_joints(numbers("--noise", options.noise or ()), limbs)
@@ -185,7 +189,7 @@ def designed(model: str, robot: RobotOptions, options: DesignOptions) -> Designs
     for limb, own in limbs.items():
         with screen.bar(f"design {limb}".rstrip()) as show:
             found[limb] = design_experiment(
-                options.plant(own, known),
+                options.plant(own, known | assumed),
                 limits=_own(limits, limbs, limb),
                 noise=_own(noise, limbs, limb) or None,
                 outputs=None if machine.drives is None else drive_forces(machine.drives, list(own.coordinates)),
