@@ -52,7 +52,9 @@ def hand(q, v, a, u, p):
 
 
 def designed(**changes):
-    return dr.design_experiment(ARM, **{"limits": LIMITS, "noise": NOISE, "outputs": hand, "duration": 8.0} | changes)
+    return dr.design_experiment(
+        ARM, **{"limits": LIMITS, "noise": NOISE, "outputs": hand, "duration": 8.0, "harmonics": 6} | changes
+    )
 
 
 @pytest.fixture(scope="module")

@@ -45,7 +45,7 @@ _BISECTIONS = 14
 _SAMPLES_PER_SINE = 12
 """Rows of the grid of the optimisation per period of the fastest sine."""
 
-_LAST_BARRIER, _BARRIER_FACTOR = 2e-5, 0.3
+_LAST_BARRIER, _BARRIER_FACTOR = 1e-4, 0.3
 """Last barrier parameter, and what it is reduced by: it is the change of the objective per active limit."""
 
 _MERIT_CHANGE = 1e-2
@@ -289,9 +289,9 @@ class Observed:
         sign, value = np.linalg.slogdet(self.information(x))
         return float(value) if sign > 0.0 else -np.inf
 
-    def standard_errors(self, x: FloatArray, repeats: float = 1.0) -> FloatArray:
+    def standard_errors(self, x: FloatArray) -> FloatArray:
         """Standard errors (n_p,) of least squares from the rows of a motion (3 n, K); infinite if not identifiable."""
-        information = repeats * self.information(x)
+        information = self.information(x)
         whole = np.full(len(self.identifiable), np.inf)
         if np.linalg.cond(information) < 1.0 / np.finfo(float).eps:
             variances = np.einsum("ij,jk,ik->i", self.directions, np.linalg.inv(information), self.directions)
@@ -326,7 +326,7 @@ class Search:
         """Why the search ended."""
         if self.out_of_time:
             return f"the time limit was reached after {self.taken} iterations"
-        return f"{'converged' if self.converged else 'stopped'} after {self.taken} iterations"
+        return f"converged after {self.taken} iterations" if self.converged else f"{self.taken} iterations, the limit"
 
     def goes_on(self) -> bool:
         """Count an iteration; False if there is none left."""
