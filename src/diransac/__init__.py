@@ -31,7 +31,16 @@ if TYPE_CHECKING:
     from diransac.flight.closed_loop import fly, fly_batch, tracking_error
     from diransac.flight.corruption import CorruptedLog, corrupt
     from diransac.flight.noise import Noise
-    from diransac.flight.planning import multisine, plan, random_waypoints, sine, square, star
+    from diransac.flight.planning import (
+        Experiment,
+        design_experiment,
+        multisine,
+        plan,
+        random_waypoints,
+        sine,
+        square,
+        star,
+    )
     from diransac.flight.trajectory import Trajectory
     from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
     from diransac.identification.estimate import Finding
@@ -58,6 +67,7 @@ __all__ = [
     "Diransac",
     "DiransacError",
     "Disturbance",
+    "Experiment",
     "FilterSpecification",
     "Finding",
     "IDiransac",
@@ -93,6 +103,7 @@ __all__ = [
     "Validation",
     "corrupt",
     "cross_validate",
+    "design_experiment",
     "despike",
     "differentiate",
     "fly",
@@ -130,7 +141,16 @@ _FOUND_IN = {
     "flight.closed_loop": ("fly", "fly_batch", "tracking_error"),
     "flight.corruption": ("CorruptedLog", "corrupt"),
     "flight.noise": ("Noise",),
-    "flight.planning": ("multisine", "plan", "random_waypoints", "sine", "square", "star"),
+    "flight.planning": (
+        "Experiment",
+        "design_experiment",
+        "multisine",
+        "plan",
+        "random_waypoints",
+        "sine",
+        "square",
+        "star",
+    ),
     "flight.trajectory": ("Trajectory",),
     "flight.tvlqr": ("Controller", "tvlqr", "tvlqr_batch"),
     "identification.estimate": ("Finding",),

@@ -9,6 +9,7 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import load_model, model_file
+from diransac.cli.design import DesignedModel, DesignOptions, designed, source_of
 from diransac.cli.flight_options import (
     FlightPicture,
     FlightSeed,
@@ -279,6 +280,25 @@ def _fly(
         if plot:
             test.flight.draw(picture)
         screen.show(test, as_json)
+
+
+@app.command("design")
+@grouped
+def _design(
+    model: DesignedModel,
+    robot: RobotOptions,
+    options: DesignOptions,
+    output: LogOutput,
+    plot: FlightPicture = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Design a motion within limits from which parameters are identified best, and predict their standard errors."""
+    with staged([output, plot], [source_of(model)]) as (written, picture):
+        designs = designed(model, robot, options)
+        designs.log(designs.motion).write(written)
+        if plot:
+            designs.draw(picture)
+        screen.show(designs, as_json)
 
 
 @app.command("export")

@@ -15,7 +15,7 @@ from diransac.model.library.servo_axis import servo_axis
 from diransac.model.library.single_track_vehicle import single_track_vehicle
 from diransac.model.library.underwater_vehicle import underwater_vehicle
 from diransac.model.model import Model
-from diransac.model.robots import robot
+from diransac.model.robots import drive_forces, robot, robot_limits
 
 __all__ = [
     "BLADE_FLAPPING",
@@ -26,11 +26,13 @@ __all__ = [
     "dc_motor",
     "differential_drive",
     "double_pendulum",
+    "drive_forces",
     "extended_rotorcraft",
     "flexible_joint",
     "planar_rotorcraft",
     "quadrotor",
     "robot",
+    "robot_limits",
     "servo_axis",
     "single_track_vehicle",
     "underwater_vehicle",
