@@ -27,7 +27,7 @@ from diransac.text_table import aligned, telling_digits
 
 __all__ = ["MARKS", "Result"]
 
-_FORMAT = 6
+_FORMAT = 7
 _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
 MARKS = {"bad": "!", "care": "·"}
@@ -426,8 +426,15 @@ class Result:
         ResultError
             The data are of another format, or damaged.
         """
-        if not isinstance(data, Mapping) or data.get("format") != _FORMAT:
-            raise ResultError(f"this is no diransac result of format {_FORMAT}; identify again")
+        found = data.get("format") if isinstance(data, Mapping) else None
+        if type(found) is not int:
+            raise ResultError("this is no result of diransac; give a file that identify wrote")
+        if found != _FORMAT:
+            writer = "an earlier version" if found < _FORMAT else "a later version"
+            raise ResultError(
+                f"the result has format {found}, of {writer} of diransac; this one reads {_FORMAT}. Identify again"
+            )
+        assert isinstance(data, Mapping)
         try:
             return cls._from_checked(data)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
