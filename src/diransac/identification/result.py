@@ -23,6 +23,7 @@ from diransac.identification.settings import Settings
 from diransac.identification.suggestions import Suggestion
 from diransac.identification.uncertainty import student_quantile, students_draws
 from diransac.model import Model
+from diransac.plain_data import json_data, read_text
 from diransac.text_table import aligned, telling_digits
 
 __all__ = ["MARKS", "Result"]
@@ -437,8 +438,11 @@ class Result:
         assert isinstance(data, Mapping)
         try:
             return cls._from_checked(data)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ResultError(f"the result is damaged: {type(error).__name__} at {error}; identify again") from error
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
+            reason = str(error).partition("\n")[0]
+            raise ResultError(
+                f"the result is damaged: {type(error).__name__} at {reason:.200}; identify again"
+            ) from error
 
     @classmethod
     def _from_checked(cls, data: Mapping[str, Any]) -> Result:
@@ -487,11 +491,13 @@ class Result:
             There is no such file, or it does not contain a result; the message names the file.
         """
         try:
-            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
+            data = json_data(read_text(path))
         except OSError as error:
             raise ResultError(f"{path}: cannot be read: {error.strerror}") from error
-        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        except ValueError as error:
             raise ResultError(f"{path}: is no JSON: {error}") from error
+        try:
+            return cls.from_dict(data)
         except DiransacError as error:
             raise ResultError(f"{path}: {error}") from error
 
