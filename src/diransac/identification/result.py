@@ -456,8 +456,15 @@ class Result:
         masks = [] if estimate.diagnosis is None else estimate.diagnosis.outliers.values()
         if any(len(mask) != n_rows for mask in (evaluation.inliers, *masks)):
             raise ValueError(f"a mask of other than {n_rows} rows")
+        if not 1 <= estimate.degrees_of_freedom <= 2**53:
+            raise ValueError(f"{estimate.degrees_of_freedom} degrees of freedom")
+        for log in plain.logs:
+            if not (log.n_rows > 0 and 0.0 < log.dt < np.inf and np.isfinite(log.start)):
+                raise ValueError(f"a log of {log.n_rows} rows, {log.dt} s apart")
         settings = Settings.from_dict(data["settings"])
-        return cls(model, estimate=estimate, evaluation=evaluation, settings=settings, **vars(plain))
+        found = cls(model, estimate=estimate, evaluation=evaluation, settings=settings, **vars(plain))
+        found._derived(), str(found)  # fail where names and figures do not fit together
+        return found
 
     def save(self, path: str | Path) -> None:
         """Write the result as JSON, atomically.

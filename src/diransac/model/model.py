@@ -639,6 +639,8 @@ class Model:
         model = cls.__new__(cls)
         if data["checksum"] != _checksum({k: x for k, x in data.items() if k != "checksum"}):
             raise ResultError("the stored model is damaged: its checksum does not match; identify again")
+        if not isinstance(data["name"], str) or not isinstance(data["description"], str):
+            raise TypeError("name or description")
         parameters = {n: _parameter_from_dict(x) for n, x in data["parameters"].items()}
         units = (data["coordinates"], data["inputs"], parameters, data["velocities"], data.get("first_order", {}))
         model._name_signals(data["name"], *units, data["description"], data.get("sensors", {}))
@@ -690,11 +692,14 @@ def _parameter_to_dict(parameter: Parameter) -> dict[str, Any]:
 
 
 def _parameter_from_dict(data: Mapping[str, Any]) -> Parameter:
-    lower = -np.inf if data["lower"] is None else data["lower"]
-    upper = np.inf if data["upper"] is None else data["upper"]
-    own_values, nominal = bool(data.get("per_log", False)), data.get("value")
+    """Raises KeyError, TypeError, ValueError, ModelError: the data are not those of a parameter."""
+    unit, positive, own_values, nominal = data["unit"], data["positive"], data.get("per_log", False), data.get("value")
+    if not isinstance(unit, str) or not isinstance(positive, bool) or not isinstance(own_values, bool):
+        raise TypeError(f"parameter {data!r:.60}")
+    lower = -np.inf if data["lower"] is None else float(data["lower"])
+    upper = np.inf if data["upper"] is None else float(data["upper"])
     combination = tuple((str(name), float(weight)) for name, weight in data.get("combination", ()))
-    return Parameter(data["unit"], lower, upper, data["positive"], own_values, nominal, combination)
+    return Parameter(unit, lower, upper, positive, own_values, None if nominal is None else float(nominal), combination)
 
 
 def _checksum(data: Mapping[str, Any]) -> str:
