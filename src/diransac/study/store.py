@@ -289,7 +289,7 @@ def _reported(path: Path) -> Iterator[None]:
     """Raises StudyError in place of SQLite's errors."""
     try:
         yield
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeError) as error:
         raise StudyError(f'store "{path}": {error}; give a file that diransac study made, or a new one') from error
 
 

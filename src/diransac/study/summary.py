@@ -264,7 +264,9 @@ class _Table:
         self.ran[self._where] = True
 
     def column(self, name: str) -> FloatArray:
-        """A column of numbers; NaN for null."""
+        """A column of numbers; NaN for null.  Raises KeyError: there is none of that name."""
+        if name not in self._rows.columns:
+            raise KeyError(name)
         found = np.full(self.ran.shape, np.nan)
         found[self._where] = self._rows[name].to_numpy()
         return found
