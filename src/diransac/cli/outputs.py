@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from diransac.atomic import draft
-from diransac.errors import ResultError
+from diransac.errors import DiransacError, ResultError
 
 __all__ = ["checked", "staged"]
 
@@ -64,12 +64,28 @@ def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -
     targets = checked(outputs, inputs)
     with ExitStack() as folders:
         drafts = [Path() if path is None else _made(path, folders) for path in targets]
-        yield drafts
+        with _naming(dict(zip(drafts, outputs, strict=True))):
+            yield drafts
         for written, target in zip(drafts, targets, strict=True):
             if target is not None:
                 if target.exists():
                     written.chmod(target.stat().st_mode)
                 written.replace(target)
+
+
+@contextmanager
+def _naming(outputs: Mapping[Path, Path | None]) -> Iterator[None]:
+    """Context whose errors name the outputs in place of their drafts."""
+    try:
+        yield
+    except DiransacError as error:
+        message = str(error)
+        for written, output in outputs.items():
+            if output is not None:
+                message = message.replace(str(written), str(output))
+        if message == str(error):
+            raise
+        raise type(error)(message) from error
 
 
 def _made(target: Path, folders: ExitStack) -> Path:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from diransac.errors import SettingsError
+from diransac.errors import SettingsError, StudyError
 from diransac.plain_data import json_data
 from diransac.study.store import Store, damage, quoted, whole, word
 from diransac.text_table import aligned
@@ -141,19 +141,24 @@ def export(store: str | Path, path: str | Path, kind: str) -> None:
     Raises
     ------
     StudyError
-        There is no such store.
+        There is no such store, or the file cannot be written.
     SettingsError
         Another kind.
     """
     import polars as pl
 
     frame = read(store)
+    memory = io.BytesIO()  # Polars' own errors of a full disk are no OSError
     if kind == "parquet":
-        frame.write_parquet(path)
+        frame.write_parquet(memory)
     elif kind == "csv":
-        frame.with_columns(pl.col("seconds").struct.json_encode()).write_csv(path)
+        frame.with_columns(pl.col("seconds").struct.json_encode()).write_csv(memory)
     else:
         raise SettingsError(f'there is no kind "{kind}"; there are parquet, csv')
+    try:
+        Path(path).write_bytes(memory.getbuffer())
+    except OSError as error:
+        raise StudyError(f'"{path}" cannot be written: {error.strerror}') from error
 
 
 # Progress --------------------------------------------------------------------------------------------------
