@@ -23,11 +23,12 @@ from diransac.identification.settings import Settings
 from diransac.identification.suggestions import Suggestion
 from diransac.identification.uncertainty import student_quantile, students_draws
 from diransac.model import Model
+from diransac.plain_data import json_data, read_text
 from diransac.text_table import aligned, telling_digits
 
 __all__ = ["MARKS", "Result"]
 
-_FORMAT = 6
+_FORMAT = 7
 _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
 MARKS = {"bad": "!", "care": "·"}
@@ -426,12 +427,22 @@ class Result:
         ResultError
             The data are of another format, or damaged.
         """
-        if not isinstance(data, Mapping) or data.get("format") != _FORMAT:
-            raise ResultError(f"this is no diransac result of format {_FORMAT}; identify again")
+        found = data.get("format") if isinstance(data, Mapping) else None
+        if type(found) is not int:
+            raise ResultError("this is no result of diransac; give a file that identify wrote")
+        if found != _FORMAT:
+            writer = "an earlier version" if found < _FORMAT else "a later version"
+            raise ResultError(
+                f"the result has format {found}, of {writer} of diransac; this one reads {_FORMAT}. Identify again"
+            )
+        assert isinstance(data, Mapping)
         try:
             return cls._from_checked(data)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ResultError(f"the result is damaged: {type(error).__name__} at {error}; identify again") from error
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
+            reason = str(error).partition("\n")[0]
+            raise ResultError(
+                f"the result is damaged: {type(error).__name__} at {reason:.200}; identify again"
+            ) from error
 
     @classmethod
     def _from_checked(cls, data: Mapping[str, Any]) -> Result:
@@ -445,8 +456,15 @@ class Result:
         masks = [] if estimate.diagnosis is None else estimate.diagnosis.outliers.values()
         if any(len(mask) != n_rows for mask in (evaluation.inliers, *masks)):
             raise ValueError(f"a mask of other than {n_rows} rows")
+        if not 1 <= estimate.degrees_of_freedom <= 2**53:
+            raise ValueError(f"{estimate.degrees_of_freedom} degrees of freedom")
+        for log in plain.logs:
+            if not (log.n_rows > 0 and 0.0 < log.dt < np.inf and np.isfinite(log.start)):
+                raise ValueError(f"a log of {log.n_rows} rows, {log.dt} s apart")
         settings = Settings.from_dict(data["settings"])
-        return cls(model, estimate=estimate, evaluation=evaluation, settings=settings, **vars(plain))
+        found = cls(model, estimate=estimate, evaluation=evaluation, settings=settings, **vars(plain))
+        found._derived(), str(found)  # fail where names and figures do not fit together
+        return found
 
     def save(self, path: str | Path) -> None:
         """Write the result as JSON, atomically.
@@ -480,11 +498,13 @@ class Result:
             There is no such file, or it does not contain a result; the message names the file.
         """
         try:
-            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
+            data = json_data(read_text(path))
         except OSError as error:
             raise ResultError(f"{path}: cannot be read: {error.strerror}") from error
-        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        except ValueError as error:
             raise ResultError(f"{path}: is no JSON: {error}") from error
+        try:
+            return cls.from_dict(data)
         except DiransacError as error:
             raise ResultError(f"{path}: {error}") from error
 
