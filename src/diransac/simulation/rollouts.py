@@ -163,14 +163,21 @@ class Rollouts(Simulator):
 
     def errors(self, batch: RolloutBatch, measurements: Measurements, *, threads: int = 1) -> FloatArray:
         """Simulated less measured, (n_lanes, n_rows, n_s), NaN from a divergence on; see `Simulator.errors`."""
+        return self.errors_and_ends(batch, measurements, threads=threads)[0]
+
+    def errors_and_ends(
+        self, batch: RolloutBatch, measurements: Measurements, *, threads: int = 1
+    ) -> tuple[FloatArray, FloatArray]:
+        """Errors, and the states (n_lanes, n_x) one row after the last; see `Simulator.errors_and_ends`."""
         from diransac.simulation.compiler.outputs import ErrorOutput
 
         n_signals = len(self.signals)
         lanes = self._lanes(batch)
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_signals))
+        final = aligned((lanes.n_padded // LANES, len(self._model.state), LANES))
         values = arranged_measurements(lanes, n_signals, measurements.values, measurements.valid)
-        self._run(ErrorOutput, batch, lanes, {**values, "series": series}, threads)
-        return series
+        self._run(ErrorOutput, batch, lanes, {**values, "series": series, "final": final}, threads)
+        return series, _by_lane(final, lanes.n_lanes)
 
     def trajectories(self, batch: RolloutBatch, *, threads: int = 1) -> FloatArray:
         """All signals of the model, (n_lanes, n_rows, n_signals): states, accelerations; NaN from a divergence on."""
@@ -360,18 +367,18 @@ def _unpacked(sensitivities: Sensitivities, n_lanes: int, sums: FloatArray, fina
     final : (n_blocks, n_x + n_entries, 8)
         State, then its derivatives.
     """
-    sums, final = (
-        array.swapaxes(1, 2).reshape(len(array) * LANES, array.shape[1])[:n_lanes] for array in (sums, final)
-    )
+    sums, final = _by_lane(sums, n_lanes), _by_lane(final, n_lanes)
     n_x, n_z = sensitivities.initial.shape
-    place = np.argsort(list(chain(*sensitivities.groups)))
-    upper = np.triu_indices(n_z)
-    pair = np.empty((n_z, n_z), int)
-    pair[upper] = pair[upper[::-1]] = np.arange(1 + n_z, sums.shape[1])
-    cost, gradient = sums[:, 0].copy(), sums[:, 1 + place]
-    normal_matrix = sums[:, pair[np.ix_(place, place)]]
+    cost, gradient = sums[:, 0].copy(), np.take(sums, 1 + sensitivities.places, axis=1)
+    normal_matrix = np.take(sums, 1 + n_z + sensitivities.pairs, axis=1)
     diverged = np.isinf(cost)
     slopes = sensitivities.matrix(final[:, n_x:])
-    slopes[diverged] = np.nan
+    if diverged.any():
+        slopes[diverged] = np.nan
     states = final[:, :n_x].copy()
     return GaussNewtonBatch(sensitivities.unknowns, cost, gradient, normal_matrix, states, slopes, diverged)
+
+
+def _by_lane(blocks: FloatArray, n_lanes: int) -> FloatArray:
+    """Values ``(n_lanes, n)`` from the blocks ``(n_blocks, n, 8)`` of a time loop, without lanes that fill the last."""
+    return blocks.swapaxes(1, 2).reshape(len(blocks) * LANES, blocks.shape[1])[:n_lanes]

@@ -139,10 +139,14 @@ def arranged_weights(
     w = np.asarray(weights, np.float64)
     w = np.broadcast_to(w, (lanes.n_log, n_signals)) if w.shape == (n_signals,) else w
     w = checked_array("weights", w, (lanes.n_log, n_signals))[lanes.window]
-    if not (np.isfinite(w).all() and (w >= 0).all()):
+    if w.size and not (w.min() >= 0.0 and w.max() < np.inf):
         raise SettingsError("weights hold a number that is negative or not finite.")
-    y = checked_array("measurements.values", values, (lanes.n_log, n_signals))[lanes.window]
-    w = np.where(valid[lanes.window, None], w, 0.0)
+    y, counts = checked_array("measurements.values", values, (lanes.n_log, n_signals))[lanes.window], valid[lanes.window]
+    w = w if counts.all() else np.where(counts[:, None], w, 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        total = y.sum()
+    if np.isfinite(total):  # as is then every term
+        return {"measured": y, "weights": w}
     finite = np.isfinite(y)
     if not finite[w > 0].all():
         raise SettingsError(

@@ -214,15 +214,15 @@ class _Scores:
         """By the difference of simulations, which end elsewhere, too."""
         step, fit = _STEPS[kind.what], self.fit
         moved = self.intervals.with_input_error(kind, step)
-        own = (with_residuals(moved, fit).residuals - fit.residuals) / step
-        ends = [x.ends(fit.shared, fit.x, fit.d) for x in (self.intervals, moved)]
-        return self._slope(kind, np.where(self.intervals.known, own, 0.0), (ends[0] - ends[1]) / step)
+        late = with_residuals(moved, fit)
+        own, jumps = late.residuals - fit.residuals, late.jumps(moved) - fit.jumps(self.intervals)
+        return self._slope(kind, np.where(self.intervals.known, own / step, 0.0), jumps / step)
 
     def _slope(self, kind: ErrorKind, own: FloatArray, jumps: FloatArray) -> _Slope:
         """Derivatives, from those of the residuals and of the jumps."""
         at = self.at
         # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
-        z, s = data_gradient(replace(self.intervals, measured=self.intervals.measured - own), self.fit, self.weights)
+        z, s = data_gradient(self.intervals, self.fit, self.weights, self.intervals.measured - own)
         of_z, of_s = at.by_jumps(self.intervals, jumps)
         of_z, of_s = of_z + at.data_z - z, of_s + (at.data_s - s).sum(axis=0)
         score = (self.weights * own * self.fit.residuals).sum() + (at.precision * jumps * at.jumps).sum()
