@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -176,6 +177,7 @@ def students_draws(
     return kept[:, :n]
 
 
+@lru_cache(maxsize=64)
 def student_quantile(degrees_of_freedom: float, probability: float) -> float:
     """Quantile of Student's t distribution, accurate to about twelve digits.
 

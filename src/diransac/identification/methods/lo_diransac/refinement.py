@@ -444,7 +444,7 @@ def _update(
     noise = fit.noise.updated(fit.residuals, intervals.known, inlying, outliers=settings.outliers)
     if robust:
         squares = len(fit.d) * np.square(1.4826 * np.median(np.abs(fit.d), axis=0))
-        variance = np.einsum("wii->wi", solved.var_z)[:, n_x:]
+        variance = solved.var_z[:, n_x:]
         determined = (1.0 - variance / np.square(fit.tau)).clip(0.0).sum(axis=0)
         expected, rho = _GUARDED * prior.tau, fit.rho
     else:
@@ -463,8 +463,7 @@ def _process(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Squares of the innovations in the unit of tau, the number of those that the logs determine, and the new rho."""
     n_x, linked = fit.x.shape[1], intervals.linked[:, None]
-    variance = np.einsum("wii->wi", solved.var_z)[:, n_x:]
-    common = np.einsum("wii->wi", solved.var_below)[:, n_x:]
+    variance, common = solved.var_z[:, n_x:], solved.var_below[:, n_x:]
     spread = variance.copy()
     spread[1:] += np.where(linked, fit.rho * (fit.rho * variance[:-1] - 2.0 * common), 0.0)
     determined = (1.0 - spread / np.square(innovation_std(intervals, fit))).sum(axis=0).clip(0.0)
@@ -506,7 +505,7 @@ def _continuity(intervals: ShootingIntervals, tau: FloatArray) -> FloatArray:
 
 def _unbroken(fit: Fit, solved: Factored) -> FloatArray:
     """Jumps ``(n_x,)`` that are negligible beside the uncertainty of the states, over all intervals together."""
-    variance = np.einsum("wii->wi", solved.var_z)[:, : fit.x.shape[1]]
+    variance = solved.var_z[:, : fit.x.shape[1]]
     return np.asarray(_UNBROKEN * np.sqrt(np.median(variance, axis=0).clip(0.0) / len(fit.x)))
 
 
