@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from diransac.cli.arguments import is_description, load_model, names, pairs
 from diransac.identification.result import Result
 from diransac.model import Model
-from diransac.model.library import robot
 from diransac.model.parts import independent_parts
-from diransac.model.robots import Actuation, MotorCurrents, PositionControl
 from diransac.text_table import aligned, telling_digits
+
+if TYPE_CHECKING:
+    from diransac.model.robots import Actuation, MotorCurrents, PositionControl
 
 __all__ = ["LimbResults", "RobotOptions", "of_limb"]
 
@@ -60,6 +61,8 @@ class RobotOptions:
         Raises typer.BadParameter: options for a robot belong to no other model; ModelError: as `load_model`.
         """
         if is_description(model):
+            from diransac.model.library import robot
+
             return robot(model, **self._arguments())
         for given in (x.name for x in fields(self) if getattr(self, x.name) is not None):
             raise typer.BadParameter(f"--{given} is for the description of a robot (.xml, .urdf)")
@@ -87,6 +90,8 @@ class RobotOptions:
     def _actuation(self) -> Actuation | None:
         if self.control is not None and self.motor is not None:
             raise typer.BadParameter("--control and --motor are two kinds of drives; give one")
+        from diransac.model.robots import MotorCurrents, PositionControl
+
         if self.control is not None:
             return _made(PositionControl, "--control", self.control)
         return None if self.motor is None else _made(MotorCurrents, "--motor", self.motor)
@@ -98,7 +103,7 @@ def _made(kind: type[PositionControl | MotorCurrents], option: str, text: str) -
     for key in given:
         if key not in known:
             raise typer.BadParameter(f"{option}: there is no {key!r}; there are {', '.join(known)}")
-    needed = "kp" if kind is PositionControl else "constant"
+    needed = "kp" if option == "--control" else "constant"
     if needed not in given:
         raise typer.BadParameter(f"{option}: {needed} is missing; give {needed}=number")
     try:

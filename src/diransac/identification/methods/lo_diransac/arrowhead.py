@@ -58,12 +58,13 @@ class Factored:
     @cached_property
     def var_z(self) -> FloatArray:
         """Diagonal ``(W, k)`` of the inverse: variances."""
-        return np.einsum("wii->wi", self.alone) + np.einsum("wim,wim->wi", self._moved, self.gain)
+        return np.asarray(np.einsum("wii->wi", self.alone) + np.einsum("wim,wim->wi", self._moved, self.gain))
 
     @cached_property
     def var_below(self) -> FloatArray:
-        """Diagonals ``(W - 1, k)`` of the blocks of the inverse below its diagonal: covariances with the window before."""
-        return np.einsum("wii->wi", self.alone_below) + np.einsum("wim,wim->wi", self._moved[1:], self.gain[:-1])
+        """Diagonals ``(W - 1, k)`` of the inverse's blocks below the diagonal: covariances with the window before."""
+        own = np.einsum("wii->wi", self.alone_below)
+        return np.asarray(own + np.einsum("wim,wim->wi", self._moved[1:], self.gain[:-1]))
 
     @cached_property
     def _moved(self) -> FloatArray:

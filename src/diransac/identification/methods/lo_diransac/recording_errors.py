@@ -17,7 +17,7 @@ Rao 1948 (score test); Furgale, Rehder, Siegwart 2013 (delays of sensors).
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -197,8 +197,9 @@ class _Slope:
     @classmethod
     def sum(cls, kind: ErrorKind, parts: Sequence[_Slope]) -> _Slope:
         """Derivatives with respect to errors of the same size, as one."""
-        total = (np.sum([getattr(x, name) for x in parts], axis=0) for name in ("sensitivity", "jumps", "of_z", "of_s"))
-        return cls(kind, *total, sum(x.score for x in parts))
+        names = ("sensitivity", "jumps", "of_z", "of_s")
+        total: dict[str, FloatArray] = {n: np.sum([getattr(x, n) for x in parts], axis=0) for n in names}
+        return cls(kind=kind, **total, score=sum(x.score for x in parts))
 
 
 class _Scores:

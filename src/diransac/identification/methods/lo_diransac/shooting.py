@@ -381,9 +381,7 @@ class ShootingIntervals:
         """Model parameters ``(n, n_p)`` of the logs ``(n,)`` from a vector; the vector itself if all are shared."""
         return values if self.layout.is_shared else values[self.layout.index[logs]]
 
-    def batch(
-        self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray | None = None
-    ) -> RolloutBatch:
+    def batch(self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray | None = None) -> RolloutBatch:
         """Lanes of all or chosen intervals.
 
         Parameters

@@ -16,10 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
@@ -42,6 +43,8 @@ __all__ = [
     "split_signals",
     "stuck_rows",
 ]
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 _DEGREE, _STEPS = 4, 12
 _SHRINK = 0.3
@@ -229,7 +232,7 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
     if model.kinematics is not None:
         rates = np.zeros((len(measured), model.n_q))
         for columns in _alike(chains[: model.n_q], smoother.rows.size):
-            parts = smoother.smoothed(*(x[:, columns] for x in (measured, known, centre)), derivatives=1)
+            parts = smoother.smoothed(measured[:, columns], known[:, columns], centre[:, columns], derivatives=1)
             signals[:, columns], rates[:, columns[:, 0]] = parts[:, :, :1], parts[:, :, 1]
         _project(model, signals, rates, known)
         n_x = model.n_q + len(model.velocities_of_motion)
@@ -239,14 +242,14 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
             measured[:, lacking], known[:, lacking], centre[:, lacking] = inferred, ~log.gaps[:, None], inferred
         chains = chains[model.n_q :]
     for columns in _alike(chains, smoother.rows.size):
-        signals[:, columns] = smoother.smoothed(*(x[:, columns] for x in (measured, known, centre)))
+        signals[:, columns] = smoother.smoothed(measured[:, columns], known[:, columns], centre[:, columns])
     for chain in chains:
         _integrate(signals, known, chain, dt)
     for k in range(_n_motion(model), len(model.signals)):
         near = _near(known[:, k], half)
         signals[:, [k]] = np.nan
         if near.any():
-            smoothed = smoother.smoothed(*(x[:, [[k]]] for x in (measured, known, centre)))
+            smoothed = smoother.smoothed(measured[:, [[k]]], known[:, [[k]]], centre[:, [[k]]])
             signals[near, k] = smoothed[near, 0, 0]
     rows, seen = np.arange(len(signals)), np.flatnonzero(~log.gaps)
     return signals if log.gaps.all() else np.column_stack([np.interp(rows, seen, x[seen]) for x in signals.T])
@@ -333,9 +336,7 @@ class _Smoother:
         blend = np.maximum(0.0, 1.0 - np.abs(offsets) / (step + 1.0))
         return cls(rows, inside, _basis(offsets / half, half * dt), blend)
 
-    def smoothed(
-        self, values: FloatArray, known: BoolArray, centre: FloatArray, derivatives: int = 0
-    ) -> FloatArray:
+    def smoothed(self, values: FloatArray, known: BoolArray, centre: FloatArray, derivatives: int = 0) -> FloatArray:
         """Signals ``(N, C, c + derivatives)`` of C chains of c signals, and further derivatives of their last."""
         (N, _, c), n = values.shape, values.shape[2] + derivatives
         inside, at = self.inside, self.rows[self.inside]
@@ -405,7 +406,7 @@ def _prediction_error(model: Model, logs: Sequence[Samples], dt: float, half: in
     return loss
 
 
-def _windows(values: FloatArray, rows: IntArray) -> FloatArray:
+def _windows(values: NDArray[Scalar], rows: IntArray) -> NDArray[Scalar]:
     """Values ``(C, K, n_t, c)`` of chains ``(N, C, c)`` in the rows ``(K, n_t)`` of each window."""
     return np.ascontiguousarray(np.moveaxis(values, 1, 0))[:, rows]
 
@@ -515,7 +516,7 @@ def _coefficients(
         coefficients = np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d
         residuals = values - (coefficients @ flat.T).reshape(shape)
         scale = np.maximum(np.maximum(_scale(residuals.reshape(known.shape), known), floor), _SHRINK * scale)
-    return coefficients.reshape(C, K, -1)
+    return np.asarray(coefficients.reshape(C, K, -1))
 
 
 def _scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
