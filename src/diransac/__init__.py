@@ -21,7 +21,6 @@ from diransac.errors import (
 from diransac.model import Disturbance, Model, Parameter, Plant, Sensor, sensors
 from diransac.model import library as models
 from diransac.model.parts import independent_parts
-from diransac.model.robots import JointTorques, MotorCurrents, PositionControl
 
 if TYPE_CHECKING:
     from diransac.data.filters import FilterSpecification
@@ -55,6 +54,7 @@ if TYPE_CHECKING:
     from diransac.identification.settings import Settings
     from diransac.identification.suggestions import Suggestion
     from diransac.identification.validation import CrossValidation, Validation, cross_validate, validate
+    from diransac.model.robots import JointTorques, MotorCurrents, PositionControl
     from diransac.plots import plot_flight
     from diransac.report import write_report
     from diransac.study import Study, run_study
@@ -165,6 +165,7 @@ _FOUND_IN = {
     "identification.settings": ("Settings",),
     "identification.suggestions": ("Suggestion",),
     "identification.validation": ("CrossValidation", "Validation", "cross_validate", "validate"),
+    "model.robots": ("JointTorques", "MotorCurrents", "PositionControl"),
     "plots": ("plot_flight",),
     "report": ("write_report",),
     "study": ("Study", "run_study"),

@@ -5,21 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
 from diransac.cli.arguments import is_description, load_model, names, pairs
 from diransac.identification.result import Result
 from diransac.model import Model
-from diransac.model.library import robot, robot_limits
 from diransac.model.parts import independent_parts
-from diransac.model.robots import Actuation, JointTorques, MotorCurrents, PositionControl
 from diransac.text_table import aligned, telling_digits
+
+if TYPE_CHECKING:
+    from diransac.model.robots import Actuation, MotorCurrents, PositionControl
 
 __all__ = ["LimbResults", "RobotOptions", "UnsaturatedRobot", "of_limb"]
 
-Drives = TypeVar("Drives", PositionControl, MotorCurrents)
+Drives = TypeVar("Drives", "PositionControl", "MotorCurrents")
 
 _NUMBERS = {"kp", "kd", "limit", "constant", "gear"}
 
@@ -81,6 +82,8 @@ class RobotOptions:
         Raises typer.BadParameter: options for a robot belong to no other model; ModelError: as `load_model`.
         """
         if is_description(model):
+            from diransac.model.library import robot
+
             return robot(model, **self._arguments())
         for given in (x.name for x in fields(self) if getattr(self, x.name) is not None):
             raise typer.BadParameter(f"--{given} is for the description of a robot (.xml, .urdf)")
@@ -99,6 +102,9 @@ class RobotOptions:
         """
         if not is_description(model):
             return UnsaturatedRobot({"": self.load(model)}, {}, None)
+        from diransac.model.library import robot, robot_limits
+        from diransac.model.robots import JointTorques
+
         arguments = self._arguments()
         given = self._actuation() or JointTorques()
         drives = replace(given, limit=None)
@@ -123,6 +129,8 @@ class RobotOptions:
     def _actuation(self) -> PositionControl | MotorCurrents | None:
         if self.control is not None and self.motor is not None:
             raise typer.BadParameter("--control and --motor are two kinds of drives; give one")
+        from diransac.model.robots import MotorCurrents, PositionControl
+
         if self.control is not None:
             return _made(PositionControl, "--control", self.control)
         return None if self.motor is None else _made(MotorCurrents, "--motor", self.motor)
