@@ -131,13 +131,14 @@ def test_a_mapping_that_is_not_there_names_the_built_in_ones(tmp_path):
 
 def test_a_suggested_mapping_reads_the_log(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    path = csv(tmp_path, time_ms=1000.0 * T, pos_m=Q, force_N=TAU, temperature=Q)
+    path = csv(tmp_path, time_ms=1000.0 * T, pos_mm=1000.0 * Q, force_N=TAU, temperature=Q)
     done = run("map", path, "--model", "servo-axis", "-o", "axis.toml")
     assert done.exit_code == 0
     assert "position_ddot: from position_dot with --differentiate" in done.stdout
     log = dr.read_log(path, mapping="axis.toml")
-    np.testing.assert_array_equal(log["position"], Q)
+    np.testing.assert_allclose(log["position"], Q)
     np.testing.assert_array_equal(log["force"], TAU)
+    assert log.units == {"position": "m", "force": "N"}
     np.testing.assert_allclose(log.time, T, atol=1e-12)
 
 
