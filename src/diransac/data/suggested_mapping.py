@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from diransac.data.mapping import BUILT_IN, LogMapping, MappedSignals, load_mapping
+from diransac.data.units import conversion
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Coverage", "suggest_mapping"]
 
-_LEAST, _LISTED = 0.5, 3
+_LEAST, _LISTED, _MOST_LISTED = 0.5, 3, 60
 _WORD = re.compile(r"[a-z]+|\d+")
 _ALIKE = {
     **dict.fromkeys(("pos", "position", "q", "angle", "pose"), "position"),
@@ -53,6 +54,8 @@ class Coverage:
         Built-in mapping that serves most of the signals.
     clock : str
         Line of the mapping file about the time.
+    unused : tuple of str
+        Fields that serve no signal, as ``topic.field``.
     """
 
     model: str
@@ -63,6 +66,7 @@ class Coverage:
     units: Mapping[str, str]
     built_in: str | None = None
     clock: str = ""
+    unused: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON."""
@@ -96,6 +100,9 @@ class Coverage:
                 f"# No field was found for {name} [{unit}]{listed}.\n"
                 f"# [[signals]]\n# name = {json.dumps(name)}\n# topic = \n# field = \n# unit = {json.dumps(unit)}\n"
             )
+        if self.missing and self.unused:
+            more = f" and {len(self.unused) - _MOST_LISTED} more" if len(self.unused) > _MOST_LISTED else ""
+            parts.append(f"# Other fields: {', '.join(self.unused[:_MOST_LISTED])}{more}\n")
         return "\n".join(parts)
 
 
@@ -130,8 +137,7 @@ def suggest_mapping(
             continue
         near = _nearest(name, fields)
         if near and near[0][0] >= _LEAST and not _is_taken(near[0][1], entries):
-            topic, label = near[0][1]
-            entries[name] = MappedSignals((name,), (label,), topic)
+            entries[name] = _entry(name, *near[0][1], model.units.get(name, "?"))
     derivable, missing = dict[str, str](), dict[str, tuple[str, ...]]()
     for name in needed:
         if name in entries:
@@ -143,7 +149,14 @@ def suggest_mapping(
             near = [x for x in _nearest(name, fields) if x[0] > 0.0][:_LISTED]
             missing[name] = tuple(f"{topic}.{label}" if topic else label for _, (topic, label) in near)
     ordered = {name: entries[name] for name in needed if name in entries}
-    return Coverage(model.name, source, ordered, derivable, missing, model.units, built_in, _clock(fields))
+    used = {(entry.topic, label) for entry in ordered.values() for label in entry.fields}
+    unused = tuple(
+        f"{topic}.{label}" if topic else label
+        for topic, labels in fields.items()
+        for label in labels
+        if (topic, label) not in used
+    )
+    return Coverage(model.name, source, ordered, derivable, missing, model.units, built_in, _clock(fields), unused)
 
 
 def _clock(fields: Mapping[str, Sequence[str]]) -> str:
@@ -189,6 +202,14 @@ def _served(
     except LogError:
         return {}
     return {name: entry for entry in entries for name in entry.names if name in needed}
+
+
+def _entry(name: str, topic: str, label: str, unit: str) -> MappedSignals:
+    """Entry of a field; in the model's unit where the field's name ends in a unit, as ``position_mm`` does."""
+    factor = conversion(label.rsplit("_", 1)[1], unit) if "_" in label else None
+    if factor is None:
+        return MappedSignals((name,), (label,), topic)
+    return MappedSignals((name,), (label,), topic, (unit,), (factor,))
 
 
 def _is_taken(place: tuple[str, str], entries: Mapping[str, MappedSignals]) -> bool:

@@ -26,7 +26,14 @@ from diransac.data.readers.parquet import read_parquet
 from diransac.data.readers.recording import Recording, Samples
 from diransac.data.readers.repair import Repairs
 from diransac.data.readers.table import Table
-from diransac.data.readers.topics import TopicTable, is_one_table, list_topics, mapped_table, whole_topic, wired_topics
+from diransac.data.readers.topics import (
+    TopicTable,
+    is_one_table,
+    list_topics,
+    mapped_table,
+    table_of_topics,
+    whole_topic,
+)
 from diransac.data.readers.ulog import UlogRecording
 from diransac.data.units import conversion, split_unit
 from diransac.errors import LogError, SettingsError
@@ -120,7 +127,7 @@ def read_log(
     elif chosen is None and is_one_table(opened, rename or {}):
         table = whole_topic(opened, repairs)
     else:
-        table, resample = wired_topics(opened, chosen, rename or {}, resample, repairs)
+        table, resample = table_of_topics(opened, chosen, rename or {}, resample, repairs)
         rename = None
     if rename:
         table = _renamed(table, rename, source)

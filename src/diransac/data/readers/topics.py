@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from diransac.data.readers.repair import Repairs
 
-__all__ = ["TopicFacts", "TopicTable", "is_one_table", "list_topics", "mapped_table", "whole_topic", "wired_topics"]
+__all__ = ["TopicFacts", "TopicTable", "is_one_table", "list_topics", "mapped_table", "table_of_topics", "whole_topic"]
 
 _GAP = 3.5
 _FIELDS_SHOWN = 6
@@ -66,7 +66,7 @@ def whole_topic(recording: Recording, repairs: Repairs) -> Table:
     return Table({"t": samples.time, **samples.columns, **samples.unusable}, notes=recording.notes)
 
 
-def wired_topics(
+def table_of_topics(
     recording: Recording,
     mapping: LogMapping | None,
     rename: Mapping[str, str],
