@@ -128,7 +128,7 @@ class Resolution:
 
 
 Outcome = Literal["passed", "differs", "rejected", "weak", "untested"]
-"""Of a `HausmanTest`: no difference; one at 5 %; one at 1 %; instruments that are too weak; no test."""
+"""Of a `HausmanTest`: no difference; one at 5 %; one at 0.1 %; instruments that are too weak; no test."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class HausmanTest:
     strength : float
         First-stage F of the instruments.
     outcome : str
-        "passed"; "differs" at a level of 5 %, shared by all parameters that are tested; "rejected" at 1 %; "weak",
+        "passed"; "differs" at a level of 5 %, shared by all parameters that are tested; "rejected" at 0.1 %; "weak",
         where the instruments of the parameter, or of one that shares an equation with it, have an F below 10.
     """
 

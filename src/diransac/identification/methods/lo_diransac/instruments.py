@@ -13,7 +13,8 @@ Imbens, Krueger 1999).
 
 The instrumented estimate has a larger variance, and replaces least squares only where Hausman's test rejects that both
 have the same expectation.  Where it is significant alone, their difference widens the interval.  Parameters whose
-regressor the set-points hardly predict are not tested, nor are those that share an equation with one.
+regressor the set-points hardly predict are not tested, nor are those that share an equation with one.  An instrumented
+estimate that bounds cut off is not taken: what it moves to the other parameters is no estimate of them.
 
 References
 ----------
@@ -52,7 +53,7 @@ __all__ = ["Instrumented", "check_set_points", "instrumented_estimate"]
 
 # First-stage F below which instruments are weak (Staiger, Stock 1997); levels of Hausman's test from which on the
 # estimate is the instrumented one, and from which on the difference widens the interval.
-_STRONG, _REJECTED, _SIGNIFICANT = 10.0, 0.01, 0.05
+_STRONG, _REJECTED, _SIGNIFICANT = 10.0, 1e-3, 0.05
 # Difference of two estimates over the parameter that is none.
 _NEGLIGIBLE, _TINY = 1e-3, 1e-300
 # Folds of a cross-fit; shortest time constant of the filter, samples, and longest, over the log.
@@ -151,7 +152,8 @@ def instrumented_estimate(
     result = plain
     if rejected.any():
         found = estimate_parameters(intervals, fit, prior_inflation, Instruments(means, replaced))
-        result = plain if intervals.layout.violations(found.parameters) else found
+        stopped = intervals.layout.on_bounds(found.parameters)[replaced].any()
+        result = plain if stopped or intervals.layout.violations(found.parameters) else found
     if result is plain:
         replaced = np.zeros(len(tests), bool)
     left = np.where(differs & ~replaced, contrast.instrumented - contrast.plain, 0.0)
