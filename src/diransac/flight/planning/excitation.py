@@ -40,10 +40,16 @@ _N_POSES = 200
 _SPREAD = 0.8
 """Fraction of the ranges of the coordinates in which poses are drawn."""
 
-_BISECTIONS = 14
+_SHARES = (*(1.0 - 0.002 * 2.0 ** np.arange(9.0)), *0.25 ** np.arange(1.0, 5.0), 0.0)
+"""Shares of a motion, one after the other, of which the first that keeps the limits is taken."""
+
+_BISECTIONS = 6
 
 _SAMPLES_PER_SINE = 12
-"""Rows of the grid of the optimisation per period of the fastest sine."""
+"""Rows per period of the fastest sine in which the optimisation evaluates the information.
+
+Limits hold in twice as many: forces have products of sines, of twice the frequency.
+"""
 
 _LAST_BARRIER, _BARRIER_FACTOR = 1e-4, 0.3
 """Last barrier parameter, and what it is reduced by: it is the change of the objective per active limit."""
@@ -185,13 +191,24 @@ class Limited:
         """
         rest = np.zeros_like(z)
         rest[-1] = pose
-        fits = [0.0]
-        for share in (1.0, *0.5 ** np.arange(1.0, _BISECTIONS)):
-            tried = fits[-1] + share
-            x = motion_of(rest + tried * (z - rest), basis)
-            if tried <= 1.0 and (self.margin(x) >= narrowed).all():
-                fits.append(tried)
-        return rest + fits[-1] * (z - rest)
+
+        def scaled(share: float) -> FloatArray:
+            return np.asarray(rest + share * (z - rest))
+
+        def fits(share: float) -> bool:
+            return bool((self.margin(motion_of(scaled(share), basis)) >= narrowed).all())
+
+        tried = 1.0
+        if fits(tried):
+            return scaled(tried)
+        for share in _SHARES:  # not by bisection alone: limits of forces may hold, fail and hold again
+            if fits(share):
+                break
+            tried = share
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (share + tried)
+            share, tried = (middle, tried) if fits(middle) else (share, middle)
+        return scaled(share)
 
 
 def resting_pose(limited: Limited, lower: FloatArray, upper: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -243,9 +260,9 @@ def drawn_motion(
     return limited.shrunk(whole, pose, basis, 0.0)
 
 
-def grid(series: FourierSeries) -> FloatArray:
-    """Times of a period at which the optimisation evaluates a motion, s."""
-    n = _SAMPLES_PER_SINE * series.n_harmonics
+def grid(series: FourierSeries, density: int = 1) -> FloatArray:
+    """Times of a period at which the optimisation evaluates a motion, s; as many times denser."""
+    n = density * _SAMPLES_PER_SINE * series.n_harmonics
     return np.linspace(0.0, series.period, n, endpoint=False)
 
 

@@ -54,6 +54,9 @@ _FEWEST_HARMONICS = 4
 _ROOM = 1e-3
 """Fraction of a limit that is left for extremes between the rows of the check."""
 
+_NARROWED = 5e-3
+"""Fraction of limits that the optimisation leaves for extremes between its rows."""
+
 _CHECKED_PER_SINE = 64
 """Rows of the check per period of the fastest sine, at least."""
 
@@ -385,7 +388,7 @@ class _Task:
 
     def solved(self, search: Search) -> Experiment:
         """The best motion that is found, beside the median of the plain multisines."""
-        times, found = grid(self.rows.series), self.draws[-1]
+        times, found = grid(self.rows.series, 2), self.draws[-1]
         for barrier in _BARRIERS:
             found = self._optimised(found, times, search, barrier)
             more = self._exceeding(found)
@@ -402,12 +405,10 @@ class _Task:
     def _optimised(self, first: FloatArray, times: FloatArray, search: Search, barrier: float) -> FloatArray:
         """Motion of least objective within limits at some times, from one that may exceed them."""
         series = self.rows.series
-        start = self.limited.shrunk(first, self.pose, series.basis(times), 2.0 * _ROOM + barrier)
+        start = self.limited.shrunk(first, self.pose, series.basis(times), _NARROWED + barrier)
         free = np.ones(start.shape, bool)
         free[-1] = self.bounded
-        problem = DesignProblem(
-            series, self.limited, self.observed, self.sizes, free, start, times, narrowed=2.0 * _ROOM
-        )
+        problem = DesignProblem(series, self.limited, self.observed, self.sizes, free, start, times, _NARROWED)
         return best_motion(problem, search, barrier)
 
     def _exceeding(self, z: FloatArray) -> FloatArray:
