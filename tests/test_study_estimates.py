@@ -230,7 +230,7 @@ def test_a_store_is_reported_without_the_file_of_its_plant(of_a_users_plant: Pat
     assert "<summary>M</summary>" in store.with_name("a.html").read_text()
 
 
-def test_facts_of_a_store_are_those_of_the_plant_that_one_of_before_makes_anew(of_a_users_plant: Path):
+def test_facts_of_a_plants_file_are_kept_and_the_file_is_not_run_for_them(of_a_users_plant: Path):
     noted = summarise(of_a_users_plant)
     assert noted.estimates.disturbed.tolist() == [False, True]
     assert noted.estimates.errors_to_true["M"][:, 0, 0] == pytest.approx([0.0, 0.5 / 1.5])
@@ -239,8 +239,14 @@ def test_facts_of_a_store_are_those_of_the_plant_that_one_of_before_makes_anew(o
     with connection:
         assert connection.execute("DELETE FROM about WHERE key = 'plants'").rowcount == 1
     connection.close()
+    ran = Path("ran")
+    Path("own.py").write_text(f"open({str(ran.absolute())!r}, 'x')\n")
+    with pytest.raises(dr.StudyError, match="repeat the study run command"):
+        summarise(of_a_users_plant)
+    assert not ran.exists()
+    Path("own.py").write_text(OWN_PLANT)
+    for level in ("calm", "pulled"):
+        with Store("a.db", load(OWN).subset(levels=[level])):
+            pass
     anew = summarise(of_a_users_plant)
     assert (anew.units, anew.estimates.disturbed.tolist()) == (noted.units, [False, True])
-    assert all(
-        np.array_equal(x, noted.estimates.errors_to_true[name]) for name, x in anew.estimates.errors_to_true.items()
-    )

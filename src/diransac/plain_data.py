@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-__all__ = ["LARGEST", "json_data", "read_text", "toml_table"]
+__all__ = ["LARGEST", "LARGEST_TABLE", "json_data", "read_text", "toml_table"]
 
 LARGEST = 256 * 2**20
-"""Bytes of the largest file that is read as text."""
+"""Bytes of the largest result."""
+
+LARGEST_TABLE = 2**20
+"""Bytes of the largest settings or study."""
+
+
+_DEEPEST_KEY = 64
+"""Dots in a key of TOML."""
 
 
 def read_text(path: str | Path, largest: int = LARGEST) -> str:
@@ -47,10 +56,8 @@ def json_data(text: str | bytes) -> Any:
     ValueError
         It is no JSON, nested too deeply, or has a number of thousands of digits.
     """
-    try:
+    with _bounded():
         return json.loads(text, parse_constant=_refused)
-    except RecursionError as error:
-        raise ValueError("it is nested too deeply") from error
 
 
 def _refused(word: str) -> NoReturn:
@@ -65,7 +72,21 @@ def toml_table(text: str) -> dict[str, Any]:
     ValueError
         It is no TOML, nested too deeply, or has a number of thousands of digits.
     """
-    try:
+    keys = (line.partition("=")[0] for line in text.splitlines())
+    if any(key.count(".") > _DEEPEST_KEY and "," not in key for key in keys):  # tomllib takes their number squared
+        raise ValueError("it is nested too deeply")
+    with _bounded():
         return tomllib.loads(text)
+
+
+@contextmanager
+def _bounded() -> Iterator[None]:
+    """Context of a parser.  Raises ValueError: in place of errors that name the interpreter's limits."""
+    try:
+        yield
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+    except ValueError as error:
+        if "integer string conversion" in str(error):
+            raise ValueError("a number has thousands of digits") from error
+        raise

@@ -14,7 +14,7 @@ from diransac.identification.method import Method
 from diransac.identification.methods import configured, setting_names
 from diransac.identification.settings import Settings, nearest_names
 from diransac.model import Model
-from diransac.plain_data import read_text, toml_table
+from diransac.plain_data import LARGEST_TABLE, read_text, toml_table
 from diransac.user_files import definitions, file_and_name
 
 __all__ = [
@@ -229,7 +229,7 @@ def load_methods(names: Sequence[str], settings: Mapping[str, Any]) -> list[Meth
 
 def _read_toml(file: Path) -> dict[str, Any]:
     try:
-        return toml_table(read_text(file))
+        return toml_table(read_text(file, LARGEST_TABLE))
     except OSError as error:
         raise SettingsError(f'settings file "{file}" cannot be read: {error.strerror}') from error
     except ValueError as error:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from diransac.errors import SettingsError
-from diransac.plain_data import read_text, toml_table
+from diransac.plain_data import LARGEST_TABLE, read_text, toml_table
 from diransac.study.specification import Study
 from diransac.study.tables import changed
 
@@ -62,7 +62,7 @@ def _text(source: str | Path) -> str:
             )
         return (_FOLDER / "builtin" / f"{source}.toml").read_text(encoding="utf-8")
     try:
-        return read_text(path)
+        return read_text(path, LARGEST_TABLE)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise SettingsError(f"the file cannot be read: {reason}") from error
