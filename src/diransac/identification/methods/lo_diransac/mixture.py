@@ -60,7 +60,8 @@ class Mixture:
         else:
             total = core + uniform
             core = np.divide(core, total, out=np.ones_like(core), where=total > 0.0)
-        core *= known
+        if not known.all():
+            core *= known
         return core
 
     def negative_log_likelihood(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
