@@ -24,7 +24,7 @@ from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Fi
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.checks import compared_parts, findings_of_fit
-from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
+from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
 from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
 from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
 from diransac.identification.methods.lo_diransac.projection import (
@@ -312,6 +312,12 @@ def _searched(
     report(callback, "drawing hypotheses", 0.1)
     check_time()
     hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
+    intervals, hypotheses, n_spikes = find_spikes(settings, intervals, motion, hypotheses, seed, dataset)
+    if n_spikes:
+        notes += (
+            f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; the running median "
+            "replaces them",
+        )
     unit = discrepancy_units(intervals, motion, hypotheses[0])
     search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None, to_beat=to_beat)
