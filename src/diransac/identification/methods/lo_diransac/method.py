@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.refinement import Refinement
     from diransac.identification.settings import Settings
 
-__all__ = ["LoDiransac", "configured"]
+__all__ = ["LoDiransac", "configured", "prepared"]
 
 _FEWEST_INTERVALS = 4
 _OUTLIER, _TINY = 0.5, 1e-9
@@ -303,7 +303,7 @@ def _searched(
 ) -> _Searched:
     """A search that begins with a motion of a time scale that is shorter by a factor; it may end behind another one."""
     report(callback, "smoothing", 0.0)
-    intervals, motion, notes = _prepared(settings, dataset, narrower)
+    intervals, motion, notes = prepared(settings, dataset, narrower)
     if unmeasured_states(intervals):
         report(callback, "unmeasured states", 0.05)
         allowed, measured = len(dataset.model.parameters) - 1, measured_signals(intervals)
@@ -426,10 +426,30 @@ def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Ref
 # ---------------------------------------------------------------------- preparation
 
 
-def _prepared(
+def prepared(
     settings: LoDiransac, dataset: Dataset, narrower: int
 ) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
-    """The logs in intervals of the motion's own time scale, or a part of it, and the motion, row by row of them."""
+    """The logs in intervals of the motion's own time scale, or a part of it, and the motion, row by row of them.
+
+    Parameters
+    ----------
+    settings : LoDiransac
+    dataset : Dataset
+    narrower : int
+        Factor by which the time scale is shorter.
+
+    Returns
+    -------
+    intervals : ShootingIntervals
+        Inputs are screened, and act as recorded.
+    motion : Motion
+    notes : tuple of str
+
+    Raises
+    ------
+    LogError
+        The logs are too short.
+    """
     model, dt = dataset.model, dataset.dt
     screened = [_screened(settings, one, dt) for one in dataset.segments]
     samples, inputs = [x for x, _, _ in screened], [u for _, u, _ in screened]
