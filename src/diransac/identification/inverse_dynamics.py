@@ -8,12 +8,13 @@ the error r.  Motions are smoothed without the model, as lo-diransac begins with
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import LogError
 from diransac.identification.methods.lo_diransac.method import LoDiransac, prepared
 from diransac.identification.methods.lo_diransac.smoothing import without_spikes
@@ -24,10 +25,32 @@ if TYPE_CHECKING:
     from diransac.identification.estimate import Resolution
     from diransac.model import Model
 
-__all__ = ["force_errors", "joint_forces"]
+__all__ = ["PredictedForces", "force_errors", "predicted_forces"]
 
 _NO_FORCE = 1e-9
 """Force over the inertial force of an equation, below which inputs exert none."""
+
+
+@dataclass(frozen=True)
+class PredictedForces:
+    """Forces of the inputs over one log.
+
+    Parameters
+    ----------
+    velocities : (N, n_v) array
+        Smoothed.
+    forces : (N, n_v) array
+        Of the inputs in each equation.
+    errors : (N, n_v) array
+        Predicted less these.
+    counted : (N,) bool array
+        Rows without spikes of an input, and outside of gaps.
+    """
+
+    velocities: FloatArray
+    forces: FloatArray
+    errors: FloatArray
+    counted: BoolArray
 
 
 def force_errors(
@@ -53,8 +76,8 @@ def force_errors(
         measures a state, or the logs are too short to be smoothed.
     """
     squares = list[FloatArray]()
-    for forces, errors, counted in joint_forces(dataset, parameters, resolution):
-        squares.append(np.array([np.square(x[counted]).sum(axis=0) for x in (forces, errors)]))
+    for one in predicted_forces(dataset, parameters, resolution):
+        squares.append(np.array([np.square(x[one.counted]).sum(axis=0) for x in (one.forces, one.errors)]))
     if not squares:
         return {}
     of_force, of_error = np.sum(squares, axis=0)
@@ -63,10 +86,10 @@ def force_errors(
     return {n: float(100.0 * np.sqrt(e / f)) for n, f, e, x in zip(names, of_force, of_error, acting, strict=True) if x}
 
 
-def joint_forces(
+def predicted_forces(
     dataset: Dataset, parameters: Sequence[Mapping[str, float]], resolution: Resolution
-) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Force of the inputs in each equation, error of its prediction (N, n_v), and rows that count (N,), of each log."""
+) -> list[PredictedForces]:
+    """Forces of the inputs, and as inverse dynamics predict them, of each log; arguments as `force_errors`."""
     try:
         intervals, motion, _ = prepared(LoDiransac(), dataset, 1)
     except LogError:
@@ -84,7 +107,7 @@ def joint_forces(
             u = 0.5 * (u + np.concatenate([u[:1], u[:-1]]))
         p = np.repeat(model.parameter_vector(own)[:, None], len(one), axis=1)
         rest, errors = (np.array(model.residual(q.T, v.T, a.T, x.T, p)).T for x in (_without_force(model, q, v, u), u))
-        found.append((rest - errors, errors, clean & intervals.counted[logged]))
+        found.append(PredictedForces(v, rest - errors, errors, clean & intervals.counted[logged]))
     return found
 
 
