@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,10 @@ from regime_flights import REGIMES, recordings
 
 import diransac as dr
 from diransac.simulation.compiler import machine_code
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+
+from robots import panda_like, quadruped
 
 Array = np.ndarray[Any, Any]
 Case = tuple[dr.Model, dr.Log, dict[str, Any]]
@@ -95,11 +100,32 @@ def _chain() -> Case:
     return model, simulated(model, {n: {"m": 1.0, "k": 20.0, "c": 0.5}[n[0]] for n in model.parameters}, 5.0), {}
 
 
+def _robot(description: str, rms: float, **options: Any) -> Case:
+    """Log of a robot from an MJCF text under random torques, with the armature, damping and friction of its joints."""
+    with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
+        file.write(description)
+        file.flush()
+        model = dr.models.robot(file.name, **options)
+    truth = {"armature": 0.1, "damping": 0.5, "friction": 0.3}
+    return model, simulated(model, {n: truth[n.partition("_")[0]] for n in model.parameters}, rms), {}
+
+
+def _leg() -> Case:
+    joints = ["FL_hip_joint", "FL_thigh_joint", "FL_calf_joint"]
+    return _robot(quadruped(), 3.0, joints=joints)
+
+
+def _arm() -> Case:
+    return _robot(panda_like(), 5.0, joints=[f"joint{k}" for k in range(1, 8)])
+
+
 CASES: dict[str, Callable[[], Case]] = {
     "planar rotorcraft": _rotorcraft,
     "double pendulum": _double_pendulum,
     "quadrotor": _quadrotor,
     "chain of 8 masses, 8 inputs": _chain,
+    "leg of 3 joints": _leg,
+    "arm of 7 joints, 21 unknown": _arm,
 }
 
 

@@ -69,12 +69,13 @@ class Regime:
 
 @dataclass(frozen=True)
 class Recording:
-    """One seed of a regime: its columns (N,), time (N,), true parameters, and the exact signals (N,)."""
+    """One seed of a regime: its columns (N,), time (N,), true parameters, exact signals (N,) and set-points (N,)."""
 
     time: Array
     columns: Mapping[str, Array]
     truth: Mapping[str, float]
     exact: Mapping[str, Array]
+    set_points: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def log(self) -> dr.Log:
@@ -85,13 +86,16 @@ class Recording:
 def recordings(regime: Regime, seeds: Sequence[int]) -> list[Recording]:
     """The logs of some seeds; a seed's log is the same whichever others are simulated with it."""
     parameters = regime.machine.drawn(_rngs(regime.machine.name, "parameters", seeds))
-    time, exact = _simulated(regime, parameters, seeds)
+    reference = regime.machine.reference(_rngs(regime.machine.name, "reference", seeds))
+    time, exact = _simulated(regime, parameters, reference, seeds)
+    wanted = np.stack([reference(t) for t in time])
     noise = _rngs(regime.name, "noise", seeds)
     found = []
     for lane, rng in enumerate(noise):
         own = {name: values[:, lane] for name, values in exact.items()}
         truth = {name: float(getattr(parameters, name)[lane]) for name in regime.machine.model.parameters}
-        found.append(Recording(time, _measured(regime, time, own, rng), truth, own))
+        set_points = {f"set_point_{i}": values for i, values in enumerate(wanted[:, :, lane].T, start=1)}
+        found.append(Recording(time, _measured(regime, time, own, rng), truth, own, set_points))
     return found
 
 
@@ -103,10 +107,11 @@ def _rngs(name: str, stream: str, seeds: Sequence[int]) -> list[np.random.Genera
 # ---------------------------------------------------------------------- simulation
 
 
-def _simulated(regime: Regime, drawn: SimpleNamespace, seeds: Sequence[int]) -> tuple[Array, dict[str, Array]]:
+def _simulated(
+    regime: Regime, drawn: SimpleNamespace, reference: Multisine, seeds: Sequence[int]
+) -> tuple[Array, dict[str, Array]]:
     """Time, and every signal of the model (N, L), by RK4 with several steps a sample."""
     machine = regime.machine
-    reference = machine.reference(_rngs(machine.name, "reference", seeds))
     rate, control, acceleration = _plant(regime, drawn, reference, _rngs(regime.name, "force", seeds))
     x = _start(regime, reference, control)
     n_rows = round(machine.duration / machine.dt)
@@ -233,7 +238,7 @@ def _missing(rows: int, *, inputs_too: bool) -> Callable[[np.random.Generator, d
 # ---------------------------------------------------------------------- forces
 
 
-def _gusts(rms: Sequence[float], low: float, high: float) -> Callable[[Rngs], Force]:
+def gusts(rms: Sequence[float], low: float, high: float) -> Callable[[Rngs], Force]:
     """Multisine forces of 12 sines."""
 
     def draw(rngs: Rngs) -> Force:
@@ -329,10 +334,10 @@ _ALL = [
     Regime("rotor x and z 10 ms late", _ROTOR, exact=False, fault=_late("x z", 10.0)),
     Regime("quad mocap 10 ms late", _QUAD, exact=False, fault=_late(_POSE, 10.0)),
     Regime("quad mocap 40 ms late", _QUAD, exact=False, fault=_late(_POSE, 40.0)),
-    Regime("rotor slight gusts", _ROTOR, exact=False, fault=Fault(force=_gusts((0.1, 0.1, 0.001), 0.05, 3.0))),
-    Regime("rotor torque gusts", _ROTOR, exact=False, fault=Fault(force=_gusts((0.0, 0.0, 0.008), 0.05, 3.0))),
-    Regime("rotor hover with gusts", _HOVER, exact=False, fault=Fault(force=_gusts((0.3, 0.3, 0.003), 0.05, 3.0))),
-    Regime("underwater waves", machines.UNDERWATER, exact=False, fault=Fault(force=_gusts((1.3,), 0.1, 0.3))),
+    Regime("rotor slight gusts", _ROTOR, exact=False, fault=Fault(force=gusts((0.1, 0.1, 0.001), 0.05, 3.0))),
+    Regime("rotor torque gusts", _ROTOR, exact=False, fault=Fault(force=gusts((0.0, 0.0, 0.008), 0.05, 3.0))),
+    Regime("rotor hover with gusts", _HOVER, exact=False, fault=Fault(force=gusts((0.3, 0.3, 0.003), 0.05, 3.0))),
+    Regime("underwater waves", machines.UNDERWATER, exact=False, fault=Fault(force=gusts((1.3,), 0.1, 0.3))),
     Regime("underwater slow current", machines.UNDERWATER, exact=False, fault=Fault(force=_slow_current(0.05))),
     *(
         Regime(f"rotor motor lag {1e3 * lag:.0f} ms", _ROTOR, exact=False, fault=Fault(lag=lag))

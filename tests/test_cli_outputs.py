@@ -67,7 +67,9 @@ def test_outputs_take_their_places_together_or_not_at_all(folder: Path):
         (["-o", "./bent.py", "--model", "bent.py:other"], "reads"),
         (["-o", "."], "not an ordinary file"),
         (["-o", "same", "--report", "./same"], "two outputs"),
-        (["-o", 250 * "x" + ".json"], f'{250 * "x"}.json" cannot be written: File name too long'),
+        (["-o", "model.yaml"], '"model.yaml" does not end in .json, the format that is written'),
+        (["--report", "page.pdf"], '"page.pdf" does not end in .html or .htm, the format that is written'),
+        (["-o", 251 * "x" + ".json"], f"{251 * 'x'}.json: File name too long"),
     ],
 )
 def test_outputs_are_checked_before_the_work(

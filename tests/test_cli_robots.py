@@ -95,3 +95,56 @@ def test_a_description_is_never_overwritten(folder):
     assert done.exit_code == 1
     assert "is a file that this command reads" in done.stderr
     assert (folder / "dog.xml").read_bytes() == before
+
+
+# ---------------------------------------------------------------------- designed excitation
+
+PAIR = """<mujoco><compiler angle="radian"/><worldbody>
+  <body name="FL"><joint name="FL_hip" axis="0 1 0" range="-0.6 0.4" actuatorfrcrange="-9 9"/>
+    <geom size="0.1" pos="0 0 -0.3"/></body>
+  <body name="FR"><joint name="FR_hip" axis="0 1 0" range="-0.6 0.4"/><geom size="0.1" pos="0 0 -0.3"/></body>
+</worldbody><actuator><motor joint="FR_hip" gear="2" ctrlrange="-20 15"/></actuator></mujoco>"""
+DESIGN = ["design", "pair.xml", "--control", "kp=200,kd=1,limit=25", "--duration", "4", "--time-limit", "30"]
+
+
+def test_limits_of_a_robot_are_those_of_its_file_and_of_its_drives(tmp_path):
+    (tmp_path / "pair.xml").write_text(PAIR)
+    found = dr.models.robot_limits(tmp_path / "pair.xml")
+    ranges = {"FL_hip": (-0.6, 0.4), "FR_hip": (-0.6, 0.4)}
+    assert found == ranges | {"FL_hip_torque": (-9.0, 9.0), "FR_hip_torque": (-40.0, 30.0)}
+    control = dr.PositionControl(kp=1.0, limit={"FL_hip": 12.0, "FR_hip": 35.0})
+    found = dr.models.robot_limits(tmp_path / "pair.xml", actuation=control)
+    assert found == ranges | {"FL_hip_torque": (-9.0, 9.0), "FR_hip_torque": (-35.0, 30.0)}
+
+
+def test_experiments_of_limbs_are_one_log_of_targets_within_the_limits_of_the_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pair.xml").write_text(PAIR)
+    done = run(*DESIGN, "--limit", "{}_dot=3,FR_hip_torque=18", "-o", "design.csv", "--json")
+    assert done.exit_code == 0, done.stderr
+    shown, log = json.loads(done.stdout)["limbs"], dr.read_log("design.csv")
+    assert set(log.names) == {f"{n}{x}" for n in ("FL_hip", "FR_hip") for x in ("", "_dot", "_target")}
+    for leg, torque in (("FL", 9.0), ("FR", 18.0)):
+        assert -0.6 <= log[f"{leg}_hip"].min() <= log[f"{leg}_hip"].max() <= 0.4
+        assert np.abs(log[f"{leg}_hip_dot"]).max() <= 3.0
+        assert shown[leg]["limits"][f"{leg}_hip_torque"]["limits"] == [-torque, torque]
+        control = 200.0 * (log[f"{leg}_hip_target"] - log[f"{leg}_hip"]) - log[f"{leg}_hip_dot"]
+        assert np.abs(control).max() <= torque + 1.0  # targets are those of the middle between two rows
+        assert shown[leg]["parameters"][f"armature_{leg}_hip"]["ratio"] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--limit", "FL_hip=far"], "--limit: FL_hip='far' is neither a number nor LOW:HIGH"),
+        (["--limit", "knee=2"], 'limits: there is no quantity "knee"'),
+        (["--parameter", "armature=2"], "--parameter: there is no 'armature'"),
+    ],
+)
+def test_a_design_that_is_refused_leaves_no_file(tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pair.xml").write_text(PAIR)
+    done = run(*DESIGN, *words, "-o", "design.csv")
+    assert done.exit_code in (1, 2)
+    assert message in done.stderr
+    assert [x.name for x in tmp_path.iterdir()] == ["pair.xml"]

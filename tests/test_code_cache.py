@@ -13,6 +13,7 @@ import pytest
 
 import diransac as dr
 from command_line import CliRunner, app
+from diransac.atomic import draft
 from diransac.simulation import Measurements, RolloutBatch
 from diransac.simulation.compiler import Map, Scan, machine_code
 from diransac.simulation.compiler.code_cache import CodeCache, hashed
@@ -263,15 +264,14 @@ def test_entries_used_the_longest_ago_leave_first(cache: CodeCache):
 
 def test_files_of_killed_processes_are_removed_and_those_of_others_are_left(cache: CodeCache):
     cache.write(KEY, CODE)
-    left, recent = (cache.folder / f".{KEY}.code.{name}.part" for name in ("old", "new"))
-    mine = cache.folder / "notes.txt"
-    for path in (left, recent, mine):
+    left, mine = cache.folder / ".diransac-01234567.part", cache.folder / "notes.txt"
+    left.mkdir()
+    for path in (left / f"{KEY}.code", mine):
         path.write_text("")
-    for path in (left, mine):
-        os.utime(path, (1e9, 1e9))
-    cache.write(OTHER_KEY, CODE)
-    assert not left.exists()
-    assert recent.exists()
+    with draft(cache.folder / f"{KEY}.code") as recent:
+        cache.write(OTHER_KEY, CODE)
+        assert not left.exists()
+        assert recent.parent.exists()
     cache.clear()
     assert mine.exists()
     assert not cache.sizes()

@@ -167,14 +167,13 @@ def test_shooting_intervals_of_a_log_do_not_depend_on_the_next_log(length, hold)
     both = _intervals(logs, length, hold)
     shared = np.append(list(TRUE.values()), np.zeros(both.n_shared - 3))
     x, d = both.measured[both.starts, :2], np.zeros((len(both), 1))
-    residuals = both.residuals(shared, x, d)
+    residuals, ends = both.simulated(shared, x, d)
     for i, rows in enumerate(both.rows_of_logs):
         alone = _intervals(logs[i : i + 1], length, hold)
         own = both.log_of == i
-        np.testing.assert_array_equal(residuals[rows], alone.residuals(shared, x[own], d[own]))
-        np.testing.assert_array_equal(
-            both.ends(shared, x, d)[np.flatnonzero(own)[:-1]], alone.ends(shared, x[own], d[own])
-        )
+        residuals_alone, ends_alone = alone.simulated(shared, x[own], d[own])
+        np.testing.assert_array_equal(residuals[rows], residuals_alone)
+        np.testing.assert_array_equal(ends[own][:-1], ends_alone[:-1])
 
 
 def _intervals(logs, length, hold):

@@ -126,9 +126,9 @@ HOSTILE = {
     "cube.npz": (npz(t=np.zeros((2, 2, 2))), '"t" has 3 dimensions'),
     "garbage.mat": (GARBAGE, "not a MAT file, or is damaged"),
     "cut.mat": (mat(t=T, x=np.random.default_rng(0).normal(size=5))[:-20], "not a MAT file, or is damaged"),
-    "v73.mat": (b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF\r\n\x1a\n", "version 7.3 .* save it in MATLAB with -v7"),
+    "v73.mat": (b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF\r\n\x1a\n", "HDF5"),
     "cells.mat": (mat(t=PICKLED), 'time column "t" is not numeric'),
-    "flight.ulg": (b"ULog", 'ending ".ulg" is not known; use one of .csv'),
+    "flight.dat": (b"ULog", 'ending ".dat" is not known; use one of .csv'),
     "flight": (b"t,x", 'ending "" is not known'),
     "flight.gz": (b"t,x", 'ending ".gz" is not known'),
 }

@@ -189,11 +189,20 @@ def test_binary_file_is_refused_by_name(tmp_path, content):
         dr.Result.load(path)
 
 
-@pytest.mark.parametrize("number", [1, 2, 3, 4, 5, "6", None])
-def test_result_of_an_older_format_is_refused_in_one_sentence(result, tmp_path, number):
+@pytest.mark.parametrize(
+    ("number", "says"),
+    [
+        (1, "format 1, of an earlier version of diransac; this one reads 7. Identify again$"),
+        (6, "format 6, of an earlier"),
+        (99, "format 99, of a later"),
+        ("7", "no result of diransac"),
+        (None, "no result of diransac"),
+    ],
+)
+def test_result_of_another_format_is_refused_in_one_sentence(result, tmp_path, number, says):
     path = tmp_path / "model.json"
     path.write_text(changed(result, ["format"], number))
-    with pytest.raises(ResultError, match=r"model\.json: .*no diransac result of format 6; identify again$") as caught:
+    with pytest.raises(ResultError, match=rf"model\.json: .*{says}") as caught:
         dr.Result.load(path)
     assert len(str(caught.value).splitlines()) == 1
 
@@ -289,6 +298,16 @@ def test_printed_result_shows_every_parameter_with_its_unit_and_how_it_came_abou
         assert f"{result.parameters[name]:.6g}" in line
     for part in ("planar-rotorcraft by i-diransac", "fit error", "inliers", result.stop_reason):
         assert part in text
+
+
+def test_a_notebook_shows_the_verdict_and_every_parameter_and_nothing_that_is_markup_of_a_log(result):
+    named = dataclasses.replace(result, logs=(dataclasses.replace(result.logs[0], source="<script>a</script>"),))
+    page = named._repr_html_()
+    assert "<script>" not in page
+    assert "&lt;script&gt;" in page
+    assert f"<strong>{result.verdict}</strong>" in page
+    assert all(f"<td>{name}</td>" in page for name in result.parameters)
+    assert len(repr(result)) < 200
 
 
 def test_printed_result_says_what_is_not_as_it_should_be(results):

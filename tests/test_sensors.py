@@ -14,6 +14,7 @@ import diransac as dr
 from diransac.data.dataset import Dataset
 from diransac.identification.inspection import inspect
 from diransac.identification.suggestions import Suggestion, with_terms
+from diransac.model import expressions
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 from instruments import INSTRUMENTS, TRUTH, flight, recorded
 
@@ -198,7 +199,8 @@ def test_affinity_of_each_sensor_is_known():
 
 def test_suggested_terms_keep_the_sensors(model):
     symbols = [ca.SX.sym(name, n) for name, n in zip("qvaup", (3, 3, 3, 2, model.n_p), strict=True)]
-    term = ca.Function("term", symbols, [ca.vertcat(symbols[1][0], 0, 0)]).serialize()
+    h = ca.Function("term", symbols, [ca.vertcat(symbols[1][0], 0, 0)], list("qvaup"), ["h"])
+    term = expressions.stored("term", h)
     suggestion = Suggestion(
         **dict.fromkeys(Suggestion.__dataclass_fields__) | {"parameter": "friction_x", "unit": "N s/m", "term": term}
     )

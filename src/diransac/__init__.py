@@ -21,17 +21,25 @@ from diransac.errors import (
 from diransac.model import Disturbance, Model, Parameter, Plant, Sensor, sensors
 from diransac.model import library as models
 from diransac.model.parts import independent_parts
-from diransac.model.robots import JointTorques, MotorCurrents, PositionControl
 
 if TYPE_CHECKING:
     from diransac.data.filters import FilterSpecification
     from diransac.data.log import Log
     from diransac.data.preprocessing import despike, differentiate, rename, resample, scale, shift
-    from diransac.data.readers import read_log
+    from diransac.data.readers import read_log, read_topics
     from diransac.flight.closed_loop import fly, fly_batch, tracking_error
     from diransac.flight.corruption import CorruptedLog, corrupt
     from diransac.flight.noise import Noise
-    from diransac.flight.planning import multisine, plan, random_waypoints, sine, square, star
+    from diransac.flight.planning import (
+        Experiment,
+        design_experiment,
+        multisine,
+        plan,
+        random_waypoints,
+        sine,
+        square,
+        star,
+    )
     from diransac.flight.trajectory import Trajectory
     from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
     from diransac.identification.estimate import Finding
@@ -46,6 +54,7 @@ if TYPE_CHECKING:
     from diransac.identification.settings import Settings
     from diransac.identification.suggestions import Suggestion
     from diransac.identification.validation import CrossValidation, Validation, cross_validate, validate
+    from diransac.model.robots import JointTorques, MotorCurrents, PositionControl
     from diransac.plots import plot_flight
     from diransac.report import write_report
     from diransac.study import Study, run_study
@@ -58,6 +67,7 @@ __all__ = [
     "Diransac",
     "DiransacError",
     "Disturbance",
+    "Experiment",
     "FilterSpecification",
     "Finding",
     "IDiransac",
@@ -93,6 +103,7 @@ __all__ = [
     "Validation",
     "corrupt",
     "cross_validate",
+    "design_experiment",
     "despike",
     "differentiate",
     "fly",
@@ -105,6 +116,7 @@ __all__ = [
     "plot_flight",
     "random_waypoints",
     "read_log",
+    "read_topics",
     "rename",
     "resample",
     "run_study",
@@ -125,11 +137,20 @@ _FOUND_IN = {
     "data.filters": ("FilterSpecification",),
     "data.log": ("Log",),
     "data.preprocessing": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
-    "data.readers": ("read_log",),
+    "data.readers": ("read_log", "read_topics"),
     "flight.closed_loop": ("fly", "fly_batch", "tracking_error"),
     "flight.corruption": ("CorruptedLog", "corrupt"),
     "flight.noise": ("Noise",),
-    "flight.planning": ("multisine", "plan", "random_waypoints", "sine", "square", "star"),
+    "flight.planning": (
+        "Experiment",
+        "design_experiment",
+        "multisine",
+        "plan",
+        "random_waypoints",
+        "sine",
+        "square",
+        "star",
+    ),
     "flight.trajectory": ("Trajectory",),
     "flight.tvlqr": ("Controller", "tvlqr", "tvlqr_batch"),
     "identification.estimate": ("Finding",),
@@ -144,6 +165,7 @@ _FOUND_IN = {
     "identification.settings": ("Settings",),
     "identification.suggestions": ("Suggestion",),
     "identification.validation": ("CrossValidation", "Validation", "cross_validate", "validate"),
+    "model.robots": ("JointTorques", "MotorCurrents", "PositionControl"),
     "plots": ("plot_flight",),
     "report": ("write_report",),
     "study": ("Study", "run_study"),

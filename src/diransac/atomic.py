@@ -1,20 +1,104 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all.
+
+A file is written in a private folder beside its place and then renamed. The folder is made under a name that nobody can
+guess, and fails where something of that name exists, so that no link of another user's is written through. It is locked
+while its process lives: the next file that is written in the same place removes what a killed process has left.
+"""
 
 from __future__ import annotations
 
 import os
+import re
+import shutil
+import sys
 import tempfile
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
+if sys.platform != "win32":
+    import fcntl
 
-__all__ = ["write_text", "write_with"]
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+__all__ = ["draft", "write_text", "write_with"]
+
+_BEGINNING, _END = ".diransac-", ".part"
+_NAME = re.compile(r"\.diransac-\w{8}\.part")
+
+
+@contextmanager
+def draft(target: Path) -> Iterator[Path]:
+    """Context with a file's place in a private folder beside it, of the same name; the folder is then removed.
+
+    Parameters
+    ----------
+    target : Path
+        File that the draft, which the block writes, is to replace: ``draft.replace(target)``.
+
+    Yields
+    ------
+    Path
+        Nothing is there yet.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be made.
+    """
+    _remove_abandoned(target.parent)
+    folder, lock = _locked_folder(target.parent)
+    try:
+        yield folder / target.name
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
+
+
+def _locked_folder(parent: Path) -> tuple[Path, int | None]:
+    """A new private folder, and its lock; None where the file system has none."""
+    while True:
+        folder = Path(tempfile.mkdtemp(dir=parent, prefix=_BEGINNING, suffix=_END))
+        lock = _lock(folder, wait=True)
+        if lock is None or folder.exists():  # else another process took it for abandoned before it was locked
+            return folder, lock
+        os.close(lock)
+
+
+def _lock(folder: Path, *, wait: bool) -> int | None:
+    """Descriptor of a folder that is locked until it is closed; None if that is impossible, or another has it."""
+    if sys.platform == "win32":  # which has no locks of this kind: what killed processes leave, stays
+        return None
+    found = None
+    try:
+        found = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        fcntl.flock(found, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        if found is not None:
+            os.close(found)
+        return None
+    return found
+
+
+def _remove_abandoned(parent: Path) -> None:
+    """Remove private folders of the user's own whose processes are dead."""
+    if sys.platform == "win32":
+        return
+    with suppress(OSError):
+        for entry in list(os.scandir(parent)):
+            if _NAME.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False):
+                if entry.stat(follow_symlinks=False).st_uid != os.geteuid():
+                    continue
+                lock = _lock(Path(entry.path), wait=False)
+                if lock is not None:
+                    shutil.rmtree(entry.path, ignore_errors=True)
+                    os.close(lock)
 
 
 def write_with(path: str | Path, write: Callable[[Path], None], *, mode: int | None = None) -> None:
-    """Write a file whole or not at all: a temporary file beside it, then a rename.
+    """Write a file whole or not at all: a temporary file in a private folder beside it, then a rename.
 
     Parameters
     ----------
@@ -26,15 +110,13 @@ def write_with(path: str | Path, write: Callable[[Path], None], *, mode: int | N
         Permissions of the file; by default those of the file that it replaces, else those that new files have.
     """
     target = Path(path)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-    os.close(handle)
-    temporary = Path(name)
-    try:
+    with draft(target) as temporary:
         write(temporary)
-        temporary.chmod(_default_mode(target) if mode is None else mode)
+        if mode is not None:
+            temporary.chmod(mode)
+        elif target.exists():
+            temporary.chmod(target.stat().st_mode)
         temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -44,12 +126,3 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_bytes(text.encode())
 
     write_with(path, write)
-
-
-def _default_mode(target: Path) -> int:
-    """Permissions of a file, or of a new one."""
-    if target.exists():
-        return target.stat().st_mode
-    umask = os.umask(0)
-    os.umask(umask)
-    return 0o666 & ~umask

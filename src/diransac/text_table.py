@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-__all__ = ["aligned", "number", "percent", "plural", "share", "telling_digits"]
+__all__ = ["aligned", "listed", "number", "percent", "plural", "share", "telling_digits"]
 
 _LEAST_PERCENT = 0.01
 _TIMES = 3.0
@@ -51,6 +51,11 @@ def share(x: float, whole: str) -> str:
     if math.isfinite(x) and x >= _TIMES:
         return f"{number(x, 2)} times {whole}"
     return f"{percent(x)} of {whole}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in a sentence: ``x``, ``x and z``, ``x, y and z``."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
 def plural(count: int, noun: str) -> str:

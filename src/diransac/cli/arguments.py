@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from diransac.identification.method import Method
 from diransac.identification.methods import configured, setting_names
 from diransac.identification.settings import Settings, nearest_names
 from diransac.model import Model
+from diransac.plain_data import read_text, toml_table
 from diransac.user_files import definitions, file_and_name
 
 __all__ = [
@@ -229,7 +229,7 @@ def load_methods(names: Sequence[str], settings: Mapping[str, Any]) -> list[Meth
 
 def _read_toml(file: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
+        return toml_table(read_text(file))
     except OSError as error:
         raise SettingsError(f'settings file "{file}" cannot be read: {error.strerror}') from error
     except ValueError as error:
@@ -258,8 +258,8 @@ def toml_value(text: str) -> object:
     """
     for candidate in (text, text.lower(), f"[{text}]" if "," in text else text):
         try:
-            return tomllib.loads(f"value = {candidate}")["value"]
-        except tomllib.TOMLDecodeError:
+            return toml_table(f"value = {candidate}")["value"]
+        except ValueError:
             continue
     try:
         return float(text)

@@ -9,6 +9,7 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import load_model, model_file
+from diransac.cli.design import DesignedModel, DesignOptions, designed, source_of
 from diransac.cli.flight_options import (
     FlightPicture,
     FlightSeed,
@@ -37,9 +38,11 @@ from diransac.cli.options import (
     known_methods,
     output_file,
 )
-from diransac.cli.outputs import checked, staged
+from diransac.cli.outputs import PAGE, RESULT, check_ending, checked, staged
 from diransac.cli.robot_options import LimbResults, RobotOptions, of_limb
-from diransac.cli.views import CacheState, Equations, ModelList, compare_methods
+from diransac.cli.views import CacheState, Equations, ModelList, Recorded, compare_methods
+from diransac.data.readers import read_fields, read_topics
+from diransac.data.suggested_mapping import suggest_mapping
 from diransac.identification.identify import identify
 from diransac.identification.inspection import inspect
 from diransac.identification.methods import DEFAULT, METHODS
@@ -94,9 +97,11 @@ def _identify(
     strict: StrictFlag = False,
 ) -> None:
     """Identify the parameters of a model from one log, or from several logs of one machine."""
-    (chosen,), derived = search.methods([method]), derivation.arguments()
+    (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
     read = [*files, model_file(model), search.settings]
     checked([output, report], read)
+    check_ending(output, RESULT)
+    check_ending(report, PAGE)
     limbs, results = robot.load_limbs(model), dict[str, Result]()
     outputs = [of_limb(path, limb) for limb in limbs for path in (output, report)]
     with staged(outputs, read) as drafts:
@@ -133,8 +138,11 @@ def _compare(
 ) -> None:
     """Identify by every method from the same logs, side by side."""
     wanted = search.methods(known_methods(methods))
-    arguments = search.arguments() | derivation.arguments()
-    with staged([report], [*files, model_file(model), search.settings]) as (page,):
+    arguments = search.arguments() | preparation.completed(derivation).arguments()
+    read = [*files, model_file(model), search.settings]
+    checked([report], read)
+    check_ending(report, PAGE)
+    with staged([report], read) as (page,):
         plant, logs = robot.load(model), preparation.read_all(files)
         with time_limited(search.time_limit):
             comparison = compare_methods(plant, logs, wanted, arguments)
@@ -156,7 +164,7 @@ def _validate(
     as_json: JsonFlag = False,
 ) -> None:
     """Predict other logs with an identified model, open loop."""
-    result = Result.load(model)
+    result, derivation = Result.load(model), preparation.completed(derivation)
     logs = [derivation.derive(log, result.model) for log in preparation.read_all(files)]
     screen.show(validate(result, logs, horizon), as_json)
 
@@ -175,7 +183,7 @@ def _cross_validate(
     as_json: JsonFlag = False,
 ) -> None:
     """Identify from all logs but one, and predict that one, for each in turn."""
-    (chosen,), derived = search.methods([method]), derivation.arguments()
+    (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
     plant, logs = robot.load(model), preparation.read_all(files)
     arguments = search.arguments() | derived | {"time_limit": search.time_limit}
     with screen.bar(f"{method}, leaving one log out") as progress:
@@ -194,7 +202,35 @@ def _inspect(
 ) -> None:
     """Show what a log holds, what is odd about it, and what is missing for a model."""
     plant = None if model is None else robot.load(model)
-    screen.show(inspect(preparation.read_uneven(file), plant), as_json)
+    topics = read_topics(file)
+    if topics is None or preparation.names_signals:
+        screen.show(inspect(preparation.read_uneven(file), plant), as_json)
+    else:
+        screen.show(Recorded.of(topics, plant), as_json)
+
+
+@app.command("map")
+@grouped
+def _map(
+    file: LogFile,
+    model: ModelName,
+    robot: RobotOptions,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", parser=output_file, metavar="FILE.toml", help="Where to write the mapping."),
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Write a first guess of a mapping from a log's topics or columns to a model's signals."""
+    with staged([output], [file, model_file(model)]) as (written,):
+        fields, elements = read_fields(file)
+        found = suggest_mapping(fields, elements, robot.load(model), f'log "{file}"')
+        if output is None and not as_json:
+            typer.echo(found.toml(), nl=False)
+            return
+        if output is not None:
+            written.write_text(found.toml(), encoding="utf-8")
+        screen.show(found, as_json)
 
 
 @app.command("simulate")
@@ -244,6 +280,25 @@ def _fly(
         if plot:
             test.flight.draw(picture)
         screen.show(test, as_json)
+
+
+@app.command("design")
+@grouped
+def _design(
+    model: DesignedModel,
+    robot: RobotOptions,
+    options: DesignOptions,
+    output: LogOutput,
+    plot: FlightPicture = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Design a motion within limits from which parameters are identified best, and predict their standard errors."""
+    with staged([output, plot], [source_of(model)]) as (written, picture):
+        designs = designed(model, robot, options)
+        designs.log(designs.motion).write(written)
+        if plot:
+            designs.draw(picture)
+        screen.show(designs, as_json)
 
 
 @app.command("export")

@@ -13,7 +13,9 @@ import typer
 from diransac.cli.arguments import fixed_parameters, load_methods, load_settings, names, numbers, pairs, prior_pairs
 from diransac.data import preprocessing
 from diransac.data.log import Log
+from diransac.data.mapping import BUILT_IN, load_mapping
 from diransac.data.readers import read_log
+from diransac.data.readers.repair import REPAIRS
 from diransac.errors import LogError, SettingsError
 from diransac.identification.method import Method
 from diransac.identification.methods import METHODS
@@ -86,7 +88,9 @@ def _moment(seconds: float | None) -> float | None:
     return seconds
 
 
-_LOG_HELP = "CSV(.gz), Parquet, NPZ or MAT: time t in seconds and one column a signal."
+_LOG_HELP = (
+    "CSV(.gz), Parquet, NPZ, MAT or HDF5: time t and one column a signal; ULog, MCAP, bag, Crazyflie: --mapping."
+)
 _MODEL = typer.Option(
     "--model", metavar="NAME|FILE.py[:NAME]|FILE.xml", help="A built-in model, one of yours, or a robot's MJCF or URDF."
 )
@@ -199,6 +203,18 @@ class Derivation:
 class Preparation:
     """Options of the preparation of a log, applied in this order."""
 
+    mapping: Annotated[
+        str | None,
+        _option("--mapping", metavar="NAME|FILE.toml", help=f"Topics to signals; built in: {', '.join(BUILT_IN)}."),
+    ] = None
+    columns: Annotated[
+        str | None, _option("--columns", metavar="NAME,...", help="Names of the columns of a CSV file without header.")
+    ] = None
+    rate: Annotated[float | None, _option("--rate", metavar="HZ", help="Rate of a file without time.")] = None
+    repair: Annotated[
+        str | None,
+        _option("--repair", metavar="safe|NAME,...", help=f"Repair instead of refusing: {', '.join(REPAIRS)}."),
+    ] = None
     rename: Annotated[
         list[str] | None,
         _option("--map", metavar="NEW=OLD,...", help="Columns to rename: position=q_m,t=t_s."),
@@ -232,12 +248,37 @@ class Preparation:
         """The prepared log of a file.  Raises LogError: it cannot be read or prepared."""
         rename, scale = pairs("--map", self.rename or ()), numbers("--scale", self.scale or ())
         delays, rate = numbers("--shift", self.shift or ()), _rate(self.resample)
-        log = read_log(file, rename=rename, scale=scale, resample=rate)
+        log = read_log(
+            file,
+            mapping=self.mapping,
+            columns=None if self.columns is None else names(self.columns),
+            rate=self.rate,
+            repair=self.repair,
+            rename=rename,
+            scale=scale,
+            resample=rate,
+        )
         if self.start is not None or self.stop is not None:
             log = log.between(-inf if self.start is None else self.start, inf if self.stop is None else self.stop)
         if self.despike is not None:
             log = preprocessing.despike(log, None if self.despike == "all" else names(self.despike))
         return preprocessing.shift(log, delays) if delays else log
+
+    def completed(self, derivation: Derivation) -> Derivation:
+        """The derivation with what the mapping file says of it and the command line does not.
+
+        Raises LogError: the mapping is not valid.
+        """
+        if self.mapping is None:
+            return derivation
+        mapping = load_mapping(self.mapping)
+        bandwidth = derivation.bandwidth if derivation.bandwidth is not None else mapping.option("bandwidth")
+        return Derivation(derivation.differentiate or bool(mapping.option("differentiate")), bandwidth)
+
+    @property
+    def names_signals(self) -> bool:
+        """True where topics are mapped to signals."""
+        return self.mapping is not None or bool(self.rename)
 
     def read_uneven(self, file: Path) -> Log:
         """As `read`, but an unevenly sampled log is resampled at its median rate, with a note."""

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence, Set
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence, Set
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from diransac.errors import ResultError
+from diransac.atomic import draft
+from diransac.errors import DiransacError, ResultError
 
-__all__ = ["checked", "staged"]
+__all__ = ["PAGE", "RESULT", "check_ending", "checked", "staged"]
+
+RESULT = (".json",)
+PAGE = (".html", ".htm")
+"""Endings of results and of pages."""
 
 
 def checked(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -> list[Path | None]:
@@ -39,6 +44,19 @@ def checked(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) 
     return targets
 
 
+def check_ending(output: Path | None, endings: Sequence[str]) -> None:
+    """Raise ResultError: the ending of an output is not that of the format in which it is written.
+
+    Parameters
+    ----------
+    output : Path or None
+    endings : sequence of str
+        Of this format.
+    """
+    if output is not None and output.suffix.lower() not in endings:
+        raise ResultError(f'output "{output}" does not end in {" or ".join(endings)}, the format that is written')
+
+
 @contextmanager
 def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -> Iterator[list[Path]]:
     """Context with temporary files beside the outputs, which they replace together when the block succeeds.
@@ -61,34 +79,40 @@ def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -
         As `checked`.
     """
     targets = checked(outputs, inputs)
-    drafts = [Path() if path is None else _draft(path) for path in targets]
-    try:
-        for draft, target in zip(drafts, targets, strict=True):
-            if target is not None:
-                _make(draft, target)
-        yield drafts
-        for draft, target in zip(drafts, targets, strict=True):
+    with ExitStack() as folders:
+        drafts = [Path() if path is None else _made(path, folders) for path in targets]
+        with _naming(dict(zip(drafts, outputs, strict=True))):
+            yield drafts
+        for written, target in zip(drafts, targets, strict=True):
             if target is not None:
                 if target.exists():
-                    draft.chmod(target.stat().st_mode)
-                draft.replace(target)
-    finally:
-        for draft, target in zip(drafts, targets, strict=True):
-            if target is not None:
-                with suppress(OSError):  # where it could not be made
-                    draft.unlink()
+                    written.chmod(target.stat().st_mode)
+                written.replace(target)
 
 
-def _draft(target: Path) -> Path:
-    """A name beside the target that keeps its ending, which chooses the format."""
-    return target.with_name(f".{os.getpid()}-{target.name}")
-
-
-def _make(draft: Path, target: Path) -> None:
+@contextmanager
+def _naming(outputs: Mapping[Path, Path | None]) -> Iterator[None]:
+    """Context whose errors name the outputs in place of their drafts."""
     try:
-        draft.touch()
+        yield
+    except DiransacError as error:
+        message = str(error)
+        for written, output in outputs.items():
+            if output is not None:
+                message = message.replace(str(written), str(output))
+        if message == str(error):
+            raise
+        raise type(error)(message) from error
+
+
+def _made(target: Path, folders: ExitStack) -> Path:
+    """The draft of a file, empty."""
+    try:
+        found = folders.enter_context(draft(target))
+        found.touch()
     except OSError as error:
         raise ResultError(f'output "{target}" cannot be written: {error.strerror}; choose another place') from error
+    return found
 
 
 def _place(path: Path, sources: Set[Path]) -> Path:

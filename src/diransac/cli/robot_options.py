@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
 from diransac.cli.arguments import is_description, load_model, names, pairs
 from diransac.identification.result import Result
 from diransac.model import Model
-from diransac.model.library import robot
 from diransac.model.parts import independent_parts
-from diransac.model.robots import Actuation, MotorCurrents, PositionControl
 from diransac.text_table import aligned, telling_digits
 
-__all__ = ["LimbResults", "RobotOptions", "of_limb"]
+if TYPE_CHECKING:
+    from diransac.model.robots import Actuation, MotorCurrents, PositionControl
+
+__all__ = ["LimbResults", "RobotOptions", "UnsaturatedRobot", "of_limb"]
+
+Drives = TypeVar("Drives", "PositionControl", "MotorCurrents")
 
 _NUMBERS = {"kp", "kd", "limit", "constant", "gear"}
 
@@ -25,6 +28,25 @@ _NUMBERS = {"kp", "kd", "limit", "constant", "gear"}
 def _option(*declarations: str, **about: Any) -> Any:
     """An option on the model of a robot."""
     return typer.Option(*declarations, rich_help_panel="Robot, for --model FILE.xml or FILE.urdf", **about)
+
+
+@dataclass(frozen=True)
+class UnsaturatedRobot:
+    """Models of a robot's limbs whose drives do not saturate.
+
+    Parameters
+    ----------
+    limbs : mapping of str to Model
+        By name; a machine in one part has an empty one.
+    limits : mapping of str to (float, float)
+        Of joints and forces of drives, by the description and the drives.
+    drives : Actuation, optional
+        None: the machine has no description.
+    """
+
+    limbs: Mapping[str, Model]
+    limits: Mapping[str, tuple[float, float]]
+    drives: Actuation | None
 
 
 @dataclass(frozen=True)
@@ -60,6 +82,8 @@ class RobotOptions:
         Raises typer.BadParameter: options for a robot belong to no other model; ModelError: as `load_model`.
         """
         if is_description(model):
+            from diransac.model.library import robot
+
             return robot(model, **self._arguments())
         for given in (x.name for x in fields(self) if getattr(self, x.name) is not None):
             raise typer.BadParameter(f"--{given} is for the description of a robot (.xml, .urdf)")
@@ -70,6 +94,24 @@ class RobotOptions:
         whole = self.load(model)
         limbs = independent_parts(whole) if is_description(model) else {}
         return limbs if len(limbs) > 1 else {"": whole}
+
+    def load_unsaturated(self, model: str) -> UnsaturatedRobot:
+        """A robot for whose inputs its equations can be solved; of another model, itself alone.
+
+        Raises as `load`.
+        """
+        if not is_description(model):
+            return UnsaturatedRobot({"": self.load(model)}, {}, None)
+        from diransac.model.library import robot, robot_limits
+        from diransac.model.robots import JointTorques
+
+        arguments = self._arguments()
+        given = self._actuation() or JointTorques()
+        drives = replace(given, limit=None)
+        whole = robot(model, **arguments | {"actuation": drives})
+        limits = robot_limits(model, actuation=given, joints=arguments.get("joints"), base=self.base)
+        limbs = independent_parts(whole)
+        return UnsaturatedRobot(limbs if len(limbs) > 1 else {"": whole}, limits, drives)
 
     def _arguments(self) -> dict[str, Any]:
         found: dict[str, Any] = {"actuation": self._actuation(), "base": self.base}
@@ -84,21 +126,23 @@ class RobotOptions:
                 found["joints"] = pairs("--joints", [self.joints])
         return found
 
-    def _actuation(self) -> Actuation | None:
+    def _actuation(self) -> PositionControl | MotorCurrents | None:
         if self.control is not None and self.motor is not None:
             raise typer.BadParameter("--control and --motor are two kinds of drives; give one")
+        from diransac.model.robots import MotorCurrents, PositionControl
+
         if self.control is not None:
             return _made(PositionControl, "--control", self.control)
         return None if self.motor is None else _made(MotorCurrents, "--motor", self.motor)
 
 
-def _made(kind: type[PositionControl | MotorCurrents], option: str, text: str) -> Actuation:
+def _made(kind: type[Drives], option: str, text: str) -> Drives:
     """A drive from ``key=value`` pairs.  Raises typer.BadParameter: a key is unknown, or a value is no number."""
     given, known = pairs(option, [text]), [x.name for x in fields(kind)]
     for key in given:
         if key not in known:
             raise typer.BadParameter(f"{option}: there is no {key!r}; there are {', '.join(known)}")
-    needed = "kp" if kind is PositionControl else "constant"
+    needed = known[0]
     if needed not in given:
         raise typer.BadParameter(f"{option}: {needed} is missing; give {needed}=number")
     try:

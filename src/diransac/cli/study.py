@@ -17,7 +17,7 @@ import typer
 from diransac.cli import screen
 from diransac.cli.arguments import names, toml_value
 from diransac.cli.options import JsonFlag
-from diransac.cli.outputs import staged
+from diransac.cli.outputs import PAGE, check_ending, checked, staged
 from diransac.errors import SettingsError
 from diransac.identification.identify import METHODS
 from diransac.study import Status, Study, builtin_names, connected, export, load, run_study, status, template
@@ -189,6 +189,8 @@ def _report(
     """Write a store as one HTML page: figures, tables, failures and run times."""
     from diransac.report.study import write_study_report
 
+    checked([output], [store])
+    check_ending(output, PAGE)
     with staged([output], [store]) as (written,):
         write_study_report(store, written)
 

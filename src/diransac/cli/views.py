@@ -10,6 +10,8 @@ from typing import Any
 
 from diransac.cli.screen import bar
 from diransac.data.log import Log
+from diransac.data.readers import TopicTable
+from diransac.data.suggested_mapping import Coverage, suggest_mapping
 from diransac.errors import DiransacError
 from diransac.identification.identify import identify
 from diransac.identification.method import Method
@@ -19,7 +21,7 @@ from diransac.model.library import BUILTIN
 from diransac.simulation.compiler.code_cache import CodeCache
 from diransac.text_table import aligned
 
-__all__ = ["CacheState", "Comparison", "Equations", "ModelList", "compare_methods"]
+__all__ = ["CacheState", "Comparison", "Equations", "ModelList", "Recorded", "compare_methods"]
 
 
 @dataclass(frozen=True)
@@ -227,3 +229,25 @@ def _bounds(parameter: Parameter) -> str:
     low = "0 <" if parameter.positive else f"{parameter.lower:g} <=" if parameter.lower > -float("inf") else ""
     high = f"<= {parameter.upper:g}" if parameter.upper < float("inf") else ""
     return " ".join(part for part in (low, "value" if low or high else "any", high) if part)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Topics of a recording, and which of them a model's signals may come from."""
+
+    topics: TopicTable
+    coverage: Coverage | None = None
+
+    @classmethod
+    def of(cls, topics: TopicTable, model: Model | None) -> Recorded:
+        """Topics, and the coverage of a model."""
+        if model is None:
+            return cls(topics)
+        return cls(topics, suggest_mapping(topics.fields, topics.elements, model, topics.source))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Both."""
+        return self.topics.to_dict() | {"fitness": None if self.coverage is None else self.coverage.to_dict()}
+
+    def __str__(self) -> str:
+        return str(self.topics) + ("" if self.coverage is None else f"\n\n{self.coverage}")

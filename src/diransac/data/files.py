@@ -17,6 +17,7 @@ A log without any of it is written without metadata.
 from __future__ import annotations
 
 import gzip
+import io
 import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -150,7 +151,9 @@ def _write_csv_gz(columns: Mapping[str, FloatArray], metadata: str, file: Path) 
 def _write_parquet(columns: Mapping[str, FloatArray], metadata: str, file: Path) -> None:
     import polars as pl
 
-    pl.DataFrame(dict(columns)).write_parquet(file, metadata={KEY: metadata} if metadata else None)
+    memory = io.BytesIO()  # Polars' own errors of a full disk are no OSError
+    pl.DataFrame(dict(columns)).write_parquet(memory, metadata={KEY: metadata} if metadata else None)
+    file.write_bytes(memory.getbuffer())
 
 
 def _write_npz(columns: Mapping[str, FloatArray], metadata: str, file: Path) -> None:

@@ -16,7 +16,7 @@ from diransac.identification.agreement import disagreements
 from diransac.identification.estimate import Evaluation, LogSummary, Prediction
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
 from diransac.identification.known_parameters import KnownParameters
-from diransac.identification.method import Callback, Method, fit, report, within
+from diransac.identification.method import Callback, Method, fit, numerical_failures, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, factory
 from diransac.identification.prediction import predictions
 from diransac.identification.refusal import check_motion
@@ -132,7 +132,7 @@ def identify(
     pointwise = chosen.needs_all_signals or not differentiate
     known = KnownParameters.of(model, fixed, priors)
     task = _Task(known, given, chosen, int(seed), pointwise, hold, compares=compare_logs and len(given) > 1)
-    with time_limited(time_limit):
+    with time_limited(time_limit), numerical_failures(given):
         if with_suggestions:
             return task.with_suggestions(progress)
         if not filtered:

@@ -170,7 +170,7 @@ class Inspection:
             return []
         lines = ["", f"for {found.model}:"]
         rest = [name for name in found.missing if name not in found.derivable]
-        lines += [f"  missing: {', '.join(rest)}; name columns with --map"] if rest else []
+        lines += [f"  missing: {', '.join(rest)}; name columns with --map, or see diransac map"] if rest else []
         lines += [f"  missing, --differentiate supplies: {', '.join(found.derivable)}"] if found.derivable else []
         lines += [f"  {found.reason}"] if found.reason else []
         if found.excitation:

@@ -24,7 +24,7 @@ from diransac.data.dataset import ParameterLayout
 from diransac.errors import SettingsError
 from diransac.identification.identifiability import structural, structural_slopes
 from diransac.identification.uncertainty import combined
-from diransac.model.derivation import deserialize
+from diransac.model import expressions
 
 if TYPE_CHECKING:
     from diransac.arrays import FloatArray
@@ -174,13 +174,14 @@ class KnownParameters:
         while name in constants:
             name += "_2"
         code = re.sub(rf"\bp\.{found.parameter}\b", f"p.{name}", found.code)
-        term = deserialize(found.term)
-        q, v, a, u = (ca.SX.sym(n, term.size1_in(i)) for i, n in enumerate("qvau"))
+        sizes = {**self.model.argument_sizes, "p": self.model.n_p - len(constants)}
+        term = expressions.restored("term", found.term, sizes, {"h": self.model.n_v})
+        q, v, a, u = (ca.SX.sym(n, sizes[n]) for n in "qvau")
         p = ca.vertcat(*(ca.SX.sym(n) for n in self.model.parameters))
         every = zip(self.model.parameters, ca.vertsplit(p), strict=True)
         own = ca.vertcat(*(x for n, x in every if n not in constants))
         h = ca.Function("term", [q, v, a, u, p], [term(q, v, a, u, own)], list("qvaup"), ["h"])
-        return replace(found, parameter=name, code=code, term=h.serialize())
+        return replace(found, parameter=name, code=code, term=expressions.stored(f"parameter {name}", h))
 
 
 def _as_mapping(fixed: object) -> Mapping[str, object]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,11 +14,12 @@ from diransac.identification.refusal import cause_of_refusal, motion_rows
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
+    from diransac.data.log import Log
     from diransac.identification.estimate import Estimate
     from diransac.identification.settings import Settings
     from diransac.model import Model
 
-__all__ = ["Callback", "Method", "Progress", "fit", "report", "within"]
+__all__ = ["Callback", "Method", "Progress", "extremes", "fit", "numerical_failures", "report", "within"]
 
 
 @dataclass(frozen=True)
@@ -115,8 +117,52 @@ def fit(method: Method, dataset: Dataset, seed: int, callback: Callback | None =
 
 
 def _not_finite(method: Method, dataset: Dataset) -> str:
-    cause = cause_of_refusal(dataset.model, dataset.layout, motion_rows(dataset))
+    try:
+        cause = cause_of_refusal(dataset.model, dataset.layout, motion_rows(dataset))
+    except np.linalg.LinAlgError:
+        cause = extremes(dataset.given)
     return f"{dataset.source}: {method.name} finds no finite parameters: {cause}"
+
+
+@contextmanager
+def numerical_failures(logs: Sequence[Log]) -> Iterator[None]:
+    """Context of all that is computed from logs.  Raises IdentificationError: linear algebra fails; the cause is named.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    """
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        source = ", ".join(dict.fromkeys(log.source for log in logs))
+        raise IdentificationError(f"{source}: the numbers exceed floating point ({error}): {extremes(logs)}") from error
+
+
+def extremes(logs: Sequence[Log]) -> str:
+    """Sentence on the signal whose values range most widely.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+
+    Returns
+    -------
+    str
+    """
+    found = []
+    for log in logs:
+        for name in log.names:
+            sizes = np.abs(log[name])
+            sizes = sizes[np.isfinite(sizes) & (sizes > 0.0)]
+            if len(sizes):
+                with np.errstate(all="ignore"):
+                    usual, largest = float(np.median(sizes)), float(sizes.max())
+                    found.append((max(np.log10(largest) - np.log10(usual), abs(np.log10(usual))), name, usual, largest))
+    if not found:
+        return "all signals are zero; record a motion"
+    _, name, usual, largest = max(found)
+    return f'"{name}" is {usual:.3g} in the median and {largest:.3g} at most; check its unit, and remove such outliers'
 
 
 def report(callback: Callback | None, stage: str, fraction: float, note: str = "") -> None:

@@ -126,15 +126,17 @@ def simulated_rows(
         The log lacks its initial state, and no other is given.
     """
     if restarts is None:
-        begins = [(rows.start, state) for rows, state in simulation.starts[log]]
+        begins = simulation.starts[log]
+        rows, states = np.array([x.start for x, _ in begins], int), np.array([state for _, state in begins])
     else:
-        begins = list(zip(restarts.rows.tolist(), restarts.states, strict=True))
+        rows, states = restarts.rows, restarts.states
     outside = np.flatnonzero(np.append(observations.gaps, True))
+    sizes = np.minimum(outside[np.searchsorted(outside, rows)], np.append(rows[1:], len(observations))) - rows
     series = np.full((len(observations), len(observations.model.signals)), np.nan)
-    for k, (row, state) in enumerate(begins):
-        end = min([int(outside[np.searchsorted(outside, row)]), *(other for other, _ in begins[k + 1 : k + 2])])
-        found = simulation.trajectories(log, parameters, state[None], np.array([row]), end - row)
-        series[row:end] = found[0]
+    for size in np.unique(sizes).tolist():
+        alike = sizes == size
+        found = simulation.trajectories(log, parameters, states[alike], rows[alike], size)
+        series[rows[alike][:, None] + np.arange(size)] = found
     return series
 
 

@@ -23,11 +23,12 @@ from diransac.identification.settings import Settings
 from diransac.identification.suggestions import Suggestion
 from diransac.identification.uncertainty import student_quantile, students_draws
 from diransac.model import Model
+from diransac.plain_data import json_data, read_text
 from diransac.text_table import aligned, telling_digits
 
 __all__ = ["MARKS", "Result"]
 
-_FORMAT = 6
+_FORMAT = 7
 _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
 MARKS = {"bad": "!", "care": "·"}
@@ -426,12 +427,22 @@ class Result:
         ResultError
             The data are of another format, or damaged.
         """
-        if not isinstance(data, Mapping) or data.get("format") != _FORMAT:
-            raise ResultError(f"this is no diransac result of format {_FORMAT}; identify again")
+        found = data.get("format") if isinstance(data, Mapping) else None
+        if type(found) is not int:
+            raise ResultError("this is no result of diransac; give a file that identify wrote")
+        if found != _FORMAT:
+            writer = "an earlier version" if found < _FORMAT else "a later version"
+            raise ResultError(
+                f"the result has format {found}, of {writer} of diransac; this one reads {_FORMAT}. Identify again"
+            )
+        assert isinstance(data, Mapping)
         try:
             return cls._from_checked(data)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ResultError(f"the result is damaged: {type(error).__name__} at {error}; identify again") from error
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
+            reason = str(error).partition("\n")[0]
+            raise ResultError(
+                f"the result is damaged: {type(error).__name__} at {reason:.200}; identify again"
+            ) from error
 
     @classmethod
     def _from_checked(cls, data: Mapping[str, Any]) -> Result:
@@ -445,8 +456,15 @@ class Result:
         masks = [] if estimate.diagnosis is None else estimate.diagnosis.outliers.values()
         if any(len(mask) != n_rows for mask in (evaluation.inliers, *masks)):
             raise ValueError(f"a mask of other than {n_rows} rows")
+        if not 1 <= estimate.degrees_of_freedom <= 2**53:
+            raise ValueError(f"{estimate.degrees_of_freedom} degrees of freedom")
+        for log in plain.logs:
+            if not (log.n_rows > 0 and 0.0 < log.dt < np.inf and np.isfinite(log.start)):
+                raise ValueError(f"a log of {log.n_rows} rows, {log.dt} s apart")
         settings = Settings.from_dict(data["settings"])
-        return cls(model, estimate=estimate, evaluation=evaluation, settings=settings, **vars(plain))
+        found = cls(model, estimate=estimate, evaluation=evaluation, settings=settings, **vars(plain))
+        found._derived(), str(found)  # fail where names and figures do not fit together
+        return found
 
     def save(self, path: str | Path) -> None:
         """Write the result as JSON, atomically.
@@ -480,11 +498,13 @@ class Result:
             There is no such file, or it does not contain a result; the message names the file.
         """
         try:
-            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
+            data = json_data(read_text(path))
         except OSError as error:
             raise ResultError(f"{path}: cannot be read: {error.strerror}") from error
-        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        except ValueError as error:
             raise ResultError(f"{path}: is no JSON: {error}") from error
+        try:
+            return cls.from_dict(data)
         except DiransacError as error:
             raise ResultError(f"{path}: {error}") from error
 
@@ -501,8 +521,22 @@ class Result:
         values = ", ".join(f"{name}={value:.4g}" for name, value in self.parameters.items())
         return f"<Result of {self.method} for {self.model.name}: {values}; {self.verdict}>"
 
+    def _repr_html_(self) -> str:
+        """Parameters, verdict and the findings against the result, as a notebook shows them."""
+        from html import escape
+
+        header, *rows = ([escape(cell) for cell in row] for row in self._cells())
+        table = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+        against = [x for x in self.findings if x.level in MARKS]
+        findings = "".join(f"<li>{escape(f'{MARKS[x.level]} {x}')}</li>" for x in against)
+        return (
+            f"<p>{escape(self._headline())}: <strong>{self.verdict}</strong></p>"
+            f"<table><tr>{''.join(f'<th>{cell}</th>' for cell in header)}</tr>{table}</table>"
+            + (f"<ul>{findings}</ul>" if findings else "")
+        )
+
     def __str__(self) -> str:
-        parts = (self._headline(), *self._table(), *self._prior_lines(), self._summary())
+        parts = (self._headline(), *aligned(self._cells()), *self._prior_lines(), self._summary())
         return "\n".join([*parts, *self._diagnosed(), *self._assessed()])
 
     def _headline(self) -> str:
@@ -513,7 +547,8 @@ class Result:
         rate = rates[0] if len(rates) == 1 else f"{rates[0]} to {rates[-1]}"
         return f"{self.model.name} by {self.method} from {source} ({seconds:.4g} s at {rate} Hz)"
 
-    def _table(self) -> list[str]:
+    def _cells(self) -> list[tuple[str, str, str, str]]:
+        """Header and rows of the table of parameters."""
         rows = [("parameter", "estimate", "95 % interval", "unit")]
         for name, (low, high) in self.intervals().items():
             digits = telling_digits(low, high)
@@ -523,7 +558,7 @@ class Result:
             varies = not self.layout.is_shared and self.model.parameters[name].per_log
             averaged = varies and name not in self.fixed
             rows.append((f"{name} (mean of logs)" if averaged else name, estimate, interval, self.units[name]))
-        return aligned(rows)
+        return rows
 
     def _prior_lines(self) -> list[str]:
         """The priors, in a line; none without them."""

@@ -37,7 +37,7 @@ class _Form:
     def _checked(self, value: object) -> Any:
         try:
             return self.decode(value)
-        except (TypeError, AttributeError, KeyError) as error:
+        except (TypeError, AttributeError, LookupError, ArithmeticError) as error:
             raise ValueError(f"{type(error).__name__}: {error}") from error
 
     def by_name(self) -> _Form:

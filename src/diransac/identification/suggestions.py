@@ -21,17 +21,16 @@ selection); Brunton, Proctor, Kutz 2016 (sparse identification).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.serialization import Number
-from diransac.model import Model, Parameter
-from diransac.model.derivation import deserialize
+from diransac.model import Model, Parameter, expressions
 
 if TYPE_CHECKING:
     from diransac.identification.candidate_terms import CandidateTerm, CandidateTerms
@@ -84,8 +83,8 @@ class Suggestion:
         Fraction of the mean square unmodelled force of the equation that the term explains.
     code : str
         Python code, with CasADi as ``ca``: a summand of the residual with its sign, or the input with its gain.
-    term : str
-        The term without its coefficient, ``(q, v, a, u, p) -> h (n_v)``, as a serialised CasADi function.
+    term : mapping of str to object
+        The term without its coefficient, ``(q, v, a, u, p) -> h (n_v)``, as data.
     """
 
     kind: str
@@ -97,7 +96,7 @@ class Suggestion:
     unit: str
     explained: Number
     code: str
-    term: str
+    term: Mapping[str, Any]
 
     @property
     def declaration(self) -> str:
@@ -131,7 +130,8 @@ def with_terms(model: Model, suggestions: Sequence[Suggestion]) -> Model:
     ResultError
         A stored term is damaged.
     """
-    terms = [deserialize(x.term) for x in suggestions]
+    results = {"h": model.n_v}
+    terms = [expressions.restored("term", x.term, model.argument_sizes, results) for x in suggestions]
     derived = model.kinematics is None
 
     def arguments(q, v, a, u, p):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
@@ -565,5 +565,5 @@ def _suggestion(candidates: CandidateTerms, term: CandidateTerm, found: Selected
     h = ca.Function("term", list(candidates.symbols), [ca.densify(term.residuals)], list("qvaup"), ["h"])
     return Suggestion(
         term.kind, term.place, text, term.parameter, found.value, found.standard_error, term.unit, found.explained,
-        term.code, h.serialize(),
+        term.code, expressions.stored(f"term {term.parameter}", h),
     )  # fmt: skip

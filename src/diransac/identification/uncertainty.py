@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -160,11 +161,16 @@ def students_draws(
     Raises
     ------
     ResultError
-        Next to no draws are within the bounds.
+        Next to no draws are within the bounds, or the covariance is none.
     """
     rng, kept, n_drawn = np.random.default_rng(seed), np.zeros((len(mean), 0)), 0
     while kept.shape[1] < n:
-        normal = rng.multivariate_normal(np.zeros(len(mean)), covariance, _N_DRAWS, method="eigh").T
+        try:
+            normal = rng.multivariate_normal(np.zeros(len(mean)), covariance, _N_DRAWS, method="eigh").T
+        except np.linalg.LinAlgError as error:
+            raise ResultError(
+                "the covariance has no eigenvalues in floating point; identify from other data"
+            ) from error
         draws = mean[:, None] + normal / np.sqrt(rng.chisquare(degrees_of_freedom, _N_DRAWS) / degrees_of_freedom)
         inside = np.all([x.admits(own) for x, own in zip(bounds, draws, strict=True)], axis=0)
         kept, n_drawn = np.hstack([kept, draws[:, inside]]), n_drawn + _N_DRAWS
@@ -176,6 +182,7 @@ def students_draws(
     return kept[:, :n]
 
 
+@lru_cache(maxsize=256)
 def student_quantile(degrees_of_freedom: float, probability: float) -> float:
     """Quantile of Student's t distribution, accurate to about twelve digits.
 
@@ -194,7 +201,7 @@ def student_quantile(degrees_of_freedom: float, probability: float) -> float:
     -------
     float
     """
-    n, (points, weights) = degrees_of_freedom, np.polynomial.legendre.leggauss(_N_POINTS)
+    n, (points, weights) = degrees_of_freedom, _quadrature()
 
     def density(theta: FloatArray | float) -> FloatArray:
         return np.asarray(np.exp(0.5 * (n - 1.0) * np.log1p(-np.square(np.sin(theta)))))
@@ -209,3 +216,9 @@ def student_quantile(degrees_of_freedom: float, probability: float) -> float:
         if step <= 1e-15 * theta:
             break
     return math.sqrt(n) * math.tan(theta)
+
+
+@cache
+def _quadrature() -> tuple[FloatArray, FloatArray]:
+    """Points and weights of Gauss-Legendre quadrature on [-1, 1]."""
+    return np.polynomial.legendre.leggauss(_N_POINTS)

@@ -15,7 +15,8 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.errors import ModelError, ResultError
+from diransac.errors import ModelError
+from diransac.model import expressions
 
 if TYPE_CHECKING:
     from diransac.model.parameter import Parameter
@@ -24,6 +25,9 @@ __all__ = ["Probe", "Symbols"]
 
 
 _N_POINTS = 40
+_MOST_NAMES = 3000
+"""Largest number of names of a model; matrices grow with its square."""
+
 _SINGULAR = 1e-10
 _TOLERANCE = 1e-8
 _NEAR_NOMINAL = 1e-3
@@ -118,6 +122,9 @@ def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
     Raises ModelError: a name is not an identifier or is used twice, or there are no states or parameters.
     """
     names = [n for group in groups for n in group]
+    if len(names) > _MOST_NAMES:
+        raise ModelError(f"{label}: there are {len(names)} names; up to {_MOST_NAMES} are possible")
+    known = set[object]()
     for name in names:
         if str(name) != name or not name.isidentifier() or keyword.iskeyword(name) or name.startswith("__"):
             raise ModelError(
@@ -125,8 +132,9 @@ def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
             )
         if name == "t":
             raise ModelError(f'{label}: the name "t" is reserved for time; choose another')
-        if names.count(name) > 1:
+        if name in known:
             raise ModelError(f"{label}: the name {name!r} is used twice; signals and parameters need different names")
+        known.add(name)
     for kind, group in (("coordinates or first_order states", [*groups[0], *groups[2]]), ("parameters", groups[-2])):
         if not group:
             raise ModelError(f"{label}: there are no {kind}; give at least one")
@@ -156,10 +164,14 @@ def check_kinematics(label: str, kinematics: ca.Function) -> None:
     check_constants(label, "kinematics", kinematics)
 
 
-def check_sensors(label: str, probe: Probe, names: Sequence[str]) -> None:
-    """Raises ModelError: a NaN constant in a sensor's equation, or one that is finite at no random point."""
-    for i, _ in _nan_outputs(probe.residual):
+def check_readings(label: str, measurement: ca.Function, names: Sequence[str]) -> None:
+    """Raises ModelError: a NaN constant in a sensor's equation."""
+    for i, _ in _nan_outputs(measurement):
         raise ModelError(f"{label}: sensor {names[i]!r} contains NaN; use casadi's functions, not Python's math")
+
+
+def check_sensors(label: str, probe: Probe, names: Sequence[str]) -> None:
+    """Raises ModelError: a sensor is finite at no random point."""
     finite: BoolArray = np.asarray(np.isfinite(np.array(probe.residual(*probe.points))).any(axis=1))
     for name in (n for n, x in zip(names, finite, strict=True) if not x):
         raise ModelError(
@@ -178,11 +190,11 @@ def check_constants(label: str, what: str, function: ca.Function) -> None:
 
 def _nan_outputs(function: ca.Function) -> Iterator[tuple[int, str]]:
     """Indices of the outputs whose expression holds a NaN constant."""
+    if not expressions.has_nan(function):
+        return
     arguments = [ca.SX.sym(n, *function.size_in(i)) for i, n in enumerate(function.name_in())]
     for i, expression in enumerate(ca.vertsplit(function(*arguments))):
-        one = ca.Function("one", arguments, [expression])
-        constants = (k for k in range(one.n_instructions()) if one.instruction_id(k) == ca.OP_CONST)
-        if any(np.isnan(one.instruction_constant(k)) for k in constants):
+        if expressions.has_nan(ca.Function("one", arguments, [expression])):
             yield i, "equation"
 
 
@@ -357,17 +369,3 @@ def find_quaternions(kinematics: ca.Function) -> tuple[tuple[int, int, int, int]
         else:
             start += 1
     return tuple(found)
-
-
-def deserialize(text: str) -> ca.Function:
-    """The SX function that ``Function.serialize`` wrote.
-
-    Raises ResultError: the text is damaged, or not an SX function.
-    """
-    try:
-        function = ca.Function.deserialize(text)
-    except (RuntimeError, UnicodeDecodeError, MemoryError, TypeError, NotImplementedError) as error:
-        raise ResultError("the stored equations cannot be read; identify again") from error
-    if function.is_null() or not function.is_a("SXFunction"):
-        raise ResultError("the stored equations are not an SX function; identify again")
-    return function

@@ -25,7 +25,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, ResultError
-from diransac.model import derivation
+from diransac.model import derivation, expressions
 from diransac.model.derivation import Probe, Symbols
 from diransac.model.parameter import Parameter
 from diransac.model.sensors import Sensor, with_parameters_of
@@ -102,18 +102,15 @@ class Model:
             given, missing = ("velocities", "kinematics") if kinematics is None else ("kinematics", "velocities")
             raise ModelError(f'model "{name}": {given} without {missing}; give both, or neither')
         q, v, a, u, p = self._symbols()
-        residual = derivation.call_user(self._label, "equations", equations, *self.named(q, v, a, u, p))
-        self.residual = ca.Function("residual", [q, v, a, u, p], [residual], list("qvaup"), ["r"])
-        self.kinematics: ca.Function | None = None
-        if kinematics is not None:
-            rates = derivation.call_user(self._label, "kinematics", kinematics, *self.named(q, v))
-            self.kinematics = ca.Function("kinematics", [q, v], [rates], list("qv"), ["q_dot"])
         named = self.named(q, v, a, u, p)
+        residual = derivation.call_user(self._label, "equations", equations, *named)
+        results: dict[str, ca.SX | None] = {"residual": residual, "kinematics": None, "measurement": None}
+        if kinematics is not None:
+            results["kinematics"] = derivation.call_user(self._label, "kinematics", kinematics, *self.named(q, v))
         outputs = [derivation.call_sensor(self._label, n, x.equation, *named) for n, x in (sensors or {}).items()]
-        self.measurement: ca.Function | None = None
         if outputs:
-            self.measurement = ca.Function("measurement", [q, v, a, u, p], [ca.vertcat(*outputs)], list("qvaup"), ["y"])
-        self._check()
+            results["measurement"] = ca.vertcat(*outputs)
+        self._restore(self._written((q, v, a, u, p), results))
 
     # ------------------------------------------------------------------ names and sizes
 
@@ -183,10 +180,19 @@ class Model:
         """Unit of every signal and input by name."""
         return {**self.coordinates, **self.velocities, **self.accelerations, **self.sensors, **self.inputs}
 
+    @property
+    def argument_sizes(self) -> dict[str, int]:
+        """Number of elements of the arguments q, v, a, u and p."""
+        return {"q": self.n_q, "v": self.n_v, "a": self.n_v, "u": self.n_u, "p": self.n_p}
+
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
-        groups = (self.coordinates, self.velocities, self.accelerations, self.inputs, self.parameters)
-        q, v, a, u, p = (ca.vertcat(*(ca.SX.sym(n) for n in names)) for names in groups)
+        q, v, a, u, p = (ca.vertcat(*(ca.SX.sym(n) for n in names)) for names in self._groups)
         return q, v, a, u, p
+
+    @property
+    def _groups(self) -> tuple[Mapping[str, Any], ...]:
+        """Names behind the arguments q, v, a, u and p."""
+        return (self.coordinates, self.velocities, self.accelerations, self.inputs, self.parameters)
 
     @property
     def rate_names(self) -> tuple[str, ...]:
@@ -229,12 +235,52 @@ class Model:
     def _velocities_are_derivatives(self) -> bool:
         return list(self.velocities_of_motion) == [f"{q}_dot" for q in self.coordinates]
 
-    # ------------------------------------------------------------------ checks
+    # ------------------------------------------------------------------ equations
+
+    def _written(self, symbols: Sequence[ca.SX], results: Mapping[str, ca.SX | None]) -> dict[str, Any]:
+        """Equations as data by name, checked; None for those that the model lacks."""
+        written: dict[str, Any] = {}
+        for name, expression in results.items():
+            if expression is None:
+                written[name] = None
+                continue
+            arguments, outputs = self._signature(name)
+            function = ca.Function(name, list(symbols[: len(arguments)]), [expression], list(arguments), list(outputs))
+            expressions.check_size(self._label, function)
+            if name == "residual":
+                derivation.check_residual(self._label, function, tuple(self.accelerations))
+            elif name == "kinematics":
+                derivation.check_kinematics(self._label, function)
+            else:
+                derivation.check_readings(self._label, function, tuple(self.sensors))
+            written[name] = expressions.stored(self._label, function)
+        return written
+
+    def _signature(self, name: str) -> tuple[dict[str, int], dict[str, int]]:
+        """Sizes of the arguments and of the result of the residual, the kinematics or the measurement."""
+        if name == "kinematics":
+            return {"q": self.n_q, "v": self.n_v}, {"q_dot": self.n_q}
+        return self.argument_sizes, {"r": self.n_v} if name == "residual" else {"y": len(self.sensors)}
+
+    def _restore(self, written: Mapping[str, Any]) -> None:
+        """Make the functions of equations as data; those of a new model and of a loaded one are the same.
+
+        Raises ResultError: the data are damaged.
+        Raises ModelError: the equations are not those of a model.
+        """
+        self._equations_data = dict(written)
+        made = {
+            name: None if data is None else expressions.restored(name, data, *self._signature(name))
+            for name, data in written.items()
+        }
+        if made["residual"] is None:
+            raise ResultError("the stored model is damaged: it has no equations; identify again")
+        self.residual: ca.Function = made["residual"]
+        self.kinematics: ca.Function | None = made["kinematics"]
+        self.measurement: ca.Function | None = made["measurement"]
+        self._check()
 
     def _check(self) -> None:
-        derivation.check_residual(self._label, self.residual, tuple(self.accelerations))
-        if self.kinematics is not None:
-            derivation.check_kinematics(self._label, self.kinematics)
         self._probe = Probe(self.residual, self._bounds)
         self._mass_matrix, self._bias = derivation.affine_in_acceleration(self._label, self._probe, self.accelerations)
         self._definite = derivation.mass_matrix_sign(self._label, self._probe, self._mass_matrix, self.accelerations)
@@ -358,13 +404,13 @@ class Model:
         symbols = [q, v, a, u, ca.vertcat(*own)]
         data = {k: x for k, x in self.to_dict().items() if k not in ("checksum", "sensors", "measurement")}
         data["parameters"] = {n: data["parameters"][n] for n in parameters}
-        data["residual"] = ca.Function(
-            "residual", symbols, [self.residual(q, v, a, u, p)], list("qvaup"), ["r"]
-        ).serialize()
+        written = ca.Function("residual", symbols, [self.residual(q, v, a, u, p)], list("qvaup"), ["r"])
+        data["residual"] = expressions.stored(self._label, written)
         if kept and self.measurement is not None:
             y = self.measurement(q, v, a, u, p)[[list(self.sensors).index(n) for n in kept]]
             data["sensors"] = {n: self.sensors[n] for n in kept}
-            data["measurement"] = ca.Function("measurement", symbols, [y], list("qvaup"), ["y"]).serialize()
+            written = ca.Function("measurement", symbols, [y], list("qvaup"), ["y"])
+            data["measurement"] = expressions.stored(self._label, written)
         return Model.from_dict({**data, "checksum": _checksum(data)})
 
     def sensors_of(self, arguments: Callable[..., Sequence[ca.SX]]) -> dict[str, Sensor]:
@@ -508,13 +554,18 @@ class Model:
         return self._definite * ca.ldl_solve(ca.densify(rhs), D, LT, order)
 
     def equations_text(self) -> tuple[str, ...]:
-        """Every residual as readable text, ``0 = ...``, in the signals' names, and every sensor, ``name = ...``."""
-        symbols = self._symbols()
-        residuals = tuple(f"0 = {r}" for r in ca.vertsplit(self.residual(*symbols)))
-        if self.measurement is None:
-            return residuals
-        outputs = zip(self.sensors, ca.vertsplit(self.measurement(*symbols)), strict=True)
-        return (*residuals, *(f"{name} = {y}" for name, y in outputs))
+        """Every residual as readable text, ``0 = ...``, in the signals' names, and every sensor, ``name = ...``.
+
+        Parts of very deep expressions come first, ``#1 = ...``.
+        """
+        names = dict(zip("qvaup", (list(x) for x in self._groups), strict=True))
+        texts, n_parts = list[str](), 0
+        for function, left in ((self.residual, ["0"] * self.n_v), (self.measurement, list(self.sensors))):
+            if function is not None:
+                parts, elements = expressions.printed(function, names, n_parts + 1)
+                texts += [*parts, *(f"{x} = {y}" for x, y in zip(left, elements, strict=True))]
+                n_parts += len(parts)
+        return tuple(texts)
 
     def parameter_vector(self, parameters: Mapping[str, float]) -> FloatArray:
         """Values ``(n_p,)`` in the model's order.
@@ -550,7 +601,7 @@ class Model:
         return hash(self.fingerprint)
 
     def to_dict(self) -> dict[str, Any]:
-        """Names, units, bounds and serialised equations as JSON data, which `from_dict` reads."""
+        """Names, units, bounds and equations as JSON data, which `from_dict` reads."""
         data = {
             "name": self.name,
             "description": self.description,
@@ -558,12 +609,12 @@ class Model:
             "velocities": None if self.kinematics is None else self.velocities_of_motion,
             "inputs": self.inputs,
             "parameters": {n: _parameter_to_dict(x) for n, x in self.parameters.items()},
-            "residual": self.residual.serialize(),
-            "kinematics": None if self.kinematics is None else self.kinematics.serialize(),
+            "residual": self._equations_data["residual"],
+            "kinematics": self._equations_data["kinematics"],
             **({"first_order": self.first_order} if self.first_order else {}),
         }
         if self.measurement is not None:
-            data |= {"sensors": self.sensors, "measurement": self.measurement.serialize()}
+            data |= {"sensors": self.sensors, "measurement": self._equations_data["measurement"]}
         return {**data, "checksum": _checksum(data)}
 
     @classmethod
@@ -577,9 +628,10 @@ class Model:
         """
         try:
             return cls._from_checked(data)
-        except (KeyError, TypeError, AttributeError, ValueError, ModelError) as error:
+        except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, RuntimeError, ModelError) as error:
+            reason = str(error).partition("\n")[0]
             raise ResultError(
-                f"the stored model is damaged: {type(error).__name__}: {error}; identify again"
+                f"the stored model is damaged: {type(error).__name__}: {reason:.200}; identify again"
             ) from error
 
     @classmethod
@@ -587,21 +639,17 @@ class Model:
         model = cls.__new__(cls)
         if data["checksum"] != _checksum({k: x for k, x in data.items() if k != "checksum"}):
             raise ResultError("the stored model is damaged: its checksum does not match; identify again")
+        if not isinstance(data["name"], str) or not isinstance(data["description"], str):
+            raise TypeError("name or description")
         parameters = {n: _parameter_from_dict(x) for n, x in data["parameters"].items()}
         units = (data["coordinates"], data["inputs"], parameters, data["velocities"], data.get("first_order", {}))
         model._name_signals(data["name"], *units, data["description"], data.get("sensors", {}))
-        model.residual = derivation.deserialize(data["residual"])
-        stored = data["kinematics"]
-        model.kinematics = None if stored is None else derivation.deserialize(stored)
-        stored = data.get("measurement")
-        model.measurement = None if stored is None else derivation.deserialize(stored)
-        wanted = [model.n_q, model.n_v, model.n_v, model.n_u, model.n_p]
-        functions = [model.residual, *([] if model.measurement is None else [model.measurement])]
-        sizes = [[function.size1_in(i) for i in range(function.n_in())] for function in functions]
-        n_sensors = 0 if model.measurement is None else model.measurement.numel_out(0)
-        if any(found != wanted for found in sizes) or n_sensors != len(model.sensors):
+        has_kinematics, has_sensors = data["kinematics"] is not None, data.get("measurement") is not None
+        if has_kinematics != (data["velocities"] is not None) or has_sensors != bool(model.sensors):
             raise ResultError("the stored model is damaged: its names do not fit its equations; identify again")
-        model._check()
+        model._restore(
+            {"residual": data["residual"], "kinematics": data["kinematics"], "measurement": data.get("measurement")}
+        )
         return model
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -644,11 +692,14 @@ def _parameter_to_dict(parameter: Parameter) -> dict[str, Any]:
 
 
 def _parameter_from_dict(data: Mapping[str, Any]) -> Parameter:
-    lower = -np.inf if data["lower"] is None else data["lower"]
-    upper = np.inf if data["upper"] is None else data["upper"]
-    own_values, nominal = bool(data.get("per_log", False)), data.get("value")
+    """Raises KeyError, TypeError, ValueError, ModelError: the data are not those of a parameter."""
+    unit, positive, own_values, nominal = data["unit"], data["positive"], data.get("per_log", False), data.get("value")
+    if not isinstance(unit, str) or not isinstance(positive, bool) or not isinstance(own_values, bool):
+        raise TypeError(f"parameter {data!r:.60}")
+    lower = -np.inf if data["lower"] is None else float(data["lower"])
+    upper = np.inf if data["upper"] is None else float(data["upper"])
     combination = tuple((str(name), float(weight)) for name, weight in data.get("combination", ()))
-    return Parameter(data["unit"], lower, upper, data["positive"], own_values, nominal, combination)
+    return Parameter(unit, lower, upper, positive, own_values, None if nominal is None else float(nominal), combination)
 
 
 def _checksum(data: Mapping[str, Any]) -> str:

@@ -6,6 +6,7 @@ Planning, control and identification use the model alone; only simulations inclu
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,7 +18,7 @@ import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
-from diransac.model import derivation
+from diransac.model import derivation, expressions
 from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 
@@ -107,7 +108,9 @@ class Disturbance:
             "rates": (rates, tuple(self.states)),
         }
         results = [self._expressions(what, *wanted[what], arguments) for what in wanted]
-        self.effect = ca.Function("effect", [q, v, u, p, own], results, list("qvupd"), list(wanted))
+        effect = ca.Function("effect", [q, v, u, p, own], results, list("qvupd"), list(wanted))
+        self._effect_data = expressions.stored(self._label, effect)
+        self.effect = self._restored_effect()
         if forces is not None:
             model.force_response  # noqa: B018  refuses a model that is no balance of forces
 
@@ -161,13 +164,20 @@ class Disturbance:
         derivation.check_constants(self._label, what, ca.Function(what, [ca.vertcat(*ca.symvar(column))], [column]))
         return column
 
+    def _restored_effect(self) -> ca.Function:
+        """Function ``(q, v, u, p, d) -> (forces, accelerations, rates)`` of the stored effect."""
+        model = self.model
+        sizes = {"q": model.n_q, "v": model.n_v, "u": model.n_u, "p": model.n_p, "d": len(self._own)}
+        results = {"forces": model.n_v, "accelerations": model.n_v, "rates": len(self.states)}
+        return expressions.restored("effect", self._effect_data, sizes, results)
+
     def drawn_start(self, rng: np.random.Generator) -> list[float]:
         """Initial states, in order; uniform over those given as a range."""
         return [float(rng.uniform(*value) if isinstance(value, tuple) else value) for value in self.start.values()]
 
     def __reduce__(self) -> tuple[Any, ...]:
         kept = {name: value for name, value in vars(self).items() if name != "effect"}
-        return (_restored, (kept, self.effect.serialize()))
+        return (_restored, (kept,))
 
     def __repr__(self) -> str:
         return f"Disturbance({self.name!r} of {self.model.name!r}, constants={self.constants})"
@@ -178,10 +188,11 @@ def _as_start(value: Any) -> Any:
     return tuple(value) if isinstance(value, Sequence | np.ndarray) else value
 
 
-def _restored(kept: Mapping[str, Any], effect: str) -> Disturbance:
+def _restored(kept: Mapping[str, Any]) -> Disturbance:
     """Unpickled disturbance."""
     disturbance = Disturbance.__new__(Disturbance)
-    vars(disturbance).update(kept, effect=derivation.deserialize(effect))
+    vars(disturbance).update(kept)
+    disturbance.effect = disturbance._restored_effect()
     return disturbance
 
 
@@ -214,7 +225,9 @@ class DisturbedModel:
     @cached_property
     def _equations(self) -> tuple[Any, ...]:
         """The model, and the names and effect of every disturbance."""
-        effects = ((one.name, *one.constants, "", *one.states, one.effect.serialize()) for one in self.disturbances)
+        effects = (
+            (one.name, *one.constants, "", *one.states, json.dumps(one._effect_data)) for one in self.disturbances
+        )
         return (self.model, *effects)
 
     def __eq__(self, other: object) -> bool:

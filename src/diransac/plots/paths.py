@@ -95,7 +95,8 @@ def plot_paths(
 def levels_with_paths(store: str | Path) -> list[str]:
     """Levels with paths in a store.  Raises StudyError: there is no such store."""
     with Store.existing(store) as kept:
-        return [level for (level,) in kept.select("SELECT DISTINCT level FROM trials WHERE paths NOT NULL")]
+        query = "SELECT DISTINCT level FROM trials JOIN cells USING (level, method) WHERE paths NOT NULL"
+        return [level for (level,) in kept.select(query)]
 
 
 def _chosen(levels: Sequence[str], level: str | None) -> str:

@@ -45,6 +45,8 @@ _COLUMNS = 3
 _SPREAD = 0.5
 # Ratio of the largest to the median mean above which the scale is logarithmic; its decades above a linear part.
 _MANY, _DECADES = 20.0, 3
+_TOP = 1e300
+"""Largest value on an axis; Matplotlib adds margins."""
 # Letters per line of a title, and largest difference between its lines.
 _LETTERS, _RAGGED = 92, 12
 
@@ -244,7 +246,7 @@ def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool)
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
     largest = float(mean[np.isfinite(mean)].max(initial=0.0))
-    top = max(largest, float(np.nan_to_num(highest).max(initial=0.0)))
+    top = min(max(largest, float(np.nan_to_num(highest).max(initial=0.0))), _TOP)
     if not largest > 0.0:
         axes.set_ylim(-0.04, 1.0)
         return

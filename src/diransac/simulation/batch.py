@@ -410,6 +410,11 @@ class Simulator(Protocol):
         The sign of a quaternion is ignored: its four simulated components change sign where that is nearer.
         """
 
+    def errors_and_ends(
+        self, batch: RolloutBatch, measurements: Measurements, *, threads: int = 1
+    ) -> tuple[FloatArray, FloatArray]:
+        """Errors as of `errors`, and the states (n_lanes, n_x) one row after the last, NaN in a lane that diverged."""
+
     def trajectories(self, batch: RolloutBatch, *, threads: int = 1) -> FloatArray:
         """All signals of the model, (n_lanes, n_rows, n_signals): states, accelerations; NaN from a divergence on."""
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import casadi as ca
@@ -176,10 +177,24 @@ class Sensitivities:
 
     def matrix(self, values: FloatArray) -> FloatArray:
         """Whole matrices (n, n_x, n_z) from the stored derivatives (n, n_entries)."""
-        whole = np.zeros((len(values), *self.initial.shape))
+        n_x, n_z = self.initial.shape
         rows, columns = self.entries
-        whole[:, rows, columns] = values
-        return whole
+        whole = np.zeros((len(values), n_x * n_z))
+        whole[:, rows * n_z + columns] = values
+        return whole.reshape(len(values), n_x, n_z)
+
+    @cached_property
+    def places(self) -> IntArray:
+        """Place of each unknown (n_z,) in the order of the groups, in which the time loop has them."""
+        return np.argsort(list(chain(*self.groups)))
+
+    @cached_property
+    def pairs(self) -> IntArray:
+        """Place of each pair of unknowns (n_z, n_z) in the upper triangle of a symmetric matrix in that order."""
+        n_z = len(self.unknowns)
+        upper, pair = np.triu_indices(n_z), np.empty((n_z, n_z), int)
+        pair[upper] = pair[upper[::-1]] = np.arange(len(upper[0]))
+        return pair[np.ix_(self.places, self.places)]
 
 
 def sensitivities_of(model: SimulatedModel, unknowns: Sequence[str]) -> Sensitivities:

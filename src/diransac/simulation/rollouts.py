@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from itertools import chain
 from threading import RLock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +25,7 @@ from diransac.simulation.batch import (
 )
 from diransac.simulation.compiler.graph import read_graph
 from diransac.simulation.compiler.lanes import (
+    ARGUMENTS,
     Lanes,
     aligned,
     arranged_feedback,
@@ -39,11 +40,17 @@ from diransac.simulation.compiler.machine_code import LANES, MachineCode, Target
 from diransac.simulation.integrators import HOLDS, INTEGRATORS, Sensitivities, loop_specification, sensitivities_of
 
 if TYPE_CHECKING:
-    from diransac.simulation.compiler.time_loop import InputSource, LoopSpecification, Output
+    from diransac.simulation.compiler.time_loop import LoopSpecification
     from diransac.simulation.compiler.vectors import Value
     from diransac.simulation.integrators import SimulatedModel
 
 __all__ = ["Rollouts", "rollouts"]
+
+OutputName: TypeAlias = Literal[
+    "ScoreOutput", "ErrorOutput", "SignalOutput", "GaussNewtonOutput", "LinearizedErrorOutput", "ClosedLoopOutput"
+]
+InputName: TypeAlias = Literal["inputs_from_log", "inputs_by_feedback", "inputs_by_shared_feedback"]
+"""What a time loop writes, and where its inputs are from: names in modules that are imported only to emit code."""
 
 
 def rollouts(
@@ -143,8 +150,6 @@ class Rollouts(Simulator):
         threads: int = 1,
     ) -> ScoreBatch:
         """Sums of squared errors and inliers of every lane; see `Simulator.score`."""
-        from diransac.simulation.compiler.outputs import ScoreOutput
-
         n_signals = len(self.signals)
         lanes = self._lanes(batch)
         sums, counts = np.empty((n_signals, lanes.n_padded)), np.empty((2, lanes.n_padded), np.int64)
@@ -157,28 +162,31 @@ class Rollouts(Simulator):
             "counts": counts,
             "inlier_bits": bits,
         }
-        self._run(ScoreOutput, batch, lanes, values, threads)
+        self._run("ScoreOutput", batch, lanes, values, threads)
         n = lanes.n_lanes
         return ScoreBatch(batch, sums[:, :n].T.copy(), counts[0, :n].copy(), counts[1, :n] != 0, bits)
 
     def errors(self, batch: RolloutBatch, measurements: Measurements, *, threads: int = 1) -> FloatArray:
         """Simulated less measured, (n_lanes, n_rows, n_s), NaN from a divergence on; see `Simulator.errors`."""
-        from diransac.simulation.compiler.outputs import ErrorOutput
+        return self.errors_and_ends(batch, measurements, threads=threads)[0]
 
+    def errors_and_ends(
+        self, batch: RolloutBatch, measurements: Measurements, *, threads: int = 1
+    ) -> tuple[FloatArray, FloatArray]:
+        """Errors, and the states (n_lanes, n_x) one row after the last; see `Simulator.errors_and_ends`."""
         n_signals = len(self.signals)
         lanes = self._lanes(batch)
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_signals))
+        final = aligned((lanes.n_padded // LANES, len(self._model.state), LANES))
         values = arranged_measurements(lanes, n_signals, measurements.values, measurements.valid)
-        self._run(ErrorOutput, batch, lanes, {**values, "series": series}, threads)
-        return series
+        self._run("ErrorOutput", batch, lanes, {**values, "series": series, "final": final}, threads)
+        return series, _by_lane(final, lanes.n_lanes)
 
     def trajectories(self, batch: RolloutBatch, *, threads: int = 1) -> FloatArray:
         """All signals of the model, (n_lanes, n_rows, n_signals): states, accelerations; NaN from a divergence on."""
-        from diransac.simulation.compiler.outputs import SignalOutput
-
         lanes = self._lanes(batch)
         series = np.empty((lanes.n_lanes, lanes.n_rows, len(self._model.signals)))
-        self._run(SignalOutput, batch, lanes, {"series": series}, threads)
+        self._run("SignalOutput", batch, lanes, {"series": series}, threads)
         return series
 
     def gauss_newton(
@@ -191,8 +199,6 @@ class Rollouts(Simulator):
         threads: int = 1,
     ) -> GaussNewtonBatch:
         """Sums e' W e, J' W e and J' W J of every lane; see `Simulator.gauss_newton`."""
-        from diransac.simulation.compiler.outputs import GaussNewtonOutput
-
         lanes = self._lanes(batch)
         names, sensitivities = self._unknowns(unknowns)
         n_z, n_blocks = len(names), lanes.n_padded // LANES
@@ -203,7 +209,7 @@ class Rollouts(Simulator):
             "sums": sums,
             "final": final,
         }
-        self._run(GaussNewtonOutput, batch, lanes, values, threads, unknowns=names)
+        self._run("GaussNewtonOutput", batch, lanes, values, threads, unknowns=names)
         return _unpacked(sensitivities, lanes.n_lanes, sums, final)
 
     def linearized_errors(
@@ -215,8 +221,6 @@ class Rollouts(Simulator):
         threads: int = 1,
     ) -> LinearizedErrors:
         """Errors and Jacobian row by row; see `Simulator.linearized_errors`."""
-        from diransac.simulation.compiler.outputs import LinearizedErrorOutput
-
         lanes = self._lanes(batch)
         names, sensitivities = self._unknowns(unknowns)
         n_s, n_z = len(self.signals), len(names)
@@ -225,7 +229,7 @@ class Rollouts(Simulator):
             **arranged_measurements(lanes, n_s, measurements.values, measurements.valid),
             "series": series,
         }
-        self._run(LinearizedErrorOutput, batch, lanes, values, threads, unknowns=names)
+        self._run("LinearizedErrorOutput", batch, lanes, values, threads, unknowns=names)
         columns = series[..., n_s:].reshape(*series.shape[:2], n_z, n_s)
         jacobian = np.empty((*series.shape[:2], n_s, n_z))
         jacobian[..., list(chain(*sensitivities.groups))] = columns.swapaxes(-1, -2)
@@ -240,9 +244,6 @@ class Rollouts(Simulator):
         threads: int = 1,
     ) -> ClosedLoopBatch:
         """Signals of closed loops, and the inputs that were applied; see `Simulator.fly`."""
-        from diransac.simulation.compiler.outputs import ClosedLoopOutput
-        from diransac.simulation.compiler.time_loop import inputs_by_feedback, inputs_by_shared_feedback
-
         model, n_signals = self._model, len(self._model.signals)
         if self._hold != "zero-order":
             raise SettingsError(f"a closed loop holds its inputs from row to row; these rollouts are {self._hold}.")
@@ -257,8 +258,8 @@ class Rollouts(Simulator):
         values = arranged_feedback(lanes, feedback.table(), feedback.n_laws, feedback_of_lane)
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_signals + model.n_u))
         values |= {"limits": np.array([feedback.u_min, feedback.u_max]), "series": series}
-        source = inputs_by_feedback if "feedback_starts" in values else inputs_by_shared_feedback
-        self._run(ClosedLoopOutput, batch, lanes, values, threads, inputs=source)
+        source: InputName = "inputs_by_feedback" if "feedback_starts" in values else "inputs_by_shared_feedback"
+        self._run("ClosedLoopOutput", batch, lanes, values, threads, inputs=source)
         return ClosedLoopBatch(series[..., :n_signals], series[..., n_signals:])
 
     def _lanes(self, batch: RolloutBatch, inputs: FloatArray | None = None) -> Lanes:
@@ -287,20 +288,18 @@ class Rollouts(Simulator):
 
     def _run(
         self,
-        output: type[Output],
+        output: OutputName,
         batch: RolloutBatch,
         lanes: Lanes,
         values: dict[str, Any],
         threads: int,
         *,
-        inputs: InputSource | None = None,
+        inputs: InputName = "inputs_from_log",
         unknowns: tuple[str, ...] = (),
     ) -> None:
         """Run the time loop over all blocks of lanes; `values` are its other arguments by name."""
-        from diransac.simulation.compiler.time_loop import inputs_from_log
-
         if lanes.n_lanes:
-            code = self._compiled(output, inputs or inputs_from_log, unknowns, lanes.has_windows)
+            code = self._compiled(output, inputs, unknowns, lanes.has_windows)
             run_time_loop(code, lanes, {"step": batch.dt / self._substeps, **values}, threads)
 
     def _derivatives(self, unknowns: tuple[str, ...]) -> Sensitivities:
@@ -324,19 +323,19 @@ class Rollouts(Simulator):
                 )
             return self._specifications[unknowns]
 
-    def _compiled(
-        self, output: type[Output], inputs: InputSource, unknowns: tuple[str, ...], windows: bool
-    ) -> MachineCode:
+    def _compiled(self, output: OutputName, inputs: InputName, unknowns: tuple[str, ...], windows: bool) -> MachineCode:
         """Machine code of a variant of the time loop, compiled when first needed."""
-        from diransac.simulation.compiler.time_loop import ARGUMENTS, emit_time_loop
 
         def emit() -> Value:
-            return emit_time_loop(self._specified(unknowns), output, inputs, windows=windows)
+            from diransac.simulation.compiler import outputs, time_loop
+
+            variant = getattr(outputs, output), getattr(time_loop, inputs)
+            return time_loop.emit_time_loop(self._specified(unknowns), *variant, windows=windows)
 
         variant = (output, inputs, unknowns, windows)
         with self._lock:
             if variant not in self._code:
-                definition = (*self._definition(unknowns), output.__name__, inputs.__name__, repr(windows))
+                definition = (*self._definition(unknowns), output, inputs, repr(windows))
                 code = compile_function(emit, definition, "time_loop", ARGUMENTS.values(), self._target)
                 self._code[variant] = code
             return self._code[variant]
@@ -360,18 +359,18 @@ def _unpacked(sensitivities: Sensitivities, n_lanes: int, sums: FloatArray, fina
     final : (n_blocks, n_x + n_entries, 8)
         State, then its derivatives.
     """
-    sums, final = (
-        array.swapaxes(1, 2).reshape(len(array) * LANES, array.shape[1])[:n_lanes] for array in (sums, final)
-    )
+    sums, final = _by_lane(sums, n_lanes), _by_lane(final, n_lanes)
     n_x, n_z = sensitivities.initial.shape
-    place = np.argsort(list(chain(*sensitivities.groups)))
-    upper = np.triu_indices(n_z)
-    pair = np.empty((n_z, n_z), int)
-    pair[upper] = pair[upper[::-1]] = np.arange(1 + n_z, sums.shape[1])
-    cost, gradient = sums[:, 0].copy(), sums[:, 1 + place]
-    normal_matrix = sums[:, pair[np.ix_(place, place)]]
+    cost, gradient = sums[:, 0].copy(), np.take(sums, 1 + sensitivities.places, axis=1)
+    normal_matrix = np.take(sums, 1 + n_z + sensitivities.pairs, axis=1)
     diverged = np.isinf(cost)
     slopes = sensitivities.matrix(final[:, n_x:])
-    slopes[diverged] = np.nan
+    if diverged.any():
+        slopes[diverged] = np.nan
     states = final[:, :n_x].copy()
     return GaussNewtonBatch(sensitivities.unknowns, cost, gradient, normal_matrix, states, slopes, diverged)
+
+
+def _by_lane(blocks: FloatArray, n_lanes: int) -> FloatArray:
+    """Values ``(n_lanes, n)`` from the blocks ``(n_blocks, n, 8)`` of a time loop, without lanes that fill the last."""
+    return blocks.swapaxes(1, 2).reshape(len(blocks) * LANES, blocks.shape[1])[:n_lanes]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +54,16 @@ class PlantFacts:
     units: Mapping[str, str]
     parameters: Mapping[str, float]
     disturbed: bool
+
+    @classmethod
+    def from_dict(cls, facts: Mapping[str, Any]) -> PlantFacts:
+        """Properties as a store holds them.  Raises TypeError, KeyError: they are none."""
+        units, parameters, disturbed = facts["units"], facts["parameters"], facts["disturbed"]
+        if not units or not all(isinstance(unit, str) for unit in units.values()) or type(disturbed) is not bool:
+            raise TypeError("properties of a plant")
+        if any(type(value) not in (int, float) for value in parameters.values()):
+            raise TypeError("parameters of a plant")
+        return cls(dict(units), {name: float(value) for name, value in parameters.items()}, disturbed)
 
     @classmethod
     def of(cls, plant: Plant) -> PlantFacts:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from diransac.errors import SettingsError
+from diransac.plain_data import read_text, toml_table
 from diransac.study.specification import Study
 from diransac.study.tables import changed
 
@@ -45,12 +45,12 @@ def load(source: Study | Mapping[str, Any] | str | Path, changes: Mapping[str, A
     if isinstance(source, Mapping):
         return Study.from_dict(changed(source, changes or {}))
     try:
-        return Study.from_dict(changed(tomllib.loads(_text(source)), changes or {}))
-    except tomllib.TOMLDecodeError as error:
-        why = str(error).replace("Cannot overwrite a value", "a key, or a level, stands there twice")
-        raise SettingsError(f'study "{source}" is not TOML: {why}') from error
+        return Study.from_dict(changed(toml_table(_text(source)), changes or {}))
     except SettingsError as error:
         raise SettingsError(f'study "{source}": {error}') from error
+    except ValueError as error:
+        why = str(error).replace("Cannot overwrite a value", "a key, or a level, stands there twice")
+        raise SettingsError(f'study "{source}" is not TOML: {why}') from error
 
 
 def _text(source: str | Path) -> str:
@@ -62,7 +62,7 @@ def _text(source: str | Path) -> str:
             )
         return (_FOLDER / "builtin" / f"{source}.toml").read_text(encoding="utf-8")
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        return read_text(path)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
         raise SettingsError(f"the file cannot be read: {reason}") from error

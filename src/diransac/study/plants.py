@@ -28,7 +28,7 @@ from diransac.model.plant import Disturbance, Plant
 from diransac.study.tables import RANDOM, FunctionTable, Text, check_signature, function_arguments
 from diransac.user_files import blaming, definitions, file_and_name, running
 
-__all__ = ["PlantChoice", "double_pendulum", "pendulum", "servo_axis"]
+__all__ = ["PlantChoice", "double_pendulum", "is_builtin", "pendulum", "servo_axis"]
 
 SERVO_AXIS: Mapping[str, float] = MappingProxyType(
     {"mass": 95.0, "viscous_friction": 200.0, "dry_friction": 20.0, "offset": -12.0}
@@ -157,6 +157,11 @@ _KINDS: dict[str, Callable[..., Plant]] = {
     "pendulum": pendulum,
 }
 _DEFAULT_NAME = "plant"
+
+
+def is_builtin(kind: object) -> bool:
+    """True for a kind of plant that is not a user's file."""
+    return isinstance(kind, str) and kind in _KINDS
 
 
 class PlantChoice(FunctionTable):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,14 +13,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from diransac.errors import SettingsError
-from diransac.study.store import Store
+from diransac.errors import SettingsError, StudyError
+from diransac.plain_data import json_data
+from diransac.study.store import Store, damage, quoted, whole, word
 from diransac.text_table import aligned
 
 if TYPE_CHECKING:
     import polars as pl
 
 __all__ = ["Status", "TrialCounts", "about", "export", "paths", "read", "status"]
+
+_NEEDED = ("level", "trial", "method", "status", "seed", "versions", "seconds", "host")
+_LARGEST_PATH = 64 * 2**20
+"""Bytes of the longest flown path."""
 
 _KINDS: dict[str, type] = {"TEXT": str, "INTEGER": int, "REAL": float}
 
@@ -47,14 +53,41 @@ def read(store: str | Path) -> pl.DataFrame:
 
     with Store.existing(store) as kept:
         columns = {name: column for name, column in kept.columns.items() if name != "paths"}
-        names = ", ".join(f't."{column}"' for column, _ in columns.values())
+        names = ", ".join(f"t.{quoted(column)}" for column, _ in columns.values())
         rows = kept.select(
             f"SELECT {names} FROM trials t JOIN cells c USING (level, method) "
             "ORDER BY (SELECT min(rowid) FROM cells WHERE level = t.level), t.trial, c.rowid"
         )
-    frame = pl.DataFrame(rows, schema={name: _KINDS[kind] for name, (_, kind) in columns.items()}, orient="row")
-    stages = list(json.loads(frame["seconds"][0])) if len(frame) else []
+    with damage(Path(store)):
+        schema = {name: _KINDS[kind] for name, (_, kind) in columns.items()}
+        by_name = {name: [row[k] for row in rows] for k, name in enumerate(schema)}
+        seconds = _checked(by_name, schema)
+        frame = pl.DataFrame({**by_name, "seconds": seconds}, schema={**schema, "seconds": str})
+    stages = list(json.loads(seconds[0])) if seconds else []
     return frame.with_columns(pl.col("seconds").str.json_decode(pl.Struct(dict.fromkeys(stages, pl.Float64))))
+
+
+def _checked(columns: Mapping[str, Sequence[Any]], schema: Mapping[str, type]) -> list[str]:
+    """Computing times of the rows as JSON, with the same stages; the other columns are checked.
+
+    Raises LookupError, TypeError, ValueError: a value is not of its column's kind.
+    """
+    for name in _NEEDED:
+        if any(value is None for value in columns[name]):
+            raise ValueError(f"a row has no {name}")
+    for name, kind in schema.items():
+        allowed = (int, float) if kind is float else (kind,)
+        wrong = [value for value in columns[name] if value is not None and type(value) not in allowed]
+        if wrong:
+            raise TypeError(f"{name} is {wrong[0]!r:.40}")
+    for trial in columns["trial"]:
+        whole(trial)
+    times = [json_data(text) for text in columns["seconds"]]
+    stages = list(times[0]) if times else []
+    for time in times:
+        if list(time) != stages or not all(type(value) in (int, float) for value in time.values()):
+            raise ValueError(f"seconds are {time!r:.40}")
+    return [json.dumps(dict(zip(stages, map(float, time.values()), strict=True))) for time in times]
 
 
 def about(store: str | Path) -> dict[str, str]:
@@ -80,11 +113,26 @@ def paths(store: str | Path, trajectory: str) -> dict[tuple[str, int, str], npt.
     with Store.existing(store) as kept:
         rows = kept.select("SELECT level, trial, method, paths FROM trials WHERE paths NOT NULL ORDER BY rowid")
     found = {}
-    for level, trial, method, packed in rows:
-        with np.load(io.BytesIO(packed), allow_pickle=False) as flown:
-            if trajectory in flown:
-                found[level, trial, method] = flown[trajectory]
+    with damage(Path(store)):
+        for level, trial, method, packed in rows:
+            path = _unpacked(packed, trajectory)
+            if path is not None:
+                found[level, trial, method] = path
     return found
+
+
+def _unpacked(packed: bytes, trajectory: str) -> npt.NDArray[np.float32] | None:
+    """Flown path (K, n_q) of a trajectory; None if there is none.  Raises ValueError: it is damaged, or too large."""
+    with zipfile.ZipFile(io.BytesIO(packed)) as archive:
+        if any(entry.file_size > _LARGEST_PATH for entry in archive.infolist()):
+            raise ValueError("a flown path is too large")
+    with np.load(io.BytesIO(packed), allow_pickle=False) as flown:
+        if trajectory not in flown:
+            return None
+        path: npt.NDArray[np.float32] = flown[trajectory]
+    if path.dtype != np.float32 or path.ndim != 2 or min(path.shape) < 1:
+        raise ValueError(f"a flown path is of {path.dtype}, {path.shape}")
+    return path
 
 
 def export(store: str | Path, path: str | Path, kind: str) -> None:
@@ -93,19 +141,24 @@ def export(store: str | Path, path: str | Path, kind: str) -> None:
     Raises
     ------
     StudyError
-        There is no such store.
+        There is no such store, or the file cannot be written.
     SettingsError
         Another kind.
     """
     import polars as pl
 
     frame = read(store)
+    memory = io.BytesIO()  # Polars' own errors of a full disk are no OSError
     if kind == "parquet":
-        frame.write_parquet(path)
+        frame.write_parquet(memory)
     elif kind == "csv":
-        frame.with_columns(pl.col("seconds").struct.json_encode()).write_csv(path)
+        frame.with_columns(pl.col("seconds").struct.json_encode()).write_csv(memory)
     else:
         raise SettingsError(f'there is no kind "{kind}"; there are parquet, csv')
+    try:
+        Path(path).write_bytes(memory.getbuffer())
+    except OSError as error:
+        raise StudyError(f'"{path}" cannot be written: {error.strerror}') from error
 
 
 # Progress --------------------------------------------------------------------------------------------------
@@ -194,7 +247,14 @@ def status(store: str | Path) -> Status:
             "coalesce(sum(t.status = 'failed'), 0), min(t.error) "
             "FROM cells c LEFT JOIN trials t USING (level, method) GROUP BY c.level, c.method ORDER BY c.rowid"
         )
-    return Status(str(store), name, {(level, method): TrialCounts(*counts) for level, method, *counts in rows})
+    with damage(Path(store)):
+        cells = {
+            (word(level), word(method)): TrialCounts(
+                whole(asked), whole(done), whole(failed), None if error is None else word(error)
+            )
+            for level, method, asked, done, failed, error in rows
+        }
+    return Status(str(store), name, cells)
 
 
 def _text(cell: TrialCounts | None) -> str:

@@ -10,25 +10,32 @@
 The file has a rollback journal: a write-ahead log needs shared memory, which network file systems lack. Every write is
 one transaction, so that a killed process leaves all of it or nothing. Values that may differ between equal runs are in
 the columns ``seconds`` and ``host`` only.
+
+A store may come from anyone: it is opened for reading without the right to write, its tables must be tables, queries
+have a time limit, every value is checked, and none of them names code that reading would run.
 """
 
 from __future__ import annotations
 
 import json
 import sqlite3
+import time
+import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from diransac.errors import StudyError
+from diransac.plain_data import json_data
 from diransac.study.assessment import PlantFacts
 from diransac.study.specification import Study
 
-__all__ = ["Store"]
+__all__ = ["Store", "damage", "quoted", "whole", "word"]
 
 _APPLICATION = 0x6469726E
 """SQLite's application id: "dirn"."""
@@ -36,6 +43,23 @@ _APPLICATION = 0x6469726E
 _FORMAT = 2
 _LOCK_TIMEOUT = 120.0
 """s to wait while another process writes."""
+
+_READ_TIMEOUT = 120.0
+"""s that one query may take."""
+
+_ANOTHER_JOURNAL = bytes.fromhex("d9d505f920a163d7")
+"""Last bytes of a journal of several databases, which names a file that is deleted when it is rolled back."""
+
+_LARGEST_VALUE = 64 * 2**20
+"""Bytes of the largest value in a store."""
+
+_MOST_TRIALS = 10_000_000
+"""Trials of the largest study."""
+
+_TABLES = {"trials", "cells", "configuration", "about"}
+_DAMAGE = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, EOFError,
+           NotImplementedError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+"""Errors of values that a store of diransac never holds."""
 
 _RENAMED_KEYS = {
     "noise.freeze_probability": "noise.stuck_probability",
@@ -84,6 +108,8 @@ class Store:
             with _transaction(self._connection, self.path):
                 if _is_empty(self._connection):
                     _create(self._connection, study)
+                else:
+                    _check_tables(self._connection, self.path)
                 _upgrade(self._connection, self.path)
                 self._ask_for(study)
         except BaseException:
@@ -92,17 +118,18 @@ class Store:
 
     @classmethod
     def existing(cls, path: str | Path) -> Self:
-        """An existing store, for reading.  Raises StudyError: there is none."""
+        """An existing store, for reading alone.  Raises StudyError: there is none."""
         store = cls.__new__(cls)
         store.path = Path(path)
         if not store.path.is_file():
             raise StudyError(f'store "{path}" does not exist; make one with diransac study run NAME --store {path}')
-        store._connection = _connected(store.path, "rw")
+        _roll_back(store.path)
+        store._connection = _connected(store.path, "ro")
         try:
             with _reported(store.path):
-                current = _format(store._connection, store.path) == _FORMAT
-            if not current:
-                with _transaction(store._connection, store.path):
+                _check_tables(store._connection, store.path)
+                if _format(store._connection, store.path) != _FORMAT:
+                    store._connection = _copied(store._connection)
                     _upgrade(store._connection, store.path)
         except BaseException:
             store._connection.close()
@@ -126,7 +153,7 @@ class Store:
         columns = {name: column for name, (column, _) in self.columns.items()}
         with _transaction(self._connection, self.path):
             for row in rows:
-                names = ", ".join(_quoted(columns.get(name, name)) for name in row)
+                names = ", ".join(quoted(columns.get(name, name)) for name in row)
                 marks = ", ".join("?" * len(row))
                 values = [json.dumps(value) if isinstance(value, Mapping) else value for value in row.values()]
                 self._connection.execute(f"INSERT OR IGNORE INTO trials ({names}) VALUES ({marks})", values)
@@ -134,6 +161,8 @@ class Store:
 
     def select(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Rows of a query."""
+        end = time.monotonic() + _READ_TIMEOUT
+        self._connection.set_progress_handler(lambda: time.monotonic() > end, 100_000)
         with _reported(self.path):
             return self._connection.execute(query, values).fetchall()
 
@@ -147,21 +176,34 @@ class Store:
     def about(self) -> dict[str, Any]:
         """The study's ``name`` and ``description``, the name of its ``axis`` and the ``unit``."""
         rows = self.select("SELECT key, value FROM about WHERE key <> ?", (_PLANTS,))
-        return {key: json.loads(value) for key, value in rows}
+        with damage(self.path):
+            found = {key: json_data(value) for key, value in rows}
+            return {key: word(found[key]) for key in ("name", "description", "axis", "unit")}
 
     @property
     def plants(self) -> dict[str, PlantFacts]:
         """Properties of the plant of each level; absent in old stores until they are written to again."""
         rows = self.select("SELECT value FROM about WHERE key = ?", (_PLANTS,))
-        return {level: PlantFacts(**facts) for (value,) in rows for level, facts in json.loads(value).items()}
+        with damage(self.path):
+            facts = [pair for (value,) in rows for pair in json_data(value).items()]
+            return {level: PlantFacts.from_dict(one) for level, one in facts}
 
     @property
     def configuration(self) -> dict[str, dict[str, Any]]:
         """The values that determine rows, as `Study.configuration` returns them."""
         found: dict[str, dict[str, Any]] = {}
-        for part, key, value in self.select("SELECT part, key, value FROM configuration"):
-            found.setdefault(part, {})[key] = json.loads(value)
+        rows = self.select("SELECT part, key, value FROM configuration")
+        with damage(self.path):
+            for part, key, value in rows:
+                found.setdefault(word(part), {})[word(key)] = json_data(value)
         return found
+
+    @property
+    def cells(self) -> list[tuple[str, str, int]]:
+        """Level, method and number of trials that were asked for, in order."""
+        rows = self.select("SELECT level, method, trials FROM cells ORDER BY rowid")
+        with damage(self.path):
+            return [(word(level), word(method), whole(trials)) for level, method, trials in rows]
 
     def _ask_for(self, study: Study) -> None:
         """Add the study's levels, methods and trials.  Raises StudyError: its configuration is another."""
@@ -199,12 +241,43 @@ def _differences(kept: Mapping[str, Mapping[str, Any]], wanted: Mapping[str, Map
                     yield f"{name} is {old} in the store, {new} was asked for"
 
 
+# Values --------------------------------------------------------------------------------------------------------------
+@contextmanager
+def damage(path: Path) -> Iterator[None]:
+    """Context in which values of a store are used.  Raises StudyError: one is none that a study writes."""
+    try:
+        yield
+    except _DAMAGE as error:
+        reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise StudyError(f'store "{path}" is damaged: {reason:.200}; run its study into a new one') from error
+
+
+def word(value: object) -> str:
+    """A text.  Raises TypeError: the value is none."""
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r:.40} is no text")
+    return value
+
+
+def whole(value: object) -> int:
+    """A number of trials or of one.  Raises TypeError, ValueError: it is none, or beyond sense."""
+    if type(value) is not int:
+        raise TypeError(f"{value!r:.40} is no whole number")
+    if not 0 <= value <= _MOST_TRIALS:
+        raise ValueError(f"{value} trials")
+    return value
+
+
 # SQLite --------------------------------------------------------------------------------------------------------------
 def _connected(path: Path, mode: str) -> sqlite3.Connection:
     """A connection without implicit transactions.  Raises StudyError: the file cannot be opened."""
     try:
         uri = f"{path.absolute().as_uri()}?mode={mode}"
-        return sqlite3.connect(uri, timeout=_LOCK_TIMEOUT, isolation_level=None, uri=True)
+        connection = sqlite3.connect(uri, timeout=_LOCK_TIMEOUT, isolation_level=None, uri=True)
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST_VALUE)
+        connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute("PRAGMA cell_size_check = ON")
+        return connection
     except sqlite3.Error as error:
         raise StudyError(
             f'store "{path}" cannot be opened: {error}; does its folder exist, may you write there?'
@@ -216,7 +289,7 @@ def _reported(path: Path) -> Iterator[None]:
     """Raises StudyError in place of SQLite's errors."""
     try:
         yield
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeError) as error:
         raise StudyError(f'store "{path}": {error}; give a file that diransac study made, or a new one') from error
 
 
@@ -231,6 +304,50 @@ def _transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
             connection.execute("ROLLBACK")
             raise
         connection.execute("COMMIT")
+
+
+def _roll_back(path: Path) -> None:
+    """Undo what a killed process has left half written, which needs the right to write.
+
+    Raises StudyError: the journal names a further file, which a study's never does and SQLite would delete.
+    """
+    journal = path.with_name(f"{path.name}-journal")
+    if not journal.is_file():
+        return
+    with closing(_connected(path, "ro")) as connection:
+        try:
+            connection.execute("SELECT count(*) FROM sqlite_master")
+            return
+        except sqlite3.Error as error:
+            if error.sqlite_errorname != "SQLITE_READONLY_ROLLBACK":
+                return  # said when the store is read
+    if journal.read_bytes().endswith(_ANOTHER_JOURNAL):
+        raise StudyError(f'store "{path}" has a journal that no study writes; give the store without it')
+    with closing(_connected(path, "rw")) as connection, _reported(path):
+        connection.execute("SELECT count(*) FROM sqlite_master")
+
+
+def _check_tables(connection: sqlite3.Connection, path: Path) -> None:
+    """Raises StudyError: the file is no store, or has views, triggers or virtual tables, which run as they are read."""
+    _format(connection, path)
+    tables = set()
+    for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
+        is_plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE ")
+        if not is_plain and (kind != "index" or sql is not None):
+            raise StudyError(f'store "{path}" has {kind} "{name!s:.40}", which no study makes; give another store')
+        if is_plain:
+            tables.add(name)
+    if not tables >= _TABLES:
+        missing = ", ".join(sorted(_TABLES - tables))
+        raise StudyError(f'store "{path}" is damaged: it has no {missing}; run its study into a new one')
+
+
+def _copied(connection: sqlite3.Connection) -> sqlite3.Connection:
+    """A copy of a database in memory, which may be changed."""
+    copy = sqlite3.connect(":memory:", isolation_level=None)
+    connection.backup(copy)
+    connection.close()
+    return copy
 
 
 def _is_empty(connection: sqlite3.Connection) -> bool:
@@ -256,7 +373,7 @@ def _upgrade(connection: sqlite3.Connection, path: Path) -> None:
     for _, column, *_ in connection.execute("PRAGMA table_info(trials)").fetchall():
         if column.startswith("best_"):
             new = "pseudo_true_" + column.removeprefix("best_")
-            connection.execute(f"ALTER TABLE trials RENAME COLUMN {_quoted(column)} TO {_quoted(new)}")
+            connection.execute(f"ALTER TABLE trials RENAME COLUMN {quoted(column)} TO {quoted(new)}")
     for part, key, text in connection.execute("SELECT part, key, value FROM configuration").fetchall():
         value = json.loads(text)
         renamed = _RENAMED_VALUES.get((key, value), value) if isinstance(value, str) else value
@@ -270,7 +387,7 @@ def _upgrade(connection: sqlite3.Connection, path: Path) -> None:
 def _create(connection: sqlite3.Connection, study: Study) -> None:
     """Make the tables of a new store."""
     kinds = _columns(study)
-    columns = ", ".join(f"{_quoted(name)} {kind}" for name, kind in zip(_apart(kinds), kinds.values(), strict=True))
+    columns = ", ".join(f"{quoted(name)} {kind}" for name, kind in zip(_apart(kinds), kinds.values(), strict=True))
     for statement in (
         f"PRAGMA application_id = {_APPLICATION}",
         f"PRAGMA user_version = {_FORMAT}",
@@ -316,5 +433,6 @@ def _apart(names: Iterable[str]) -> Iterator[str]:
         before[name.lower()] += 1
 
 
-def _quoted(name: str) -> str:
+def quoted(name: str) -> str:
+    """An identifier of SQL."""
     return '"' + name.replace('"', '""') + '"'

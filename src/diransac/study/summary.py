@@ -15,15 +15,18 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import StudyError
 from diransac.study.assessment import PlantFacts, covers, differ, relative_errors
-from diransac.study.plants import PlantChoice
-from diransac.study.reading import read, status
-from diransac.study.store import Store
+from diransac.study.plants import PlantChoice, is_builtin
+from diransac.study.reading import Status, read, status
+from diransac.study.store import Store, damage
 from diransac.study.tables import changed
 
 if TYPE_CHECKING:
     import polars as pl
 
 __all__ = ["ParameterErrors", "Summary", "TrackingErrors", "summarise"]
+
+_MOST_CELLS = 100_000_000
+"""Levels times methods times trials of the largest summary."""
 
 _Statistic = Callable[[FloatArray], np.floating]
 
@@ -189,13 +192,27 @@ def summarise(store: str | Path) -> Summary:
     """
     rows, progress = read(store), status(store)
     with Store.existing(store) as kept:
-        words, parts, noted = kept.about, kept.configuration, kept.plants
-        cells = kept.select("SELECT level, method FROM cells ORDER BY rowid")
+        words, parts, noted, cells = kept.about, kept.configuration, kept.plants, kept.cells
     if not len(rows):
         raise StudyError(f'store "{store}" has no rows yet; run its study first')
-    levels = _in_order(list(dict.fromkeys(level for level, _ in cells)))
-    methods = tuple(dict.fromkeys(method for _, method in cells))
+    with damage(Path(store)):
+        return _summary(rows, progress, words, parts, noted, cells)
+
+
+def _summary(
+    rows: pl.DataFrame,
+    progress: Status,
+    words: Mapping[str, str],
+    parts: Mapping[str, Mapping[str, Any]],
+    noted: Mapping[str, PlantFacts],
+    cells: Sequence[tuple[str, str, int]],
+) -> Summary:
+    """Summary of what a store holds.  Raises LookupError, TypeError, ValueError: its parts do not fit together."""
+    levels = _in_order(list(dict.fromkeys(level for level, *_ in cells)))
+    methods = tuple(dict.fromkeys(method for _, method, _ in cells))
     plants = [noted.get(level) or _facts(level, parts) for level in levels]
+    if any((list(x.units), list(x.parameters)) != (list(plants[0].units), list(plants[0].parameters)) for x in plants):
+        raise ValueError("plants of several models")
     units = plants[0].units
     table = _Table(rows, levels, methods)
     seconds = rows.select("method", "seconds").unnest("seconds")
@@ -219,8 +236,16 @@ def summarise(store: str | Path) -> Summary:
 
 
 def _facts(level: str, parts: Mapping[str, Mapping[str, Any]]) -> PlantFacts:
-    """Properties of the plant of a level from the configuration, for old stores that have not kept them."""
+    """Properties of the built-in plant of a level, for old stores that have not kept them.
+
+    Raises StudyError: the plant is a user's file, which is not run for a look at a store.
+    """
     table = changed(changed({}, parts["study"]), parts[f"levels.{level}"])
+    if not is_builtin(table["plant"]["kind"]):
+        raise StudyError(
+            "the store has no properties of its plant, which is a file that is not run here; repeat the study run "
+            "command that made it, which adds them"
+        )
     return PlantFacts.of(PlantChoice.from_dict(table["plant"]).plant)
 
 
@@ -233,11 +258,15 @@ class _Table:
             for level, method, trial in rows.select("level", "method", "trial").iter_rows()
         ]
         self._rows, self._where = rows, tuple(np.array(cells).T)
+        if len(levels) * len(methods) * int(self._where[2].max()) > _MOST_CELLS:
+            raise ValueError(f"trial {int(self._where[2].max())}")
         self.ran = np.zeros((len(levels), len(methods), int(self._where[2].max()) + 1), dtype=bool)
         self.ran[self._where] = True
 
     def column(self, name: str) -> FloatArray:
-        """A column of numbers; NaN for null."""
+        """A column of numbers; NaN for null.  Raises KeyError: there is none of that name."""
+        if name not in self._rows.columns:
+            raise KeyError(name)
         found = np.full(self.ran.shape, np.nan)
         found[self._where] = self._rows[name].to_numpy()
         return found

@@ -96,14 +96,15 @@ def interpolated(signals: Mapping[str, FloatArray], left: IntArray, weight: Floa
     """
     nearest = left + (weight > 0.5)
     found = {}
-    for name, values in signals.items():
-        turns = sum((turn * _revolutions(values, turn) for turn in _TURNS), np.zeros(len(values)))
-        found[name] = _between(values + turns, left, weight) - turns[nearest]
-    for names in _quaternions_of(signals):
-        q = np.column_stack([signals[name] for name in names])
-        signs = np.where(np.nansum(continuous_quaternions(q) * q, axis=1) < 0.0, -1.0, 1.0)
-        for name in names:
-            found[name] = _between(signals[name] * signs, left, weight) * signs[nearest]
+    with np.errstate(over="ignore", invalid="ignore"):  # of samples that are damaged
+        for name, values in signals.items():
+            turns = sum((turn * _revolutions(values, turn) for turn in _TURNS), np.zeros(len(values)))
+            found[name] = _between(values + turns, left, weight) - turns[nearest]
+        for names in _quaternions_of(signals):
+            q = np.column_stack([signals[name] for name in names])
+            signs = np.where(np.nansum(continuous_quaternions(q) * q, axis=1) < 0.0, -1.0, 1.0)
+            for name in names:
+                found[name] = _between(signals[name] * signs, left, weight) * signs[nearest]
     return found
 
 

@@ -20,11 +20,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "check_factor",
+    "describe_resampling",
+    "interpolate_at",
     "origins_of",
     "rename",
     "rename_columns",
     "resample",
     "resample_columns",
+    "resampling_grid",
     "scale",
     "shift",
 ]
@@ -157,22 +160,53 @@ def resample(log: Log, rate: float | str = "median") -> Log:
 def resample_columns(
     time: FloatArray, signals: Mapping[str, FloatArray], rate: float | str, source: str
 ) -> tuple[FloatArray, dict[str, FloatArray], dict[str, Any], list[str]]:
-    """Time, columns, step of the history and notes at a uniform rate; ``time`` (N,) increases.
+    """Time, columns, step of the history and notes at a uniform rate; ``time`` (N,) increases."""
+    grid, hertz = resampling_grid(time, rate, source)
+    step, notes = describe_resampling(time, grid, hertz)
+    return grid, interpolate_at(time, signals, grid, hertz), step, notes
 
-    An interval of more than three and a half median ones (and more than one new sample) is a gap, which stays NaN.
-    """
-    steps = np.diff(time)
-    usual = float(np.median(steps))
-    hertz = _rate(rate, usual)
+
+def describe_resampling(time: FloatArray, grid: FloatArray, hertz: float) -> tuple[dict[str, Any], list[str]]:
+    """Step of the history, and notes, of a clock (N,) that is resampled to a grid (n,) of a rate."""
+    gaps = _gaps(time, hertz)
+    rows = [len(time), len(grid)]
+    step = {"step": "resample", "rate": hertz, "method": "linear", "rows": rows, "gaps": int(gaps.sum())}
+    return step, _resampling_notes(time, gaps, _in_gaps(time, grid, gaps)[2], hertz)
+
+
+def resampling_grid(time: FloatArray, rate: float | str, source: str) -> tuple[FloatArray, float]:
+    """Uniform time (n,) over that of a clock, and its rate in Hz.  Raises LogError, SettingsError: as `resample`."""
+    hertz = _rate(rate, float(np.median(np.diff(time))))
     n = _new_rows(float(time[-1] - time[0]), hertz, source)
-    grid = time[0] + np.arange(n) / hertz
+    return time[0] + np.arange(n) / hertz, hertz
+
+
+def interpolate_at(
+    time: FloatArray, signals: Mapping[str, FloatArray], grid: FloatArray, hertz: float
+) -> dict[str, FloatArray]:
+    """Signals interpolated linearly at the times (n,) of a grid; NaN in gaps of the clock and beyond its ends.
+
+    An interval of more than three and a half median ones (and more than one new sample) is a gap.
+    """
+    left, weight, blank = _in_gaps(time, grid, _gaps(time, hertz))
+    slack = _ROUNDING / hertz
+    blank |= (grid < time[0] - slack) | (grid > time[-1] + slack)
+    return {name: np.where(blank, np.nan, x) for name, x in interpolated(signals, left, weight).items()}
+
+
+def _gaps(time: FloatArray, hertz: float) -> npt.NDArray[np.bool_]:
+    """Intervals (N - 1,) that are not bridged."""
+    steps = np.diff(time)
+    return np.asarray(steps > max(_BRIDGED_INTERVALS * float(np.median(steps)), 1.0 / hertz))
+
+
+def _in_gaps(
+    time: FloatArray, grid: FloatArray, gaps: npt.NDArray[np.bool_]
+) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.bool_]]:
+    """Sample before each new one, the new one's weight between the two, and whether it lies in a gap: (n,) each."""
     left = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, len(time) - 2)
-    weight = np.clip((grid - time[left]) / steps[left], 0.0, 1.0)
-    gaps = steps > max(_BRIDGED_INTERVALS * usual, 1.0 / hertz)
-    blank = gaps[left] & (weight > _ROUNDING) & (weight < 1.0 - _ROUNDING)
-    resampled = {name: np.where(blank, np.nan, x) for name, x in interpolated(signals, left, weight).items()}
-    step = {"step": "resample", "rate": hertz, "method": "linear", "rows": [len(time), n], "gaps": int(gaps.sum())}
-    return grid, resampled, step, _resampling_notes(time, gaps, blank, hertz)
+    weight = np.clip((grid - time[left]) / np.diff(time)[left], 0.0, 1.0)
+    return left, weight, gaps[left] & (weight > _ROUNDING) & (weight < 1.0 - _ROUNDING)
 
 
 def _rate(rate: float | str, usual: float) -> float:

@@ -2,54 +2,85 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.data.checks import check_clock, check_names, check_time_order
+from diransac.data import preprocessing
+from diransac.data.checks import check_clock, check_even, check_names, check_time_order
 from diransac.data.log import Log
+from diransac.data.mapping import LogMapping, load_mapping
 from diransac.data.preprocessing.steps import check_factor, origins_of, rename_columns, resample_columns
-from diransac.data.readers.comma_separated import read_csv, read_csv_gz
+from diransac.data.readers import crazyflie
+from diransac.data.readers.bags import open_bag, open_mcap
+from diransac.data.readers.comma_separated import joined, read_csv, read_csv_gz
+from diransac.data.readers.crazyflie import CrazyflieRecording
+from diransac.data.readers.hdf5 import read_hdf5
 from diransac.data.readers.mat import read_mat
 from diransac.data.readers.npz import read_npz
 from diransac.data.readers.parquet import read_parquet
+from diransac.data.readers.recording import Recording, Samples
+from diransac.data.readers.repair import Repairs
 from diransac.data.readers.table import Table
+from diransac.data.readers.topics import TopicTable, is_one_table, list_topics, mapped_table, whole_topic, wired_topics
+from diransac.data.readers.ulog import UlogRecording
 from diransac.data.units import conversion, split_unit
-from diransac.errors import LogError
+from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from typing import Any
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
-__all__ = ["read_log"]
+__all__ = ["TopicTable", "read_fields", "read_log", "read_topics"]
 
-_READERS: dict[str, Callable[[bytes, str], Table]] = {
-    ".csv": read_csv,
-    ".csv.gz": read_csv_gz,
+_TABLES: dict[str, Callable[[bytes, str], Table]] = {
     ".parquet": read_parquet,
     ".npz": read_npz,
     ".mat": read_mat,
+    ".h5": read_hdf5,
+    ".hdf5": read_hdf5,
 }
+_TEXTS = {".csv": read_csv, ".csv.gz": read_csv_gz, ".txt": read_csv}
+_RECORDINGS: dict[str, Callable[[Path, str], Recording]] = {
+    ".ulg": UlogRecording,
+    ".ulog": UlogRecording,
+    ".mcap": open_mcap,
+    ".bag": open_bag,
+}
+_ENDINGS = (*_TEXTS, *_TABLES, *_RECORDINGS)
 
 
 def read_log(
     path: str | Path,
     *,
+    mapping: str | Path | None = None,
+    columns: Sequence[str] | None = None,
+    rate: float | None = None,
+    repair: bool | str | Iterable[str] | None = None,
     rename: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     resample: float | str | None = None,
 ) -> Log:
-    """Log of a CSV (plain or gzip), Parquet, NPZ or MAT file.
+    """Log of a CSV (plain or gzip), Parquet, NPZ, MAT, HDF5, ULog, MCAP or bag file, or of a Crazyflie's micro SD log.
 
     Parameters
     ----------
     path : str or Path
-        Its ending names the format.
+        Its ending names the format.  A folder is a ROS 2 bag, or has one CSV file for each group of signals.
+    mapping : str or Path, optional
+        Name of a built-in mapping, or a TOML file, that says which field of which topic is which signal.
+    columns : sequence of str, optional
+        Names of the columns of CSV text without a header line.
+    rate : float, optional
+        Hz, of a table without a time column.
+    repair : bool, str or iterable of str, optional
+        Repairs by name, True or "safe" for all; `diransac.data.readers.repair.REPAIRS` lists them.
     rename : mapping of str to str, optional
-        New name -> name of the column in the file; ``{"t": "t_s"}`` names the time.
+        New name -> name of the column in the file; ``{"t": "t_s"}`` names the time.  Of a file with topics,
+        ``topic.field``.
     scale : mapping of str to float, optional
         (New) name -> factor; ``{"t": 0.001}`` for a time in milliseconds.
     resample : float or "median", optional
@@ -65,22 +96,86 @@ def read_log(
     ------
     LogError
         The file cannot be read, or does not hold a log; one sentence says where, and what to do.
+    SettingsError
+        There is no repair of that name; a factor or a rate has no meaning.
 
     Notes
     -----
     The time column is ``t``, in seconds.  Every other column is a signal; a column that does not hold numbers is left
     out, with a note.  A header ``theta [deg]`` is the signal ``theta`` in degrees.  Rows count from 0, lines of text
     from 1.
+
+    Topics have clocks of their own.  The rows of the log are those of the fastest topic, or at ``resample`` Hz; a
+    sample of a slower topic stands in the row nearest to it, and the rows between are NaN.
     """
     path = Path(path)
     source = f'log "{path}"'
-    table = _reader(path, source)(_content(path, source), source)
-    history: list[dict[str, Any]] = list(table.history)
+    chosen = None if mapping is None else load_mapping(mapping)
+    repairs = Repairs.of(_given(repair, chosen, "repair"))
+    resample = _given(resample, chosen, "resample")
+    opened = _opened(path, source, columns, repairs)
+    if isinstance(opened, Table):
+        table = repairs.in_si(_with_clock(opened, rate, source))
+        rename = _stripped(rename, table)
+    elif chosen is None and is_one_table(opened, rename or {}):
+        table = whole_topic(opened, repairs)
+    else:
+        table, resample = wired_topics(opened, chosen, rename or {}, resample, repairs)
+        rename = None
     if rename:
-        names = {new: split_unit(old)[0] if old not in table.columns else old for new, old in rename.items()}
-        table = _renamed(table, names, source)
-        history.append({"step": "rename", "names": names})
-    factors = {name: float(factor) for name, factor in (scale or {}).items()}
+        table = _renamed(table, rename, source)
+    if chosen is not None and isinstance(opened, Table):
+        table = mapped_table(table, chosen, source)
+    log = _log(table, scale or {}, resample, repairs, source)
+    return log if chosen is None else _prepared(log, chosen)
+
+
+def read_topics(path: str | Path) -> TopicTable | None:
+    """Topics of a recording, with their rates, gaps and fields; None for a file with one table.
+
+    Raises LogError: as `read_log`.
+    """
+    path = Path(path)
+    is_folder_of_tables = path.is_dir() and not (path / "metadata.yaml").exists()
+    if is_folder_of_tables or _ending(path) in (*_TEXTS, *_TABLES):
+        return None
+    opened = _opened(path, f'log "{path}"', None, Repairs())
+    return None if isinstance(opened, Table) else list_topics(opened)
+
+
+def read_fields(path: str | Path) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
+    """Fields of each topic of a file, and the names of the elements of its arrays; a table has the topic ``""``.
+
+    Raises LogError: as `read_log`.
+    """
+    opened = _opened(Path(path), f'log "{path}"', None, Repairs())
+    if isinstance(opened, Table):
+        return {"": tuple(name for name in opened.columns if name != "t")}, {}
+    return dict(opened.fields), opened.elements
+
+
+def _given(value: Any, mapping: LogMapping | None, name: str) -> Any:
+    """An argument, or what the mapping says where there is none."""
+    return mapping.option(name) if value is None and mapping is not None else value
+
+
+def _prepared(log: Log, mapping: LogMapping) -> Log:
+    """The log after the steps of a mapping that need no model."""
+    start, stop = mapping.option("from"), mapping.option("until")
+    if start is not None or stop is not None:
+        log = log.between(-math.inf if start is None else start, math.inf if stop is None else stop)
+    despiked = mapping.option("despike")
+    if despiked is not None:
+        names = [despiked] if isinstance(despiked, str) else despiked
+        log = preprocessing.despike(log, None if despiked == "all" else names)
+    delays = mapping.option("shift")
+    return preprocessing.shift(log, delays) if delays else log
+
+
+def _log(table: Table, scale: Mapping[str, float], resample: float | str | None, repairs: Repairs, source: str) -> Log:
+    """Log of a table: scaled, repaired, resampled and checked."""
+    history: list[dict[str, Any]] = list(table.history)
+    factors = {name: float(factor) for name, factor in scale.items()}
     time = _time(table, factors, source)
     signals, unusable = _signals(table, len(time), source)
     for name in factors:
@@ -89,8 +184,16 @@ def read_log(
     if factors:
         time, signals = time * factors.get("t", 1.0), {n: x * factors.get(n, 1.0) for n, x in signals.items()}
         history.append({"step": "scale", "factors": factors})
+    ordered = repairs.ordered(Samples(time, signals), "")
+    time, signals = ordered.time, dict(ordered.columns)
     check_time_order(time, source)
     notes = [*table.notes, *check_clock(time, source)]
+    if resample is None and "clock" in repairs and _is_uneven(time, source):
+        resample = "median"
+        repairs.record("clock", "the clock is uneven")
+    if repairs.step is not None:
+        history.append(repairs.step)
+        notes += repairs.notes
     if resample is not None:
         time, signals, step, said = resample_columns(time, signals, resample, source)
         history.append(step)
@@ -100,13 +203,64 @@ def read_log(
     return replace(log, notes=tuple(dict.fromkeys((*notes, *log.findings()))))
 
 
-def _reader(path: Path, source: str) -> Callable[[bytes, str], Table]:
+def _is_uneven(time: FloatArray, source: str) -> bool:
+    try:
+        check_even(time, source)
+    except LogError:
+        return True
+    return False
+
+
+# ---------------------------------------------------------------------- files
+
+
+def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Repairs) -> Table | Recording:
+    """Contents of a file, or of a folder.  Raises LogError: it cannot be read."""
     if path.is_dir():
-        raise LogError(f"{source}: it is a folder; name a file in it")
-    endings = [ending for ending in _READERS if path.name.lower().endswith(ending)]
-    if not endings:
-        raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_READERS)}')
-    return _READERS[endings[-1]]
+        return _opened_folder(path, source, repairs)
+    ending = _ending(path)
+    if ending in _RECORDINGS:
+        _check_content(path, source)
+        return _RECORDINGS[ending](path, source)
+    if columns is not None and ending not in _TEXTS:
+        raise LogError(f"{source}: names of columns are those of CSV text without a header; leave them out")
+    if ending in _TEXTS:
+        return _TEXTS[ending](_content(path, source), source, columns, repairs)
+    if ending is not None:
+        return _TABLES[ending](_content(path, source), source)
+    _check_content(path, source)
+    with path.open("rb") as file:
+        is_crazyflie = file.read(1) == crazyflie.MAGIC
+    if is_crazyflie:
+        return CrazyflieRecording(_content(path, source), source)
+    raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}')
+
+
+def _ending(path: Path) -> str | None:
+    """The longest known ending of a file's name; None where it has none."""
+    return max((x for x in _ENDINGS if path.name.lower().endswith(x)), key=len, default=None)
+
+
+def _opened_folder(path: Path, source: str, repairs: Repairs) -> Table | Recording:
+    """A ROS 2 bag, or a table of the CSV files in a folder."""
+    if (path / "metadata.yaml").exists():
+        return open_bag(path, source)
+    files = sorted(x for x in path.iterdir() if x.name.lower().endswith(tuple(_TEXTS)))
+    if len(files) < 2:  # one file is a log of its own
+        raise LogError(f"{source}: it is a folder without a bag or several CSV files; name a file in it")
+    return joined([(x.name.split(".")[0], _content(x, f'log "{x}"')) for x in files], source, repairs)
+
+
+def _check_content(path: Path, source: str) -> None:
+    """Raise LogError for a file that cannot be read, or is empty."""
+    try:
+        with path.open("rb") as file:
+            if not file.read(1):
+                raise LogError(f"{source}: it is empty")
+    except FileNotFoundError as error:
+        raise LogError(f"{source}: there is no such file") from error
+    except OSError as error:
+        raise LogError(f"{source}: it cannot be read: {error.strerror}") from error
 
 
 def _content(path: Path, source: str) -> bytes:
@@ -121,12 +275,34 @@ def _content(path: Path, source: str) -> bytes:
     return data
 
 
+# ---------------------------------------------------------------------- columns
+
+
+def _with_clock(table: Table, rate: float | None, source: str) -> Table:
+    """The table with a time ``t`` at a rate, where one is given."""
+    if rate is None:
+        return table
+    if not 0.0 < rate < math.inf:
+        raise SettingsError(f"the rate of a log without time is {rate}; give Hz")
+    if "t" in table.columns:
+        raise LogError(f"{source}: it has a time column; leave out the rate of {rate:.6g} Hz")
+    n = max((len(x) for x in table.columns.values() if not isinstance(x, str)), default=0)
+    step = {"step": "clock", "rate": float(rate)}
+    return replace(table, columns={"t": np.arange(n) / rate, **table.columns}, history=(*table.history, step))
+
+
+def _stripped(rename: Mapping[str, str] | None, table: Table) -> dict[str, str]:
+    """New name -> name of a column, without the unit that its header may have."""
+    return {new: split_unit(old)[0] if old not in table.columns else old for new, old in (rename or {}).items()}
+
+
 def _renamed(table: Table, names: Mapping[str, str], source: str) -> Table:
     columns = rename_columns(table.columns, names, source)
     units = {new: table.units[old] for new, old in names.items() if old in table.units}
     kept = {name: unit for name, unit in table.units.items() if name in columns and name not in names}
     specification = None if table.filter is None else table.filter.renamed(origins_of(table.columns, names))
-    return replace(table, columns=columns, units=kept | units, filter=specification)
+    history = (*table.history, {"step": "rename", "names": dict(names)})
+    return replace(table, columns=columns, units=kept | units, filter=specification, history=history)
 
 
 def _time(table: Table, factors: Mapping[str, float], source: str) -> FloatArray:

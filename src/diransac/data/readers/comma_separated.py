@@ -1,10 +1,11 @@
-"""CSV text, plain or compressed by gzip: one header line, then one line per row."""
+"""CSV text, plain or compressed by gzip: one header line, unless names are given, then one line per row."""
 
 from __future__ import annotations
 
 import csv
 import gzip
 import io
+import re
 import zlib
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -13,52 +14,137 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.files import COMMENT
+from diransac.data.readers.repair import Repairs
 from diransac.data.readers.table import Table, check_unique, with_metadata
 from diransac.data.units import split_unit
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     import polars as pl
 
-__all__ = ["read_csv", "read_csv_gz"]
+__all__ = ["joined", "read_csv", "read_csv_gz"]
 
 _SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
 _FEW_LINES = 20_000
+_COMMENTS = ("#", "%", "//")
+_ISO = re.compile(
+    r"(?P<date>(?:19|20|21)\d\d-\d\d-\d\d)[T ](?P<clock>\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)(?P<zone>Z|[+-]\d\d:?\d\d)?"
+)
 _MISSING = ("", "na", "n/a", "nan", "null", "none")
 
 
-def read_csv_gz(data: bytes, source: str) -> Table:
+def read_csv_gz(data: bytes, source: str, names: Sequence[str] | None = None, repairs: Repairs | None = None) -> Table:
     """Table of gzip data.  Raises LogError: as `read_csv`; the data are not gzip, or are cut off."""
     try:
-        return read_csv(gzip.decompress(data), source)
+        return read_csv(gzip.decompress(data), source, names, repairs)
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise LogError(f"{source}: the gzip data are damaged or cut off ({error})") from error
 
 
-def read_csv(data: bytes, source: str) -> Table:
+def read_csv(data: bytes, source: str, names: Sequence[str] | None = None, repairs: Repairs | None = None) -> Table:
     """Table of CSV text.
+
+    Parameters
+    ----------
+    data : bytes
+    source : str
+    names : sequence of str, optional
+        Names of the columns of a file without a header line.
+    repairs : Repairs, optional
+        Of comments, rows, timestamps and cells, where they are allowed.
 
     Raises LogError: the data are not UTF-8 text with a header line and as many fields in every line.
     """
+    repairs = Repairs() if repairs is None else repairs
     lines = _text(data, source).split("\n")
     metadata = lines.pop(0).strip('"').removeprefix(COMMENT) if _is_metadata(lines[0]) else None
+    lines = _without_comments(lines, repairs)
     if not lines:
         raise LogError(f"{source}: there is no header line after the metadata; give one, and one line per row")
     line = 1 if metadata is None else 2
     separator = _separator(lines[0])
-    headers = _header(lines[0], separator, source)
+    if names is None:
+        headers = _header(lines[0], separator, source)
+    else:
+        headers = _checked_names(lines[0], names, separator, source)
+        lines, line = [separator.join(headers), *lines], line - 1
+    lines = _without_ragged(lines, separator, repairs, source)
     _check_ragged(lines, line, separator, source)
     if len(lines) == 1:
         raise LogError(f"{source}: there is a header ({', '.join(headers)[:200]}) but no row")
     named = [split_unit(header) for header in headers]
     check_unique([name for name, _ in named if name], source)
-    fields = zip(named, _columns(lines[1:], len(headers), line + 1, separator, source), strict=True)
-    columns = {name: column for (name, _), column in fields if name}
+    read = _columns(lines[1:], headers, line + 1, separator, source, repairs)
+    columns = {name: column for (name, _), column in zip(named, read, strict=True) if name}
     units = {name: unit for name, unit in named if unit is not None}
     table = Table(columns, units, tuple(_notes(named, separator)))
     return table if metadata is None else with_metadata(table, metadata, source, "remove its first line")
+
+
+def joined(files: Sequence[tuple[str, bytes]], source: str, repairs: Repairs) -> Table:
+    """Table of several CSV files with as many rows each, such as ``time``, ``q`` and ``tau``.
+
+    A file without a header is one column with the file's name, or the columns ``q_1`` to ``q_k``; ``time`` is ``t``.
+
+    Raises LogError: as `read_csv`; two columns have one name; the files have different numbers of rows.
+    """
+    columns: dict[str, FloatArray | str] = {}
+    units: dict[str, str] = {}
+    rows: dict[str, int] = {}
+    for name, data in files:
+        own = f"{source}, file {name}"
+        table = read_csv(data, own, _names_of(name, data, own), repairs)
+        check_unique([*columns, *table.columns], source)
+        columns |= table.columns
+        units |= table.units
+        rows[name] = max((len(x) for x in table.columns.values() if not isinstance(x, str)), default=0)
+    if len(set(rows.values())) > 1:
+        raise LogError(
+            f"{source}: its files have different numbers of rows: {', '.join(f'{n} {k}' for n, k in rows.items())}"
+        )
+    return Table(columns, units, (f"joined from the files {', '.join(rows)}",))
+
+
+def _names_of(name: str, data: bytes, source: str) -> list[str] | None:
+    """Names of the columns of a file without a header; None for a file that has one."""
+    first = next((x for x in _text(data, source).split("\n") if x.strip() and not x.startswith(_COMMENTS)), "")
+    fields = first.split(_separator(first))
+    if not all(_is_number(field) for field in fields):
+        return None
+    if len(fields) == 1:
+        return ["t" if name.lower() in ("t", "time") else name]
+    return [f"{name}_{k + 1}" for k in range(len(fields))]
+
+
+def _without_comments(lines: list[str], repairs: Repairs) -> list[str]:
+    if "comments" not in repairs:
+        return lines
+    kept = [line for line in lines if line.strip() and not line.lstrip().startswith(_COMMENTS)]
+    if len(kept) < len(lines):
+        repairs.record("comments", f"{len(lines) - len(kept)} lines of comments, or blank, left out")
+    return kept
+
+
+def _checked_names(line: str, names: Sequence[str], separator: str, source: str) -> list[str]:
+    found = line.count(separator) + 1
+    if len(names) != found:
+        raise LogError(f"{source}: {len(names)} columns are named, the first line has {found} fields")
+    return list(names)
+
+
+def _without_ragged(lines: list[str], separator: str, repairs: Repairs, source: str) -> list[str]:
+    """Lines with as many fields as the header, which are kept."""
+    if "rows" not in repairs or any('"' in line for line in lines):
+        return lines
+    expected = lines[0].count(separator)
+    kept = [line for line in lines if line.count(separator) == expected]
+    n = len(lines) - len(kept)
+    if n:
+        repairs.check_share(n, len(lines), f"lines have not {expected + 1} fields", source)
+        repairs.record("rows", f"{n} line{'s' * (n > 1)} without {expected + 1} fields left out")
+    return kept
 
 
 def _is_metadata(line: str) -> bool:
@@ -94,7 +180,10 @@ def _header(line: str, separator: str, source: str) -> list[str]:
     except csv.Error as error:
         raise LogError(f"{source}: the header line cannot be read ({error})") from error
     if all(_is_number(header) for header in headers):
-        raise LogError(f"{source}: the first line holds numbers ({line:.60}); give it a header line with names")
+        raise LogError(
+            f"{source}: the first line holds numbers ({line:.60}); give it a header line with names, or "
+            "name the columns: --columns t,x,..."
+        )
     return headers
 
 
@@ -136,7 +225,9 @@ def _quoted_counts(lines: list[str], first: int, separator: str, source: str) ->
     return counts
 
 
-def _columns(lines: list[str], n_columns: int, first: int, separator: str, source: str) -> Iterable[FloatArray | str]:
+def _columns(
+    lines: list[str], headers: Sequence[str], first: int, separator: str, source: str, repairs: Repairs
+) -> Iterable[FloatArray | str]:
     """Numbers of every column from line ``first``, or its first field that is no number.
 
     A short file of plain numbers is read without Polars, whose import takes longer.
@@ -145,8 +236,11 @@ def _columns(lines: list[str], n_columns: int, first: int, separator: str, sourc
         with suppress(ValueError):  # some field is no plain number
             numbers = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
             return np.ascontiguousarray(numbers.T)
-    frame = _frame(lines, n_columns, separator, source)
-    return [_numbers(column, first, separator) for column in frame.get_columns()]
+    frame = _frame(lines, len(headers), separator, source)
+    return [
+        _numbers(column, first, separator, f'"{header}"', repairs)
+        for column, header in zip(frame.get_columns(), headers, strict=True)
+    ]
 
 
 def _frame(lines: list[str], n_columns: int, separator: str, source: str) -> pl.DataFrame:
@@ -161,7 +255,7 @@ def _frame(lines: list[str], n_columns: int, separator: str, source: str) -> pl.
         raise LogError(f"{source}: it cannot be read as CSV ({str(error).splitlines()[0]})") from error
 
 
-def _numbers(fields: pl.Series, first: int, separator: str) -> FloatArray | str:
+def _numbers(fields: pl.Series, first: int, separator: str, name: str, repairs: Repairs) -> FloatArray | str:
     """Numbers of a column of text from line ``first``, empty fields as NaN, or the first field that is no number.
 
     Semicolons allow decimal commas.
@@ -173,9 +267,37 @@ def _numbers(fields: pl.Series, first: int, separator: str) -> FloatArray | str:
     numbers = readable.cast(pl.Float64, strict=False)
     bad = (numbers.is_null() & text.is_not_null() & ~text.str.to_lowercase().is_in(_MISSING)).to_numpy()
     if bad.any():
-        row = int(bad.argmax())
-        return f'is not numeric: line {row + first} holds "{text[row]:.60}"'
+        row, n = int(bad.argmax()), int(bad.sum())
+        if "timestamps" in repairs and (seconds := _seconds(text)) is not None:
+            repairs.record("timestamps", f"{name} holds times from {text[0]:.40} on")
+            return seconds
+        if "cells" not in repairs or n > max(1, len(bad) // 100):
+            return f'is not numeric: line {row + first} holds "{text[row]:.60}"'
+        repairs.record("cells", f'{name} has {n} field{"s" * (n > 1)} without a number, the first "{text[row]:.30}"')
     return numbers.fill_null(np.nan).to_numpy().astype(np.float64)
+
+
+def _seconds(text: pl.Series) -> FloatArray | None:
+    """Seconds (n,) since the first of ISO 8601 times; None where one of them is none."""
+    matches = [_ISO.fullmatch(x) for x in text.fill_null("")]
+    found = [m for m in matches if m is not None]
+    if len(found) < len(matches) or not found:
+        return None
+    try:
+        stamps = np.array([f"{m['date']}T{m['clock'].replace(',', '.')}" for m in found], dtype="datetime64[ns]")
+    except ValueError:  # a thirteenth month
+        return None
+    zones = np.array([_zone(m["zone"] or "Z") for m in found], dtype=np.int64)
+    since = stamps.astype(np.int64) - 60_000_000_000 * zones
+    return np.asarray((since - since[0]) / 1e9)
+
+
+def _zone(text: str) -> int:
+    """Minutes that a time zone is ahead of UTC."""
+    if text == "Z":
+        return 0
+    minutes = 60 * int(text[1:3]) + int(text[-2:])
+    return -minutes if text[0] == "-" else minutes
 
 
 def _notes(named: list[tuple[str, str | None]], separator: str) -> list[str]:

@@ -4,6 +4,8 @@
 |---|---|
 | `planner.py` | `plan`: the search for a solution, and the explanation where there is none |
 | `trajectories.py` | square, star, sine, random waypoints, multisine |
+| `experiment.py` | `design_experiment`: excitation within limits that is optimal for identification |
+| `excitation.py` | its Fourier series, limits, information and optimisation |
 | `request.py` | the arguments of a plan, checked; the trim at its start |
 | `problem.py` | the nonlinear program of a task, a first guess, the trajectory of a solution |
 | `transcription.py` | the program: index of each unknown, values and exact derivatives |
@@ -11,7 +13,8 @@
 | `solvers.py`, `snopt.py` | interior-point solvers, SNOPT |
 """
 
+from diransac.flight.planning.experiment import Experiment, design_experiment
 from diransac.flight.planning.planner import plan
 from diransac.flight.planning.trajectories import multisine, random_waypoints, sine, square, star
 
-__all__ = ["multisine", "plan", "random_waypoints", "sine", "square", "star"]
+__all__ = ["Experiment", "design_experiment", "multisine", "plan", "random_waypoints", "sine", "square", "star"]

@@ -39,7 +39,9 @@ __all__ = [
     "MEAN_SPEED",
     "ROTORCRAFT_LIMITS",
     "check_fully_actuated",
+    "check_numbers",
     "check_plane",
+    "inverse_dynamics",
     "multisine",
     "random_waypoints",
     "sine",
@@ -275,7 +277,7 @@ def random_waypoints(
     away is skipped: it cannot be reached from rest.
     """
     check_plane(plant.model)
-    _check(seed, duration, speed=speed, reach=reach)
+    check_numbers(seed, duration, speed=speed, reach=reach)
     points, times = _random_points(seed, speed, reach, duration)
     from scipy.ndimage import uniform_filter1d  # slow to import
 
@@ -350,8 +352,8 @@ def multisine(
     multisine excitation; there it is optimised, here it is drawn.
     """
     model = plant.model
-    inverse_dynamics = _inverse_dynamics(model)
-    _check(seed, duration, amplitude=amplitude, frequency=frequency)
+    to_inputs = inverse_dynamics(model)
+    check_numbers(seed, duration, amplitude=amplitude, frequency=frequency)
     rng = np.random.default_rng(seed)
     time = np.arange(round(duration / TIME_STEP) + 1, dtype=np.float64) * TIME_STEP
     shape = (_N_SINES, model.n_q, 1)
@@ -362,17 +364,20 @@ def multisine(
         """q, v and a (n_q, K): a derivative is a factor w and a quarter turn."""
         return [np.sum(size * w**k * np.sin(w * t + phase + k * np.pi / 2), axis=0) for k in range(3)]
 
-    inputs = np.array(inverse_dynamics(*motion(time + TIME_STEP / 2), model.parameter_vector(plant.parameters)))
+    inputs = np.array(to_inputs(*motion(time + TIME_STEP / 2), model.parameter_vector(plant.parameters)))
     return Trajectory(time, np.vstack(motion(time)[:2]).T, inputs.T, model.state, tuple(model.inputs))
 
 
 def check_fully_actuated(model: Model) -> None:
     """Raise SettingsError if inverse dynamics does not give unique inputs for every acceleration of this model."""
-    _inverse_dynamics(model)
+    inverse_dynamics(model)
 
 
-def _inverse_dynamics(model: Model) -> ca.Function:
-    """Inputs (n_u, K) from q, v, a (n_v, K) and p."""
+def inverse_dynamics(model: Model) -> ca.Function:
+    """Function ``(q, v, a, p) -> u`` that solves the equations of motion for the inputs.
+
+    Raises SettingsError: they do not determine the inputs linearly and uniquely.
+    """
     sizes = model.n_q, model.n_v, model.n_v, model.n_u, model.n_p
     q, v, a, u, p = (ca.SX.sym(name, size) for name, size in zip("qvaup", sizes, strict=True))
     r = model.residual(q, v, a, u, p)
@@ -387,7 +392,7 @@ def _inverse_dynamics(model: Model) -> ca.Function:
     return ca.Function("inverse_dynamics", [q, v, a, p], [inputs])
 
 
-def _check(seed: object, duration: float, **values: float) -> None:
+def check_numbers(seed: object, duration: float, **values: float) -> None:
     """Raise SettingsError unless seed, duration and values (finite, above 0) are in range."""
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise SettingsError(f"seed is {seed!r:.60}; give a whole number of at least 0")

@@ -1,6 +1,8 @@
 """Built-in models, `robot` for models from description files, and `builtin`, which returns a model by name."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 from diransac.errors import ModelError
 from diransac.model.library.cart_pole import cart_pole
@@ -14,8 +16,12 @@ from diransac.model.library.quadrotor import quadrotor
 from diransac.model.library.servo_axis import servo_axis
 from diransac.model.library.single_track_vehicle import single_track_vehicle
 from diransac.model.library.underwater_vehicle import underwater_vehicle
-from diransac.model.model import Model
-from diransac.model.robots import robot
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from diransac.model.model import Model
+    from diransac.model.robots import drive_forces, robot, robot_limits
 
 __all__ = [
     "BLADE_FLAPPING",
@@ -26,11 +32,13 @@ __all__ = [
     "dc_motor",
     "differential_drive",
     "double_pendulum",
+    "drive_forces",
     "extended_rotorcraft",
     "flexible_joint",
     "planar_rotorcraft",
     "quadrotor",
     "robot",
+    "robot_limits",
     "servo_axis",
     "single_track_vehicle",
     "underwater_vehicle",
@@ -48,6 +56,18 @@ BUILTIN: dict[str, Callable[[], Model]] = {
     "single-track-vehicle": single_track_vehicle,
     "quadrotor": quadrotor,
 }
+
+_OF_ROBOTS = ("drive_forces", "robot", "robot_limits")
+
+
+def __getattr__(name: str) -> Any:
+    """What reads descriptions of robots, imported at its first use."""
+    if name not in _OF_ROBOTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from diransac.model import robots
+
+    globals()[name] = found = getattr(robots, name)
+    return found
 
 
 def builtin(name: str) -> Model:

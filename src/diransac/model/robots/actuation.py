@@ -6,7 +6,7 @@ A setting is one number for all joints, or a mapping from the joint's coordinate
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
@@ -15,7 +15,10 @@ import numpy as np
 
 from diransac.errors import ModelError
 
-__all__ = ["Actuation", "JointTorques", "MotorCurrents", "PositionControl"]
+__all__ = ["FORCE", "Actuation", "JointTorques", "MotorCurrents", "PositionControl", "drive_forces"]
+
+FORCE = "{}_torque"
+"""Name of the force of a joint's drive."""
 
 PerJoint: TypeAlias = float | Mapping[str, float]
 
@@ -29,9 +32,22 @@ class Actuation(Protocol):
     def force(self, joint: str, q: Any, v: Any, u: Any) -> Any:
         """Force of a joint, N m or N, by its position and velocity, and by the inputs."""
 
+    def largest_force(self, joint: str) -> float:
+        """Magnitude at which the force of a joint saturates, N m or N; infinite if it does not."""
+
+
+class _Saturating:
+    """Drives with a limit."""
+
+    limit: PerJoint | None
+
+    def largest_force(self, joint: str) -> float:
+        """Magnitude at which the force of a joint saturates, N m or N; infinite if it does not."""
+        return np.inf if self.limit is None else _of_joint("limit", self.limit, joint)
+
 
 @dataclass(frozen=True)
-class JointTorques:
+class JointTorques(_Saturating):
     """Measured forces of the joints.
 
     Parameters
@@ -63,7 +79,7 @@ class JointTorques:
 
 
 @dataclass(frozen=True)
-class PositionControl:
+class PositionControl(_Saturating):
     """Position control of every joint: ``kp (target - q) + kd (target' - q') + feedforward``.
 
     Parameters
@@ -112,7 +128,7 @@ class PositionControl:
 
 
 @dataclass(frozen=True)
-class MotorCurrents:
+class MotorCurrents(_Saturating):
     """Measured currents of the motors: ``gear constant current``.
 
     Parameters
@@ -148,6 +164,31 @@ class MotorCurrents:
         """``clip(gear constant current)``."""
         gain = _of_joint("gear", self.gear, joint) * _of_joint("constant", self.constant, joint)
         return _saturated(gain * u[self.current.format(joint)], self.limit, joint)
+
+
+def drive_forces(actuation: Actuation, joints: Collection[str]) -> Callable[..., dict[str, Any]]:
+    """Forces of the drives, ``elbow_torque``, as ``outputs`` of `diransac.design_experiment`.
+
+    Parameters
+    ----------
+    actuation : Actuation
+        Drives of the robot.
+    joints : collection of str
+        Coordinates with a drive.
+
+    Returns
+    -------
+    callable
+        ``(q, v, a, u, p)`` to the forces by name, N m or N; without those that are inputs themselves.
+    """
+    units = ("rad", "N m")
+
+    def outputs(q: Any, v: Any, _a: Any, u: Any, _p: Any) -> dict[str, Any]:
+        inputs = {name for joint in joints for name in actuation.inputs(joint, units)}
+        forces = {FORCE.format(joint): joint for joint in joints}
+        return {name: actuation.force(n, q[n], v[n], u) for name, n in forces.items() if name not in inputs}
+
+    return outputs
 
 
 def _of_joint(what: str, value: PerJoint, joint: str) -> float:

@@ -7,7 +7,7 @@ here.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -46,6 +46,8 @@ class Joint:
         Coulomb friction, N m or N.
     spring_reference : float
         Position in which the spring is relaxed.
+    position_limits, force_limits : (float, float)
+        Smallest and largest position, and force of its drives, N m or N; infinite where the file has none.
     """
 
     name: str
@@ -58,6 +60,8 @@ class Joint:
     friction: float
     stiffness: tuple[float, ...]
     spring_reference: float
+    position_limits: tuple[float, float]
+    force_limits: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -204,6 +208,7 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
     names = [joint.parent.name for joint in floating]
     for joint in floating:
         spec.delete(joint)
+    drives = _drive_limits(spec)
     _drop_shapes(spec)
     try:
         spec.compiler.fusestatic = False
@@ -212,7 +217,7 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
         raise _unreadable(path, error) from error
     label = f'robot description "{path}"'
     _check_supported(label, model)
-    joints = tuple(_joint(model, k) for k in range(model.njnt))
+    joints = tuple(_joint(model, k, drives) for k in range(model.njnt))
     if not joints:
         raise ModelError(f"{label}: there are no joints, and nothing can move")
     bodies = tuple(_body(model, i) for i in range(1, model.nbody))
@@ -286,10 +291,29 @@ def _couplings(label: str, model: Any) -> Iterator[Coupling]:
         yield Coupling(int(model.eq_obj1id[k]), None if leader < 0 else leader, tuple(model.eq_data[k, :5].tolist()))
 
 
-def _joint(model: Any, k: int) -> Joint:
-    dof = model.jnt_dofadr[k]
+def _drive_limits(spec: Any) -> dict[str, tuple[float, float]]:
+    """Range of the force that the actuators of a joint exert, by its name."""
+    mujoco = mujoco_module()
+    found: dict[str, tuple[float, float]] = {}
+    for drive in spec.actuators:
+        if drive.trntype != mujoco.mjtTrn.mjTRN_JOINT:
+            continue
+        ranges = [np.array(drive.forcerange)]
+        if drive.gaintype == mujoco.mjtGain.mjGAIN_FIXED and drive.biastype == mujoco.mjtBias.mjBIAS_NONE:
+            ranges.append(np.array(drive.ctrlrange) * drive.gainprm[0])
+        for force in (np.sort(x * drive.gear[0]) for x in ranges if np.ptp(x) > 0.0):
+            low, high = found.get(drive.target, (-np.inf, np.inf))
+            found[drive.target] = max(low, float(force[0])), min(high, float(force[1]))
+    return found
+
+
+def _joint(model: Any, k: int, drives: Mapping[str, tuple[float, float]]) -> Joint:
+    dof, name, unlimited = model.jnt_dofadr[k], model.joint(k).name, (-np.inf, np.inf)
+    low, high = drives.get(name, unlimited)
+    if model.jnt_actfrclimited[k]:
+        low, high = max(low, float(model.jnt_actfrcrange[k][0])), min(high, float(model.jnt_actfrcrange[k][1]))
     return Joint(
-        name=model.joint(k).name or f"joint{k}",
+        name=name or f"joint{k}",
         turns=bool(model.jnt_type[k] == mujoco_module().mjtJoint.mjJNT_HINGE),
         axis=_snapped(model.jnt_axis[k]),
         anchor=np.array(model.jnt_pos[k]),
@@ -299,6 +323,8 @@ def _joint(model: Any, k: int) -> Joint:
         friction=float(model.dof_frictionloss[dof]),
         stiffness=_polynomial(model.jnt_stiffness[k], getattr(model, "jnt_stiffnesspoly", None), k),
         spring_reference=float(model.qpos_spring[model.jnt_qposadr[k]]),
+        position_limits=tuple(model.jnt_range[k].tolist()) if model.jnt_limited[k] else unlimited,
+        force_limits=(low, high),
     )
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.model import Model
-from diransac.model.robots.actuation import Actuation, JointTorques
+from diransac.model.robots.actuation import FORCE, Actuation, JointTorques
 from diransac.model.robots.description import Description, read_description
 from diransac.model.robots.mechanism import UNKNOWN, Mechanism, identifier, ordered_couplings
 
-__all__ = ["robot"]
+__all__ = ["robot", "robot_limits"]
 
 
 def robot(
@@ -108,6 +108,46 @@ def robot(
         speeds=(_positive("friction_speed", friction_speed), _positive("stribeck_speed", stribeck_speed)),
     )
     return mechanism.model(actuation or JointTorques(), _known_names("passive", passive, mechanism.coordinates))
+
+
+def robot_limits(
+    path: str | Path,
+    *,
+    actuation: Actuation | None = None,
+    joints: Collection[str] | Mapping[str, str] | str | None = None,
+    base: str | None = None,
+) -> dict[str, tuple[float, float]]:
+    """Ranges of joints and of the forces of their drives in a robot's description, for `diransac.design_experiment`.
+
+    Parameters
+    ----------
+    path : str or Path
+        MJCF or URDF.
+    actuation : Actuation, optional
+        Drives of the robot, whose own limits hold, too.
+    joints, base
+        As of `robot`.
+
+    Returns
+    -------
+    dict of str to (float, float)
+        By coordinate, ``elbow``, in rad or m, and by force of the drive, ``elbow_torque``, in N m or N (as
+        `drive_forces`). What the file does not limit on both sides is left out. MuJoCo does not read velocity limits
+        of URDF.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read, or a name is unknown.
+    """
+    description = read_description(path, base)
+    chosen = _coordinates(f'robot "{path}"', description, joints)
+    found: dict[str, tuple[float, float]] = {}
+    for name, joint in ((n, description.joints[k]) for n, k in chosen.items()):
+        own = np.inf if actuation is None else actuation.largest_force(name)
+        low, high = joint.force_limits
+        found |= {name: joint.position_limits, FORCE.format(name): (max(low, -own), min(high, own))}
+    return {name: pair for name, pair in found.items() if np.isfinite(pair).all()}
 
 
 # ---------------------------------------------------------------------- arguments

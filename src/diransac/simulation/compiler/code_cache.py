@@ -12,7 +12,6 @@ import hashlib
 import os
 import stat
 import sys
-import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,9 +28,6 @@ SIZE_LIMIT = 256 * 2**20
 """Bytes of all entries of a folder; a module has 20 kB to 5 MB."""
 
 MAGIC = b"diransac machine code 1\n"
-
-ABANDONED = 3600.0
-"""Age at which a file that was never finished is removed, s."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +122,7 @@ class CodeCache:
         return sorted(found, key=lambda entry: entry[1].st_mtime)
 
     def _trim(self) -> None:
-        """Remove the oldest entries beyond the limit, and files that a killed process has left."""
+        """Remove the oldest entries beyond the limit."""
         sizes = self.sizes()
         excess = sum(sizes.values()) - self.size_limit
         for path, size in sizes.items():
@@ -134,9 +130,6 @@ class CodeCache:
                 break
             path.unlink(missing_ok=True)
             excess -= size
-        for path, found in self._files(".*.code.*.part"):
-            if found.st_mtime < time.time() - ABANDONED:
-                path.unlink(missing_ok=True)
 
 
 def hashed(parts: Iterable[str]) -> str:

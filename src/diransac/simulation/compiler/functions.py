@@ -12,7 +12,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
 from diransac.simulation.compiler.graph import read_graph
-from diransac.simulation.compiler.lanes import arranged_lanes, run_time_loop
+from diransac.simulation.compiler.lanes import ARGUMENTS, arranged_lanes, map_signature, run_time_loop
 from diransac.simulation.compiler.machine_code import LANES, MachineCode, Target, compile_function, run_blocks
 
 if TYPE_CHECKING:
@@ -83,11 +83,11 @@ class Map:
 
     def _compiled(self, shared: tuple[bool, ...]) -> MachineCode:
         """Machine code for inputs some of which are shared by all rows."""
-        from diransac.simulation.compiler.operations import emit_map_loop, map_signature
-
         function, definition = self._function, ("map", self._serialized, repr(shared))
 
         def emit() -> Value:
+            from diransac.simulation.compiler.operations import emit_map_loop
+
             graph = read_graph(function, [k for k, fixed in enumerate(shared) if fixed])
             return emit_map_loop(graph, [function.numel_in(k) for k in range(function.n_in())])
 
@@ -182,10 +182,11 @@ class Scan:
 
     def _compiled(self, windows: bool) -> MachineCode:
         """Machine code for lanes with rows of their own, or with the same ones."""
-        from diransac.simulation.compiler.outputs import SignalOutput
-        from diransac.simulation.compiler.time_loop import ARGUMENTS, emit_time_loop, inputs_from_log
 
         def emit() -> Value:
+            from diransac.simulation.compiler.outputs import SignalOutput
+            from diransac.simulation.compiler.time_loop import emit_time_loop, inputs_from_log
+
             return emit_time_loop(self._specification(), SignalOutput, inputs_from_log, windows=windows)
 
         definition = ("scan", self._serialized, repr(windows))

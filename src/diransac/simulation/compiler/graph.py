@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import TYPE_CHECKING
 
 import casadi as ca
 
 from diransac.errors import ModelError
+from diransac.model.expressions import steps
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
@@ -127,12 +127,6 @@ def read_graph(function: ca.Function, invariant_inputs: Collection[int] = (), *,
     return _fused(graph, frozenset(invariant_inputs))
 
 
-@cache
-def _operation_names() -> dict[int, str]:
-    """CasADi's names of its operations."""
-    return {getattr(ca, name): name.removeprefix("OP_") for name in dir(ca) if name.startswith("OP_")}
-
-
 def _read(function: ca.Function) -> tuple[list[Instruction], list[list[int]]]:
     """Instructions of a function, each value once, and the dense outputs."""
     builder = _Builder()
@@ -140,20 +134,20 @@ def _read(function: ca.Function) -> tuple[list[Instruction], list[list[int]]]:
     elements_out = [_dense_elements(function.sparsity_out(k)) for k in range(function.n_out())]
     zero = builder.constant(0.0)
     outputs = [[zero] * function.numel_out(k) for k in range(function.n_out())]
-    register: dict[int, int] = {}
-    for k in range(function.n_instructions()):
-        name = _operation_names()[function.instruction_id(k)]
-        sources, targets = function.instruction_input(k), function.instruction_output(k)
-        if name == "OUTPUT":
-            outputs[targets[0]][elements_out[targets[0]][targets[1]]] = register[sources[0]]
-        elif name == "INPUT":
-            element = elements_in[sources[0]][sources[1]]
-            register[targets[0]] = builder.add(Instruction("INPUT", source=(sources[0], element)))
-        elif name == "CONST":
-            register[targets[0]] = builder.constant(function.instruction_constant(k))
+    moved: list[int] = []
+    for step in steps(function):
+        number, place = step.place
+        if step.operation == "output":
+            moved.append(moved[step.operands[0]])
+            outputs[number][elements_out[number][place]] = moved[-1]
+        elif step.operation == "input":
+            moved.append(builder.add(Instruction("INPUT", source=(number, elements_in[number][place]))))
+        elif step.operation == "const":
+            moved.append(builder.constant(step.constant))
         else:
+            name = step.operation.upper()
             _refuse(name, function)
-            register[targets[0]] = builder.operation(name, tuple(register[i] for i in sources))
+            moved.append(builder.operation(name, tuple(moved[k] for k in step.operands)))
     return builder.instructions, outputs
 
 

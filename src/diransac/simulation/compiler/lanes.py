@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 
 __all__ = [
+    "ARGUMENTS",
     "Lanes",
     "aligned",
     "arranged_feedback",
@@ -27,9 +28,42 @@ __all__ = [
     "arranged_measurements",
     "arranged_weights",
     "checked_array",
+    "map_signature",
     "run_time_loop",
     "squared_thresholds",
 ]
+
+ARGUMENTS = {
+    "parameters": "pointer",  # (n_p, n_padded) float64
+    "initial_states": "pointer",  # (n_states, n_padded) float64
+    "inputs": "pointer",  # (n_log, n_inputs) float64, read where the log gives the inputs
+    "feedback": "pointer",  # (n_laws, n_log, width) float64, read where feedback gives the inputs
+    "feedback_starts": "pointer",  # (n_padded,) int64, row of all laws' rows at which each lane's law starts
+    "limits": "pointer",  # (2, n_u) float64, smallest and largest inputs of the feedback
+    "measured": "pointer",  # (n_log, n_s) float64
+    "valid": "pointer",  # (n_log,) bytes, 0 or 1
+    "weights": "pointer",  # (n_log, n_s) float64
+    "squared_thresholds": "pointer",  # (n_s,) float64
+    "start_rows": "pointer",  # (n_padded,) int64, read where lanes start at different rows
+    "sums": "pointer",  # float64, written by the output; so are the next four
+    "counts": "pointer",  # (2, n_padded) int64
+    "inlier_bits": "pointer",  # (n_blocks, n_rows) bytes, one bit per lane
+    "series": "pointer",  # (n_lanes, n_rows, width) float64
+    "final": "pointer",  # (n_blocks, n_states, 8) float64
+    "step": "number",  # seconds, of one sub-step
+    "min_inlier_signals": "integer",
+    "n_lanes": "integer",
+    "n_padded": "integer",  # n_lanes rounded up to whole vectors; the last lane is repeated
+    "n_rows": "integer",
+    "first_block": "integer",  # vectors of lanes to run: first_block .. end_block - 1
+    "end_block": "integer",
+}
+"""Arguments of the compiled time loop, in order, and their kinds."""
+
+
+def map_signature(n_arrays: int) -> list[str]:
+    """Kinds of the compiled function's arguments: inputs and outputs, n_rows, first_block, end_block."""
+    return ["pointer"] * n_arrays + ["integer"] * 3
 
 
 @dataclass(frozen=True)
@@ -139,10 +173,17 @@ def arranged_weights(
     w = np.asarray(weights, np.float64)
     w = np.broadcast_to(w, (lanes.n_log, n_signals)) if w.shape == (n_signals,) else w
     w = checked_array("weights", w, (lanes.n_log, n_signals))[lanes.window]
-    if not (np.isfinite(w).all() and (w >= 0).all()):
+    if w.size and not (w.min() >= 0.0 and w.max() < np.inf):
         raise SettingsError("weights hold a number that is negative or not finite.")
-    y = checked_array("measurements.values", values, (lanes.n_log, n_signals))[lanes.window]
-    w = np.where(valid[lanes.window, None], w, 0.0)
+    y, counts = (
+        checked_array("measurements.values", values, (lanes.n_log, n_signals))[lanes.window],
+        valid[lanes.window],
+    )
+    w = w if counts.all() else np.where(counts[:, None], w, 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        total = y.sum()
+    if np.isfinite(total):  # as is then every term
+        return {"measured": y, "weights": w}
     finite = np.isfinite(y)
     if not finite[w > 0].all():
         raise SettingsError(
@@ -197,8 +238,6 @@ def squared_thresholds(thresholds: ArrayLike, n_signals: int) -> FloatArray:
 
 def run_time_loop(code: MachineCode, lanes: Lanes, values: Mapping[str, Any], threads: int) -> None:
     """Run a compiled time loop over all blocks of lanes; `values` are its other arguments by name, 0 where absent."""
-    from diransac.simulation.compiler.time_loop import ARGUMENTS
-
     sizes = {"n_lanes": lanes.n_lanes, "n_padded": lanes.n_padded, "n_rows": lanes.n_rows}
     known = {**lanes.arrays, **values, **sizes}
     arguments = [

@@ -9,6 +9,7 @@ from llvmlite import ir
 
 from diransac.errors import ModelError
 from diransac.simulation.compiler import elementary
+from diransac.simulation.compiler.lanes import map_signature
 from diransac.simulation.compiler.machine_code import LANES
 from diransac.simulation.compiler.vectors import DOUBLE, INTEGER, POINTER, Value, Vectors, integer
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     from diransac.simulation.compiler.graph import Graph
 
-__all__ = ["OPERATIONS", "Operation", "emit_map_loop", "evaluate", "map_signature", "numbers"]
+__all__ = ["OPERATIONS", "Operation", "emit_map_loop", "evaluate", "numbers"]
 
 
 @dataclass(frozen=True)
@@ -163,11 +164,6 @@ def _as_kind(v: Vectors, value: Value, kind: str) -> Value:
 
 
 # A loop over rows ----------------------------------------------------------------------------------------------------
-def map_signature(n_arrays: int) -> list[str]:
-    """Kinds of the compiled function's arguments: inputs and outputs, n_rows, first_block, end_block."""
-    return ["pointer"] * n_arrays + ["integer"] * 3
-
-
 def emit_map_loop(graph: Graph, widths_in: Sequence[int]) -> Value:
     """LLVM module with one function, `map_loop`, that takes `map_signature`.
 

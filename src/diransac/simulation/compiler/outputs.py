@@ -39,6 +39,11 @@ class _Output:
     def end(self, block: Block) -> None:
         """Nothing after the last row."""
 
+    def first(self, block: Block, name: str, width: int) -> Value:
+        """First of a block's vectors in an array that holds so many for every block."""
+        start = self.loop.builder.mul(block.first, integer(width))  # block.first is eight times the block
+        return self.loop.builder.gep(self.arguments[name], [start], source_etype=DOUBLE)
+
     def errors(self, block: Block, row: LoopRow) -> list[Value]:
         """Simulated less measured; a quaternion, and its derivatives, first take the sign that is nearer."""
         v = self.v
@@ -124,7 +129,7 @@ class GaussNewtonOutput(_Output):
 
     def start(self, block: Block) -> None:
         """Set the sums to zero."""
-        self.sums = self._first(block, "sums", self.n_sums)
+        self.sums = self.first(block, "sums", self.n_sums)
         self.v.each(0, self.n_sums, lambda k: self.v.put(self.v.number(0.0), self.sums, k))
 
     def row(self, block: Block, row: LoopRow) -> None:
@@ -200,7 +205,7 @@ class GaussNewtonOutput(_Output):
     def end(self, block: Block) -> None:
         """Write the sums and the final state; mark lanes in which anything is not finite."""
         v, guard = self.v, self.loop.guard
-        final = self._first(block, "final", self.n_final)
+        final = self.first(block, "final", self.n_final)
         for k, variable in enumerate(self.loop.state):
             v.put(v.get(variable), final, k)
         first = self.specification.n_states
@@ -229,11 +234,6 @@ class GaussNewtonOutput(_Output):
     def _replace(self, array: Value, lanes: Value, value: float, index: Value | int) -> None:
         """Replace some lanes of one vector."""
         self.v.put(self.v.select(lanes, self.v.number(value), self.v.pick(array, index)), array, index)
-
-    def _first(self, block: Block, name: str, width: int) -> Value:
-        """First of a block's vectors in an array; `first` is eight times the block."""
-        start = self.loop.builder.mul(block.first, integer(width))
-        return self.loop.builder.gep(self.arguments[name], [start], source_etype=DOUBLE)
 
 
 def _columns_of(loop: TimeLoop) -> Columns:
@@ -283,11 +283,18 @@ class ClosedLoopOutput(_SeriesOutput):
 
 
 class ErrorOutput(_SeriesOutput):
-    """Errors of the scored signals."""
+    """Errors of the scored signals, and `final` states (n_blocks, n_states, 8), NaN in a lane that diverged."""
 
     def values(self, block: Block, row: LoopRow) -> list[Value]:
         """Errors of the scored signals."""
         return self.errors(block, row)
+
+    def end(self, block: Block) -> None:
+        """Write a block's state after its last row."""
+        v, diverged = self.v, self.v.is_nan(self.v.get(self.loop.guard))
+        final = self.first(block, "final", self.specification.n_states)
+        for k, variable in enumerate(self.loop.state):
+            v.put(v.select(diverged, v.number(float("nan")), v.get(variable)), final, k)
 
 
 class LinearizedErrorOutput(_SeriesOutput):

@@ -176,6 +176,7 @@ class Columns:
             argument.add_attribute("noalias")
         point, fixed, varying = function.args
         v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
+        v.align_frame()
         values = [v.pick(point, k) for k in range(n_states + n_inputs)]
         sources = {_POINT: values[:n_states], _INPUT: values[n_states:]}
         first, places = len(self._places.fixed), self._places.varying

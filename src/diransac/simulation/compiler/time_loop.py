@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from llvmlite import ir
 
+from diransac.simulation.compiler.lanes import ARGUMENTS
 from diransac.simulation.compiler.machine_code import LANES
 from diransac.simulation.compiler.operations import evaluate, numbers
 from diransac.simulation.compiler.sensitivities import Columns, Points
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler.sensitivities import DerivativeSpecification
 
 __all__ = [
-    "ARGUMENTS",
     "Block",
     "InputSource",
     "LoopRow",
@@ -47,33 +47,6 @@ __all__ = [
     "inputs_by_shared_feedback",
     "inputs_from_log",
 ]
-
-ARGUMENTS = {
-    "parameters": "pointer",  # (n_p, n_padded) float64
-    "initial_states": "pointer",  # (n_states, n_padded) float64
-    "inputs": "pointer",  # (n_log, n_inputs) float64, read where the log gives the inputs
-    "feedback": "pointer",  # (n_laws, n_log, width) float64, read where feedback gives the inputs
-    "feedback_starts": "pointer",  # (n_padded,) int64, row of all laws' rows at which each lane's law starts
-    "limits": "pointer",  # (2, n_u) float64, smallest and largest inputs of the feedback
-    "measured": "pointer",  # (n_log, n_s) float64
-    "valid": "pointer",  # (n_log,) bytes, 0 or 1
-    "weights": "pointer",  # (n_log, n_s) float64
-    "squared_thresholds": "pointer",  # (n_s,) float64
-    "start_rows": "pointer",  # (n_padded,) int64, read where lanes start at different rows
-    "sums": "pointer",  # float64, written by the output; so are the next four
-    "counts": "pointer",  # (2, n_padded) int64
-    "inlier_bits": "pointer",  # (n_blocks, n_rows) bytes, one bit per lane
-    "series": "pointer",  # (n_lanes, n_rows, width) float64
-    "final": "pointer",  # (n_blocks, n_states, 8) float64
-    "step": "number",  # seconds, of one sub-step
-    "min_inlier_signals": "integer",
-    "n_lanes": "integer",
-    "n_padded": "integer",  # n_lanes rounded up to whole vectors; the last lane is repeated
-    "n_rows": "integer",
-    "first_block": "integer",  # vectors of lanes to run: first_block .. end_block - 1
-    "end_block": "integer",
-}
-"""Arguments of the compiled time loop, in order, and their kinds."""
 
 STATE, INPUT, PARAMETER, STEP = range(4)
 

@@ -12,6 +12,7 @@ inverse cost O(W).  Windows are eliminated by compiled code, for the border as f
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -34,10 +35,10 @@ class Factored:
         Solution of each window.
     step_p : (m,) array
         Solution of the shared unknowns.
-    var_z : (W, k, k) array
-        Diagonal blocks of the inverse.
-    var_below : (W - 1, k, k) array
-        Blocks of the inverse below the diagonal.
+    alone : (W, k, k) array
+        Diagonal blocks of ``A^-1``, the inverse without the shared unknowns: covariances where these are given.
+    alone_below : (W - 1, k, k) array
+        Blocks of ``A^-1`` below the diagonal.
     var_p : (m, m) array
         Corner of the inverse.
     gain : (W, k, m) array
@@ -48,11 +49,28 @@ class Factored:
 
     step_z: FloatArray
     step_p: FloatArray
-    var_z: FloatArray
-    var_below: FloatArray
+    alone: FloatArray
+    alone_below: FloatArray
     var_p: FloatArray
     gain: FloatArray
     log_det: float
+
+    @cached_property
+    def var_z(self) -> FloatArray:
+        """Diagonal ``(W, k)`` of the inverse: variances."""
+        return np.asarray(np.einsum("wii->wi", self.alone) + np.einsum("wim,wim->wi", self._moved, self.gain))
+
+    @cached_property
+    def var_below(self) -> FloatArray:
+        """Diagonals ``(W - 1, k)`` of the inverse's blocks below the diagonal: covariances with the window before."""
+        own = np.einsum("wii->wi", self.alone_below)
+        return np.asarray(own + np.einsum("wim,wim->wi", self._moved[1:], self.gain[:-1]))
+
+    @cached_property
+    def _moved(self) -> FloatArray:
+        """Covariances ``(W, k, m)`` with the shared unknowns, but for their sign."""
+        W, k, m = self.gain.shape
+        return (self.gain.reshape(W * k, m) @ self.var_p).reshape(W, k, m)
 
 
 @dataclass(frozen=True)
@@ -118,25 +136,24 @@ class Arrowhead:
         """
         sz, sp = _scale(np.einsum("wii->wi", self.diagonal)), _scale(np.diag(self.corner))
         k, m = self.border.shape[1:]
-        D = self.diagonal * sz[:, :, None] * sz[:, None, :] + (damping + self.ridge) * np.eye(k)
-        E = self.below * sz[1:, :, None] * sz[:-1, None, :]
-        B = self.border * sz[:, :, None] * sp
-        C = self.corner * sp[:, None] * sp + (damping + self.ridge) * np.eye(m)
-        solved, inverse, below, log_det = solve_blocks(D, E, np.concatenate([B, right_z * sz[:, :, None]], axis=2))
-        gain = solved[:, :, :m]
-        common = B.reshape(-1, m).T @ solved.reshape(len(B) * k, -1)
+        own, following = sz[:, :, None] * sz[:, None, :], sz[1:, :, None] * sz[:-1, None, :]
+        D, E = self.diagonal * own + (damping + self.ridge) * np.eye(k), self.below * following
+        C = self.corner * np.outer(sp, sp) + (damping + self.ridge) * np.eye(m)
+        right = np.concatenate([self.border * sp, right_z], axis=2)
+        right *= sz[:, :, None]
+        solved, inverse, below, log_det = solve_blocks(D, E, right)
+        solved = np.ascontiguousarray(solved)
+        gain, flat = solved[:, :, :m], solved.reshape(len(D) * k, -1)
+        common = right.reshape(flat.shape)[:, :m].T @ flat
         left = C - common[:, :m]
         var_p = _inverse(left)
         p = var_p @ (right_p * sp[:, None] - common[:, m:])
-        z = solved[:, :, m:] - gain @ p
-        moved = gain @ var_p
-        var = inverse + moved @ gain.swapaxes(1, 2)
-        below = below + moved[1:] @ gain[:-1].swapaxes(1, 2)
+        z = solved[:, :, m:] - (flat[:, :m] @ p).reshape(len(D), k, -1)
         return Factored(
             z * sz[:, :, None],
             p * sp[:, None],
-            var * sz[:, :, None] * sz[:, None, :],
-            below * sz[1:, :, None] * sz[:-1, None, :],
+            inverse * own,
+            below * following,
             var_p * sp[:, None] * sp,
             gain * sz[:, :, None] / sp,
             float(log_det + np.linalg.slogdet(left)[1] - 2.0 * (np.log(sz).sum() + np.log(sp).sum())),

@@ -366,7 +366,6 @@ def _scores(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray
     )  # fmt: skip
     compared = Measurements(intervals.measured[:, seen], intervals.measurements.valid)
     errors = rollouts(intervals.model, names, hold=intervals.hold).errors(batch, compared).reshape(n, -1, len(names))
-    rows = (starts[:, None] + np.arange(intervals.length)).ravel()
-    known = np.broadcast_to(intervals.known[rows][:, seen], errors.shape)
+    known = np.broadcast_to(intervals.known[intervals.rows_of(chosen)][:, seen], errors.shape)
     scale = lower_scale(np.nan_to_num(errors, copy=False, nan=np.inf), known)
     return np.asarray(np.log(np.maximum(scale, 1e-4 * motion.spread[seen])).sum(axis=1))

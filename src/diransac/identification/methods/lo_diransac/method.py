@@ -20,11 +20,16 @@ from diransac.blas import single_threaded
 from diransac.data.input_timing import InputTiming
 from diransac.data.segment import long_runs, silent_rows
 from diransac.errors import IdentificationError, LogError, ModelError, SettingsError, TimeLimitError
-from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, Resolution
+from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, HausmanTest, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.checks import compared_parts, findings_of_fit
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
+from diransac.identification.methods.lo_diransac.instruments import (
+    Instrumented,
+    check_set_points,
+    instrumented_estimate,
+)
 from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
 from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
 from diransac.identification.methods.lo_diransac.projection import (
@@ -130,6 +135,10 @@ class LoDiransac(LoDiransacSettings):
     max_sensor_errors : int, optional
         Largest number of unnamed ones of these that are estimated; where the model is exact, only of groups of sensors
         and of those with a measurement equation.
+    set_points : sequence of str, optional
+        Columns of the logs that disturbances do not change: set-points, or inputs of a machine without feedback.  Where
+        the model is not exact, they are instruments: a parameter that feedback biases is estimated from them, and
+        named.
     substeps : int, optional
         Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
         samples or links are light.
@@ -190,7 +199,7 @@ class LoDiransac(LoDiransacSettings):
         LogError
             The logs are too short, or sampled at different rates.
         SettingsError
-            A signal or an input is named that the logs lack.
+            A signal or an input is named that the logs lack, or a set-point that is no instrument.
         IdentificationError
             No sample gives parameters within their bounds.
         TimeLimitError
@@ -220,6 +229,7 @@ def configured(settings: Settings, **options: Any) -> LoDiransac:
 def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
     """Parameters of the dataset's model, step by step."""
     _check_sensors(settings, dataset)
+    check_set_points(dataset, settings.set_points)
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
     best = _searched(settings, dataset, seed, callback)
     for narrower in _NARROWER if best.is_doubtful else ():
@@ -232,20 +242,27 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
     notes, refined = best.notes, likeliest.refinement
     report(callback, "estimating parameters", 0.9)
+    instrumented = Instrumented(result, np.zeros(len(result.parameters)))
+    if settings.set_points and settings.projection and not (likeliest.exact or best.impossible):
+        instrumented = instrumented_estimate(
+            intervals, refined.fit, result, dataset, settings.set_points, settings.prior_inflation
+        )
+        result = instrumented.result
     if best.impossible or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
     parts, lacks = compared_parts(likeliest, result), None
     if settings.suggestions and not likeliest.exact:
         lacks = missing_terms(intervals, refined.fit, result, settings.candidate_terms)
-    ambiguity = _ambiguity(len(result.parameters), parts.changes, lacks)
+    ambiguity = _ambiguity(parts.changes, lacks, instrumented)
     checks = (
         *_checks(settings, intervals, motion, refined),
         *_checks_of_bounds(best),
         *_checks_of_unmeasured(best),
+        *instrumented.findings,
         *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), parts),
     )
     forced = bool(settings.input_delay or settings.input_lag)
-    found = _Found(dataset, intervals, motion, refined, result, ambiguity, forced)
+    found = _Found(dataset, intervals, motion, refined, result, ambiguity, forced, instrumented.tests)
     end = "converged" if refined.converged else "limit of steps"
     end = end if likeliest.complete else TIME_LIMIT
     estimate = _estimate(settings, found, best.n_hypotheses, end, notes, checks)
@@ -334,9 +351,11 @@ def _parameters(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[P
     return (fitted_parameters(intervals, fit) if impossible else result), impossible
 
 
-def _ambiguity(n: int, changes: Sequence[Change], lacks: MissingTerms | None) -> FloatArray:
-    """Covariance of parameters that change during the log, or with terms that the model lacks."""
-    found = np.zeros((n, n)) if lacks is None else np.outer(lacks.change, lacks.change)
+def _ambiguity(changes: Sequence[Change], lacks: MissingTerms | None, instrumented: Instrumented) -> FloatArray:
+    """Covariance of parameters that change during the log, with terms that the model lacks, or with instruments."""
+    found = np.diag(np.square(instrumented.ambiguity))
+    if lacks is not None:
+        found += np.outer(lacks.change, lacks.change)
     for one in changes:
         found[one.index, one.index] += one.variance
     return found
@@ -522,6 +541,7 @@ class _Found:
     result: ProjectedEstimate
     ambiguity: FloatArray
     forced: bool
+    hausman_tests: tuple[HausmanTest, ...]
 
     @property
     def late(self) -> float:
@@ -617,6 +637,7 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
         input_delay_significant=found.is_late,
         unidentifiable=lost,
         combinations=combinations,
+        hausman_tests=found.hausman_tests,
     )
 
 

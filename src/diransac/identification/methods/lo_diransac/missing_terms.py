@@ -187,9 +187,8 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForce
     n_p, n_v, n_u = intervals.n_p, intervals.model.n_v, intervals.model.n_u
     at = linearize(intervals, fit, weights_of(intervals, fit))
     found = at.system.solve(at.right_z, at.right_s)
-    alone = found.var_z - found.gain @ found.var_p @ found.gain.swapaxes(1, 2)
     M, sizes = rows.mean(rows.M), np.diff(rows.windows, append=intervals.occupied.sum())
-    of_force = np.einsum("wij,wjk,wik->wi", M, rows.over_windows(alone[:, n_x:, n_x:]), M) / sizes[:, None]
+    of_force = np.einsum("wij,wjk,wik->wi", M, rows.over_windows(found.alone[:, n_x:, n_x:]), M) / sizes[:, None]
     inertial = np.einsum("nij,nj->ni", rows.M, rows.motion[2])[intervals.counted]
     force = rows.mean(rows.r)
     own = rows.mean(np.concatenate([rows.W, rows.input_rates()], axis=2))

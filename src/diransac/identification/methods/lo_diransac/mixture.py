@@ -54,21 +54,36 @@ class Mixture:
 
     def inlying(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Probability ``(N, n_s)`` that each sample is not an outlier; 0 where it is missing (the E step)."""
-        core = self._core(residuals)
-        total = core + self.pi / (2.0 * self.span)
-        return np.where(known, np.divide(core, total, out=np.ones_like(core), where=total > 0.0), 0.0)
+        core, uniform = self._core(residuals), self.pi / (2.0 * self.span)
+        if (uniform > 0.0).all():
+            core /= core + uniform
+        else:
+            total = core + uniform
+            core = np.divide(core, total, out=np.ones_like(core), where=total > 0.0)
+        core *= known
+        return core
 
     def negative_log_likelihood(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Negative log-likelihood ``(N, n_s)`` of each sample; 0 where it is missing."""
-        total = self._core(residuals) + self.pi / (2.0 * self.span)
-        with np.errstate(over="ignore"):
-            gaussian = 0.5 * np.square(residuals / self.sigma) + np.log(self.sigma * np.sqrt(2.0 * np.pi))
-        return np.where(known, np.negative(np.log(total, out=-gaussian, where=total > 0.0)), 0.0)
+        total, uniform = self._core(residuals), self.pi / (2.0 * self.span)
+        total += uniform
+        if (uniform > 0.0).all():
+            loss = np.negative(np.log(total, out=total), out=total)
+        else:
+            with np.errstate(over="ignore"):
+                gaussian = 0.5 * np.square(residuals / self.sigma) + np.log(self.sigma * np.sqrt(2.0 * np.pi))
+            loss = np.negative(np.log(total, out=-gaussian, where=total > 0.0))
+        return loss if known.all() else np.where(known, loss, 0.0)
 
     def _core(self, residuals: FloatArray) -> FloatArray:
         """Density of the Gaussian with its share; exactly 0 beyond 40 sigma, whose squares might overflow."""
-        distance = np.minimum(np.abs(residuals) / self.sigma, _FAR)
-        return np.asarray(np.exp(-0.5 * np.square(distance)) * (1.0 - self.pi) / (self.sigma * np.sqrt(2.0 * np.pi)))
+        density = residuals / self.sigma
+        np.clip(density, -_FAR, _FAR, out=density)
+        np.square(density, out=density)
+        density *= -0.5
+        np.exp(density, out=density)
+        density *= (1.0 - self.pi) / (self.sigma * np.sqrt(2.0 * np.pi))
+        return density
 
     def updated(
         self, residuals: FloatArray, known: BoolArray, inlying: FloatArray, *, outliers: bool = True
@@ -89,8 +104,8 @@ class Mixture:
         -------
         Mixture
         """
-        weight = inlying.sum(axis=0)
-        squares = (inlying * np.square(residuals)).sum(axis=0)
+        weight = np.einsum("ni->i", inlying)
+        squares = np.einsum("ni,ni,ni->i", inlying, residuals, residuals)
         variance = squares / np.maximum(weight, 1e-9)
         for four in self.quaternions:
             columns = list(four)
@@ -118,9 +133,11 @@ def lower_scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
     (..., n_s) array
         NaN where fewer than 5 samples are known.
     """
-    size = np.where(known, np.abs(residuals), np.inf)
-    count = known.sum(axis=-2)
-    place = np.maximum((BREAKDOWN * count).astype(int), 0)
-    ordered = np.partition(size, np.unique(place), axis=-2)
-    found = np.take_along_axis(ordered, place[..., None, :], axis=-2)[..., 0, :]
+    size = np.abs(residuals.swapaxes(-1, -2), order="C")  # each column's side by side
+    count = np.count_nonzero(known, axis=-2)
+    if count.min(initial=known.shape[-2]) < known.shape[-2]:
+        np.copyto(size, np.inf, where=~known.swapaxes(-1, -2))
+    place = (BREAKDOWN * count).astype(int)
+    size.partition(place.flat[0] if (place == place.flat[0]).all() else np.unique(place), axis=-1)
+    found = np.take_along_axis(size, place[..., None], axis=-1)[..., 0]
     return np.where(count >= _FEWEST, found / _OF_NORMAL, np.nan)

@@ -61,6 +61,8 @@ class Fit:
         Unmodelled accelerations.
     residuals : (N, n_signals) array
         Simulated less measured signals.
+    ends : (W, n_x) array
+        States in which the intervals end.
     noise : Mixture
         Noise of each signal.
     tau : (n_v,) array
@@ -79,12 +81,17 @@ class Fit:
     x: FloatArray
     d: FloatArray
     residuals: FloatArray
+    ends: FloatArray
     noise: Mixture
     tau: FloatArray
     rho: FloatArray
     continuity_std: FloatArray
     prior: FloatArray
     prior_mean: FloatArray
+
+    def jumps(self, intervals: ShootingIntervals) -> FloatArray:
+        """States at the intervals' starts less the ends of the intervals before, (W - 1, n_x); 0 where unlinked."""
+        return np.where(intervals.linked[:, None], self.x[1:] - self.ends[:-1], 0.0)
 
 
 @dataclass(frozen=True)
@@ -141,8 +148,7 @@ class NormalEquations:
         z = np.hstack([moved.x - fit.x, moved.d - fit.d])
         s = (moved.shared - fit.shared)[_places(intervals)[intervals.log_of]]
         linear = self.jumps + z[1:, :n_x] - np.einsum("wij,wj->wi", self.slopes, np.hstack([z, s])[:-1])
-        found = moved.x[1:] - intervals.ends(moved.shared, moved.x, moved.d)
-        of_z, of_s = self.by_jumps(intervals, found - linear)
+        of_z, of_s = self.by_jumps(intervals, moved.jumps(intervals) - linear)
         return self.right_z - of_z, self.right_s - of_s
 
     def by_jumps(self, intervals: ShootingIntervals, more: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -168,7 +174,7 @@ class NormalEquations:
 
 
 def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
-    """The fit with its residuals over the given intervals.
+    """The fit with its residuals and ends over the given intervals.
 
     Parameters
     ----------
@@ -179,7 +185,8 @@ def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
     -------
     Fit
     """
-    return replace(fit, residuals=intervals.residuals(fit.shared, fit.x, fit.d))
+    residuals, ends = intervals.simulated(fit.shared, fit.x, fit.d)
+    return replace(fit, residuals=residuals, ends=ends)
 
 
 def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> NormalEquations:
@@ -202,7 +209,7 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     data_z, data_s = g[:, :k].copy(), _in_places(intervals, g[:, k:])
     F = sums.final_slopes[:-1]
     linked = intervals.linked
-    jumps = np.where(linked[:, None], fit.x[1:] - sums.final_states[:-1], 0.0)
+    jumps = fit.jumps(intervals)
     F = F if linked.all() else np.where(linked[:, None, None], F, 0.0)
     precision = linked[:, None] / np.square(fit.continuity_std)
     FP = F.swapaxes(1, 2) * precision[:, None, :]
@@ -253,8 +260,10 @@ def variances_of_intervals(
     return np.asarray(own.swapaxes(1, 2) @ sums.normal_matrix @ own)
 
 
-def data_gradient(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Right-hand sides of the measurements alone, `data_z` and `data_s` of `NormalEquations`.
+def data_gradient(
+    intervals: ShootingIntervals, fit: Fit, weights: FloatArray, measured: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Right-hand sides of other measurements alone, as `data_z` and `data_s` of `NormalEquations`.
 
     Parameters
     ----------
@@ -262,12 +271,13 @@ def data_gradient(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -
     fit : Fit
     weights : (N, n_signals) array
         Weights of the measurements, one over each signal's unit squared.
+    measured : (N, n_signals) array
 
     Returns
     -------
     (W, n_x + n_v) array, (W, n_s) array
     """
-    gradient = -intervals.gauss_newton(fit.shared, fit.x, fit.d, weights).gradient
+    gradient = -intervals.gauss_newton(fit.shared, fit.x, fit.d, weights, measured=measured).gradient
     k = fit.x.shape[1] + fit.d.shape[1]
     return gradient[:, :k], _in_places(intervals, gradient[:, k:])
 
@@ -349,7 +359,7 @@ def _shared_blocks(
     return wide, whole, total
 
 
-def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray, jumps: FloatArray | None = None) -> float:
+def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
     """Twice the cost of a fit with fixed weights.
 
     Parameters
@@ -358,19 +368,15 @@ def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray, jumps: Flo
     fit : Fit
     weights : (N, n_signals) array
         Weights of the measurements, one over each signal's unit squared.
-    jumps : (W - 1, n_x) array, optional
-        Those of `NormalEquations` at the fit; None: simulated.
 
     Returns
     -------
     float
         Infinite where a rollout diverges.
     """
-    if jumps is None:
-        jumps = fit.x[1:] - intervals.ends(fit.shared, fit.x, fit.d)
     terms = (
-        (weights * np.square(fit.residuals)).sum(),
-        np.square(jumps / fit.continuity_std).sum(),
+        np.einsum("ns,ns,ns->", weights, fit.residuals, fit.residuals),
+        np.square(fit.jumps(intervals) / fit.continuity_std).sum(),
         np.square(innovations(intervals, fit)).sum(),
         np.square((fit.shared - fit.prior_mean) / fit.prior).sum(),
     )

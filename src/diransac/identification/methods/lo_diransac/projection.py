@@ -6,10 +6,11 @@ squares on noise-free data: ``W p = b`` is solved again on the fitted motion, so
 in the regressor's column space is attributed to the parameters.  Equations are weighted by their inertial forces.
 
 Inputs are no instruments: a controller answers disturbances, and its inputs are correlated with them (Forssell, Ljung
-1999).  Nor are any needed: the fitted accelerations are posterior means, whose errors are uncorrelated with themselves,
-so that they do not bias the slopes of a regression on them (Berkson 1950).  The motion of a state that nothing measures
-follows from the equations and from its unmodelled accelerations: a regression on it would attenuate its parameters, and
-these accelerations are not attributed to them.
+1999).  Set-points are, where a user names them (`instruments`).  Against noise none are needed: the fitted
+accelerations are posterior means, whose errors are uncorrelated with themselves, so that they do not bias the slopes of
+a regression on them (Berkson 1950).  The motion of a state that nothing measures follows from the equations and from
+its unmodelled accelerations: a regression on it would attenuate its parameters, and these accelerations are not
+attributed to them.
 
 The covariance has four parts: that of the fit and of the errors of its sensors, propagated through the projection;
 that of the unmodelled forces outside the regressor's column space, as a sample of forces that differ from log to log;
@@ -24,11 +25,13 @@ wide, and the combination has what is left of their precision.
 
 References
 ----------
-Plumlee 2017 (discrepancies orthogonal to the model); White 1982 (inference under a wrong model).
+Plumlee 2017 (discrepancies orthogonal to the model); White 1982 (inference under a wrong model); Söderström, Stoica
+1983 (instrumental variables).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -55,7 +58,9 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler import Map
 
 __all__ = [
+    "Contrast",
     "EffectOfIntervals",
+    "Instruments",
     "ProjectedEstimate",
     "batch_sums",
     "discrepancy_units",
@@ -63,7 +68,9 @@ __all__ = [
     "estimate_parameters",
     "fitted_parameters",
     "inertial_forces",
+    "instrumented_contrast",
     "least_squares_gains",
+    "mean_regressors",
     "means_of_intervals",
     "means_of_windows",
     "parameter_units",
@@ -81,6 +88,8 @@ _WIDER = 100.0
 _EQUATIONS, _CLEAR, _NEGLIGIBLE, _KEPT = 8, 2.5, 0.05, 0.95
 # Steps of reweighting, the width of Cauchy's loss in standard deviations, and what is rounding of an equation's scale.
 _REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
+# Least variance of a regressor's covariance with its instruments: beyond it they are the regressor.
+_EXACT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -105,7 +114,58 @@ class ProjectedEstimate:
     windows: IntArray
 
 
-def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation: float) -> ProjectedEstimate:
+@dataclass(frozen=True)
+class Instruments:
+    """Regressors without what disturbances contribute to them.
+
+    Parameters
+    ----------
+    means : (W, n_v, n) array
+        Mean over each interval.
+    used : (n,) bool array
+        Parameters whose regressor is replaced; the others are their own instruments.
+    """
+
+    means: FloatArray
+    used: BoolArray
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """Instrumented less plain least squares.
+
+    Parameters
+    ----------
+    instrumented, plain : (n,) array
+        Parameters.
+    covariance : (n, n) array
+        Of their difference, without the assumption that either is efficient.
+    n_batches : int
+        Sums over neighbouring intervals from which the covariance is estimated.
+    strength : (n,) array
+        First-stage F of each parameter: 1 over the variance of its regressor's covariance with the instruments that is
+        not theirs, over that covariance; NaN for a parameter on a bound, or without a regressor.
+    together : (n, n) bool array
+        Parameters that share an equation, directly or by others.
+    """
+
+    instrumented: FloatArray
+    plain: FloatArray
+    covariance: FloatArray
+    n_batches: int
+    strength: FloatArray
+    together: BoolArray
+
+    def critical(self, level: float) -> float:
+        """Standard errors that the difference of a parameter exceeds with a probability of ``level`` by chance."""
+        freedom = max(self.n_batches - 1, 1)
+        usual = student_quantile(freedom, _UPPER) / _NORMAL_UPPER
+        return student_quantile(freedom, 1.0 - 0.5 * level) / usual
+
+
+def estimate_parameters(
+    intervals: ShootingIntervals, fit: Fit, prior_inflation: float, instruments: Instruments | None = None
+) -> ProjectedEstimate:
     """Parameters that solve the equations on the fitted motion by least squares, and their covariance.
 
     Parameters
@@ -115,6 +175,7 @@ def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation:
         Most probable motion.
     prior_inflation : float
         Factor of the prior on model error whose effect on the parameters is added to their covariance.
+    instruments : Instruments, optional
 
     Returns
     -------
@@ -122,13 +183,13 @@ def estimate_parameters(intervals: ShootingIntervals, fit: Fit, prior_inflation:
         Within the inclusive bounds; parameters on them have an infinite variance.
     """
     wide = _with_wide_priors(intervals, fit)
-    found = _solution(intervals, wide)
-    change = projected_parameters(intervals, _inflated_prior(intervals, wide, prior_inflation)) - found.parameters
+    found, inflated = _solution(intervals, wide, instruments), _inflated_prior(intervals, wide, prior_inflation)
+    change = projected_parameters(intervals, inflated, instruments) - found.parameters
     found = replace(found, covariance=found.covariance + np.outer(change, change))
     return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
 
 
-def projected_parameters(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+def projected_parameters(intervals: ShootingIntervals, fit: Fit, instruments: Instruments | None = None) -> FloatArray:
     """Parameters ``(n,)`` that solve the equations on the fitted motion by least squares, without priors.
 
     Parameters
@@ -136,14 +197,62 @@ def projected_parameters(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     intervals : ShootingIntervals
     fit : Fit
         Most probable motion.
+    instruments : Instruments, optional
 
     Returns
     -------
     (n,) array
         Within the inclusive bounds.
     """
-    now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit)
+    now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit, instruments)
     return _bounded_projection(intervals, now, rows, _windows(intervals, now, rows)[-1], _REWEIGHTED)[0]
+
+
+def instrumented_contrast(intervals: ShootingIntervals, fit: Fit, instruments: Instruments) -> Contrast:
+    """Difference between instrumented and plain least squares of the same equations.
+
+    Both are linear in the unmodelled forces, so that the covariance of their difference follows as that of an estimate
+    does: from the fit, and by sums over neighbouring intervals.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        Most probable motion.
+    instruments : Instruments
+
+    Returns
+    -------
+    Contrast
+
+    References
+    ----------
+    Hausman 1978 (the contrast); Wooldridge 2010, section 6.3 (its covariance without homoscedasticity); Sanderson,
+    Windmeijer 2016 (strength with several regressors).
+    """
+    n, wide = intervals.n_p, _with_wide_priors(intervals, fit)
+    rows = _Rows.of(intervals, wide, instruments)
+    now, plain = wide.shared[:n], replace(rows, instruments=None)
+    windows = _windows(intervals, now, rows)[-1]
+    found, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
+    of_plain, plain_gains, plain_stuck = _bounded_projection(intervals, now, plain, windows, _REWEIGHTED)
+    apart = (gains[0] - plain_gains[0], gains[1] - plain_gains[1])
+    covariance = _covariance_of_fit(intervals, wide, rows, apart, np.zeros((n, n)))
+    sums = batch_sums(_parts(intervals, rows, gains) - _parts(intervals, plain, plain_gains))
+    free = ~(stuck | plain_stuck) & rows.means.any(axis=(0, 1))
+    strength, acts = np.full(n, np.nan), rows.means.any(axis=0).astype(float)
+    together = acts.T @ acts > 0.0
+    for _ in range(n.bit_length()):
+        together = together.astype(float) @ together > 0.0
+    strength[free] = _strengths(instruments.means[:, :, free], rows.means[:, :, free], gains[1][free])
+    return Contrast(found, of_plain, covariance + sums.T @ sums, len(sums), strength, together)
+
+
+def _strengths(Z: FloatArray, W: FloatArray, gains: FloatArray) -> FloatArray:
+    """First-stage F ``(k,)`` of k parameters from instruments and regressors (W, n_v, k) and gains (k, W, n_v)."""
+    shares = np.linalg.lstsq(np.einsum("pwi,wik->pk", gains, Z), np.eye(Z.shape[2]), rcond=None)[0]
+    parts = np.einsum("pwi,wip->wp", gains, W - Z @ shares)
+    return np.asarray(1.0 / np.maximum(np.square(batch_sums(parts)).sum(axis=0), _EXACT))
 
 
 def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -252,6 +361,8 @@ class _Rows:
         Equations of which ``M d`` is attributed to the parameters: those of measured motion.
     inertial : (W, n_v) array
         Mean inertial force of each equation.
+    instruments : (W, n_v, n) array, optional
+        Instruments in the mean over each interval; None: the regressors themselves.
     """
 
     W: FloatArray
@@ -261,9 +372,10 @@ class _Rows:
     latent: FloatArray
     attributed: BoolArray
     inertial: FloatArray
+    instruments: FloatArray | None = None
 
     @classmethod
-    def of(cls, intervals: ShootingIntervals, fit: Fit) -> _Rows:
+    def of(cls, intervals: ShootingIntervals, fit: Fit, instruments: Instruments | None = None) -> _Rows:
         """Equations of the logged rows."""
         evaluate, motion = _residual_map(intervals.model), _motion(intervals, fit)
         logged = intervals.counted[:, None]
@@ -274,41 +386,59 @@ class _Rows:
         inertial = np.einsum("wij,wj->wi", M, means_of_intervals(intervals, motion[2]))
         latent, hidden = np.einsum("wij,wj->wi", M, fit.d), unmeasured_states(intervals)
         attributed = np.array([name not in hidden for name in intervals.model.velocities])
-        return cls(W, push, means_of_intervals(intervals, W), M, latent, attributed, inertial)
+        means = means_of_intervals(intervals, W)
+        Z = None if instruments is None else np.where(instruments.used, instruments.means, means)
+        return cls(W, push, means, M, latent, attributed, inertial, Z)
 
 
-def _solution(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
+def _solution(intervals: ShootingIntervals, fit: Fit, instruments: Instruments | None = None) -> ProjectedEstimate:
     """Parameters, and the first two parts of their covariance.
 
     The component of the discrepancies and of the unmodelled accelerations in the regressor's column space is attributed
     to the parameters: of the discrepancies row by row; of the accelerations, which are constant over an interval, by
     interval means.
     """
-    n_p, n_s, n_x = intervals.n_p, len(fit.shared), fit.x.shape[1]
-    now, rows = fit.shared[:n_p], _Rows.of(intervals, fit)
+    now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit, instruments)
     *shorter, windows = _windows(intervals, now, rows)
     p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
     others = [_bounded_projection(intervals, now, rows, windows, 0)[0]]
     # What windows of half the length change is an upper limit of the attenuation that is left.
     others += [_bounded_projection(intervals, now, rows, x, _REWEIGHTED)[0] for x in shorter[-1:]]
-    by_rows, by_means = gains
-    of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + fit.d.shape[1], n_p))
-    level = np.hstack([np.ones((len(rows.push), 1)), intervals.inputs])
-    of_s[:n_p] = np.eye(n_p)
-    of_s[n_p:-1] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
-    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means * rows.attributed, rows.M)
-    at = linearize(intervals, fit, weights_of(intervals, fit))
-    z, s = at.system.functional(of_z, of_s)
-    covariance = np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s + effect_on(intervals, fit, z, s)
-    unmade = rows.latent - rows.means @ np.einsum("pwi,wi->p", by_means, rows.latent)
-    unpushed = rows.push - rows.W @ np.einsum("pni,ni->p", by_rows, rows.push)
-    of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)
-    sums = batch_sums(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
+    covariance = _covariance_of_fit(intervals, fit, rows, gains, np.eye(intervals.n_p))
+    sums = batch_sums(_parts(intervals, rows, gains))
     covariance = covariance + sums.T @ sums + sum(np.outer(x - p, x - p) for x in others)
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
     left = _over_windows(unexplained(intervals, fit, p), windows)
     return ProjectedEstimate(p, covariance, left, windows)
+
+
+def _covariance_of_fit(
+    intervals: ShootingIntervals, fit: Fit, rows: _Rows, gains: tuple[FloatArray, FloatArray], own: FloatArray
+) -> FloatArray:
+    """Covariance (n, n) of the fit and of the errors of its sensors, propagated through the projection.
+
+    ``own (n, n)`` is the effect of the fit's parameters: the identity for an estimate, 0 for a difference of two.
+    """
+    n_p, n_s, n_x = intervals.n_p, len(fit.shared), fit.x.shape[1]
+    by_rows, by_means = gains
+    of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + fit.d.shape[1], n_p))
+    level = np.hstack([np.ones((len(rows.push), 1)), intervals.inputs])
+    of_s[:n_p] = own
+    of_s[n_p:-1] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
+    of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means * rows.attributed, rows.M)
+    at = linearize(intervals, fit, weights_of(intervals, fit))
+    z, s = at.system.functional(of_z, of_s)
+    return np.asarray(np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s + effect_on(intervals, fit, z, s))
+
+
+def _parts(intervals: ShootingIntervals, rows: _Rows, gains: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """What the unmodelled forces of each interval that parameters leave contribute to their error, (W, n)."""
+    by_rows, by_means = gains
+    unmade = rows.latent - rows.means @ np.einsum("pwi,wi->p", by_means, rows.latent)
+    unpushed = rows.push - rows.W @ np.einsum("pni,ni->p", by_rows, rows.push)
+    of_rows = np.einsum("pni,ni->np", by_rows, unpushed).reshape(len(intervals), intervals.length, -1).sum(axis=1)
+    return np.asarray(np.einsum("pwi,wi->wp", by_means, unmade) + of_rows)
 
 
 def _bounded_projection(
@@ -345,7 +475,7 @@ def _gains(
 
     Equations of intervals have the known sides ``known (W, n_v)``.
     """
-    if len(windows) == len(intervals):
+    if len(windows) == len(intervals) and rows.instruments is None:
         weak = WeakForm(rows.means[:, :, free], known)
         weights = _robust_weights(weak, intervals.occupied, _rms(rows.inertial), reweighted)
         every = np.repeat(weights, intervals.length, axis=0)
@@ -353,7 +483,8 @@ def _gains(
     W, b, inertial = (means_of_windows(x, windows) for x in (rows.means[:, :, free], known, rows.inertial))
     sizes = np.diff(windows, append=len(intervals))
     occupied = np.logical_or.reduceat(intervals.occupied, windows)
-    gains = least_squares_gains(W, _robust_weights(WeakForm(W, b), occupied, _rms(inertial), reweighted))
+    Z = None if rows.instruments is None else means_of_windows(rows.instruments[:, :, free], windows)
+    gains = _gains_of(W, Z, _robust_weights(WeakForm(W, b), occupied, _rms(inertial), reweighted, Z))
     of_intervals = np.repeat(gains / sizes[:, None], sizes, axis=1)
     return np.repeat(of_intervals / intervals.length, intervals.length, axis=1), of_intervals
 
@@ -424,6 +555,7 @@ def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> list
     information.  The shortest windows are taken that attenuate no parameter, in comparison with all longer ones (Lepski
     1991), whose regressor has such noise: windows of twice the length take a part of its power.
     """
+    rows = replace(rows, instruments=None)
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
     tried, size = list[_Averaged](), 1
     while True:
@@ -442,20 +574,30 @@ def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> list
     return [x.windows for x in tried]
 
 
-def _robust_weights(rows: WeakForm, occupied: BoolArray, scale: FloatArray, steps: int) -> FloatArray:
+def _robust_weights(
+    rows: WeakForm, occupied: BoolArray, scale: FloatArray, steps: int, instruments: FloatArray | None = None
+) -> FloatArray:
     """Square roots of the weights ``(W, n_v)``: of the equations by their scales, and of intervals by Cauchy's loss.
 
     Scales are inertial forces, so that unmodelled accelerations count by their share of the motion: an equation that is
     wrong throughout, as by the gain of its input, has its say on the parameters that it shares with others.  A gust of
-    a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.
+    a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.  With
+    instruments, residuals are those of the instrumented estimate: weights by other ones would be correlated with them.
     """
     loss = np.ones(rows.b.shape)
     for _ in range(steps):
-        gains = least_squares_gains(rows.W, loss / scale)
+        gains = _gains_of(rows.W, instruments, loss / scale)
         left = rows.b - rows.W @ np.einsum("pwi,wi->p", gains, rows.b)
         spread = 1.4826 * np.median(np.abs(left[occupied]), axis=0)
         loss = 1.0 / np.sqrt(1.0 + np.square(left / (_CAUCHY * np.maximum(spread, _ROUNDING * scale))))
     return np.asarray(loss / scale)
+
+
+def _gains_of(W: FloatArray, instruments: FloatArray | None, weights: FloatArray) -> FloatArray:
+    """Gains ``(n, N, r)`` of least squares, or with instruments."""
+    if instruments is None:
+        return least_squares_gains(W, weights)
+    return _instrumented_gains(W, instruments, weights)
 
 
 def least_squares_gains(W: FloatArray, weights: FloatArray) -> FloatArray:
@@ -480,6 +622,17 @@ def least_squares_gains(W: FloatArray, weights: FloatArray) -> FloatArray:
     if not np.isfinite(normal).all():  # LAPACK would print to the terminal
         raise np.linalg.LinAlgError("the regressors of the fitted motion are not finite")
     solved = np.linalg.lstsq(normal, rows.T, rcond=None)[0] / scale[:, None]
+    return np.asarray(solved.reshape(-1, *W.shape[:2]) * weights)
+
+
+def _instrumented_gains(W: FloatArray, Z: FloatArray, weights: FloatArray) -> FloatArray:
+    """``(Z'VW)^-1 Z'V`` of stacked regressors and as many instruments (N, r, n); as `least_squares_gains`, Z = W."""
+    weights = np.broadcast_to(weights, W.shape[:2])
+    regressors, instruments = ((x * weights[:, :, None]).reshape(-1, W.shape[2]) for x in (W, Z))
+    sizes = [np.linalg.norm(x, axis=0) for x in (regressors, instruments)]
+    of_W, of_Z = (np.where(x > 0.0, x, 1.0) for x in sizes)
+    instruments = instruments / of_Z
+    solved = np.linalg.lstsq(instruments.T @ (regressors / of_W), instruments.T, rcond=None)[0] / of_W[:, None]
     return np.asarray(solved.reshape(-1, *W.shape[:2]) * weights)
 
 
@@ -547,6 +700,25 @@ def residuals_of_motion(
     r, W, M = _residual_map(model)(*motion, p)
     rows = np.broadcast_to(p, (len(r), model.n_p))
     return (*motion, rows), r, _regressors(intervals, W), _matrices(M, model.n_v)
+
+
+def mean_regressors(intervals: ShootingIntervals, motion: Sequence[FloatArray], parameters: FloatArray) -> FloatArray:
+    """Mean over each interval of ``dr/dp`` on any motion.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : sequence of (N, ...) array
+        q, v, a and the inputs as they act.
+    parameters : (n,) array
+
+    Returns
+    -------
+    (W, n_v, n) array
+        Rows that do not count are 0.
+    """
+    columns = _residual_map(intervals.model)(*motion, _row_parameters(intervals, parameters))[1]
+    return means_of_intervals(intervals, _regressors(intervals, columns) * intervals.counted[:, None, None])
 
 
 def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ Rao 1948 (score test); Furgale, Rehder, Siegwart 2013 (delays of sensors).
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,6 +47,8 @@ __all__ = [
 _CLEAR, _LEAST_DELAY, _LATEST = 3.0, 0.1, 0.1
 # Groups of which a fit is made at a time.
 _GROUPS = 4
+# Numbers of the sensitivities that are held at a time.
+_NUMBERS_AT_A_TIME = 1_000_000
 # Signals that are known in fewer rows than this are not tested.
 _FEWEST = 50
 # Part of the information of an error that other unknowns must leave; of an error of inputs, which moves the ends of
@@ -107,9 +109,10 @@ def clear_errors(
     tested = [x for x in _candidates(intervals, among) if x.what in kinds]
     if not tested:
         return []
-    scores = _Scores(intervals, fit)
+    scores, at_a_time = _Scores(intervals, fit), max(1, _NUMBERS_AT_A_TIME // intervals.measured.size)
     latest = _LATEST * max(x.stop - x.start for x in intervals.rows_of_logs)
-    found = [x for x in map(scores.tested, tested) if x is not None]
+    parts = [tested[k : k + at_a_time] for k in range(0, len(tested), at_a_time)]
+    found = [x for part in parts for x in scores.tested(part)]
     found = [x for x in found if x.kind.what != "delay" or _LEAST_DELAY < abs(x.size) < latest]
     single = [x for x in found if len(x.kind.columns) == 1 and x.ratio > _CLEAR]
     groups = [x for x in found if len(x.kind.columns) > 1 and x.gain > worth]
@@ -191,6 +194,13 @@ class _Slope:
     of_s: FloatArray
     score: float
 
+    @classmethod
+    def sum(cls, kind: ErrorKind, parts: Sequence[_Slope]) -> _Slope:
+        """Derivatives with respect to errors of the same size, as one."""
+        names = ("sensitivity", "jumps", "of_z", "of_s")
+        total: dict[str, FloatArray] = {n: np.sum([getattr(x, n) for x in parts], axis=0) for n in names}
+        return cls(kind=kind, **total, score=sum(x.score for x in parts))
+
 
 class _Scores:
     """Score tests at a fit: of errors one by one, or estimates of several together."""
@@ -204,6 +214,18 @@ class _Scores:
         """Derivatives with respect to an error."""
         return self._of_inputs(kind) if kind.of_inputs else self._of_signals(kind)
 
+    def _slopes_of_signals(self, kinds: Sequence[ErrorKind]) -> list[_Slope]:
+        """Derivatives with respect to errors of signals; those of a group that others make up are sums of theirs."""
+        found = dict[ErrorKind, _Slope]()
+        for kind in sorted(kinds, key=lambda x: len(x.columns)):
+            left, parts = set(kind.columns), list[_Slope]()
+            for other, slope in reversed(found.items()):
+                if other.what == kind.what and left.issuperset(other.columns):
+                    left.difference_update(other.columns)
+                    parts.append(slope)
+            found[kind] = self.slope(kind) if left else _Slope.sum(kind, parts)
+        return [found[x] for x in kinds]
+
     def _of_signals(self, kind: ErrorKind) -> _Slope:
         columns = list(kind.columns)
         own = np.zeros_like(self.rates)
@@ -214,25 +236,31 @@ class _Scores:
         """By the difference of simulations, which end elsewhere, too."""
         step, fit = _STEPS[kind.what], self.fit
         moved = self.intervals.with_input_error(kind, step)
-        own = (with_residuals(moved, fit).residuals - fit.residuals) / step
-        ends = [x.ends(fit.shared, fit.x, fit.d) for x in (self.intervals, moved)]
-        return self._slope(kind, np.where(self.intervals.known, own, 0.0), (ends[0] - ends[1]) / step)
+        late = with_residuals(moved, fit)
+        own, jumps = late.residuals - fit.residuals, late.jumps(moved) - fit.jumps(self.intervals)
+        return self._slope(kind, np.where(self.intervals.known, own / step, 0.0), jumps / step)
 
     def _slope(self, kind: ErrorKind, own: FloatArray, jumps: FloatArray) -> _Slope:
         """Derivatives, from those of the residuals and of the jumps."""
         at = self.at
         # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
-        z, s = data_gradient(replace(self.intervals, measured=self.intervals.measured - own), self.fit, self.weights)
+        z, s = data_gradient(self.intervals, self.fit, self.weights, self.intervals.measured - own)
         of_z, of_s = at.by_jumps(self.intervals, jumps)
         of_z, of_s = of_z + at.data_z - z, of_s + (at.data_s - s).sum(axis=0)
         score = (self.weights * own * self.fit.residuals).sum() + (at.precision * jumps * at.jumps).sum()
         return _Slope(kind, own, jumps, of_z, of_s, float(score))
 
-    def tested(self, kind: ErrorKind) -> RecordingError | None:
-        """Estimate of an error, given all else that is estimated, or None if the log does not determine it."""
-        slope, n = self.slope(kind), len(self.intervals)
-        z, s = (x[..., 0] for x in self.at.system.functional(slope.of_z[:, :, None], slope.of_s[:, None]))
-        weighted = self.weights * slope.sensitivity
+    def tested(self, kinds: Sequence[ErrorKind]) -> list[RecordingError]:
+        """Estimates of errors one by one, given all else that is estimated; without those not determined by the log."""
+        slopes = self._slopes_of_signals(kinds)
+        of_z, of_s = np.stack([x.of_z for x in slopes], axis=-1), np.stack([x.of_s for x in slopes], axis=-1)
+        z, s = self.at.system.functional(of_z, of_s)
+        found = (self._estimate(x, z[..., k], s[:, k]) for k, x in enumerate(slopes))
+        return [x for x in found if x is not None]
+
+    def _estimate(self, slope: _Slope, z: FloatArray, s: FloatArray) -> RecordingError | None:
+        """Estimate of an error from the inverse times its slope, or None if the log does not determine it."""
+        n, weighted = len(self.intervals), self.weights * slope.sensitivity
         share = (weighted * slope.sensitivity).sum(axis=1).reshape(n, -1).sum(axis=1)
         information = float(share.sum() - (slope.of_z * z).sum() - slope.of_s @ s)
         if information <= _DETERMINED * share.sum():
@@ -244,7 +272,7 @@ class _Scores:
         batches = np.add.reduceat(scores, np.arange(0, n, max(1, round(np.sqrt(n)))))
         variance = max(information, float(np.square(batches).sum()))
         gain = 0.5 * slope.score**2 / information
-        return RecordingError(kind, -slope.score / information, abs(slope.score) / np.sqrt(variance), gain)
+        return RecordingError(slope.kind, -slope.score / information, abs(slope.score) / np.sqrt(variance), gain)
 
     def together(self, slopes: Sequence[_Slope]) -> tuple[list[int], FloatArray, FloatArray, FloatArray]:
         """Errors that the log determines, their covariance, and what they change of the gradient of the fit."""

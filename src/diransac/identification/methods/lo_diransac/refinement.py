@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
@@ -177,7 +177,7 @@ def start(
     n_x, n_v = intervals.model.n_q + intervals.model.n_v, intervals.model.n_v
     x, d = motion.signals[intervals.starts, :n_x].copy(), np.zeros((len(intervals), n_v))
     shared = np.concatenate([p, np.zeros(intervals.n_shared - len(p))])
-    residuals = intervals.residuals(shared, x, d)
+    residuals, ends = intervals.simulated(shared, x, d)
     floor = _SIGMA_FLOOR * motion.spread
     sigma = 1.5 * np.maximum(np.nan_to_num(lower_scale(residuals, intervals.known), nan=1.0), floor)
     low = np.where(intervals.known, intervals.measured, np.inf).min(axis=0)
@@ -191,7 +191,7 @@ def start(
     mean = np.concatenate([intervals.layout.prior_mean, np.zeros(len(shared) - len(p))])
     tau = _TAU_START * _accelerations(intervals.model, motion)
     continuity = motion.spread[:n_x].copy() if settings.gradual_continuity else _continuity(intervals, tau)
-    fit = Fit(shared, x, d, residuals, noise, tau, np.zeros(n_v), continuity, sizes, mean)
+    fit = Fit(shared, x, d, residuals, ends, noise, tau, np.zeros(n_v), continuity, sizes, mean)
     return _anchored(intervals, fit) if settings.neighbouring_starts else fit
 
 
@@ -200,30 +200,51 @@ def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
 
     Where outliers are in the majority for longer than an interval, its state follows from its neighbours alone.
     """
+    n, losses = len(intervals), _losses(intervals, fit.noise, fit.residuals, np.arange(len(intervals)))
+    # States that changed since those of their neighbours were last propagated from them: others give what they gave.
+    forward, backward = np.ones(n, bool), np.ones(n, bool)
     for _ in range(_MAX_SWEEPS):
-        before, after = fit.x.copy(), fit.x.copy()
-        before[1:] = np.nan_to_num(intervals.ends(fit.shared, fit.x, fit.d))
-        fit, forward = _better(intervals, fit, before)
-        after[:-1] = intervals.origins(fit.shared, fit.x, fit.d)
-        fit, backward = _better(intervals, fit, after)
-        if not (forward or backward):
+        after = 1 + np.flatnonzero(intervals.linked & forward[:-1])
+        fit, losses, forward = _better(intervals, fit, losses, after, np.nan_to_num(fit.ends[after - 1]))
+        backward |= forward
+        before = np.flatnonzero(intervals.linked & (backward[:-1] | backward[1:]))
+        if len(before):
+            found = intervals.origins(fit.shared, fit.x, fit.d, before)
+            fit, losses, backward = _better(intervals, fit, losses, before, found)
+            forward |= backward
+        if not forward.any():
             break
     return fit
 
 
-def _better(intervals: ShootingIntervals, fit: Fit, x: FloatArray) -> tuple[Fit, bool]:
-    """The fit with those of other initial states that have a higher likelihood; True if there are any."""
-    residuals = intervals.residuals(fit.shared, x, fit.d)
-    found = _loss_by_interval(intervals, replace(fit, residuals=residuals)) < _loss_by_interval(intervals, fit)
-    rows = np.repeat(found, intervals.length)[:, None]
-    x, residuals = np.where(found[:, None], x, fit.x), np.where(rows, residuals, fit.residuals)
-    return replace(fit, x=x, residuals=residuals), bool(found.any())
+def _better(
+    intervals: ShootingIntervals, fit: Fit, losses: FloatArray, chosen: IntArray, states: FloatArray
+) -> tuple[Fit, FloatArray, BoolArray]:
+    """The fit with other initial states of chosen intervals where they have a higher likelihood, and its losses.
+
+    The last result is the mask ``(W,)`` of the intervals whose states are new.
+    """
+    changed = np.zeros(len(intervals), bool)
+    if not len(chosen):
+        return fit, losses, changed
+    x, residuals, ends = fit.x.copy(), fit.residuals.copy(), fit.ends.copy()
+    x[chosen] = states
+    simulated, ended = intervals.simulated(fit.shared, x, fit.d, chosen)
+    found = _losses(intervals, fit.noise, simulated, chosen)
+    better = found < losses[chosen]
+    x[chosen[~better]] = fit.x[chosen[~better]]
+    changed[chosen[better]] = True
+    residuals[np.repeat(changed, intervals.length)] = simulated[np.repeat(better, intervals.length)]
+    ends[changed] = ended[better]
+    losses = losses.copy()
+    losses[changed] = found[better]
+    return replace(fit, x=x, residuals=residuals, ends=ends), losses, changed
 
 
-def _loss_by_interval(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
-    """Negative log-likelihood of each interval's samples, (W,)."""
-    losses = fit.noise.negative_log_likelihood(fit.residuals, intervals.known)
-    return np.asarray(losses.reshape(len(intervals), -1).sum(axis=1))
+def _losses(intervals: ShootingIntervals, noise: Mixture, residuals: FloatArray, chosen: IntArray) -> FloatArray:
+    """Negative log-likelihood ``(n,)`` of the samples of chosen intervals, from their residuals."""
+    known = intervals.known if len(chosen) == len(intervals) else intervals.known[intervals.rows_of(chosen)]
+    return np.asarray(noise.negative_log_likelihood(residuals, known).reshape(len(chosen), -1).sum(axis=1))
 
 
 @dataclass
@@ -374,7 +395,7 @@ def _step(intervals: ShootingIntervals, fit: Fit, damping: float) -> tuple[Fit, 
     """One Gauss-Newton step within the bounds, corrected or damped until the cost falls; damping of the next one."""
     weights = weights_of(intervals, fit)
     at = linearize(intervals, fit, weights)
-    before = cost(intervals, fit, weights, at.jumps)
+    before = cost(intervals, fit, weights)
     for _ in range(_MAX_TRIALS):
         right, excess = (at.right_z, at.right_s), np.inf
         while True:
@@ -395,7 +416,7 @@ def _moved(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:
     shared, n_x = _bounded(intervals, fit.shared, fit.shared + step.step_p), fit.x.shape[1]
     z = step.step_z - step.gain @ (shared - fit.shared - step.step_p)
     x, d = fit.x + z[:, :n_x], fit.d + z[:, n_x:]
-    return replace(fit, shared=shared, x=x, d=d, residuals=intervals.residuals(shared, x, d))
+    return with_residuals(intervals, replace(fit, shared=shared, x=x, d=d))
 
 
 def _bounded(intervals: ShootingIntervals, now: FloatArray, then: FloatArray) -> FloatArray:
@@ -423,7 +444,7 @@ def _update(
     noise = fit.noise.updated(fit.residuals, intervals.known, inlying, outliers=settings.outliers)
     if robust:
         squares = len(fit.d) * np.square(1.4826 * np.median(np.abs(fit.d), axis=0))
-        variance = np.einsum("wii->wi", solved.var_z)[:, n_x:]
+        variance = solved.var_z[:, n_x:]
         determined = (1.0 - variance / np.square(fit.tau)).clip(0.0).sum(axis=0)
         expected, rho = _GUARDED * prior.tau, fit.rho
     else:
@@ -442,8 +463,7 @@ def _process(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Squares of the innovations in the unit of tau, the number of those that the logs determine, and the new rho."""
     n_x, linked = fit.x.shape[1], intervals.linked[:, None]
-    variance = np.einsum("wii->wi", solved.var_z)[:, n_x:]
-    common = np.einsum("wii->wi", solved.var_below)[:, n_x:]
+    variance, common = solved.var_z[:, n_x:], solved.var_below[:, n_x:]
     spread = variance.copy()
     spread[1:] += np.where(linked, fit.rho * (fit.rho * variance[:-1] - 2.0 * common), 0.0)
     determined = (1.0 - spread / np.square(innovation_std(intervals, fit))).sum(axis=0).clip(0.0)
@@ -485,7 +505,7 @@ def _continuity(intervals: ShootingIntervals, tau: FloatArray) -> FloatArray:
 
 def _unbroken(fit: Fit, solved: Factored) -> FloatArray:
     """Jumps ``(n_x,)`` that are negligible beside the uncertainty of the states, over all intervals together."""
-    variance = np.einsum("wii->wi", solved.var_z)[:, : fit.x.shape[1]]
+    variance = solved.var_z[:, : fit.x.shape[1]]
     return np.asarray(_UNBROKEN * np.sqrt(np.median(variance, axis=0).clip(0.0) / len(fit.x)))
 
 

@@ -42,6 +42,7 @@ class LoDiransacSettings:
     sensor_biases: tuple[str, ...] | None = None
     gain_drifts: tuple[str, ...] | None = None
     max_sensor_errors: int = 8
+    set_points: tuple[str, ...] = ()
     substeps: int = 5
     max_starts: int = 5
     max_fits: int = 8
@@ -96,7 +97,7 @@ class LoDiransacSettings:
 
 _OBJECTS = ("criteria", "candidate_terms")
 _SWITCHES = ("input_delay", "input_lag")
-_NAMES = ("sensor_delays", "sensor_biases", "gain_drifts")
+_NAMES = ("sensor_delays", "sensor_biases", "gain_drifts", "set_points")
 _MAY_BE_ZERO = (
     "n_samples",
     "max_delay_shifts",
@@ -131,8 +132,10 @@ def _checked(name: str, value: Any, default: Any) -> Any:
 def _checked_names(name: str, value: Any) -> tuple[str, ...] | None:
     """Names of signals or inputs; one name stands for itself.  Raises SettingsError: a value is no name."""
     names = (value,) if isinstance(value, str) else value
-    if names is None:
+    by_evidence = name != "set_points"
+    if names is None and by_evidence:
         return None
     if not isinstance(names, list | tuple) or not all(isinstance(x, str) for x in names):
-        raise SettingsError(f"{name} is {value!r}; give names of signals, () for none, or None for the clear ones")
+        wanted = "signals, () for none, or None for the clear ones" if by_evidence else "columns, or () for none"
+        raise SettingsError(f"{name} is {value!r}; give names of {wanted}")
     return tuple(names)

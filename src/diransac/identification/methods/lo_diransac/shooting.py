@@ -239,6 +239,10 @@ class ShootingIntervals:
         """Mask ``(W,)`` of the intervals with a row that counts; others begin in a gap, or after the end of a log."""
         return np.asarray(self.counted[self.starts])
 
+    def rows_of(self, chosen: IntArray) -> IntArray:
+        """Rows ``(n * length,)`` of chosen intervals, one interval after the other."""
+        return (self.starts[chosen][:, None] + np.arange(self.length)).ravel()
+
     @property
     def duration(self) -> float:
         """Duration of an interval, s."""
@@ -377,9 +381,7 @@ class ShootingIntervals:
         """Model parameters ``(n, n_p)`` of the logs ``(n,)`` from a vector; the vector itself if all are shared."""
         return values if self.layout.is_shared else values[self.layout.index[logs]]
 
-    def batch(
-        self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray | None = None, more_rows: int = 0
-    ) -> RolloutBatch:
+    def batch(self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray | None = None) -> RolloutBatch:
         """Lanes of all or chosen intervals.
 
         Parameters
@@ -392,26 +394,25 @@ class ShootingIntervals:
             Unmodelled accelerations.
         chosen : (n,) int array, optional
             Indices of intervals; None: all.
-        more_rows : int, optional
-            Number of rows that are simulated beyond each interval.
 
         Returns
         -------
         RolloutBatch
         """
-        chosen = np.arange(len(self)) if chosen is None else chosen
-        own = np.broadcast_to(
-            self.parameters_of(shared[: self.n_p], self.log_of[chosen]), (len(chosen), self.model.n_p)
-        )
-        rest = np.broadcast_to(shared[self.n_p :], (len(chosen), len(shared) - self.n_p))
-        parameters = np.hstack([own, rest, d[chosen]])
+        logs, starts = self.log_of, self.starts
+        if chosen is not None:
+            logs, starts, x, d = logs[chosen], starts[chosen], x[chosen], d[chosen]
+        parameters = np.empty((len(x), self.model.n_p + len(shared) - self.n_p + d.shape[1]))
+        parameters[:, : self.model.n_p] = self.parameters_of(shared[: self.n_p], logs)
+        parameters[:, self.model.n_p : -d.shape[1]] = shared[self.n_p :]
+        parameters[:, -d.shape[1] :] = d
         return RolloutBatch(
             parameters,
-            x[chosen],
+            x,
             self.moving_inputs,
             self.dt,
-            self.starts[chosen],
-            self.length + more_rows,
+            starts,
+            self.length,
             self.first_of_log,
         )
 
@@ -420,55 +421,84 @@ class ShootingIntervals:
         """Measured signals; all rows count, and unknown samples have no weight."""
         return Measurements(self.measured, np.ones(len(self.measured), bool))
 
-    def residuals(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
-        """Simulated less measured signals ``(N, n_s)``, huge from a divergence on; arguments as `batch`."""
-        errors = self.rollouts.errors(self.batch(shared, x, d), self.measurements).reshape(self.measured.shape)
+    def simulated(
+        self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residuals and ends of all or chosen intervals; arguments as `batch`.
+
+        Parameters
+        ----------
+        shared, x, d : array
+        chosen : (n,) int array, optional
+
+        Returns
+        -------
+        (n * length, n_s) array
+            Simulated less measured signals, huge from a divergence on.
+        (n, n_x) array
+            States one row after the last of each interval, NaN where it diverges.
+        """
+        errors, ends = self.rollouts.errors_and_ends(self.batch(shared, x, d, chosen), self.measurements)
         if not np.isfinite(errors).all():
             np.nan_to_num(errors, copy=False, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
-        return errors
+        return errors.reshape(-1, errors.shape[2]), ends
 
-    def gauss_newton(self, shared: FloatArray, x: FloatArray, d: FloatArray, weights: FloatArray) -> GaussNewtonBatch:
-        """Least-squares sums of every interval with ``weights (N, n_s)``; other arguments as `batch`.
+    def gauss_newton(
+        self,
+        shared: FloatArray,
+        x: FloatArray,
+        d: FloatArray,
+        weights: FloatArray,
+        *,
+        measured: FloatArray | None = None,
+        chosen: IntArray | None = None,
+    ) -> GaussNewtonBatch:
+        """Least-squares sums of all or chosen intervals; other arguments as `batch`.
 
         Unknowns are in the order of x, d and the shared ones.  Derivatives of signals that nothing measures are left
         out, which are most of them in many logs.
+
+        Parameters
+        ----------
+        shared, x, d : array
+        weights : (N, n_s) array
+            Of the measurements, one over each signal's unit squared.
+        measured : (N, n_s) array, optional
+            Instead of the measured signals.
+        chosen : (n,) int array, optional
+
+        Returns
+        -------
+        GaussNewtonBatch
         """
-        names, columns = self._derived
-        derived = rollouts(self.augmented.model, names, substeps=self.substeps, hold=self.hold)
-        measurements = Measurements(self.measured[:, columns], self.measurements.valid)
-        batch, unknowns = self.batch(shared, x, d), self.augmented.unknowns
+        derived, columns = self._derived
+        batch, unknowns = self.batch(shared, x, d, chosen), self.augmented.unknowns
         threads = self.threads if len(self.measured) * len(unknowns) ** 2 > _WORTH_THREADS else 1
+        y = self.measured if measured is None else measured
+        measurements = Measurements(y[:, columns], self.measurements.valid)
         return derived.gauss_newton(batch, measurements, weights[:, columns], unknowns=unknowns, threads=threads)
 
     @cached_property
-    def _derived(self) -> tuple[tuple[str, ...], IntArray]:
-        """Names and indices of the signals that the logs have, quaternions as a whole."""
+    def _derived(self) -> tuple[Simulator, IntArray | slice]:
+        """Simulator of the signals that the logs have, quaternions as a whole, and their columns."""
         signals, seen = self.augmented.model.signals, np.array(self.sampled.any(axis=0))
         for four in self.model.quaternions:
             seen[list(four)] = seen[list(four)].any()
-        columns = np.flatnonzero(seen)
-        return tuple(signals[k] for k in columns), columns
+        names = [name for name, has in zip(signals, seen, strict=True) if has]
+        simulator = rollouts(self.augmented.model, names, substeps=self.substeps, hold=self.hold)
+        return simulator, slice(None) if seen.all() else np.flatnonzero(seen)
 
-    def ends(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
-        """Final states (W - 1, n_x) of all intervals but the last; the successor's initial state where unlinked."""
-        chosen = np.flatnonzero(self.linked)
-        found = x[1:].copy()
-        if len(chosen):
-            series = self.rollouts.trajectories(self.batch(shared, x, d, chosen, more_rows=1))
-            found[chosen] = series[:, -1, : x.shape[1]]
-        return found
-
-    def origins(self, shared: FloatArray, x: FloatArray, d: FloatArray) -> FloatArray:
-        """Initial states (W - 1, n_x) for which all intervals but the last end in their successor's initial state.
+    def origins(self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray) -> FloatArray:
+        """Initial states (n, n_x) for which chosen intervals end in their successors' initial states.
 
         One Newton step; states are unchanged where it has no solution.
         """
-        sums = self.gauss_newton(shared, x, d, np.zeros(self.measured.shape))
-        jumps, slopes = x[1:] - sums.final_states[:-1], sums.final_slopes[:-1, :, : x.shape[1]]
-        finite = np.isfinite(jumps).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2)) & self.linked
+        sums = self.gauss_newton(shared, x, d, np.zeros(self.measured.shape), chosen=chosen)
+        jumps, slopes = x[chosen + 1] - sums.final_states, sums.final_slopes[:, :, : x.shape[1]]
+        finite = np.isfinite(jumps).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
         usable = np.flatnonzero(finite)
         usable = usable[np.linalg.cond(slopes[usable]) < _WELL_CONDITIONED]
-        found = x[:-1].copy()
+        found = x[chosen]
         found[usable] += np.linalg.solve(slopes[usable], jumps[usable][:, :, None])[:, :, 0]
         return found
 

@@ -16,10 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
@@ -44,6 +45,8 @@ __all__ = [
     "without_spikes",
 ]
 
+Scalar = TypeVar("Scalar", bound=np.generic)
+
 _DEGREE, _STEPS = 4, 12
 _SHRINK = 0.3
 _FLOOR = 1e-4
@@ -57,6 +60,8 @@ _FEWEST, _ENOUGH_SAMPLES = 5, 25
 _ENOUGH = 4000
 # Samples of the running median beside which inputs have spikes: those of two samples at most.
 _SPIKE_WINDOW, _MAD_TO_STD = 5, 1.4826
+# Numbers of the windows of chains that are fitted together at most; more would only take memory.
+_NUMBERS_TOGETHER = 100_000
 
 
 @dataclass(frozen=True)
@@ -207,6 +212,16 @@ def _chains(model: Model) -> list[list[int]]:
     return [[model.signals.index(name) for name in chain] for chain in model.chains]
 
 
+def _alike(chains: Sequence[Sequence[int]], size: int) -> list[IntArray]:
+    """Columns ``(C, c)`` of chains of one length, which are fitted together; fewer together, the larger each is."""
+    together = max(1, _NUMBERS_TOGETHER // size)
+    found = []
+    for c in sorted({len(x) for x in chains}):
+        columns = np.array([x for x in chains if len(x) == c])
+        found += [columns[k : k + together] for k in range(0, len(columns), together)]
+    return found
+
+
 def _n_motion(model: Model) -> int:
     """Number of signals before the sensors."""
     return len(model.signals) - len(model.sensors)
@@ -250,8 +265,9 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
     chains = _chains(model)
     if model.kinematics is not None:
         rates = np.zeros((len(measured), model.n_q))
-        for d in range(model.n_q):
-            signals[:, [d]], rates[:, d] = smoother.smoothed(measured[:, [d]], known[:, [d]], centre[:, [d]])
+        for columns in _alike(chains[: model.n_q], smoother.rows.size):
+            parts = smoother.smoothed(measured[:, columns], known[:, columns], centre[:, columns], derivatives=1)
+            signals[:, columns], rates[:, columns[:, 0]] = parts[:, :, :1], parts[:, :, 1]
         _project(model, signals, rates, known)
         n_x = model.n_q + len(model.velocities_of_motion)
         lacking = model.n_q + np.flatnonzero(~known[:, model.n_q : n_x].any(axis=0))
@@ -259,15 +275,16 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
             inferred = _velocities_of_rates(model, signals, rates, measured, known, lacking)
             measured[:, lacking], known[:, lacking], centre[:, lacking] = inferred, ~log.gaps[:, None], inferred
         chains = chains[model.n_q :]
-    for columns in chains:
-        signals[:, columns], _ = smoother.smoothed(measured[:, columns], known[:, columns], centre[:, columns])
-        _integrate(signals, known, columns, dt)
+    for columns in _alike(chains, smoother.rows.size):
+        signals[:, columns] = smoother.smoothed(measured[:, columns], known[:, columns], centre[:, columns])
+    for chain in chains:
+        _integrate(signals, known, chain, dt)
     for k in range(_n_motion(model), len(model.signals)):
         near = _near(known[:, k], half)
         signals[:, [k]] = np.nan
         if near.any():
-            smoothed, _ = smoother.smoothed(measured[:, [k]], known[:, [k]], centre[:, [k]])
-            signals[near, k] = smoothed[near, 0]
+            smoothed = smoother.smoothed(measured[:, [[k]]], known[:, [[k]]], centre[:, [[k]]])
+            signals[near, k] = smoothed[near, 0, 0]
     rows, seen = np.arange(len(signals)), np.flatnonzero(~log.gaps)
     return signals if log.gaps.all() else np.column_stack([np.interp(rows, seen, x[seen]) for x in signals.T])
 
@@ -353,18 +370,22 @@ class _Smoother:
         blend = np.maximum(0.0, 1.0 - np.abs(offsets) / (step + 1.0))
         return cls(rows, inside, _basis(offsets / half, half * dt), blend)
 
-    def smoothed(self, values: FloatArray, known: BoolArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """A chain's signals ``(N, c)``, and the derivative ``(N,)`` of its last."""
-        rows, inside, c = self.rows, self.inside, values.shape[1]
-        oks = known[rows] & inside[:, :, None]
-        first = (values - centre)[rows]
-        coefficients = _coefficients(values[rows], oks, first, self.basis[:c], _spread(centre))
-        fitted = np.einsum("ka,jta->ktj", coefficients, self.basis[: c + 1])
-        informed = oks.any(axis=2).sum(axis=1) > _DEGREE + 1
-        weight = (self.blend * np.where(informed, 1.0, _UNINFORMED)[:, None])[inside]
-        total = np.bincount(rows[inside], weight, len(values))
-        blended = [np.bincount(rows[inside], fitted[inside, j] * weight, len(values)) / total for j in range(c + 1)]
-        return np.column_stack(blended[:c]), blended[c]
+    def smoothed(self, values: FloatArray, known: BoolArray, centre: FloatArray, derivatives: int = 0) -> FloatArray:
+        """Signals ``(N, C, c + derivatives)`` of C chains of c signals, and further derivatives of their last."""
+        (N, _, c), n = values.shape, values.shape[2] + derivatives
+        inside, at = self.inside, self.rows[self.inside]
+        oks = _windows(known, self.rows) & inside[:, :, None]
+        first, measured = _windows(values - centre, self.rows), _windows(values, self.rows)
+        coefficients = _coefficients(measured, oks, first, self.basis[:c], _spread(centre))
+        blended = np.empty((*values.shape[:2], n))
+        for i, (own, ok) in enumerate(zip(coefficients, oks, strict=True)):
+            fitted = np.einsum("ka,jta->ktj", own, self.basis[:n])
+            informed = ok.any(axis=2).sum(axis=1) > _DEGREE + 1
+            weight = (self.blend * np.where(informed, 1.0, _UNINFORMED)[:, None])[inside]
+            total = np.bincount(at, weight, N)
+            for j in range(n):
+                blended[:, i, j] = np.bincount(at, fitted[inside, j] * weight, N) / total
+        return blended
 
 
 def choose_half_width(model: Model, logs: Sequence[Samples], dt: float, narrowest: float) -> int:
@@ -407,23 +428,28 @@ def _prediction_error(model: Model, logs: Sequence[Samples], dt: float, half: in
     near = np.abs(offsets) <= half // 2
     basis = _basis(offsets / half, half * dt)
     loss = 0.0
-    for columns in _chains(model):
-        values, oks = measured[:, columns][rows], known[:, columns][rows]
-        first = values - centre[:, columns][rows]
-        spread = _spread(about[:, columns])
-        even = _every_other(oks)
-        fitted = _fit(values, oks & even, first, basis[: len(columns)], spread)
+    for columns in _alike(_chains(model), rows.size):
+        values, oks = _windows(measured[:, columns], rows), _windows(known[:, columns], rows)
+        first = values - _windows(centre[:, columns], rows)
+        spread, even, orders = _spread(about[:, columns]), _every_other(oks), basis[: columns.shape[1]]
+        coefficients = _coefficients(values, oks & even, first, orders, spread)
+        fitted = np.einsum("Cka,jta->Cktj", coefficients, orders)
         scale = _scale(values - fitted, oks & near[:, None] & ~even)
-        seen = oks.any(axis=(0, 1))
+        seen = oks.any(axis=(1, 2))
         loss += float(np.log(np.maximum(scale, _FLOOR * spread + 1e-12))[seen].sum())
     return loss
 
 
+def _windows(values: NDArray[Scalar], rows: IntArray) -> NDArray[Scalar]:
+    """Values ``(C, K, n_t, c)`` of chains ``(N, C, c)`` in the rows ``(K, n_t)`` of each window."""
+    return np.ascontiguousarray(np.moveaxis(values, 1, 0))[:, rows]
+
+
 def _every_other(known: BoolArray) -> BoolArray:
-    """Every other row ``(K, n_t, c)``, and of the samples of slow signals every other one."""
-    rows = np.arange(known.shape[1])[:, None] % 2 == 0
-    slow = known.mean(axis=(0, 1)) < 0.5
-    return np.asarray(np.where(slow, np.cumsum(known, axis=1) % 2 == 1, rows))
+    """Every other row ``(C, K, n_t, c)``, and of the samples of slow signals every other one."""
+    rows = np.arange(known.shape[2])[:, None] % 2 == 0
+    slow = known.mean(axis=(1, 2), keepdims=True) < 0.5
+    return np.asarray(np.where(slow, np.cumsum(known, axis=2) % 2 == 1, rows) if slow.any() else rows)
 
 
 def _joined(model: Model, logs: Sequence[FloatArray]) -> FloatArray:
@@ -497,41 +523,40 @@ def _basis(t: FloatArray, unit: float) -> FloatArray:
     return np.stack(orders)
 
 
-def _fit(
-    values: FloatArray, known: BoolArray, residuals: FloatArray, basis: FloatArray, spread: FloatArray
-) -> FloatArray:
-    """Fitted values ``(K, n_t, c)`` of the c signals of one chain."""
-    coefficients = _coefficients(values, known, residuals, basis, spread)
-    return np.asarray(np.einsum("ka,jta->ktj", coefficients, basis))
-
-
 def _coefficients(
     values: FloatArray, known: BoolArray, residuals: FloatArray, basis: FloatArray, spread: FloatArray
 ) -> FloatArray:
-    """Coefficients ``(K, 5)`` of the polynomials of the c signals of one chain, ``(K, n_t, c)``."""
-    K, n_t, c = values.shape
+    """Coefficients ``(C, K, 5)`` of the polynomials of C chains of c signals, ``(C, K, n_t, c)``."""
+    C, K, n_t, c = values.shape
     floor = _FLOOR * spread + 1e-12
     scale = np.maximum(_scale(residuals, known), floor)
-    width = 3.0 * scale
     products = np.einsum("jta,jtb->tjab", basis, basis).reshape(n_t * c, -1)
     flat = basis.swapaxes(0, 1).reshape(n_t * c, -1)
+    shape = (C, K, n_t * c)
+    values, measured, residuals = values.reshape(shape), known.reshape(shape).astype(float), residuals.reshape(shape)
+    weights = np.empty(shape)
     for _ in range(_STEPS):
-        weights = np.where(known, 1.0 / np.square(1.0 + np.square(residuals / width)), 0.0) / np.square(scale)
-        G = (weights.reshape(K, -1) @ products).reshape(K, _DEGREE + 1, _DEGREE + 1)
-        h = (weights * values).reshape(K, -1) @ flat
+        np.multiply(residuals, np.tile(1.0 / (3.0 * scale), n_t)[:, None], out=weights)
+        weights *= weights
+        weights += 1.0
+        weights *= weights
+        weights *= np.tile(np.square(scale), n_t)[:, None]
+        np.divide(measured, weights, out=weights)
+        G = (weights.reshape(C * K, -1) @ products).reshape(C * K, _DEGREE + 1, _DEGREE + 1)
+        weights *= values
+        h = weights.reshape(C * K, -1) @ flat
         d = np.sqrt(np.einsum("kii->ki", G)) + 1e-12
         G = G / d[:, :, None] / d[:, None, :] + 1e-9 * np.eye(_DEGREE + 1)
         coefficients = np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d
-        fitted = (coefficients @ flat.T).reshape(K, n_t, c)
-        residuals = values - fitted
-        scale = np.maximum(np.maximum(_scale(residuals, known), floor), _SHRINK * scale)
-        width = 3.0 * scale
-    return np.asarray(coefficients)
+        residuals = values - (coefficients @ flat.T).reshape(shape)
+        scale = np.maximum(np.maximum(_scale(residuals.reshape(known.shape), known), floor), _SHRINK * scale)
+    return np.asarray(coefficients.reshape(C, K, -1))
 
 
 def _scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
-    """Robust standard deviation of each column; one where nothing is measured."""
-    c = residuals.shape[-1]
-    flat, seen = residuals.reshape(-1, c), known.reshape(-1, c)
-    every = max(1, len(flat) // _ENOUGH) | 1
-    return np.nan_to_num(lower_scale(flat[::every], seen[::every]), nan=1.0)
+    """Robust standard deviation ``(C, c)`` of each chain's signals; one where nothing is measured."""
+    C, K, n_t, c = residuals.shape
+    flat, seen = residuals.reshape(C, K * n_t, c), known.reshape(C, K * n_t, c)
+    every = max(1, K * n_t // _ENOUGH) | 1
+    scale = lower_scale(flat[:, ::every], seen[:, ::every])
+    return np.where(np.isnan(scale), 1.0, scale)

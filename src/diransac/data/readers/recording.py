@@ -1,0 +1,190 @@
+"""Recordings of several topics, each with a clock of its own, and the one table of signals that a log is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from diransac.arrays import FloatArray
+from diransac.data.checks import check_time_order
+from diransac.data.preprocessing.steps import describe_resampling, interpolate_at, resampling_grid
+from diransac.errors import LogError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+__all__ = ["Aligned", "Recording", "Samples", "Stamps", "align", "find_field", "seconds_since"]
+
+Stamps = str
+"""``"header"``: time at which a message says it was sampled; ``"message"``: time at which it was recorded."""
+
+_SLOW = 1.5
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of a topic.
+
+    Parameters
+    ----------
+    time : (n,) array
+        Seconds since the start of the recording.
+    columns : mapping of str to (n,) array
+        Samples of each field that was asked for; NaN where a message lacks it.
+    unusable : mapping of str to str
+        Fields that hold no numbers, and why.
+    """
+
+    time: FloatArray
+    columns: Mapping[str, FloatArray]
+    unusable: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def interval(self) -> float:
+        """Median time from a sample to the next, s; infinite for fewer than two samples."""
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else np.inf
+
+    def select(self, rows: npt.NDArray[Any]) -> Samples:
+        """Samples of some rows."""
+        return Samples(self.time[rows], {name: x[rows] for name, x in self.columns.items()}, self.unusable)
+
+
+class Recording(Protocol):
+    """An opened file with one or more topics; `read` may be called again."""
+
+    source: str
+    """Name in messages, such as ``log "flight.ulg"``."""
+    metadata: dict[str, Any]
+    """Facts beside the samples, that JSON can hold: the machine, its parameters, messages in words."""
+    elements: dict[str, tuple[str, ...]]
+    """Names of the elements of arrays, such as joints, of the topics that have some."""
+
+    @property
+    def fields(self) -> Mapping[str, tuple[str, ...]]:
+        """Names of the fields of each topic."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Findings about the file, a sentence each; complete after a `read`."""
+
+    def read(self, wanted: Mapping[str, Sequence[str]], stamps: Stamps) -> dict[str, Samples]:
+        """Samples of some fields of some topics.  Raises LogError: a topic has no message, or is damaged."""
+
+
+def seconds_since(origin: int, nanoseconds: npt.NDArray[np.int64]) -> FloatArray:
+    """Seconds (n,) from an origin, correctly rounded: 30,000,000 ns is the number that ``0.03`` is read as."""
+    return np.asarray((nanoseconds - np.int64(origin)) / 1e9)
+
+
+def find_field(path: str, fields: Mapping[str, Iterable[str]], source: str) -> tuple[str, str]:
+    """Topic and field of ``topic.field``; the topic may be left out where there is only one.
+
+    Raises LogError: there is no such topic, or it has no such field; the message lists what is there.
+    """
+    topics = [topic for topic in fields if path.startswith(f"{topic}.")]
+    if topics:
+        topic = max(topics, key=len)
+        return topic, path[len(topic) + 1 :]
+    if len(fields) == 1:
+        return next(iter(fields)), path
+    raise LogError(f'{source}: "{path}" names no topic; found {_some(fields)}. Name it as topic.field')
+
+
+def _some(names: Iterable[str], most: int = 40) -> str:
+    """Names in one line, cut where they are many."""
+    listed = list(names)
+    return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
+
+
+# ---------------------------------------------------------------------- one clock
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Signals of several clocks on one: time (N,), signals (N,), what was done, and sentences about it."""
+
+    time: FloatArray
+    signals: dict[str, FloatArray]
+    step: dict[str, Any] | None
+    notes: list[str]
+
+
+def align(parts: Mapping[str, Samples], rate: float | str | None, source: str) -> Aligned:
+    """Signals of several topics on the clock of one; no sample is invented.
+
+    Parameters
+    ----------
+    parts : mapping of str to Samples
+        Topic -> its signals, under their final names.
+    rate : float, "median" or None
+        Hz of a uniform clock; ``"median"`` for that of the fastest topic.  None: the rows are those of the fastest
+        topic.
+    source : str
+
+    Returns
+    -------
+    Aligned
+
+    Raises
+    ------
+    LogError
+        The time of a topic repeats or runs backwards; no two rows are left.
+
+    Notes
+    -----
+    At a given rate, a topic at least about as fast is interpolated linearly.  Each sample of every other topic stands,
+    unchanged, in the row nearest to it, and the rows between are NaN.
+    """
+    for topic, samples in parts.items():
+        check_time_order(samples.time, f'{source}, topic "{topic}"' if topic else source)
+    fastest = min(parts, key=lambda topic: parts[topic].interval)
+    reference = parts[fastest]
+    signals: dict[str, FloatArray] = {}
+    if rate is None:
+        time, step, hertz = reference.time, None, None
+        notes = [f'rows are those of topic "{fastest}"']
+    else:
+        time, hertz = resampling_grid(reference.time, rate, source)
+        step, notes = describe_resampling(reference.time, time, hertz)
+        notes.insert(0, ", ".join(f'"{topic}" at {1.0 / x.interval:.4g} Hz' for topic, x in parts.items()))
+    for topic, samples in parts.items():
+        columns, said = _on_rows(samples, time, hertz, topic)
+        signals |= columns
+        notes += said
+    return Aligned(time, signals, step, notes)
+
+
+def _on_rows(
+    samples: Samples, time: FloatArray, hertz: float | None, topic: str
+) -> tuple[dict[str, FloatArray], list[str]]:
+    """Columns of a topic on the rows of the log, and sentences about samples that moved or found no row."""
+    if samples.time is time or np.array_equal(samples.time, time):
+        return dict(samples.columns), []
+    if hertz is not None and samples.interval <= _SLOW / hertz:
+        return interpolate_at(samples.time, samples.columns, time, hertz), []
+    return _nearest_rows(samples, time, float(np.median(np.diff(time))), topic)
+
+
+def _nearest_rows(samples: Samples, time: FloatArray, dt: float, topic: str) -> tuple[dict[str, FloatArray], list[str]]:
+    """Columns with each sample in the nearest row; of two samples of one row, the nearer; NaN elsewhere."""
+    after = np.clip(np.searchsorted(time, samples.time), 1, len(time) - 1)
+    row = np.where(samples.time - time[after - 1] <= time[after] - samples.time, after - 1, after)
+    moved = np.abs(time[row] - samples.time)
+    inside = moved <= dt * (0.5 + 1e-6)
+    order = np.lexsort((moved, row))
+    first = order[np.r_[True, np.diff(row[order]) > 0]]
+    kept = np.sort(first[inside[first]])
+    columns = {}
+    for name, values in samples.columns.items():
+        columns[name] = np.full(len(time), np.nan)
+        columns[name][row[kept]] = values[kept]
+    notes = []
+    if len(kept) and moved[kept].max() > 1e-3 * dt:
+        notes.append(f'samples of "{topic}" stand in the nearest row, up to {1e3 * moved[kept].max():.3g} ms away')
+    if len(kept) < len(samples.time):
+        n = len(samples.time) - len(kept)
+        notes.append(f'{n} of {len(samples.time)} samples of "{topic}" are left out: they have no row of their own')
+    return columns, notes

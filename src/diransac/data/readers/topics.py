@@ -1,0 +1,246 @@
+"""A recording's topics as one table of signals, and as a listing."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.data.mapping import LogMapping, MappedSignals
+from diransac.data.readers.recording import Recording, Samples, align, find_field
+from diransac.data.readers.table import Table
+from diransac.errors import LogError
+from diransac.text_table import aligned
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from diransac.data.readers.repair import Repairs
+
+__all__ = ["TopicFacts", "TopicTable", "is_one_table", "list_topics", "mapped_table", "whole_topic", "wired_topics"]
+
+_GAP = 3.5
+_FIELDS_SHOWN = 6
+
+
+# ---------------------------------------------------------------------- tables
+
+
+def mapped_table(table: Table, mapping: LogMapping, source: str) -> Table:
+    """Table of the signals of a mapping, with the time ``t``, from the columns of another.
+
+    Raises LogError: as `LogMapping.chosen`; a column that is wanted holds no numbers.
+    """
+    columns = dict(table.columns)
+    if mapping.time_column is not None:
+        if mapping.time_column not in columns:
+            found = ", ".join(columns)
+            raise LogError(f'{source}: {mapping.source} has its time in "{mapping.time_column}"; found {found}')
+        time = columns[mapping.time_column]
+        columns["t"] = time if isinstance(time, str) else time * mapping.time_scale
+    entries, notes = mapping.chosen({"": list(columns)}, {}, source)
+    mapped: dict[str, FloatArray | str] = {"t": columns["t"]} if "t" in columns else {}
+    units: dict[str, str] = {}
+    for entry in entries:
+        texts = {name: columns[name] for name in entry.needs if isinstance(columns[name], str)}
+        for name, why in texts.items():
+            raise LogError(f'{source}: column "{name}" {why}')
+        mapped |= entry.apply({name: x for name, x in columns.items() if not isinstance(x, str)})
+        units |= entry.known_units()
+    step = {"step": "map", "mapping": mapping.source, "signals": _origins(entries)}
+    history = (*table.history, step)
+    return replace(table, columns=mapped, units=units, notes=(*table.notes, *notes), history=history, filter=None)
+
+
+def is_one_table(recording: Recording, rename: Mapping[str, str]) -> bool:
+    """True for a recording of one topic whose fields are called by their names alone."""
+    return len(recording.fields) == 1 and set(rename.values()) <= set(next(iter(recording.fields.values())))
+
+
+def whole_topic(recording: Recording, repairs: Repairs) -> Table:
+    """Table of all fields of a recording with one topic."""
+    ((topic, fields),) = recording.fields.items()
+    samples = repairs.ordered(recording.read({topic: fields}, "header")[topic], topic)
+    return Table({"t": samples.time, **samples.columns, **samples.unusable}, notes=recording.notes)
+
+
+def wired_topics(
+    recording: Recording,
+    mapping: LogMapping | None,
+    rename: Mapping[str, str],
+    resample: float | str | None,
+    repairs: Repairs,
+) -> tuple[Table, float | str | None]:
+    """Table of the signals that a mapping, and ``rename`` by ``topic.field``, take from a recording's topics.
+
+    Returned beside it is the resampling that is left to do: that of the samples of a single topic.
+
+    Raises LogError: neither is given; a topic or field is missing; as `align`.
+    """
+    source, fields = recording.source, recording.fields
+    entries, notes = ([], []) if mapping is None else mapping.chosen(fields, recording.elements, source)
+    for name, path in rename.items():
+        if name == "t":
+            raise LogError(f'{source}: each topic has its own time; leave out "t", and give the signals')
+        topic, label = find_field(path, fields, source)
+        entries.append(MappedSignals((name,), (label,), topic))
+    if not entries:
+        raise LogError(
+            f"{source}: it has {len(fields)} topics, {_some(fields)}; say what they are: --mapping NAME|FILE.toml, or "
+            "--map thrust=topic.field"
+        )
+    wanted: dict[str, tuple[str, ...]] = {}
+    for entry in entries:
+        wanted[entry.topic] = tuple(dict.fromkeys((*wanted.get(entry.topic, ()), *entry.needs)))
+    read = recording.read(wanted, "header" if mapping is None else mapping.time)
+    parts = {topic: _signals_of(topic, samples, entries, repairs, source) for topic, samples in read.items()}
+    if "clock" in repairs and resample is None and len(parts) > 1 and not _is_even(parts):
+        resample = "median"
+        repairs.record("clock", "the topics' clocks are uneven; resampled at the median rate of the fastest")
+    made = align(parts, resample if len(parts) > 1 else None, source)
+    units = {name: unit for entry in entries for name, unit in entry.known_units().items()}
+    step: dict[str, Any] = {"step": "map", "mapping": None if mapping is None else mapping.source}
+    step["signals"] = _origins(entries)
+    information = recording.metadata.get("information", {})
+    step |= {"log": {name: information[name] for name in _KEPT if name in information}} if information else {}
+    history = (step,) if made.step is None else (step, made.step)
+    said = (*recording.notes, *notes, *(made.notes if len(parts) > 1 else ()))
+    unusable = {name: why for samples in parts.values() for name, why in samples.unusable.items()}
+    return Table({"t": made.time, **made.signals, **unusable}, units, said, history), None if len(
+        parts
+    ) > 1 else resample
+
+
+_KEPT = ("sys_name", "ver_hw", "ver_sw", "ver_sw_branch", "sys_uuid")
+"""What a log's history keeps of the machine's description."""
+
+
+def _signals_of(
+    topic: str, samples: Samples, entries: Sequence[MappedSignals], repairs: Repairs, source: str
+) -> Samples:
+    """The mapped signals of one topic."""
+    signals: dict[str, FloatArray] = {}
+    unusable: dict[str, str] = {}
+    for entry in entries:
+        if entry.topic == topic:
+            for label in entry.needs:
+                if label in samples.unusable:
+                    raise LogError(f'{source}: field "{label}" of topic "{topic}" {samples.unusable[label]}')
+            why = entry.invalid(samples.columns)
+            unusable |= dict.fromkeys(entry.names, why) if why else {}
+            signals |= {} if why else entry.apply(samples.columns)
+    return repairs.ordered(Samples(samples.time, signals, unusable), topic)
+
+
+def _is_even(parts: Mapping[str, Samples]) -> bool:
+    """True for a fastest topic whose intervals differ by less than a fifth."""
+    steps = np.diff(min(parts.values(), key=lambda x: x.interval).time)
+    return bool(len(steps) == 0 or np.abs(steps - steps.mean()).max() <= 0.2 * steps.mean())
+
+
+def _origins(entries: Sequence[MappedSignals]) -> dict[str, str]:
+    return {
+        name: f"{entry.topic}.{label}" if entry.topic else label
+        for entry in entries
+        for name, label in zip(entry.names, entry.fields, strict=True)
+    }
+
+
+def _some(names: Mapping[str, Any], most: int = 12) -> str:
+    listed = list(names)
+    return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
+
+
+# ---------------------------------------------------------------------- listing
+
+
+@dataclass(frozen=True)
+class TopicFacts:
+    """One topic.
+
+    Parameters
+    ----------
+    n_messages : int
+    rate : float
+        One over the median interval, Hz; NaN for fewer than two messages.
+    start, end : float
+        First and last time, s since the start of the recording.
+    n_gaps, longest_gap : int, float
+        Intervals of more than three and a half median ones, and the longest interval, s.
+    fields : tuple of str
+    """
+
+    n_messages: int
+    rate: float
+    start: float
+    end: float
+    n_gaps: int
+    longest_gap: float
+    fields: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TopicTable:
+    """Topics of a recording, returned by `read_topics`; printed as a table.
+
+    Parameters
+    ----------
+    source : str
+    topics : mapping of str to TopicFacts
+    notes : tuple of str
+        Findings about the file.
+    metadata : mapping
+        Facts beside the samples: of a ULog ``information``, ``parameters``, ``messages`` and ``dropouts``.
+    elements : mapping of str to tuple of str
+        Names of the elements of arrays, such as joints.
+    """
+
+    source: str
+    topics: Mapping[str, TopicFacts]
+    notes: tuple[str, ...] = ()
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    elements: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def fields(self) -> dict[str, tuple[str, ...]]:
+        """Fields of each topic."""
+        return {name: facts.fields for name, facts in self.topics.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, ready for JSON apart from numbers that are not finite."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        rows = [["topic", "messages", "Hz", "from s", "to s", "gaps", "longest s", "fields"]]
+        for name, x in self.topics.items():
+            gaps = [str(x.n_gaps or "-"), f"{x.longest_gap:.3g}" if x.n_gaps else "-"]
+            shown = ", ".join(x.fields[:_FIELDS_SHOWN]) + (", ..." if len(x.fields) > _FIELDS_SHOWN else "")
+            rate = f"{x.rate:.4g}" if np.isfinite(x.rate) else "-"
+            rows.append([name, str(x.n_messages), rate, f"{x.start:.6g}", f"{x.end:.6g}", *gaps, shown])
+        machine = self.metadata.get("information", {})
+        about = [f"  {k}: {machine[k]}" for k in ("sys_name", "ver_hw", "ver_sw") if k in machine]
+        parameters = self.metadata.get("parameters", {})
+        about += [f"  {len(parameters)} parameters"] if parameters else []
+        messages = [f"  {at:.3f} s: {text}" for at, text in self.metadata.get("messages", [])[:10]]
+        notes = [f"  {note}" for note in self.notes]
+        head = f"{self.source}: {len(self.topics)} topic{'s' * (len(self.topics) != 1)}"
+        return "\n".join([head, *aligned(rows), *about, *notes, *messages])
+
+
+def list_topics(recording: Recording) -> TopicTable:
+    """Topics of a recording, with their rates and gaps."""
+    fields = recording.fields
+    read = recording.read(dict.fromkeys(fields, ()), "message")
+    topics = {name: _facts(read[name].time, fields[name]) for name in fields}
+    return TopicTable(recording.source, topics, recording.notes, recording.metadata, recording.elements)
+
+
+def _facts(time: FloatArray, fields: tuple[str, ...]) -> TopicFacts:
+    steps = np.diff(time)
+    usual = float(np.median(steps)) if len(steps) else np.nan
+    n_gaps = int((steps > _GAP * usual).sum()) if usual > 0.0 else 0
+    longest = float(steps.max()) if len(steps) else np.nan
+    rate = 1.0 / usual if usual > 0.0 else np.nan
+    return TopicFacts(len(time), rate, float(time[0]), float(time[-1]), n_gaps, longest, fields)

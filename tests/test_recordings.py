@@ -1,0 +1,373 @@
+"""Recordings of several topics, written here as their own tools write them: the same arrays as from CSV, to the bit."""
+
+import json
+import random
+import struct
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+import diransac as dr
+from diransac.data.readers import read_topics
+from diransac.data.readers.crazyflie import CrazyflieRecording
+from diransac.errors import LogError
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+T = np.arange(200) / 100.0
+RNG = np.random.default_rng(3)
+X, V, EFFORT = (RNG.normal(size=len(T)) for _ in range(3))
+
+
+def shared(name):
+    path = SHARED / name
+    if not path.exists():
+        pytest.skip(f"NOT CHECKED with real recordings: {path} is missing")
+    return path
+
+
+def nanoseconds(k):
+    return 1_700_000_000_000_000_000 + 10_000_000 * int(k)
+
+
+def assert_same(log, **signals):
+    """The log has these signals and the times of a CSV file, to the bit."""
+    np.testing.assert_array_equal(log.time, T)
+    for name, values in signals.items():
+        np.testing.assert_array_equal(log[name], values)
+
+
+# ---------------------------------------------------------------------- ULog
+
+
+class Ulog:
+    """A ULog file that grows, message by message: kind, and content as the format's documentation has it."""
+
+    def __init__(self, start=5_000_000):
+        self.start, self.topics = start, {}
+        self.data = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", start)
+        self.message("B", bytes(40))
+
+    def message(self, kind, content):
+        """Add a message of a kind."""
+        self.data += struct.pack("<HB", len(content), ord(kind)) + content
+
+    def keyed(self, kind, key, value):
+        """Add an information or a parameter."""
+        self.message(kind, bytes([len(key)]) + key.encode() + value)
+
+    def format(self, name, fields):
+        """Add the format of a topic's records."""
+        self.message("F", f"{name}:{fields}".encode())
+
+    def subscribe(self, number, name, instance=0):
+        """Announce a topic under a number."""
+        self.message("A", struct.pack("<BH", instance, number) + name.encode())
+
+    def record(self, number, layout, seconds, *values):
+        """Add a record."""
+        stamp = self.start + round(1e6 * seconds)
+        self.message("D", struct.pack(f"<HQ{layout}", number, stamp, *values))
+
+
+def flight():
+    """A log as PX4 writes it, of signals in the axes NED and FRD, with doubles; and the signals in ENU and FLU."""
+    enu = {name: RNG.normal(size=len(T)) for name in ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz", "motor1")}
+    q = RNG.normal(size=(len(T), 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    file = Ulog()
+    file.keyed("I", "char[3] sys_name", b"PX4")
+    file.keyed("P", "float MC_ROLL_P", struct.pack("<f", 6.5))
+    for name, fields in {
+        "vehicle_local_position": "double[3] p;double[3] v;bool xy_valid;bool z_valid;bool v_xy_valid;bool v_z_valid;",
+        "vehicle_attitude": "double[4] q;",
+        "vehicle_angular_velocity": "uint64_t timestamp_sample;double[3] xyz;",
+        "actuator_motors": "double[4] control;uint8_t[2] _padding0;",
+    }.items():
+        own = fields.replace("double[3] p", "double x;double y;double z")
+        file.format(name, "uint64_t timestamp;" + own.replace("double[3] v;", "double vx;double vy;double vz;"))
+        file.subscribe(len(file.topics), name)
+        file.topics[name] = len(file.topics)
+    file.message("O", struct.pack("<H", 30))
+    file.message("L", b"4" + struct.pack("<Q", file.start) + b"takeoff")
+    file.message("S", bytes.fromhex("2f731320250cbb12"))
+    for k, t in enumerate(T):
+        x, y, z, vx, vy, vz, wx, wy, wz, motor = (enu[name][k] for name in enu)
+        if k % 4 == 0:
+            file.record(0, "6d4?", t, y, x, -z, vy, vx, -vz, *(k % 8 == 0,) * 2, True, True)
+        file.record(1, "4d", t, *q[k])
+        stamp = file.start + round(1e6 * t)
+        file.record(2, "Q3d", t + 0.002, stamp, wx, -wy, -wz)
+        file.record(3, "4d", t, motor, 0.5, 0.5, 0.5)
+    return file.data, enu, q
+
+
+def rotation(q):
+    w, x, y, z = q.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+@pytest.fixture(scope="module")
+def ulog(tmp_path_factory):
+    data, enu, q = flight()
+    path = tmp_path_factory.mktemp("ulog") / "flight.ulg"
+    path.write_bytes(data)
+    return path, enu, q
+
+
+def test_a_ulog_is_read_in_the_axes_of_the_model(ulog):
+    path, enu, q = ulog
+    log = dr.read_log(path, mapping="px4-multirotor", resample=None)
+    np.testing.assert_allclose(log.time, T, atol=1e-12)
+    for name in ("wx", "wy", "wz", "motor1"):
+        np.testing.assert_array_equal(log[name], enu[name])
+    ned_to_enu, flu_to_frd = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]), np.diag([1.0, -1.0, -1.0])
+    found = rotation(np.column_stack([log[n] for n in ("qw", "qx", "qy", "qz")]))
+    np.testing.assert_allclose(found, ned_to_enu @ rotation(q) @ flu_to_frd, atol=1e-12)
+
+
+def test_a_slow_topic_has_its_samples_where_they_are_valid_and_nothing_between(ulog):
+    path, enu, _ = ulog
+    log = dr.read_log(path, mapping="px4-multirotor")
+    rows = np.arange(len(T))
+    for name, every in (("vx", 4), ("x", 8)):
+        np.testing.assert_array_equal(log[name], np.where(rows % every == 0, enu[name], np.nan))
+
+
+def test_a_ulog_lists_its_topics_parameters_and_dropouts(ulog):
+    found = read_topics(ulog[0])
+    assert found.topics["vehicle_attitude"].rate == pytest.approx(100.0)
+    assert found.topics["vehicle_attitude"].fields == ("timestamp", "q[0]", "q[1]", "q[2]", "q[3]")
+    assert found.topics["actuator_motors"].fields[-1] == "control[3]"
+    assert found.metadata["parameters"] == {"MC_ROLL_P": 6.5}
+    assert found.metadata["messages"] == [[5.0, "takeoff"]]
+    assert found.notes == ("1 dropout of the logger, 0.03 s in all",)
+
+
+def test_fields_of_a_recording_are_named_on_the_spot(ulog):
+    log = dr.read_log(ulog[0], rename={"rate": "vehicle_angular_velocity.xyz[0]", "u": "actuator_motors.control[0]"})
+    np.testing.assert_array_equal(log["rate"], ulog[1]["wx"])
+    assert log.names == ("rate", "u")
+
+
+@pytest.mark.parametrize(
+    ("rename", "said"),
+    [
+        (None, "it has 4 topics, .*--mapping NAME|FILE.toml"),
+        ({"x": "vehicle_attitude.p"}, 'topic "vehicle_attitude" has no field "p"; it has timestamp, q'),
+        ({"x": "attitude"}, '"attitude" names no topic; found actuator_motors'),
+    ],
+)
+def test_a_recording_whose_signals_are_not_named_is_refused(ulog, rename, said):
+    with pytest.raises(LogError, match=said):
+        dr.read_log(ulog[0], rename=rename)
+
+
+@pytest.mark.parametrize("file", ["px4_ulog/sample_log_small.ulg", "px4_ulog/sample_appended_multiple.ulg"])
+def test_real_ulogs_are_read_as_pyulog_reads_them(file):
+    pyulog = pytest.importorskip("pyulog", reason="NOT CHECKED against the other reader: pyulog is missing")
+    from diransac.data.readers.ulog import UlogRecording
+
+    path = shared(file)
+    recording, other = UlogRecording(path, "log"), pyulog.ULog(str(path))
+    assert len(recording.fields) == len(other.data_list)
+    own = recording.read(recording.fields, "message")
+    for data in other.data_list:
+        name = data.name if data.name in own else f"{data.name}_{data.multi_id}"
+        for label, values in data.data.items():
+            np.testing.assert_array_equal(own[name].columns[label], values.astype(float))
+
+
+@pytest.mark.parametrize("file", ["px4_ulog/sample_log_small.ulg", "px4_ulog/sample_appended_multiple.ulg"])
+def test_a_bench_log_is_inspected_and_refused_with_a_reason(file):
+    path = shared(file)
+    assert read_topics(path).topics["vehicle_attitude"].n_messages > 100
+    log = dr.read_log(path, mapping="px4-multirotor")
+    assert "xy_valid is never above 0.5" in log.unusable["x"]
+    with pytest.raises(dr.DiransacError, match="sample"):
+        dr.identify(dr.models.quadrotor(speed_unit="1"), log, differentiate=True)
+
+
+def outcome(path, **options):
+    """A log, or one sentence."""
+    try:
+        return dr.read_log(path, **options)
+    except LogError as error:
+        return str(error)
+
+
+def test_damaged_ulogs_end_in_a_log_or_in_one_sentence(tmp_path):
+    data = shared("px4_ulog/sample_appended_multiple.ulg").read_bytes()
+    rng, file = random.Random(5), tmp_path / "cut.ulg"
+    for k in range(20):
+        file.write_bytes(data[: 10 + (len(data) - 10) * k // 20])
+        found = outcome(file, mapping="px4-multirotor")
+        assert isinstance(found, str) or any("cut off" in note for note in found.notes) or k == 0
+    for _ in range(10):
+        flipped = bytearray(data)
+        for _ in range(20):
+            flipped[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        file.write_bytes(flipped)
+        outcome(file, mapping="px4-multirotor")
+
+
+def test_a_ulog_is_read_on_behind_a_damage(ulog, tmp_path):
+    path, enu, _ = ulog
+    data = path.read_bytes()
+    file = tmp_path / "hole.ulg"
+    file.write_bytes(data[:8000] + bytes(64) + data[8100:])
+    log = dr.read_log(file, rename={"wx": "vehicle_angular_velocity.xyz[0]"}, resample="median")
+    assert any("damaged" in note for note in log.notes)
+    np.testing.assert_array_equal(log["wx"][-100:], enu["wx"][-100:])
+
+
+# ---------------------------------------------------------------------- MCAP and bags
+
+
+def write_mcap(path, compression=None, stop=None):
+    """JSON and ROS 2 messages, as the library of MCAP writes them."""
+    writer_of = pytest.importorskip("mcap.writer", reason="NOT CHECKED: mcap is missing")
+    typesys = pytest.importorskip("rosbags.typesys", reason="NOT CHECKED: rosbags is missing")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    kind = "sensor_msgs/msg/JointState"
+    definition, _ = store.generate_msgdef(kind, ros_version=2)
+    options = {} if compression is None else {"compression": compression}
+    with path.open("wb") as file:
+        writer = writer_of.Writer(file, chunk_size=4000, **options)
+        writer.start()
+        schema = writer.register_schema(kind, "ros2msg", definition.encode())
+        joints = writer.register_channel("/joint_states", "cdr", schema)
+        plain = writer.register_channel("/command", "json", writer.register_schema("command", "jsonschema", b"{}"))
+        for k in range(len(T)):
+            data = bytes(store.serialize_cdr(joint_state(store, kind, k), kind))
+            writer.add_message(joints, nanoseconds(k) + 300_000, data, nanoseconds(k))
+            text = json.dumps({"u": {"force": EFFORT[k]}, "on": True}).encode()
+            writer.add_message(plain, nanoseconds(k), text, nanoseconds(k))
+        if stop is None:
+            writer.finish()
+
+
+def joint_state(store, kind, k):
+    """Message k; its joints are in another order from message 100 on."""
+    types = store.types
+    time = types["builtin_interfaces/msg/Time"](sec=nanoseconds(k) // 10**9, nanosec=nanoseconds(k) % 10**9)
+    extra = {"seq": k} if "ROS1" in repr(store) or "seq" in types["std_msgs/msg/Header"].__dataclass_fields__ else {}
+    header = types["std_msgs/msg/Header"](stamp=time, frame_id="", **extra)
+    order = [0, 1] if k < 100 else [1, 0]
+    arrays = {"name": ["elbow", "wrist"], "position": np.array([X[k], 1.0]), "velocity": np.array([V[k], 2.0])}
+    arrays["effort"] = np.array([EFFORT[k], 3.0])
+    arrays = {name: [values[i] for i in order] for name, values in arrays.items()}
+    return types[kind](header=header, **{n: x if n == "name" else np.array(x) for n, x in arrays.items()})
+
+
+def write_bag(path, version):
+    typesys = pytest.importorskip("rosbags.typesys", reason="NOT CHECKED: rosbags is missing")
+    kind = "sensor_msgs/msg/JointState"
+    if version == 1:
+        from rosbags.rosbag1 import Writer
+
+        store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+        encode, writer = store.serialize_ros1, Writer(path)
+    else:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        encode = store.serialize_cdr
+        writer = Writer(path, version=9, storage_plugin=StoragePlugin[version])
+    with writer:
+        connection = writer.add_connection("/joint_states", kind, typestore=store)
+        for k in range(len(T)):
+            writer.write(connection, nanoseconds(k), bytes(encode(joint_state(store, kind, k), kind)))
+
+
+@pytest.mark.parametrize("version", [1, "SQLITE3", "MCAP"])
+def test_bags_have_the_arrays_of_the_csv_file(tmp_path, version):
+    path = tmp_path / ("log.bag" if version == 1 else "bag")
+    write_bag(path, version)
+    log = dr.read_log(path, mapping="ros-joint-states")
+    assert_same(log, elbow=X, elbow_dot=V, elbow_torque=EFFORT, wrist=np.ones(len(T)))
+    by_hand = {"x": "/joint_states.position[elbow]", "u": "/joint_states.effort[elbow]"}
+    assert_same(dr.read_log(path, rename=by_hand), x=X, u=EFFORT)
+    assert read_topics(path).topics["/joint_states"].rate == pytest.approx(100.0)
+
+
+MCAP = """
+time = "message"
+[[signals]]
+name = "x"
+topic = "/joint_states"
+field = "position[elbow]"
+[[signals]]
+name = "force"
+topic = "/command"
+field = "u.force"
+where = { field = "on", above = 0.5 }
+"""
+
+
+def test_an_mcap_file_has_the_arrays_of_the_csv_file_by_either_clock(tmp_path):
+    path, csv = tmp_path / "run.mcap", tmp_path / "run.csv"
+    write_mcap(path)
+    dr.Log.from_arrays(T, {"x": X, "force": EFFORT}).write(csv)
+    (tmp_path / "run.toml").write_text(MCAP)
+    (tmp_path / "header.toml").write_text(MCAP.replace('"message"', '"header"'))
+    by_header = dr.read_log(path, mapping=tmp_path / "header.toml")
+    by_message = dr.read_log(path, mapping=tmp_path / "run.toml")
+    assert by_header.fingerprint == dr.read_log(csv).fingerprint
+    assert_same(by_header, x=X, force=EFFORT)
+    np.testing.assert_allclose(by_message.time, T + 0.0003, atol=1e-12)
+    np.testing.assert_array_equal(by_message["force"], EFFORT)
+    assert any("0.3 ms" in note for note in by_message.notes)
+
+
+def test_damaged_mcap_files_end_in_a_log_or_in_one_sentence(tmp_path):
+    path = tmp_path / "run.mcap"
+    write_mcap(path)
+    data, rng = path.read_bytes(), random.Random(2)
+    options = {"rename": {"x": "/joint_states.position[elbow]"}, "resample": "median"}
+    for k in range(20):
+        path.write_bytes(data[: 20 + (len(data) - 20) * k // 20])
+        found = outcome(path, **options)
+        assert isinstance(found, str) or len(found) == len(T) or any("cut off" in note for note in found.notes)
+    for _ in range(10):
+        flipped = bytearray(data)
+        for _ in range(10):
+            flipped[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        path.write_bytes(flipped)
+        outcome(path, **options)
+
+
+def test_a_missing_package_is_named_with_its_install_line(tmp_path, monkeypatch):
+    for name in ("mcap.reader", "rosbags.highlevel", "h5py"):
+        monkeypatch.setitem(__import__("sys").modules, name, None)
+    for name in ("a.mcap", "a.bag", "a.h5"):
+        (tmp_path / name).write_bytes(b"x")
+        with pytest.raises(LogError, match=r'pip install "diransac\[logs\]"$'):
+            dr.read_log(tmp_path / name)
+
+
+# ---------------------------------------------------------------------- Crazyflie
+
+
+def test_a_crazyflie_log_has_the_numbers_of_its_decoded_copy():
+    recording = CrazyflieRecording(shared("crazyflie_arpl/log16").read_bytes(), "log")
+    copy = pl.read_parquet(shared("crazyflie_arpl/log16.parquet"))
+    found = recording.read(recording.fields, "message")["fixedFrequency"]
+    for name, values in found.columns.items():
+        np.testing.assert_allclose(values, copy[name].to_numpy(), rtol=1e-6)
+    np.testing.assert_allclose(np.diff(found.time), np.diff(copy["t_ms"].to_numpy()) / 1000.0, atol=1e-6)
+
+
+def test_damaged_crazyflie_logs_end_in_a_log_or_in_one_sentence(tmp_path):
+    data = shared("crazyflie_arpl/log16").read_bytes()[:200_000]
+    file = tmp_path / "log"
+    for size in (1, 4, 20, 120, 150, 5000):
+        file.write_bytes(data[:size])
+        found = outcome(file, mapping="crazyflie", resample="median")
+        assert isinstance(found, str) or any("cut off" in note for note in found.notes)
