@@ -35,6 +35,7 @@ from diransac.identification.methods.lo_diransac.smoothing import (
     screened_inputs,
     smooth,
     stuck_rows,
+    without_spikes,
 )
 from simulated import MACHINES, flight, rollout
 
@@ -463,3 +464,34 @@ def test_momentary_leaps_of_an_input_are_replaced_and_steps_are_not():
     assert n == 2
     assert np.abs(screened - clean).max() < 0.1
     assert np.array_equal(screened[:, 1], clean[:, 1])
+
+
+def test_spikes_within_the_range_of_an_input_are_replaced_where_its_noise_is_small():
+    rng, t = np.random.default_rng(3), np.arange(2000)
+    clean = np.column_stack([np.sin(0.01 * t), np.where(t // 40 % 2, 1.0, -1.0), rng.standard_normal(len(t))])
+    spoilt = clean + [0.01, 0.0, 0.0] * rng.standard_normal(clean.shape)
+    hit = rng.random(len(t)) < 0.05
+    spoilt[hit, 0] += rng.choice([-1.0, 1.0], hit.sum()) * rng.uniform(0.3, 1.0, hit.sum())
+    screened, n = without_spikes(spoilt, 8.0)
+    assert n == pytest.approx(hit.sum(), abs=3)
+    assert np.median(np.abs(screened - clean)[hit, 0]) < 0.02
+    assert np.array_equal(screened[:, 1:], spoilt[:, 1:])
+
+
+def test_spikes_of_a_force_sensor_are_left_out_and_those_that_acted_are_kept():
+    rng, t, fine = np.random.default_rng(0), np.arange(0.0, 8.0, 0.005), 20
+    wanted = 8.0 * np.sin(3.0 * t + 0.5 * t**2) + 0.02 * rng.standard_normal(len(t))
+    spikes = np.where(rng.random(len(t)) < 0.05, rng.choice([-4.0, 4.0], len(t)), 0.0)
+    noted = []
+    for acted in (wanted, wanted + spikes):
+        x, v, position = 0.0, 0.0, np.zeros(len(t))
+        for k, force in enumerate(np.repeat(acted, fine)):
+            position[k // fine] = x if k % fine == 0 else position[k // fine]
+            v += 0.005 / fine * (force - 5.0 * v - np.sign(v)) / 2.0
+            x += 0.005 / fine * v
+        columns = {"position": position + 1e-5 * rng.standard_normal(len(t)), "force": wanted + spikes}
+        log = dr.Log.from_arrays(t, columns)
+        result = dr.identify(dr.models.servo_axis(), log, differentiate=True, fixed={"offset": 0.0})
+        noted.append(any("spikes" in note for note in result.notes))
+        assert result.parameters["mass"] == pytest.approx(2.0, rel=0.02)
+    assert noted == [True, False]

@@ -701,3 +701,34 @@ def test_numbers_are_printed_as_a_reader_expects_them():
     ]
     assert share(0.02, "its range") == "2 % of its range"
     assert share(19.3, "its range") == "19 times its range"
+
+
+# ---------------------------------------------------------------------- friction of robots
+
+
+def test_friction_of_each_joint_is_drawn_over_its_speed(tmp_path):
+    pytest.importorskip("mujoco", reason="FIGURES OF FRICTION NOT CHECKED: mujoco is missing")
+    arm, page = tmp_path / "arm.xml", tmp_path / "arm.html"
+    arm.write_text(
+        '<mujoco><compiler angle="radian"/><worldbody><body><joint name="elbow" axis="0 0 1"/>'
+        '<inertial pos="0.1 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody></mujoco>'
+    )
+    model, t = dr.models.robot(arm, unknown=("armature", "damping", "friction")), np.arange(0.0, 6.0, 0.005)
+    v = np.gradient(np.sin(4.0 * t + 0.3 * t**2), t, edge_order=2)
+    friction = 0.5 * v + 0.8 * np.tanh(v / 0.05)
+    q = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * 0.005)])
+    columns = {"elbow": q, "elbow_dot": v, "elbow_ddot": np.gradient(v, t, edge_order=2)}
+    log = dr.Log.from_arrays(t, columns | {"elbow_torque": 0.12 * columns["elbow_ddot"] + friction})
+    result = dr.identify(model, log, method="ols", input_hold="linear")
+    dr.write_report(result, log, page)
+    section = page.read_text().split('<section id="friction">')[1].split("</section>")[0]
+    (plot,) = re.findall(r"<svg.*?</svg>", section)
+    low, high, start, dt = (float(re.search(rf'data-{n}="(.*?)"', plot)[1]) for n in ("low", "high", "start", "dt"))
+    curve = re.search(r'data-name="fitted" d="M0 (-?\d+)h0((?:l\d+[ -]\d+)*)"', plot)
+    steps = [[int(x) for x in re.findall(r"-?\d+", step)] for step in curve[2].split("l")[1:]]
+    columns_, heights = np.cumsum([[0, int(curve[1])], *steps], axis=0).T
+    speed = start + dt * columns_
+    expected = 0.5 * speed + 0.8 * np.tanh(speed / 0.05)
+    assert high - heights / 1000.0 * (high - low) == pytest.approx(expected, abs=0.02 * (high - low))
+    assert "speed, rad/s" in section
+    assert "predicted force off by" in section

@@ -9,7 +9,7 @@ import diransac as dr
 import robots
 from diransac import models
 from diransac.errors import ModelError
-from diransac.model.robots.calibration import calibrated
+from diransac.model.robots.calibration import calibrated, impossible_changes
 from diransac.model.robots.consistency import consistent_parameters
 from diransac.model.robots.description import read_description
 from diransac.model.robots.rigid_body import inertial_parameters
@@ -252,3 +252,44 @@ def test_a_result_writes_the_description_with_its_estimates(described, tmp_path)
 def saved(result, folder):
     result.save(folder / "result.json")
     return folder / "result.json"
+
+
+def test_base_parameters_of_no_possible_body_are_found_and_noise_is_not(described):
+    model = models.robot(described(robots.urdf(parents=(0, 1, 2))), bodies="all", unknown=("friction",))
+    values, rng = nominal(model), np.random.default_rng(0)
+    spread = 0.02 * np.abs(values) + 1e-4
+    noisy = values + spread * rng.standard_normal(len(values))
+    changes = impossible_changes(model.parameters, noisy, np.diag(spread**2))
+    assert set(changes) < set(model.parameters)
+    assert max(map(abs, changes.values())) < 2.0
+    k = next(k for k, name in enumerate(model.parameters) if name.startswith("Izz"))
+    values[k] = -values[k]
+    changes = impossible_changes(model.parameters, values, np.diag(spread**2))
+    assert max(map(abs, changes.values())) > 10.0
+    spread[k] = np.inf
+    assert max(map(abs, impossible_changes(model.parameters, values, np.diag(spread**2)).values())) < 0.1
+
+
+def test_a_result_with_impossible_bodies_says_so(described):
+    text = """<mujoco><compiler angle="radian"/><worldbody><body name="arm"><joint name="elbow" axis="0 0 1"/>
+      <inertial pos="0.1 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody></mujoco>"""
+    model, t = models.robot(described(text), bodies="all", unknown=("damping",)), np.arange(0.0, 6.0, 0.01)
+    q, v, a = np.sin(3.0 * t), 3.0 * np.cos(3.0 * t), -9.0 * np.sin(3.0 * t)
+    verdicts = []
+    for inertia in (0.02, -0.02):
+        torque = inertia * a + 0.1 * v + 1e-4 * np.random.default_rng(0).standard_normal(len(t))
+        log = dr.Log.from_arrays(t, {"elbow": q, "elbow_dot": v, "elbow_ddot": a, "elbow_torque": torque})
+        findings = dr.identify(model, log, method="ols").findings
+        verdicts.append(any("No possible bodies" in str(x) for x in findings))
+    assert verdicts == [False, True]
+
+
+def test_drake_reads_the_estimated_robot(described):
+    drake = pytest.importorskip("pydrake.all", reason="DRAKE DOES NOT READ ROBOTS: pip install drake")
+    path = described(robots.urdf())
+    model = models.robot(path, bodies="all")
+    text, _ = calibrated(path, model.parameters, nominal(model), np.diag((0.01 * nominal(model)) ** 2 + 1e-12))
+    plant = drake.MultibodyPlant(0.0)
+    drake.Parser(plant).AddModels(str(described(text, "found")))
+    plant.Finalize()
+    assert plant.num_velocities() == 6

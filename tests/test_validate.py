@@ -204,3 +204,29 @@ def test_validation_is_ready_for_json_and_prints_every_signal_with_its_unit():
     assert "RMSE 0.25 s" in lines[0]
     assert "RMSE whole log" in lines[0]
     assert [line.split()[:2] for line in lines[1:4]] == [["x", "m"], ["z", "m"], ["theta", "rad"]]
+
+
+@pytest.mark.parametrize("stiffness", [None, 400.0], ids=["measured force", "target"])
+def test_relative_error_of_the_predicted_force_is_that_of_a_wrong_mass(stiffness):
+    dt, mass, damping, wrong = 0.005, 2.0, 5.0, 2.5
+    t = np.arange(0.0, 10.0, dt)
+    q = 0.3 * np.sin(3.0 * t + 0.3 * t**2)
+    v, a = (np.gradient(q, dt, edge_order=2), np.gradient(np.gradient(q, dt, edge_order=2), dt, edge_order=2))
+    force = mass * a + damping * v
+    column = force if stiffness is None else q + force / stiffness
+    unit = "N" if stiffness is None else "m"
+    model = dr.Model(
+        "axis",
+        {"x": "m"},
+        {"drive": unit},
+        {"mass": dr.Parameter("kg", positive=True)},
+        lambda q, v, a, u, p: [
+            p.mass * a.x + damping * v.x - (u.drive if stiffness is None else stiffness * (u.drive - q.x))
+        ],
+    )
+    log = dr.Log.from_arrays(t, {"x": q, "x_dot": v, "drive": column})
+    validation = dr.validate(dr.Plant(model, {"mass": wrong}), log, input_hold="linear")
+    expected = 100.0 * (wrong - mass) * np.linalg.norm(a) / np.linalg.norm(force)
+    assert validation.force_error_percent["x"] == pytest.approx(expected, rel=0.02)
+    assert "force of the inputs" in str(validation)
+    assert validation.to_dict()["force_error_percent"]["x"] == validation.force_error_percent["x"]

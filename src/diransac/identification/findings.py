@@ -27,6 +27,8 @@ _BREAKDOWN = 2.0 / 3.0
 _UNCERTAIN = 0.5
 _CONTRADICTION = 3.0
 """Distance of an estimate from the mean of its prior, in standard deviations of that, which needs care."""
+_IMPOSSIBLE = 4.0
+"""Distance of base parameters from those of possible bodies, in standard errors of one, which needs care."""
 _STEADY, _UNSTEADY = 0.05, 0.2
 """Relative changes of a parameter with the filter's bandwidth that are good, and that need care."""
 
@@ -44,6 +46,7 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
     return by_seriousness(
         (
             *_bounds(result),
+            *_bodies(result),
             *_known(result),
             *_simulation(result.logs, restarts=result.diagnosis is not None),
             *_inliers(result.logs, result.inlier_fraction, restarted=result.diagnosis is not None),
@@ -129,6 +132,26 @@ def _bounds(result: Result) -> Iterator[Finding]:
     bounded = any(bounds_text(x) for n, x in parameters.items() if n not in result.fixed)
     if bounded and not (result.violations or result.on_bounds):
         yield Finding("note", "Every parameter is within its bounds.")
+
+
+def _bodies(result: Result) -> Iterator[Finding]:
+    """Base parameters of a robot that are those of no possible bodies, beyond their uncertainty."""
+    parameters = result.model.parameters
+    if not any(x.combination for x in parameters.values()):
+        return
+    from diransac.model.robots.calibration import impossible_changes
+
+    values = np.array([result.parameters[n] for n in parameters])
+    changes = impossible_changes(parameters, values, result.covariance)
+    name = max(changes, key=lambda n: abs(changes[n]), default="")
+    if name and abs(changes[name]) > _IMPOSSIBLE:
+        far = number(abs(changes[name]), 2)
+        yield Finding(
+            "care",
+            "No possible bodies (of positive mass, with inertias that satisfy the triangle inequality) have these base "
+            f"parameters: the nearest differ by {far} standard errors of {name}. A term is missing, or an interval is "
+            "too narrow; an exported description has the nearest possible bodies.",
+        )
 
 
 def _known(result: Result) -> Iterator[Finding]:

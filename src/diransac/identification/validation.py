@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from diransac.identification.driven_states import DrivenStates, least_squares
 from diransac.identification.estimate import Resolution
 from diransac.identification.evaluation import Simulation
 from diransac.identification.identify import checked_hold, identify
+from diransac.identification.inverse_dynamics import force_errors
 from diransac.identification.method import Callback, Method, within
 from diransac.identification.methods import DEFAULT
 from diransac.identification.result import Result
@@ -79,6 +80,10 @@ class Validation:
         Index of the requested horizon; of the whole log if none was requested.
     notes : tuple of str, optional
         Findings in the logs, a sentence each.
+    force_error_percent : mapping of str to float, optional
+        Relative error of the force of the inputs in the equation of each coordinate or velocity, as inverse dynamics
+        predict it from the smoothed motion: RMS error over the RMS of the force, %.  The force of a target under
+        position control is stiffness times target less position.
     """
 
     source: str
@@ -86,6 +91,7 @@ class Validation:
     horizons: tuple[HorizonScores, ...]
     asked: int
     notes: tuple[str, ...] = ()
+    force_error_percent: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def rmse(self) -> Mapping[str, float]:
@@ -106,7 +112,15 @@ class Validation:
         """Everything, ready for JSON (a figure that is not finite becomes null)."""
         rows = [{k: _finite(x) for k, x in vars(scores).items()} for scores in self.horizons]
         top = {k: rows[self.asked][k] for k in ("horizon", "rmse", "fit_percent", "r_squared")}
-        return {"log": self.source, **top, "units": dict(self.units), "horizons": rows, "notes": list(self.notes)}
+        forces = {n: x if np.isfinite(x) else None for n, x in self.force_error_percent.items()}
+        return {
+            "log": self.source,
+            **top,
+            "units": dict(self.units),
+            "horizons": rows,
+            "force_error_percent": forces,
+            "notes": list(self.notes),
+        }
 
     def __str__(self) -> str:
         header = ["signal", "unit"]
@@ -119,7 +133,9 @@ class Validation:
             for s in self.horizons:
                 row += [f"{s.rmse[name]:.4g}", f"{s.fit_percent[name]:.1f}", f"{s.r_squared[name]:.4f}"]
             rows.append(row)
-        return "\n".join(aligned(rows))
+        forces = [["force of the inputs", "relative error %"]]
+        forces += [[n, f"{x:.1f}"] for n, x in self.force_error_percent.items()]
+        return "\n".join(aligned(rows) + (["", *aligned(forces)] if self.force_error_percent else []))
 
 
 def validate(
@@ -185,7 +201,8 @@ def validate(
     scores = [_pooled(dataset.signals, h, predictions) for h in (*horizons, np.inf)]
     asked = 0 if horizon is not None else len(scores) - 1
     units = {n: known.model.units[n] for n in dataset.signals}
-    return Validation(dataset.source, units, tuple(scores), asked, dataset.notes)
+    forces = force_errors(dataset, own, resolution)
+    return Validation(dataset.source, units, tuple(scores), asked, dataset.notes, forces)
 
 
 class _OpenLoop:

@@ -10,6 +10,7 @@ from diransac.data.log import Log
 from diransac.errors import ResultError
 from diransac.identification.result import Result
 from diransac.report import provenance, sections
+from diransac.report.friction import friction_figures
 from diransac.report.over_time import figures_of
 from diransac.report.rendering import numbered, write_page
 from diransac.report.runs import Entry, simulate_all
@@ -91,6 +92,7 @@ def _content(entries: Sequence[Entry], logs: Sequence[Log]) -> dict[str, Any]:
         "diagnosis": sections.diagnosis(entries),
         "suggestions": sections.suggestions(entries),
         "logs": [figures_of(log, runs, len(logs)) for log, runs in zip(logs, by_log, strict=True)],
+        "friction": friction_figures(entries),
         "scores": [
             (runs[0].log_name, sections.short_term_scores(runs), [sections.scores(run) for run in runs])
             for runs in by_log

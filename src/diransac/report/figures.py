@@ -176,6 +176,7 @@ class Plot:
     scale : range of values; None for a strip
     y_ticks : texts of the values
     full : y of the highest and lowest measured sample, if outside of the scale
+    still : True if its x axis is no time, so that it does not zoom with plots of the log
     """
 
     label: str
@@ -187,6 +188,7 @@ class Plot:
     scale: Scale | None = None
     y_ticks: tuple[Tick, ...] = ()
     full: str = ""
+    still: bool = False
 
 
 @dataclass(frozen=True)
@@ -208,6 +210,7 @@ class Figure:
     panels : from top to bottom
     time_ticks : texts of the times
     beyond : caption about samples outside of the scale, empty if there are none
+    x_label : quantity on the x axis and its unit; empty for time
     """
 
     title: str
@@ -216,6 +219,7 @@ class Figure:
     panels: tuple[Panel, ...]
     time_ticks: tuple[Tick, ...]
     beyond: str = ""
+    x_label: str = ""
 
 
 def time_plot(
@@ -227,6 +231,7 @@ def time_plot(
     look: str = "",
     levels: Sequence[float] = (),
     full: tuple[float, float] | None = None,
+    still: bool = False,
 ) -> Plot:
     """Plot of several traces over time.
 
@@ -237,6 +242,7 @@ def time_plot(
     look : CSS classes of the panel
     levels : values marked by a horizontal line
     full : range of all measured samples, where it exceeds the scale
+    still : True if the axis is no time
     """
     marks = ticks(scale.low, scale.high)
     heights = [int(y) for y in scale.height([x for x, _ in marks])]
@@ -256,6 +262,7 @@ def time_plot(
         scale=scale,
         y_ticks=tuple((f"{y / 10:.1f}%", text) for y, (_, text) in zip(heights, marks, strict=True)),
         full="" if full is None else " ".join(str(y) for y in scale.height([full[1], full[0]])),
+        still=still,
     )
 
 

@@ -364,6 +364,7 @@ class ScoreTable:
     reason: str = ""
     horizons: tuple[str, ...] = ()
     rows: tuple[tuple[str, str, tuple[str, ...]], ...] = ()
+    forces: Table | None = None
 
 
 def scores(run: Run) -> ScoreTable:
@@ -376,7 +377,14 @@ def scores(run: Run) -> ScoreTable:
         name = "whole log" if np.isinf(at.horizon) else f"{number(at.horizon)} s ({plural(at.windows, 'window')})"
         horizons.append(f"{name}, {at.diverged} diverged" if at.diverged else name)
     rows = [(name, validation.units[name], _score_cells(name, validation)) for name in validation.rmse]
-    return ScoreTable(run.label, "", tuple(horizons), tuple(rows))
+    return ScoreTable(run.label, "", tuple(horizons), tuple(rows), _force_table(run.label, validation))
+
+
+def _force_table(label: str, validation: Validation) -> Table | None:
+    """Relative error of the predicted force of each equation; None without one."""
+    caption = f"{label}: force of the inputs by inverse dynamics of the smoothed motion"
+    rows = [(name, percent(x / 100.0)) for name, x in validation.force_error_percent.items()]
+    return Table(("Equation", "RMS error over RMS force"), rows, caption) if rows else None
 
 
 def _score_cells(name: str, validation: Validation) -> tuple[str, ...]:

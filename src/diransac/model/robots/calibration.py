@@ -14,11 +14,11 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.parameter import Parameter
-from diransac.model.robots.consistency import consistent_parameters
+from diransac.model.robots.consistency import consistent_parameters, inconsistency
 from diransac.model.robots.description import Description, Joint, read_description
 from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters
 
-__all__ = ["calibrated"]
+__all__ = ["calibrated", "impossible_changes"]
 
 _MJCF = {"armature": "armature", "damping": "damping", "friction": "frictionloss", "spring": "stiffness"}
 _URDF = {"damping": "damping", "friction": "friction"}
@@ -75,6 +75,35 @@ def calibrated(
     return document.text(), tuple(left_out)
 
 
+def impossible_changes(
+    parameters: Mapping[str, Parameter], values: FloatArray, covariance: FloatArray
+) -> dict[str, float]:
+    """Least changes of estimated base parameters by which they are those of possible bodies, over standard errors.
+
+    Parameters
+    ----------
+    parameters : mapping of str to Parameter
+    values, covariance : (n_p,), (n_p, n_p) arrays
+        Estimates of them; parameters of infinite variance are left out.
+
+    Returns
+    -------
+    dict of str to float
+        Empty where no parameter is one of a body.
+    """
+    places = {n: dict(x.combination) for n, x in parameters.items()}
+    spread = np.diag(covariance)
+    known = [
+        k for k, n in enumerate(places) if _has_inertials(places[n]) and np.isfinite(spread[k]) and spread[k] > 0.0
+    ]
+    if not known:
+        return {}
+    names = [list(places)[k] for k in known]
+    bodies, _, combinations = _combinations([places[n] for n in names])
+    changes = inconsistency(combinations, len(bodies), values[known], covariance[np.ix_(known, known)])
+    return dict(zip(names, changes.tolist(), strict=True))
+
+
 # ---------------------------------------------------------------------- values
 
 
@@ -123,24 +152,33 @@ def _solve_inertials(
     covariance: FloatArray,
 ) -> None:
     """Bodies and constants of joints that explain base parameters."""
-    every = list(dict.fromkeys(place for own in places for place in own))
-    bodies = [x for x in description.bodies if any(f"{kind} {x.name}" in every for kind in INERTIAL_NAMES)]
-    constants = [place for place in every if place.partition(" ")[0] not in INERTIAL_NAMES]
-    columns = [f"{kind} {body.name}" for body in bodies for kind in INERTIAL_NAMES] + constants
-    missing = [place for place in every if place not in columns]
+    names, constants, combinations = _combinations(places)
+    described = {x.name: x for x in description.bodies}
+    missing = [name for name in names if name not in described]
     if missing:
-        raise ModelError(f'there is no body "{missing[0].partition(" ")[2]}" in the description')
+        raise ModelError(f'there is no body "{missing[0]}" in the description')
+    bodies = [described[name] for name in names]
     joints = {x.name: x for x in description.joints}
     inertials, others = consistent_parameters(
         np.array([inertial_parameters(x.inertial) for x in bodies]),
         np.array([joints[place.partition(" ")[2]].armature for place in constants]),
-        np.array([[own.get(column, 0.0) for column in columns] for own in places]),
+        combinations,
         values,
         covariance,
     )
     found.bodies.update({body.name: x for body, x in zip(bodies, inertials, strict=True)})
     for place, value in zip(constants, others, strict=True):
         _assign(found, place, value)
+
+
+def _combinations(places: list[dict[str, float]]) -> tuple[list[str], list[str], FloatArray]:
+    """Bodies, constants of joints, and the matrix by which the parameters of both give base parameters."""
+    every = list(dict.fromkeys(place for own in places for place in own))
+    of_bodies = [place for place in every if place.partition(" ")[0] in INERTIAL_NAMES]
+    bodies = list(dict.fromkeys(place.partition(" ")[2] for place in of_bodies))
+    constants = [place for place in every if place not in of_bodies]
+    columns = [f"{kind} {body}" for body in bodies for kind in INERTIAL_NAMES] + constants
+    return bodies, constants, np.array([[own.get(column, 0.0) for column in columns] for own in places])
 
 
 # ---------------------------------------------------------------------- text

@@ -22,21 +22,27 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import ModelError
 from diransac.model.robots.rigid_body import inertial_parameters, pseudo_inertia
 
-__all__ = ["consistent_parameters"]
+__all__ = ["consistent_parameters", "inconsistency"]
 
 _REDUCTION = 0.1
 """Ratio of successive weights of the divergence, which begins as heavy as the error is (interior-point method)."""
-_MAX_STEPS, _TOLERANCE, _SHORTEST_STEP = 100, 1e-10, 1e-10
-"""Of Newton's method: steps, decrease of the cost, fraction of a step."""
 _RIDGE = 1e-9
 """Added to correlations, which may be singular."""
+_ROUNDING = 1e-13
+"""Added to a Hessian with a diagonal of one, which is singular where a body is almost impossible."""
 _LEAST_ERROR = 1e-4
 """Least standard error of a combination relative to the sum of its parts' magnitudes in the description."""
 _SINGULAR = 1e-12
 """Ratio of eigenvalues of a pseudo-inertia that is taken as singular."""
-_MAX_STEPS, _TOLERANCE = 200, 1e-12
+_MAX_STEPS, _TOLERANCE, _SHORTEST_STEP = 200, 1e-12, 1e-10
+"""Of Newton's method: steps, decrease of the cost, fraction of a step."""
 _LEAST_MOMENT = 1e-6
 """Second moments of thin bodies, whose pseudo-inertia is singular, relative to the mean one."""
+
+_LIGHT = 1e-3
+"""Weight of the divergence where only the error counts."""
+_ANY_BODY = (1.0, 0.0, 0.0, 0.0, 0.01, 0.01, 0.01, 0.0, 0.0, 0.0)
+"""A possible body, from which the search for others begins."""
 
 _BASIS = [np.array(ca.DM(pseudo_inertia([float(i == k) for i in range(10)]))) for k in range(10)]
 
@@ -70,16 +76,44 @@ def consistent_parameters(
     ModelError
         A body of the description is impossible: its mass or inertia is negative.
     """
-    problem = _Problem(bodies, constants, combinations, values, covariance)
-    x = np.concatenate([bodies.ravel(), constants])
-    prior_weight = max(1.0, problem.at(x, 1.0)[0])
-    while True:
-        x = _minimized(problem, x, prior_weight)
-        if prior_weight == 1.0:
-            break
-        prior_weight = max(1.0, _REDUCTION * prior_weight)
+    x = _solution(_Problem(bodies, constants, combinations, values, covariance), 1.0)
     n = bodies.size
     return x[:n].reshape(bodies.shape), x[n:]
+
+
+def inconsistency(combinations: FloatArray, n_bodies: int, values: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Least changes of estimated combinations by which they are those of possible bodies, over standard errors.
+
+    The changes minimise ``e' C^-1 e``; constants are not negative.
+
+    Parameters
+    ----------
+    combinations : (n_b, 10 n_bodies + n_constants) array
+        B, as of `consistent_parameters`.
+    n_bodies : int
+    values, covariance : (n_b,), (n_b, n_b) arrays
+        Estimates b, and their covariance C.
+
+    Returns
+    -------
+    (n_b,) array
+        Near 0 where the estimates are those of possible bodies.
+    """
+    bodies, n_constants = np.tile(_ANY_BODY, (n_bodies, 1)), combinations.shape[1] - 10 * n_bodies
+    problem = _Problem(bodies, np.full(n_constants, _ANY_BODY[4]), combinations, values, covariance)
+    change = combinations @ _solution(problem, _LIGHT) - values
+    return np.asarray(change / np.sqrt(np.diag(covariance)))
+
+
+def _solution(problem: _Problem, last_weight: float) -> FloatArray:
+    """Optimum with a weight of the divergence, by an interior-point method."""
+    x = problem.start
+    weight = max(last_weight, problem.at(x, 1.0)[0])
+    while True:
+        x = _minimized(problem, x, weight)
+        if weight == last_weight:
+            return x
+        weight = max(last_weight, _REDUCTION * weight)
 
 
 def _minimized(problem: _Problem, x: FloatArray, prior_weight: float) -> FloatArray:
@@ -101,7 +135,7 @@ def _minimized(problem: _Problem, x: FloatArray, prior_weight: float) -> FloatAr
 def _newton_step(gradient: FloatArray, hessian: FloatArray, free: BoolArray) -> tuple[FloatArray, float]:
     """Newton's step of the free parameters, each scaled by its own curvature, and the decrease that it promises."""
     scale = np.where(free, 1.0 / np.sqrt(np.where(free, np.diag(hessian), 1.0)), 0.0)
-    H = hessian * np.outer(scale, scale) + np.diag(1.0 - free)
+    H = hessian * np.outer(scale, scale) + np.diag(1.0 - free + _ROUNDING)
     step = -scale * np.linalg.solve(H, scale * gradient)
     return step, float(-gradient @ step)
 
@@ -119,6 +153,7 @@ class _Problem:
         self.weight: FloatArray = np.linalg.inv(correlation) / np.outer(spread, spread)
         self.B, self.b, self.weighted, self.curvature = B, values, B.T @ self.weight, B.T @ self.weight @ B
         self.constants, self.n_bodies = constants, len(bodies)
+        self.start: FloatArray = np.concatenate([bodies.ravel(), constants])
         self.inverses = [np.asarray(np.linalg.inv(_regular(_pseudo_inertia(x))), float) for x in bodies]
         self.free = np.concatenate([np.ones(bodies.size, bool), constants > 0.0])
 

@@ -3,7 +3,7 @@
 (() => {
   const HEIGHT = 1000;
   const group = (element) => element.closest("[data-log]") || document.querySelector("[data-log]");
-  const plots = [...document.querySelectorAll("svg.plot")].map((svg) => {
+  const plots = [...document.querySelectorAll("svg.plot:not(.still)")].map((svg) => {
     const [x, y, width, height] = svg.getAttribute("viewBox").split(" ").map(Number);
     const { low, high, start, dt } = svg.dataset;
     const home = { x, y, width, height }, box = { x, y, width, height };

@@ -20,6 +20,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
+from diransac.identification.methods.lo_diransac.smoothing import without_spikes
 from diransac.identification.nonlinear import NonlinearLeastSquares
 from diransac.identification.regression import regression_rows
 from diransac.identification.sampling import sample_rows
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["WeakForm", "equation_scales", "find_hypotheses", "robust_scores", "weak_form"]
+__all__ = ["WeakForm", "equation_scales", "find_hypotheses", "find_spikes", "robust_scores", "weak_form"]
 
 _OVERLAP = 5
 # Numbers that are held at a time for several hypotheses: bounds the memory, whatever the length of the logs.
@@ -40,6 +41,8 @@ _NUMBERS_AT_A_TIME = 1_000_000
 _SMALL_RESIDUAL = 0.01
 # Known terms that are as small beside those of another equation are rounding errors.
 _ROUNDING = 1e-9
+# Decrease of the log residuals of each signal by which inputs without spikes are those that acted.
+_CLEAR_GAIN = float(np.log(1.25))
 
 
 def find_hypotheses(
@@ -71,6 +74,51 @@ def find_hypotheses(
         return finalists
     scores = robust_scores(intervals, motion, finalists, np.arange(len(intervals)))
     return finalists[np.argsort(scores, kind="stable")[: np.isfinite(scores).sum()]]
+
+
+def find_spikes(
+    settings: LoDiransacSettings,
+    intervals: ShootingIntervals,
+    motion: Motion,
+    hypotheses: FloatArray,
+    seed: int,
+    dataset: Dataset,
+) -> tuple[ShootingIntervals, FloatArray, int]:
+    """The intervals without spikes of the inputs, where simulations agree better with the logs then.
+
+    A controller's spikes act on the machine, those of a torque sensor do not; both look alike.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+    hypotheses : (n_hypotheses, n) array
+        Of these intervals, best first.
+    seed : int
+    dataset : Dataset
+
+    Returns
+    -------
+    intervals : ShootingIntervals
+    hypotheses : (n_hypotheses, n) array
+        Best first.
+    n_spikes : int
+        Number of rows with spikes; 0 for the given intervals.
+    """
+    cleaned = [without_spikes(intervals.recorded[rows], settings.input_threshold) for rows in intervals.rows_of_logs]
+    n_spikes = sum(n for _, n in cleaned)
+    if not n_spikes:
+        return intervals, hypotheses, 0
+    trial = replace(intervals, recorded=np.concatenate([u for u, _ in cleaned]))
+    found, every = find_hypotheses(settings, trial, motion, seed, dataset), np.arange(len(intervals))
+    if not len(found):
+        return intervals, hypotheses, 0
+    best = np.concatenate([hypotheses[:1], found[:1]])
+    before, after = (robust_scores(x, motion, best, every).min() for x in (intervals, trial))
+    is_better = before - after > _CLEAR_GAIN * intervals.known.any(axis=0).sum()
+    return (trial, found, n_spikes) if is_better else (intervals, hypotheses, 0)
 
 
 def _linear(

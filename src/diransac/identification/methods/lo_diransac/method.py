@@ -24,7 +24,7 @@ from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Fi
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.checks import compared_parts, findings_of_fit
-from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
+from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
 from diransac.identification.methods.lo_diransac.instruments import (
     Instrumented,
     check_set_points,
@@ -75,7 +75,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.refinement import Refinement
     from diransac.identification.settings import Settings
 
-__all__ = ["LoDiransac", "configured"]
+__all__ = ["LoDiransac", "configured", "prepared"]
 
 _FEWEST_INTERVALS = 4
 _OUTLIER, _TINY = 0.5, 1e-9
@@ -320,7 +320,7 @@ def _searched(
 ) -> _Searched:
     """A search that begins with a motion of a time scale that is shorter by a factor; it may end behind another one."""
     report(callback, "smoothing", 0.0)
-    intervals, motion, notes = _prepared(settings, dataset, narrower)
+    intervals, motion, notes = prepared(settings, dataset, narrower)
     if unmeasured_states(intervals):
         report(callback, "unmeasured states", 0.05)
         allowed, measured = len(dataset.model.parameters) - 1, measured_signals(intervals)
@@ -329,6 +329,12 @@ def _searched(
     report(callback, "drawing hypotheses", 0.1)
     check_time()
     hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
+    intervals, hypotheses, n_spikes = find_spikes(settings, intervals, motion, hypotheses, seed, dataset)
+    if n_spikes:
+        notes += (
+            f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; the running median "
+            "replaces them",
+        )
     unit = discrepancy_units(intervals, motion, hypotheses[0])
     search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None, to_beat=to_beat)
@@ -439,10 +445,30 @@ def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Ref
 # ---------------------------------------------------------------------- preparation
 
 
-def _prepared(
+def prepared(
     settings: LoDiransac, dataset: Dataset, narrower: int
 ) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
-    """The logs in intervals of the motion's own time scale, or a part of it, and the motion, row by row of them."""
+    """The logs in intervals of the motion's own time scale, or a part of it, and the motion, row by row of them.
+
+    Parameters
+    ----------
+    settings : LoDiransac
+    dataset : Dataset
+    narrower : int
+        Factor by which the time scale is shorter.
+
+    Returns
+    -------
+    intervals : ShootingIntervals
+        Inputs are screened, and act as recorded.
+    motion : Motion
+    notes : tuple of str
+
+    Raises
+    ------
+    LogError
+        The logs are too short.
+    """
     model, dt = dataset.model, dataset.dt
     screened = [_screened(settings, one, dt) for one in dataset.segments]
     samples, inputs = [x for x, _, _ in screened], [u for _, u, _ in screened]

@@ -42,6 +42,7 @@ __all__ = [
     "smooth",
     "split_signals",
     "stuck_rows",
+    "without_spikes",
 ]
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -57,6 +58,8 @@ _UNINFORMED = 1e-9
 _FEWEST, _ENOUGH_SAMPLES = 5, 25
 # Residuals that a scale is taken from; more would only cost time.
 _ENOUGH = 4000
+# Samples of the running median beside which inputs have spikes: those of two samples at most.
+_SPIKE_WINDOW, _MAD_TO_STD = 5, 1.4826
 # Numbers of the windows of chains that are fitted together at most; more would only take memory.
 _NUMBERS_TOGETHER = 100_000
 
@@ -168,6 +171,37 @@ def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[
         return inputs, 0
     leaps, median = preprocessing.hampel(inputs, window, threshold, preprocessing.running_deviation)
     return np.where(leaps, median, inputs), int(leaps.any(axis=1).sum())
+
+
+def without_spikes(inputs: FloatArray, threshold: float) -> tuple[FloatArray, int]:
+    """Inputs whose spikes of one or two samples, large beside their noise, are replaced by the running median.
+
+    Spikes of a measured torque that are smaller than its range escape `screened_inputs`.  Those of a controller look
+    alike, so that simulations must tell which inputs acted.
+
+    Parameters
+    ----------
+    inputs : (N, n_u) array
+    threshold : float
+        Standard deviations of the noise, by second differences, from the running median beyond which an input is
+        replaced.  An input without noise, which is held or steps, is kept.
+
+    Returns
+    -------
+    inputs : (N, n_u) array
+    n_spikes : int
+        Number of rows with a replaced input.
+    """
+    if len(inputs) < _SPIKE_WINDOW or not inputs.shape[1]:
+        return inputs, 0
+    spikes, median = preprocessing.hampel(inputs, _SPIKE_WINDOW, threshold, _noise_deviation)
+    return np.where(spikes, median, inputs), int(spikes.any(axis=1).sum())
+
+
+def _noise_deviation(values: FloatArray, _median: FloatArray, _window: int) -> FloatArray:
+    """Standard deviation ``(n_u,)`` of white noise by second differences; infinite where most of these are zero."""
+    usual = np.median(np.abs(np.diff(values, 2, axis=0)), axis=0)
+    return np.where(usual > 0.0, _MAD_TO_STD / np.sqrt(6.0) * usual, np.inf)
 
 
 # ---------------------------------------------------------------------- smoothing
