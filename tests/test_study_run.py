@@ -1,5 +1,6 @@
 """Studies as they run: the same rows whatever runs them, whatever is killed, and in whatever company."""
 
+import dataclasses
 import multiprocessing
 import os
 import platform
@@ -53,6 +54,27 @@ def flown_alone(parameters: dict[str, float]) -> dict[str, float]:
     known = dr.Plant(PLANT.model, parameters)
     trajectory = dr.square(known)
     return dr.tracking_error(trajectory, dr.fly(PLANT, trajectory, dr.tvlqr(known, trajectory)))
+
+
+def test_control_missions_and_estimators_are_those_of_the_study(tmp_path: Path):
+    spec = tiny(
+        control={"Q": 1.0, "R": {"thrust": 2.0, "moment": 1.0}, "clip": False},
+        missions__square={"speed": 2.0, "input_weights": {"moment": 0.2}},
+        methods__quick__estimator="tls",
+    )
+    row = run(tmp_path, spec, levels=[40], methods=["quick"], trials=1)["40", 0, "quick"]
+    parameters = {name: row[f"parameter_{name}"] for name in PLANT.parameters}
+    known = dr.Plant(PLANT.model, parameters)
+    trajectory = dr.square(known, speed=2.0, input_weights={"moment": 0.2})
+    free = dr.tvlqr(known, trajectory, Q=1.0, R={"thrust": 2.0, "moment": 1.0}).unclipped()
+    assert errors_of(row) == dr.tracking_error(trajectory, dr.fly(PLANT, trajectory, free))
+
+    log = data_module.trial_data(spec, 40).log
+    method = load(spec).methods["quick"]
+    seed = derived_seed(row["seed"], "identify")
+    settings = dataclasses.replace(method.settings, threads=1)
+    found = dr.identify(PLANT.model, log, method.method, settings=settings, estimator="tls", seed=seed)
+    assert found.parameters == parameters
 
 
 def test_every_row_is_there_and_done(whole: dict):
@@ -222,7 +244,7 @@ def test_a_controller_that_cannot_be_takes_no_other_with_it(
 ):
     bad = whole["40", 0, "ols"]["parameter_mass"]
 
-    def alone(plant: dr.Plant, trajectory: dr.Trajectory) -> dr.Controller:
+    def alone(plant: dr.Plant, trajectory: dr.Trajectory, **_weights: object) -> dr.Controller:
         if plant.parameters["mass"] == bad:
             raise dr.PlanningError("no controller")
         return dr.tvlqr(plant, trajectory)
