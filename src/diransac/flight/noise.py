@@ -43,9 +43,6 @@ class Noise:
         pi_o, probability of an outlier.
     outlier_magnitude : float
         a_o, each signal's unit: an outlier or a sample in a burst gets uniform(-a_o, a_o) added.
-    outliers : {"signals", "rows"}
-        ``"signals"``: each sample of each signal is an outlier with that probability. ``"rows"``: each row is, in all
-        signals, of which each draws its own error.
     acceleration_std : float
         Standard deviation of signals that are linear accelerations, m/s^2.
     rate_std : float
@@ -79,6 +76,9 @@ class Noise:
         Delay of the signals after the inputs, s.
     quantisation : float or mapping of str to float
         Step by signal, in its unit; or one number for all signals, the step as a fraction of the signal's range.
+    outliers : {"signals", "rows"}
+        ``"signals"``: each sample of each signal is an outlier with ``outlier_probability``. ``"rows"``: each row is,
+        in all signals, of which each draws its own error.
 
     Raises
     ------
@@ -128,7 +128,6 @@ class Noise:
 
     outlier_probability: float = 0.0
     outlier_magnitude: float = 0.0
-    outliers: str = "signals"
     acceleration_std: float = 0.0
     rate_std: float = 0.0
     angular_acceleration_std: float | None = None
@@ -147,6 +146,7 @@ class Noise:
     leverage_quantile: float = 0.7
     delay: float = 0.0
     quantisation: Mapping[str, float] | float = 0.0
+    outliers: str = "signals"
 
     def __post_init__(self) -> None:
         fractions = [f.name for f in fields(self) if f.name.endswith(("_probability", "_quantile"))]
