@@ -129,6 +129,8 @@ def test_paths_are_kept_where_they_are_asked_for(tmp_path: Path):
     flown = paths(tmp_path / "a.db", "square")["40", 0, "true"]
     assert flown.shape == (len(trajectory), 3)
     assert np.abs(flown - trajectory.columns(["x", "z", "theta"])).max() < 1e-5
+    planned = paths(tmp_path / "a.db", "square", planned=True)["40", 0, "true"]
+    np.testing.assert_array_equal(planned, trajectory.columns(["x", "z", "theta"]).astype(np.float32))
 
 
 # In whatever company --------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.errors import SettingsError
+from diransac.study.specification import planned_path
 from diransac.study.store import Store
 from diransac.text_table import aligned
 
@@ -69,8 +70,18 @@ def about(store: str | Path) -> dict[str, str]:
         return kept.about
 
 
-def paths(store: str | Path, trajectory: str) -> dict[tuple[str, int, str], npt.NDArray[np.float32]]:
+def paths(
+    store: str | Path, trajectory: str, *, planned: bool = False
+) -> dict[tuple[str, int, str], npt.NDArray[np.float32]]:
     """Flown paths (K, n_q), coordinates in their units, by level, trial and method.
+
+    Parameters
+    ----------
+    store : str or Path
+    trajectory : str
+        Name of the mission.
+    planned : bool
+        The references of these flights instead, which were planned with what the method had identified.
 
     Raises
     ------
@@ -79,11 +90,11 @@ def paths(store: str | Path, trajectory: str) -> dict[tuple[str, int, str], npt.
     """
     with Store.existing(store) as kept:
         rows = kept.select("SELECT level, trial, method, paths FROM trials WHERE paths NOT NULL ORDER BY rowid")
-    found = {}
+    found, key = {}, planned_path(trajectory) if planned else trajectory
     for level, trial, method, packed in rows:
         with np.load(io.BytesIO(packed), allow_pickle=False) as flown:
-            if trajectory in flown:
-                found[level, trial, method] = flown[trajectory]
+            if key in flown:
+                found[level, trial, method] = flown[key]
     return found
 
 

@@ -59,7 +59,7 @@ from diransac.study.tables import (
 
 __all__ = [
     "MISSIONS", "TRAJECTORIES", "TRUE", "ControlChoice", "Criteria", "FlightChoice", "MethodChoice", "Missions",
-    "Study",
+    "Study", "planned_path",
 ]  # fmt: skip
 
 TRUE = "true"
@@ -76,6 +76,12 @@ TRAJECTORIES: dict[str, Callable[..., Trajectory]] = {
     "multisine": multisine,
 }
 """Trajectories that may be flown for data."""
+
+
+def planned_path(mission: str) -> str:
+    """Key of a mission's planned paths, beside that of the flown ones, which is its name."""
+    return f"{mission} planned"
+
 
 _LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _+()/-]*")
 _VARIABLE = ("plant", "data", "noise", "methods", "missions", "control")
@@ -330,7 +336,7 @@ class Criteria(Table):
     Parameters
     ----------
     trajectories : planned, steered and flown with what was identified
-    keep_paths : keep the paths of these flights
+    keep_paths : keep the paths of these flights, and those that were planned
     parameters : compare parameters with the pseudo-true ones of the flight that was recorded
     """
 

@@ -38,7 +38,7 @@ from diransac.study.data import (
     trial_seed,
 )
 from diransac.study.library import load
-from diransac.study.specification import TRUE, ControlChoice, Study
+from diransac.study.specification import TRUE, ControlChoice, Study, planned_path
 
 __all__ = ["STAGES", "run_trials"]
 
@@ -185,7 +185,9 @@ class _Case:
             raise PlanningError(f"{shape}: {error}") from error
         self.figures |= {f"{shape}_{name}": error for name, error in tracking_error(trajectory, log).items()}
         if self.point.study.evaluation.keep_paths:
-            self.paths[shape] = np.column_stack([log[name] for name in self.point.plant.model.coordinates])
+            names = list(self.point.plant.model.coordinates)
+            self.paths[shape] = np.column_stack([log[name] for name in names])
+            self.paths[planned_path(shape)] = trajectory.columns(names)
 
     def row(self) -> dict[str, Any]:
         """The row of the case, by column of the store."""
