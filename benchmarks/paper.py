@@ -38,25 +38,88 @@ WEIGHTS = {
     "hybrid": {},
 }
 CAPS = {f"{n} iterations": {"max_iterations": n, "stop_inlier_fraction": "none"} for n in (250, 500, 1000, 2000, 4000)}
+RANSACS = ("diransac", "diransac-without-refit", "i-diransac")
+SIGNALS = {"noise__outliers": "signals"}
+
+
+def every(key: str, value: object) -> dict[str, object]:
+    """A change of one key of every RANSAC method."""
+    return {f"methods.{method}.{key}": value for method in RANSACS}
+
+
+UNIT_WEIGHTS = {"control.Q": 1.0, "control.R": 1.0}
+SLOW_VELOCITY = dict.fromkeys(("x", "z", "theta"), 1.0) | dict.fromkeys(("x_dot", "z_dot", "theta_dot"), 0.3)
+QUICK_SINE = {"missions.sine.periods": 1.0, "missions.sine.duration": 5.0}
+CHOICES: dict[str, dict[str, object]] = {
+    "as they are": {},
+    "Q = R = 1": UNIT_WEIGHTS,
+    "Q = R = Qf = 1": UNIT_WEIGHTS | {"control.Qf": 1.0},
+    "Q = 1 and 0.3 of velocities, R = 1": {"control.Q": SLOW_VELOCITY, "control.R": 1.0},
+    "inputs not clipped": {"control.clip": False},
+    "star at 1.2 m/s": {"data.speed": 1.2},
+    "star at 2 m/s": {"data.speed": 2.0},
+    "star with moment at a fifth of the cost": {"data.input_weights": {"moment": 0.2}},
+    "star with moment at five times the cost": {"data.input_weights": {"moment": 5.0}},
+    "total least squares of samples": every("estimator", "tls"),
+    "initial state robust": every("settings.initial_state", "robust"),
+}
+"""Choices that the paper leaves open, one at a time, and what they change."""
+OF_OUTLIERS: dict[str, dict[str, object]] = {
+    "each signal by itself": {"noise.outliers": "signals"},
+    "first row corrupted": {"noise.first_row": "corrupted"},
+    "each signal by itself, first row corrupted": {"noise.outliers": "signals", "noise.first_row": "corrupted"},
+}
+OF_IMBALANCE: dict[str, dict[str, object]] = {
+    "eq. (20) as printed": {"plant.convention": "printed"},
+    "phase as printed": {"plant.phase": "instantaneous"},
+    "phase of each flight random": {"plant.rotor_phase": "random"},
+    "sine of one period in 5 s": QUICK_SINE,
+    "sine of one period in 5 s, Q = 1 and 0.3 of velocities, R = 1, not clipped": QUICK_SINE
+    | {"control.Q": SLOW_VELOCITY, "control.R": 1.0, "control.clip": False},
+}
+
+
+def choices(source: str, path: str, level: float, more: dict[str, dict[str, object]]) -> Study:
+    """A built-in study at one level, as it is and with one choice changed at a time."""
+    table = load(source, {path: level}).to_dict()
+    levels = {_word(name): changes for name, changes in (CHOICES | more).items()}
+    table["methods"] = {label: one for label, one in table["methods"].items() if label in ("ols", *RANSACS)}
+    table["axis"] = {"name": "choice", "levels": levels}
+    return load(table)
+
+
+def _word(name: str) -> str:
+    """A level's name has no commas."""
+    return name.replace(",", ";")
 
 
 def studies() -> dict[str, Study]:
     """Every study by the name of its store."""
     return {
         "fig2": load("fig2"),
+        "fig2-signals": load("fig2", {"noise.outliers": "signals"}),
+        **{
+            f"fig2-{share}{name}": load("fig2", {"noise.outlier_probability": share, "noise.outliers": reading})
+            for share in (0.3, 0.5)
+            for reading, name in (("rows", ""), ("signals", "-signals"))
+        },
         "fig3": load("fig3"),
         "fig3-printed": load("fig3", {"plant.convention": "printed"}),
         "fig4": load("fig4"),
         "fig4-printed": load("fig4", {"plant.convention": "printed"}),
         "fig5": load("fig5"),
+        "fig5-signals": load("fig5", {"noise.outliers": "signals"}),
         "gaussian": load("gaussian"),
         "gaussian-exact": load("gaussian", {"noise.angular_acceleration_std": 0.0}),
-        "acceptance-outliers": variants("fig2", WEIGHTS, [40, 60, 80]),
+        "acceptance-outliers": variants("fig2", WEIGHTS, [40, 60, 80], **SIGNALS),
         "acceptance-aerodynamic": variants("fig3", WEIGHTS, [1.4e-6]),
         "acceptance-mass": variants("fig4", WEIGHTS, [6e-5]),
         "acceptance-aerodynamic-printed": variants("fig3", WEIGHTS, [1.4e-6], plant__convention="printed"),
         "acceptance-mass-printed": variants("fig4", WEIGHTS, [1e-4], plant__convention="printed"),
-        "iterations": variants("fig2", CAPS, [40, 80]),
+        "iterations": variants("fig2", CAPS, [40, 80], **SIGNALS),
+        "choices-fig2": choices("fig2", "noise.outlier_magnitude", 80.0, OF_OUTLIERS),
+        "choices-fig3": choices("fig3", "plant.aerodynamic_imbalance", 1.4e-6, OF_IMBALANCE),
+        "choices-fig4": choices("fig4", "plant.mass_imbalance", 1e-4, OF_IMBALANCE),
     }
 
 
@@ -138,6 +201,15 @@ def flatness(summary: Summary, shape: str) -> None:
     show(f"{summary.name}, {shape}: least and largest over levels above 0", head, rows)
 
 
+def by_choice(summary: Summary, shape: str) -> None:
+    """A row per choice: mean error of each method in the coordinate of its figure, and trials that stay near."""
+    flights, state = summary.flights[shape], "z" if shape == "square" else "x"
+    mean = flights.mean(state)
+    cells = [[f"{text(x)} ({near(flights, i, k)})" for k, x in enumerate(row)] for i, row in enumerate(mean)]
+    rows = [[choice, *some] for choice, some in zip(summary.levels, cells, strict=True)]
+    show(f"{summary.name}, {shape}: mean of {state}, m (near)", ["choice", *summary.methods], rows)
+
+
 def parameters(store: Path) -> None:
     """Medians of what was identified, at each level."""
     import polars as pl
@@ -153,8 +225,11 @@ def parameters(store: Path) -> None:
 def show_gamma() -> None:
     """What blades that differ by so much in C_T and D give by eq. (12)."""
     whole = 0.06 * 0.127**4
-    rows = [[f"{100 * d:g} %", f"{whole * ((1 + d) ** 5 - 1):.3g}"] for d in (0.0125, 0.015, 0.02, 0.0223, 0.025)]
-    show("gamma of one blade that is larger in C_T and in D", ["by", "gamma, m^4"], rows)
+    rows = [
+        [f"{100 * d:g} %", f"{whole * ((1 + d) ** 5 - 1):.3g}", f"{whole * (1 - (1 - d) ** 5):.3g}"]
+        for d in (0.0125, 0.015, 0.02, 0.0223, 0.025)
+    ]
+    show("gamma, m^4, of blades that differ in C_T and in D", ["by", "the other is larger", "is smaller"], rows)
 
 
 def show_wrong_start() -> None:
@@ -275,11 +350,16 @@ def main() -> None:
     for name, summary in found.items():
         print(f"\n## {name}")
         for shape in summary.flights:
+            if name.startswith("choices"):
+                by_choice(summary, shape)
+                continue
             by_level(summary, shape)
             if "i-diransac" in summary.methods:
                 gaps(summary, shape)
                 flatness(summary, shape)
         parameters(given.stores / f"{name}.db")
+    if given.only:
+        return
     print("\n## Without studies")
     show_gamma()
     show_wrong_start()

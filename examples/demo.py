@@ -2,9 +2,9 @@
 
 A planar rotorcraft with unbalanced rotors (Dimmig et al. 2023, Tables I and II) flies a star. Its rotors produce more
 lift than the model has, and vibrate at 250 Hz, which a log at 100 Hz aliases; one in ten samples of every signal is an
-outlier of up to 80. Every method identifies a model from that log. Each model then plans a square and a sine and
-controls the same plant along them; the tracking error measures the quality of the model. Run it with ``make demo``; it
-writes ``report.html`` and ``flight.png`` into ``out/demo``.
+outlier of up to 80; the paper has either of them alone. Every method identifies a model from that log. Each model then
+plans a square and a sine and controls the same plant along them; the tracking error measures the quality of the model.
+Run it with ``make demo``; it writes ``report.html`` and ``flight.png`` into ``out/demo``.
 """
 
 from __future__ import annotations

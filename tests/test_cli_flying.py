@@ -114,7 +114,7 @@ def test_simulate_gives_the_same_bytes_for_the_same_seed(folder: Path, name: str
 
 def test_simulate_takes_every_field_of_the_noise(folder: Path):
     told = {
-        "--outliers": 0.1, "--magnitude": 5, "--acceleration-noise": 0.5, "--rate-noise": 0.1,
+        "--outliers": 0.1, "--magnitude": 5, "--outliers-hit": "rows", "--acceleration-noise": 0.5, "--rate-noise": 0.1,
         "--angular-acceleration-noise": 2, "--integrated-noise": "random-walk", "--first-row": "corrupted",
         "--bursts": 0.01, "--burst-length": 4, "--stuck": 0.02, "--stuck-length": 5,
         "--dropouts": 0.03, "--dropout-length": 6,
@@ -124,7 +124,7 @@ def test_simulate_takes_every_field_of_the_noise(folder: Path):
     words = [word for pair in told.items() for word in pair]
     done = run("simulate", "square", *words, "--correlated", "--seed", 2, "-o", "flight.csv", "--json")
     noise = dr.Noise(0.1, 5, 0.5, 0.1, 2, "random-walk", "corrupted", 0.01, 4, 0.02, 5, 0.03, 6, True, 0.2, 3, "thrust",
-                     0.8, 0.02, {"x": 0.001})  # fmt: skip
+                     0.8, 0.02, {"x": 0.001}, "rows")  # fmt: skip
     run("simulate", "square", "--seed", 2, "-o", "clean.csv")
     flown = dr.read_log("clean.csv")
     model = dr.models.planar_rotorcraft()

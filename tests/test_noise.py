@@ -272,6 +272,16 @@ def test_outliers_strike_each_sample_with_the_stated_probability(probability):
         assert in_binomial_interval((a & b)[1:].sum(), N - 1, probability**2)
 
 
+def test_outliers_by_rows_strike_all_signals_of_a_row_each_by_its_own_size():
+    by_row = Noise(outlier_probability=0.1, outlier_magnitude=80.0, outliers="rows")
+    log, corrupted = flight(), corrupt(flight(), by_row, seed=4)
+    masks = np.column_stack(list(corrupted.fault_mask.values()))
+    assert (masks == masks[:, :1]).all()
+    assert masks[:, 0].mean() == pytest.approx(0.1, abs=0.02)
+    errors = [(corrupted[name] - log[name])[masks[:, 0]] for name in corrupted.fault_mask]
+    assert np.abs(np.corrcoef(errors)[~np.eye(len(errors), dtype=bool)]).max() < 0.3
+
+
 def test_outliers_are_uniform_between_plus_and_minus_the_magnitude():
     log = flight(20_000)
     corrupted = corrupt(log, OUTLIERS, seed=6)
@@ -608,6 +618,7 @@ def test_a_delay_carries_masks_along_and_spreads_them_where_it_mixes_samples():
         ({"leverage_offset": -np.inf}, "leverage_offset is -inf"),
         ({"rate_std": "0.1"}, "rate_std is '0.1'"),
         ({"outlier_probability": True}, "outlier_probability is True"),
+        ({"outliers": "columns"}, "outliers is 'columns'; choose 'signals' or 'rows'"),
         ({"angular_acceleration_std": np.inf}, "angular_acceleration_std is inf"),
         ({"stuck_length": 0.5}, "stuck_length is 0.5; give a finite number from 1, samples"),
         ({"delay": -0.01}, "delay is -0.01"),

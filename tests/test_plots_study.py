@@ -212,6 +212,18 @@ def test_paths_are_drawn_for_every_trial_that_has_one(store_with_paths: Path):
     assert "1 of 5 leave the panel\n1 of 5 failed" in texts(figure)
 
 
+def test_the_reference_of_each_method_is_dashed_beside_its_flights(store_with_paths: Path):
+    study = load(tiny(trials=N_TRIALS + 1, evaluation__keep_paths=True, axis__levels=[40]))
+    with Store(store_with_paths, study) as kept:
+        found = packed(square=CIRCLE, **{"square planned": CIRCLE * 1.2})
+        kept.add([row("40", N_TRIALS, "ols", **errors(0.1), paths=found)])
+    figure = plot_paths(store_with_paths)
+    dashed = [one for axes in figure.axes for one in axes.collections if one.get_linestyle()[0][1] is not None]
+    (reference,) = [segment for one in dashed for segment in one.get_segments()]
+    assert np.abs(reference).max() == pytest.approx(1.2 * np.abs(CIRCLE[:, :2]).max(), rel=1e-2)
+    assert "reference of the method" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
 def test_paths_have_x_and_z_to_one_scale(store_with_paths: Path):
     figure = plot_paths(store_with_paths)
     figure.draw_without_rendering()

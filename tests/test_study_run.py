@@ -1,5 +1,6 @@
 """Studies as they run: the same rows whatever runs them, whatever is killed, and in whatever company."""
 
+import dataclasses
 import multiprocessing
 import os
 import platform
@@ -55,6 +56,27 @@ def flown_alone(parameters: dict[str, float]) -> dict[str, float]:
     return dr.tracking_error(trajectory, dr.fly(PLANT, trajectory, dr.tvlqr(known, trajectory)))
 
 
+def test_control_missions_and_estimators_are_those_of_the_study(tmp_path: Path):
+    spec = tiny(
+        control={"Q": 1.0, "R": {"thrust": 2.0, "moment": 1.0}, "clip": False},
+        missions__square={"speed": 2.0, "input_weights": {"moment": 0.2}},
+        methods__quick__estimator="tls",
+    )
+    row = run(tmp_path, spec, levels=[40], methods=["quick"], trials=1)["40", 0, "quick"]
+    parameters = {name: row[f"parameter_{name}"] for name in PLANT.parameters}
+    known = dr.Plant(PLANT.model, parameters)
+    trajectory = dr.square(known, speed=2.0, input_weights={"moment": 0.2})
+    free = dr.tvlqr(known, trajectory, Q=1.0, R={"thrust": 2.0, "moment": 1.0}).unclipped()
+    assert errors_of(row) == dr.tracking_error(trajectory, dr.fly(PLANT, trajectory, free))
+
+    log = data_module.trial_data(spec, 40).log
+    method = load(spec).methods["quick"]
+    seed = derived_seed(row["seed"], "identify")
+    settings = dataclasses.replace(method.settings, threads=1)
+    found = dr.identify(PLANT.model, log, method.method, settings=settings, estimator="tls", seed=seed)
+    assert found.parameters == parameters
+
+
 def test_every_row_is_there_and_done(whole: dict):
     assert set(whole) == {(level, k, m) for level in ("0", "40") for k in (0, 1) for m in ("true", "ols", "quick")}
     assert {row["status"] for row in whole.values()} == {"done"}
@@ -107,6 +129,8 @@ def test_paths_are_kept_where_they_are_asked_for(tmp_path: Path):
     flown = paths(tmp_path / "a.db", "square")["40", 0, "true"]
     assert flown.shape == (len(trajectory), 3)
     assert np.abs(flown - trajectory.columns(["x", "z", "theta"])).max() < 1e-5
+    planned = paths(tmp_path / "a.db", "square", planned=True)["40", 0, "true"]
+    np.testing.assert_array_equal(planned, trajectory.columns(["x", "z", "theta"]).astype(np.float32))
 
 
 # In whatever company --------------------------------------------------------------------------------------------------
@@ -222,7 +246,7 @@ def test_a_controller_that_cannot_be_takes_no_other_with_it(
 ):
     bad = whole["40", 0, "ols"]["parameter_mass"]
 
-    def alone(plant: dr.Plant, trajectory: dr.Trajectory) -> dr.Controller:
+    def alone(plant: dr.Plant, trajectory: dr.Trajectory, **_weights: object) -> dr.Controller:
         if plant.parameters["mass"] == bad:
             raise dr.PlanningError("no controller")
         return dr.tvlqr(plant, trajectory)

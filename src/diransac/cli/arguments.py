@@ -11,7 +11,7 @@ import typer
 
 from diransac.errors import ModelError, SettingsError
 from diransac.identification.method import Method
-from diransac.identification.methods import configured, setting_names
+from diransac.identification.methods import WITH_ESTIMATOR, configured, estimator_named, setting_names
 from diransac.identification.settings import Settings, nearest_names
 from diransac.model import Model
 from diransac.plain_data import LARGEST_TABLE, read_text, toml_table
@@ -199,13 +199,15 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, An
     return {key: _none_where_meant(key, value) for key, value in table.items()}
 
 
-def load_methods(names: Sequence[str], settings: Mapping[str, Any]) -> list[Method]:
+def load_methods(names: Sequence[str], settings: Mapping[str, Any], estimator: str | None = None) -> list[Method]:
     """Methods by name, each with those of the given settings that it has.
 
     Parameters
     ----------
     names : sequence of str
     settings : mapping of str to object
+    estimator : str, optional
+        Name of the estimator inside the RANSAC methods.
 
     Returns
     -------
@@ -214,17 +216,27 @@ def load_methods(names: Sequence[str], settings: Mapping[str, Any]) -> list[Meth
     Raises
     ------
     typer.BadParameter
-        A setting belongs to none of the methods.
+        A setting belongs to none of the methods, or none has an estimator inside.
     SettingsError
         A value is out of range, or of another type.
     """
+    if estimator is not None and not set(names) & set(WITH_ESTIMATOR):
+        raise typer.BadParameter(f"--estimator serves {', '.join(WITH_ESTIMATOR)}; found {', '.join(names)}")
     known = {name: setting_names(name) for name in names}
     for key in settings:
         if not any(key in own for own in known.values()):
             of_one = f'method "{names[0]}" has' if len(names) == 1 else "none of the methods has"
             own = list(dict.fromkeys(x for own in known.values() for x in own))
             raise typer.BadParameter(f'{of_one} no setting "{key}"; {nearest_names(key, own)}')
-    return [configured(name, {key: value for key, value in settings.items() if key in known[name]}) for name in names]
+    inside = {} if estimator is None else {"estimator": estimator_named(estimator)}
+    return [
+        configured(
+            name,
+            {key: value for key, value in settings.items() if key in known[name]},
+            **(inside if name in WITH_ESTIMATOR else {}),
+        )
+        for name in names
+    ]
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

@@ -246,6 +246,16 @@ class NoiseOptions:
     outlier_magnitude: Annotated[
         float | None, _noise_option("--magnitude", min=0.0, metavar="A", help="Outliers add uniform(-A, A).")
     ] = None
+    outliers: Annotated[
+        str | None,
+        _noise_option(
+            "--outliers-hit",
+            metavar="signals|rows",
+            callback=_one_of("signals", "rows"),
+            show_default="signals",
+            help="Each signal by itself, or all signals of a row.",
+        ),
+    ] = None
     acceleration_std: Annotated[
         float | None, _noise_option("--acceleration-noise", min=0.0, metavar="M/S2", help="Standard deviation.")
     ] = None
@@ -353,6 +363,7 @@ class NoiseOptions:
 _NEEDED = {
     "outlier_probability": ("outlier_magnitude",),
     "outlier_magnitude": ("outlier_probability", "burst_probability"),
+    "outliers": ("outlier_probability",),
     "burst_probability": ("outlier_magnitude",),
     "burst_length": ("burst_probability",),
     "stuck_length": ("stuck_probability",),

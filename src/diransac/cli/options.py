@@ -18,7 +18,7 @@ from diransac.data.readers import read_log
 from diransac.data.readers.repair import REPAIRS
 from diransac.errors import LogError, SettingsError
 from diransac.identification.method import Method
-from diransac.identification.methods import METHODS
+from diransac.identification.methods import ESTIMATORS, METHODS
 from diransac.model import Model
 from diransac.simulation import HOLDS
 
@@ -53,6 +53,13 @@ def _known_hold(name: str | None) -> str | None:
     """The name itself.  Raises typer.BadParameter: there is no hold of that name."""
     if name is not None and name not in HOLDS:
         raise typer.BadParameter(f"there is no hold {name!r}; there are {', '.join(HOLDS)}")
+    return name
+
+
+def _known_estimator(name: str | None) -> str | None:
+    """The name itself.  Raises typer.BadParameter: there is no estimator of that name."""
+    if name is not None and name not in ESTIMATORS:
+        raise typer.BadParameter(f"there is no estimator {name!r}; there are {', '.join(ESTIMATORS)}")
     return name
 
 
@@ -136,6 +143,15 @@ class Search:
         typer.Option("--set", metavar="KEY=VALUE", help="One setting, such as sample_size=50; repeatable."),
     ] = None
 
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            callback=_known_estimator,
+            metavar="|".join(ESTIMATORS),
+            help="Least squares of the samples of diransac and i-diransac.",
+        ),
+    ] = None
+
     input_hold: Annotated[
         str | None,
         typer.Option(
@@ -170,7 +186,7 @@ class Search:
 
     def methods(self, names: Sequence[str]) -> list[Method]:
         """The methods with these settings.  Raises SettingsError: a setting has no meaning."""
-        return load_methods(names, load_settings(self.settings, self.assignments or ()))
+        return load_methods(names, load_settings(self.settings, self.assignments or ()), self.estimator)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Draws", "Noise", "gaussian_errors", "leverage_rows", "quantised", "with_faults"]
 
-_CHOICES = {"integrated": ("white", "random-walk"), "first_row": ("clean", "corrupted")}
+_CHOICES = {
+    "outliers": ("signals", "rows"),
+    "integrated": ("white", "random-walk"),
+    "first_row": ("clean", "corrupted"),
+}
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class Noise:
     Parameters
     ----------
     outlier_probability : float
-        pi_o, probability that a sample is an outlier, independent for each signal and row.
+        pi_o, probability of an outlier.
     outlier_magnitude : float
         a_o, each signal's unit: an outlier or a sample in a burst gets uniform(-a_o, a_o) added.
     acceleration_std : float
@@ -48,8 +52,8 @@ class Noise:
     integrated : {"white", "random-walk"}
         Gaussian noise of the signals that accelerations and rates integrate to.
     first_row : {"clean", "corrupted"}
-        ``"clean"``: the first row, from which simulations start, has neither Gaussian noise nor faults, as in the
-        paper's studies.
+        ``"clean"``: the first row, from which simulations start, has neither Gaussian noise nor faults. The paper does
+        not say.
     burst_probability : float
         Probability per sample that a burst of consecutive outliers starts.
     burst_length : float
@@ -72,6 +76,9 @@ class Noise:
         Delay of the signals after the inputs, s.
     quantisation : float or mapping of str to float
         Step by signal, in its unit; or one number for all signals, the step as a fraction of the signal's range.
+    outliers : {"signals", "rows"}
+        ``"signals"``: each sample of each signal is an outlier with ``outlier_probability``. ``"rows"``: each row is,
+        in all signals, of which each draws its own error.
 
     Raises
     ------
@@ -101,6 +108,9 @@ class Noise:
     The paper gives no noise of theta_ddot. The same rule applied in reverse gives ``sigma = rate_std / dt``, the
     angular acceleration that changes the rate by rate_std within one sample: at 100 Hz, a hundred times rate_std. It
     dominates the error of an identified inertia. ``angular_acceleration_std=0`` follows the paper literally.
+
+    The paper adds outliers "to each signal with a probability", which ``outliers="signals"`` does. An inlier of its
+    Algorithm 1 is an observation, all signals of a row, and its figures look as with ``"rows"``.
 
     ============================  ==================================  =================
     Table III                     field                               range
@@ -136,6 +146,7 @@ class Noise:
     leverage_quantile: float = 0.7
     delay: float = 0.0
     quantisation: Mapping[str, float] | float = 0.0
+    outliers: str = "signals"
 
     def __post_init__(self) -> None:
         fractions = [f.name for f in fields(self) if f.name.endswith(("_probability", "_quantile"))]
@@ -338,7 +349,7 @@ def with_faults(values: FloatArray, name: str, noise: Noise, draws: Draws, eligi
     stuck = _runs("stuck", name, noise, draws) & ~spared
     recorded = values[np.maximum.accumulate(np.where(stuck, 0, np.arange(len(values))))]
 
-    is_outlier = draws.uniform("outlier", name) < noise.outlier_probability
+    is_outlier = draws.uniform("outlier", "" if noise.outliers == "rows" else name) < noise.outlier_probability
     is_outlier |= _runs("burst", name, noise, draws)
     outliers = noise.outlier_magnitude * (2.0 * draws.uniform("outlier size", name) - 1.0)
     recorded = np.where(is_outlier & ~spared, recorded + outliers, recorded)

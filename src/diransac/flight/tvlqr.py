@@ -18,7 +18,7 @@ from diransac.model import Model
 from diransac.model.plant import ModelWithParameters, as_plant
 from diransac.simulation import LinearFeedback
 
-__all__ = ["Controller", "tvlqr", "tvlqr_batch"]
+__all__ = ["Controller", "check_weights", "tvlqr", "tvlqr_batch"]
 
 Weights: TypeAlias = "npt.ArrayLike | Mapping[str, float]"
 """Matrix, diagonal, one number for the whole diagonal, or diagonal by name."""
@@ -104,6 +104,11 @@ class Controller:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def unclipped(self) -> Controller:
+        """The same law without limits of its inputs."""
+        nowhere = np.full(self.inputs.shape[1], np.inf)
+        return replace(self, u_min=-nowhere, u_max=nowhere)
 
     def law(self) -> LinearFeedback:
         """Feedback law for simulations, row by row."""
@@ -290,6 +295,11 @@ def tvlqr_batch(
 
 
 # Arguments -----------------------------------------------------------------------------------------------------------
+def check_weights(model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None) -> None:
+    """Raise SettingsError: weights of `tvlqr` of wrong shape, names or definiteness for this model."""
+    _CostMatrices(model, Q, R, Qf)
+
+
 def _check_columns(model: Model, trajectory: Trajectory) -> None:
     """Raise SettingsError if the trajectory is another model's, or the model has no inputs."""
     if not model.inputs:

@@ -17,7 +17,7 @@ from diransac.identification.estimate import Evaluation, LogSummary, Prediction
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
 from diransac.identification.known_parameters import KnownParameters
 from diransac.identification.method import Callback, Method, fit, numerical_failures, report, within
-from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, factory
+from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, estimator_named, factory
 from diransac.identification.prediction import predictions
 from diransac.identification.refusal import check_motion
 from diransac.identification.result import Result
@@ -66,8 +66,9 @@ def identify(
     settings : Settings, optional
         Settings of a method that is given by name; a setting that the method does not use is refused.
     estimator : object, optional
-        Estimator inside "diransac" and "i-diransac": `OrdinaryLeastSquares` (default; `NonlinearLeastSquares` where the
-        model is not affine in its parameters), `TotalLeastSquares`, or any scikit-learn linear regressor.
+        Estimator inside "diransac" and "i-diransac": "ols" or `OrdinaryLeastSquares` (default; "nls" or
+        `NonlinearLeastSquares` where the model is not affine in its parameters), "tls" or `TotalLeastSquares`, or any
+        scikit-learn linear regressor.
     differentiate : bool, optional
         Whether to derive the velocities and accelerations that a log lacks, and to filter both sides of the equations
         alike; the identification is then repeated at half and at twice the bandwidth, for
@@ -156,7 +157,7 @@ def _method(method: object, settings: object, estimator: object) -> Method:
     if estimator is not None:
         if method not in WITH_ESTIMATOR:
             raise SettingsError(f'estimator serves the RANSAC methods; method "{method}" is an estimator itself')
-        of_search["estimator"] = estimator
+        of_search["estimator"] = estimator_named(estimator) if isinstance(estimator, str) else estimator
     return make(settings or Settings(), **of_search)
 
 

@@ -38,12 +38,14 @@ if TYPE_CHECKING:
 __all__ = ["levels_with_paths", "plot_paths"]
 
 Path2 = npt.NDArray[np.float32]
+_Paths = Mapping[str, Mapping[str, list[Path2]]]
 
 # Inches: left of the panels, between them, above a row (trajectory's name), below it (counts), the caption.
 _LEFT, _GAP, _NAME, _BELOW, _CAPTION = 0.42, 0.12, 0.24, 0.42, 0.3
 # Margin around the reference as a fraction of its larger side; every n-th row of paths is drawn.
 _MARGIN, _EVERY = 0.3, 3
 _PALE = 0.35
+_DASHES = (0.0, (4.0, 3.0))
 # Largest number of grid lines across a panel.
 _LINES = 5.0
 
@@ -78,15 +80,19 @@ def plot_paths(
 
     Notes
     -----
-    The path flown with the true parameters is broad and grey, if the study has the method ``true``. The panels cover
-    that path and a margin; below each are the numbers of flights that leave it and of failed trials.
+    The path flown with the true parameters is broad and grey, if the study has the method ``true``; dashed are the
+    references of the flights, which each method planned with what it had identified. The panels cover the true path and
+    a margin; below each are the numbers of flights that leave it and of failed trials.
     """
     if path is not None:
         check_ending(Path(path))
     summary = summarise(store)
     chosen = _chosen(levels_with_paths(store), level)
-    flown = {shape: _at(paths(store, shape), chosen, summary.methods) for shape in summary.flights}
-    figure = _drawn(summary, chosen, flown, title_of(summary) if title is None else title)
+    flown, planned = (
+        {shape: _at(paths(store, shape, planned=which), chosen, summary.methods) for shape in summary.flights}
+        for which in (False, True)
+    )
+    figure = _drawn(summary, chosen, flown, planned, title_of(summary) if title is None else title)
     if path is not None:
         write(figure, Path(path))
     return figure
@@ -116,11 +122,13 @@ def _at(found: Mapping[tuple[str, int, str], Path2], level: str, methods: Sequen
 
 
 # Panels --------------------------------------------------------------------------------------------------------------
-def _drawn(summary: Summary, level: str, flown: Mapping[str, Mapping[str, list[Path2]]], title: str) -> Figure:
+def _drawn(summary: Summary, level: str, flown: _Paths, planned: _Paths, title: str) -> Figure:
     from matplotlib.figure import Figure
 
     looks = method_looks(summary.methods)
     entries = [("flown with the true parameters", looks[TRUE])] if TRUE in looks else []
+    if any(some for by_method in planned.values() for some in by_method.values()):
+        entries.append(("reference of the method", {"color": INK, "linestyle": _DASHES, "linewidth": 0.8}))
     width = (WIDTH - _LEFT - 0.1) / len(looks) - _GAP
     boxes = {shape: _box(by_method) for shape, by_method in flown.items()}
     heights = {shape: width * extent(box[1]) / extent(box[0]) for shape, box in boxes.items()}
@@ -136,6 +144,7 @@ def _drawn(summary: Summary, level: str, flown: Mapping[str, Mapping[str, list[P
             place = (left / WIDTH, 1.0 - below / full, width / WIDTH, heights[shape] / full)
             axes = figure.add_axes(place, facecolor=SOFT)
             _draw_flights(axes, by_method[label], by_method.get(TRUE, []), look["color"], label == TRUE)
+            _draw_references(axes, planned[shape][label])
             _dress(axes, boxes[shape], first=k == 0)
             _write(figure, left + width, top + 0.06, label, fontsize=8, color=look["color"], ha="right")
             unseen = _unseen(by_method[label], boxes[shape], *counts[label])
@@ -167,6 +176,17 @@ def _draw_flights(axes: Axes, flown: Sequence[Path2], true: Sequence[Path2], col
         axes.add_collection(
             LineCollection(lines, colors=colour, linewidths=0.6, alpha=_PALE, zorder=2.5), autolim=False
         )
+
+
+def _draw_references(axes: Axes, planned: Sequence[Path2]) -> None:
+    """Draw planned paths, equal ones once."""
+    from matplotlib.collections import LineCollection
+
+    lines = [path[::_EVERY, :2] for path in {path.tobytes(): path for path in planned}.values()]
+    axes.add_collection(
+        LineCollection(lines, colors=INK, linewidths=0.5, linestyles=[_DASHES], alpha=_PALE, zorder=2.7),
+        autolim=False,
+    )
 
 
 def _dress(axes: Axes, box: tuple[Range, Range], first: bool) -> None:

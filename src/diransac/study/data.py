@@ -21,7 +21,7 @@ from diransac.model.plant import Plant
 from diransac.study.assessment import pseudo_true_parameters
 from diransac.study.library import load
 from diransac.study.plants import PlantChoice
-from diransac.study.specification import FlightChoice, Study
+from diransac.study.specification import ControlChoice, FlightChoice, Study
 from diransac.study.tables import check_whole
 
 __all__ = [
@@ -111,7 +111,7 @@ def _flights(study: Study, seeds: Sequence[int]) -> list[Log | Exception]:
     """The recorded flight of each trial, or its error; all trials share one where nothing is drawn."""
     data, plant = study.data, study.plant.plant
     different = seeds if data.is_drawn or study.plant.is_drawn else seeds[:1]
-    key = json.dumps(study.plant.to_dict()), json.dumps(data.to_dict())
+    key = json.dumps(study.plant.to_dict()), json.dumps(data.to_dict()), json.dumps(study.control.to_dict())
     steering = [_steering(*key, derived_seed(seed, "data plan") if data.is_drawn else 0) for seed in different]
     steered = {k: one for k, one in enumerate(steering) if isinstance(one, Controller)}
     drawn = [derived_seed(different[k], "data flight") for k in steered]
@@ -121,11 +121,13 @@ def _flights(study: Study, seeds: Sequence[int]) -> list[Log | Exception]:
 
 
 @lru_cache(maxsize=64)
-def _steering(plant: str, data: str, seed: int) -> Controller | Exception:
+def _steering(plant: str, data: str, control: str, seed: int) -> Controller | Exception:
     """The controller of the recorded flight, or its error; trials and levels with the same plan share it."""
     known, flight = PlantChoice.from_dict(json.loads(plant)).plant, FlightChoice.from_dict(json.loads(data))
+    steering = ControlChoice.from_dict(json.loads(control))
     try:
-        return tvlqr(known, flight.planned(known, seed, time_limit=PLANNING_TIME_LIMIT))
+        plan = flight.planned(known, seed, time_limit=PLANNING_TIME_LIMIT)
+        return steering.limited(tvlqr(known, plan, **steering.weights))
     except Exception as error:  # noqa: BLE001  the rows of every trial that needs it say what it was
         return error
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from diransac.errors import SettingsError, StudyError
 from diransac.plain_data import json_data
+from diransac.study.specification import planned_path
 from diransac.study.store import Store, damage, quoted, whole, word
 from diransac.text_table import aligned
 
@@ -102,8 +103,18 @@ def about(store: str | Path) -> dict[str, str]:
         return kept.about
 
 
-def paths(store: str | Path, trajectory: str) -> dict[tuple[str, int, str], npt.NDArray[np.float32]]:
+def paths(
+    store: str | Path, trajectory: str, *, planned: bool = False
+) -> dict[tuple[str, int, str], npt.NDArray[np.float32]]:
     """Flown paths (K, n_q), coordinates in their units, by level, trial and method.
+
+    Parameters
+    ----------
+    store : str or Path
+    trajectory : str
+        Name of the mission.
+    planned : bool
+        The references of these flights instead, which were planned with what the method had identified.
 
     Raises
     ------
@@ -112,10 +123,10 @@ def paths(store: str | Path, trajectory: str) -> dict[tuple[str, int, str], npt.
     """
     with Store.existing(store) as kept:
         rows = kept.select("SELECT level, trial, method, paths FROM trials WHERE paths NOT NULL ORDER BY rowid")
-    found = {}
+    found, key = {}, planned_path(trajectory) if planned else trajectory
     with damage(Path(store)):
         for level, trial, method, packed in rows:
-            path = _unpacked(packed, trajectory)
+            path = _unpacked(packed, key)
             if path is not None:
                 found[level, trial, method] = path
     return found

@@ -24,8 +24,16 @@ from diransac.flight.noise import Noise
 from diransac.flight.planning import multisine, random_waypoints, sine, square, star
 from diransac.flight.planning.trajectories import MAX_DURATION, check_fully_actuated, check_plane
 from diransac.flight.trajectory import Trajectory
+from diransac.flight.tvlqr import Controller, check_weights
 from diransac.identification.method import Method
-from diransac.identification.methods import METHODS, default_options, factory
+from diransac.identification.methods import (
+    ESTIMATORS,
+    METHODS,
+    WITH_ESTIMATOR,
+    default_options,
+    estimator_named,
+    factory,
+)
 from diransac.identification.settings import Settings
 from diransac.model import Model
 from diransac.model.plant import ModelWithParameters
@@ -50,7 +58,8 @@ from diransac.study.tables import (
 )
 
 __all__ = [
-    "MISSIONS", "TRAJECTORIES", "TRUE", "Criteria", "FlightChoice", "MethodChoice", "Study",
+    "MISSIONS", "TRAJECTORIES", "TRUE", "ControlChoice", "Criteria", "FlightChoice", "MethodChoice", "Missions",
+    "Study", "planned_path",
 ]  # fmt: skip
 
 TRUE = "true"
@@ -68,11 +77,20 @@ TRAJECTORIES: dict[str, Callable[..., Trajectory]] = {
 }
 """Trajectories that may be flown for data."""
 
+
+def planned_path(mission: str) -> str:
+    """Key of a mission's planned paths, beside that of the flown ones, which is its name."""
+    return f"{mission} planned"
+
+
 _LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _+()/-]*")
-_VARIABLE = ("plant", "data", "noise", "methods")
+_VARIABLE = ("plant", "data", "noise", "methods", "missions", "control")
 """Tables that an axis may change; the others are the same at every level."""
 
 _NO_ANSWER_CHANGES = ("threads", "batch_size")
+
+_OWN_ESTIMATOR = "default"
+"""Word for the estimator that a method chooses."""
 
 
 # Tables of a study ----------------------------------------------------------------------------------------------------
@@ -103,13 +121,7 @@ class FlightChoice(FunctionTable):
         if "trajectory" not in info.data:
             return given
         function, keys = TRAJECTORIES[info.data["trajectory"]], ["trajectory", "substeps"]
-        arguments = function_arguments(function, given, "data", keys, random="seed")
-        for name, value in arguments.items():
-            if name != "seed" and is_number(value) and value <= 0:
-                raise SettingsError(f"data.{name} is {value:g}; give a number above 0")
-            if name == "duration" and value > MAX_DURATION:
-                raise SettingsError(f"data.duration is {value:g}; give {MAX_DURATION:g} s or less")
-        return arguments
+        return _trajectory_arguments(function, given, "data", keys)
 
     @property
     def is_drawn(self) -> bool:
@@ -137,6 +149,85 @@ class FlightChoice(FunctionTable):
         return function(plant, **arguments, **(options if takes_options(function) else {}))
 
 
+def _trajectory_arguments(
+    function: Callable[..., Trajectory], given: Mapping[str, Any], place: str, keys: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Arguments of a trajectory's function from a table, completed and checked; ``keys`` are others of that table."""
+    arguments = function_arguments(function, given, place, keys, random="seed")
+    for name, value in arguments.items():
+        if name != "seed" and is_number(value) and value <= 0:
+            raise SettingsError(f"{place}.{name} is {value:g}; give a number above 0")
+        if name == "duration" and value > MAX_DURATION:
+            raise SettingsError(f"{place}.duration is {value:g}; give {MAX_DURATION:g} s or less")
+    return arguments
+
+
+class Missions(Table):
+    """The trajectories that estimates are evaluated on, the table ``[missions]``: a table of arguments for each.
+
+    Parameters
+    ----------
+    square, star, sine : arguments of the function of that name, by name, defaults included
+
+    Raises
+    ------
+    SettingsError
+        An unknown mission or key, a value of another kind, a number that is not above 0.
+    """
+
+    PLACE: ClassVar[str] = "missions"
+
+    square: dict[str, Any] = Field({}, validate_default=True, description="a table")
+    star: dict[str, Any] = Field({}, validate_default=True, description="a table")
+    sine: dict[str, Any] = Field({}, validate_default=True, description="a table")
+
+    @field_validator("square", "star", "sine")
+    @classmethod
+    def _complete(cls, given: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        assert info.field_name is not None
+        return _trajectory_arguments(MISSIONS[info.field_name], given, f"missions.{info.field_name}")
+
+    def planned(self, mission: str, plant: ModelWithParameters, **options: Any) -> Trajectory:
+        """The trajectory of a mission, a key of `MISSIONS`; options of `plan`.  Raises PlanningError: there is none."""
+        return MISSIONS[mission](plant, **getattr(self, mission), **options)
+
+
+_Cost = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)]
+_Weights = _Cost | dict[str, _Cost] | None
+_WANTED_WEIGHTS = "a number, or a table of numbers by name, from 0"
+
+
+class ControlChoice(Table):
+    """Control of every flight, the table ``[control]``.
+
+    Parameters
+    ----------
+    Q, R, Qf : weights of `tvlqr`, a number for all or by name; None: its defaults
+    clip : keep inputs within the limits of the trajectory
+
+    Raises
+    ------
+    SettingsError
+        An unknown key, or a value of another kind.
+    """
+
+    PLACE: ClassVar[str] = "control"
+
+    Q: _Weights = Field(None, description=_WANTED_WEIGHTS)
+    R: _Weights = Field(None, description=_WANTED_WEIGHTS)
+    Qf: _Weights = Field(None, description=_WANTED_WEIGHTS)
+    clip: Flag = True
+
+    @property
+    def weights(self) -> dict[str, Any]:
+        """Weights by the name of their argument of `tvlqr`."""
+        return {"Q": self.Q, "R": self.R, "Qf": self.Qf}
+
+    def limited(self, controller: Controller) -> Controller:
+        """The controller itself, or without limits."""
+        return controller if self.clip else controller.unclipped()
+
+
 @dataclass(frozen=True)
 class MethodChoice:
     """A method of identification with its settings.
@@ -146,11 +237,13 @@ class MethodChoice:
     method : one of `diransac.METHODS`, or ``true``
     settings : of the search and the evaluation
     options : the method's own settings that differ from their defaults, such as those of `diransac.LoDiransac`
+    estimator : of the samples of a RANSAC method, one of `ESTIMATORS`, or ``default``
     """
 
     method: str
     settings: Settings
     options: Mapping[str, Any] = field(default_factory=dict)
+    estimator: str = _OWN_ESTIMATOR
 
     def __post_init__(self) -> None:
         if self.method != TRUE:
@@ -168,12 +261,18 @@ class MethodChoice:
         unknown = [name for name in self.options if name not in own]
         if unknown:
             raise SettingsError(f'there is no option "{unknown[0]}"; there are {", ".join(own) or "none"}')
-        return factory(self.method)(replace(self.settings, threads=1), **self.options)
+        inside = {}
+        if self.estimator != _OWN_ESTIMATOR:
+            if self.method not in WITH_ESTIMATOR:
+                raise SettingsError(f"estimator serves {', '.join(WITH_ESTIMATOR)}, not {self.method}")
+            inside["estimator"] = estimator_named(self.estimator)
+        return factory(self.method)(replace(self.settings, threads=1), **self.options, **inside)
 
     def to_dict(self) -> dict[str, Any]:
         """The table of the method in a study file, with all of its settings and no preset."""
         options = {"options": dict(self.options)} if self.options else {}
-        return {"method": self.method, "settings": self.settings.to_dict(), **options}
+        inside = {} if self.estimator == _OWN_ESTIMATOR else {"estimator": self.estimator}
+        return {"method": self.method, "settings": self.settings.to_dict(), **options, **inside}
 
 
 class _MethodTable(Table):
@@ -183,6 +282,7 @@ class _MethodTable(Table):
     preset: Annotated[Text, OneOf(PRESETS)] = "default"
     settings: dict[str, Any] = Field({}, description="a table")
     options: dict[str, Any] = Field({}, description="a table")
+    estimator: Annotated[Text, OneOf((_OWN_ESTIMATOR, *ESTIMATORS))] = _OWN_ESTIMATOR
 
 
 def _methods(tables: object) -> object:
@@ -206,9 +306,12 @@ def _method(label: str, table: object) -> MethodChoice:
     given = {name: None if x == "none" and name != "refit" else x for name, x in found.settings.items()}
     try:
         settings = Settings.from_dict({**PRESETS[found.preset]().to_dict(), **given})
-        return MethodChoice(found.method, settings, found.options)
     except SettingsError as error:
         raise SettingsError(f"{place}.settings: {error}") from error
+    try:
+        return MethodChoice(found.method, settings, found.options, found.estimator)
+    except SettingsError as error:
+        raise SettingsError(f"{place}: {error}") from error
 
 
 def _noise(table: object) -> Noise:
@@ -233,7 +336,7 @@ class Criteria(Table):
     Parameters
     ----------
     trajectories : planned, steered and flown with what was identified
-    keep_paths : keep the paths of these flights
+    keep_paths : keep the paths of these flights, and those that were planned
     parameters : compare parameters with the pseudo-true ones of the flight that was recorded
     """
 
@@ -269,6 +372,8 @@ class Study(Table):
     noise : of the record
     methods : of identification, by label
     evaluation : of the estimates
+    missions : the trajectories of the evaluation
+    control : of the flight that is recorded, and of those of the evaluation
     axis : the quantity that varies
 
     Raises
@@ -288,19 +393,22 @@ class Study(Table):
         dict[str, Annotated[InstanceOf[MethodChoice], PlainSerializer(MethodChoice.to_dict)]], BeforeValidator(_methods)
     ]
     evaluation: Criteria
+    missions: Missions = Missions.from_dict({})
+    control: ControlChoice = ControlChoice.from_dict({})
     axis: AnyAxis
 
     @model_validator(mode="after")
     def _can_be_flown(self) -> Self:
-        flown = {
-            self.data.trajectory: "data.trajectory",
-            **dict.fromkeys(self.evaluation.trajectories, "evaluation.trajectories"),
-        }
-        for trajectory, key in flown.items():
+        missions = [("evaluation.trajectories", x, getattr(self.missions, x)) for x in self.evaluation.trajectories]
+        for key, trajectory, arguments in [("data.trajectory", self.data.trajectory, self.data.arguments), *missions]:
             try:
-                _check_flown(trajectory, self.plant.plant.model)
+                _check_flown(trajectory, self.plant.plant.model, arguments)
             except SettingsError as error:
                 raise SettingsError(f"{key} has {trajectory!r}: {error}") from error
+        try:
+            check_weights(self.plant.plant.model, **self.control.weights)
+        except SettingsError as error:
+            raise SettingsError(f"control.{error}") from error
         return self
 
     @classmethod
@@ -395,13 +503,25 @@ class Study(Table):
     def configuration(self) -> dict[str, dict[str, Any]]:
         """The values that determine rows, by part and dotted path: ``study``, ``methods.<label>``, ``levels.<text>``.
 
-        The number of trials, names and descriptions do not.
+        The number of trials, names and descriptions do not. Keys that studies did not always have stand here where they
+        differ from their defaults, so that earlier stores remain those of the same study.
         """
         table = self.to_dict()
         if not self.evaluate_parameters:
             del table["evaluation"]["parameters"]
+        if table["noise"]["outliers"] == Noise.outliers:
+            del table["noise"]["outliers"]
+        missions = {name: table["missions"][name] for name in self.evaluation.trajectories}
+        later = {
+            "missions": {name: _changes(name, arguments) for name, arguments in missions.items()},
+            "control": self.control.model_dump(exclude_defaults=True),
+        }
+        if self.data.trajectory in MISSIONS:
+            own = {"trajectory": self.data.trajectory, "substeps": self.data.substeps}
+            given = {name: value for name, value in own.items() if value is not None}
+            table["data"] = given | _changes(self.data.trajectory, self.data.arguments)
         decisive = {name: table[name] for name in ("seed", "plant", "data", "noise", "evaluation")}
-        parts = {"study": dict(flat(decisive))}
+        parts = {"study": dict(flat(decisive)) | {path: value for path, value in flat(later) if value != {}}}
         for label, method in table["methods"].items():
             silent = [f"settings.{name}" for name in _NO_ANSWER_CHANGES]
             parts[f"methods.{label}"] = {path: value for path, value in flat(method) if path not in silent}
@@ -409,6 +529,15 @@ class Study(Table):
         return parts | {f"levels.{text}": some for text, some in changes.items()}
 
 
-def _check_flown(trajectory: str, model: Model) -> None:
-    """Raises SettingsError: no model of this structure can fly the trajectory."""
+def _changes(mission: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of a mission that differ from their defaults."""
+    defaults = _trajectory_arguments(MISSIONS[mission], {}, "")
+    return {name: value for name, value in arguments.items() if value != defaults[name]}
+
+
+def _check_flown(trajectory: str, model: Model, arguments: Mapping[str, Any]) -> None:
+    """Raises SettingsError: no model of this structure can fly the trajectory, or it has no such input."""
     (check_fully_actuated if trajectory == "multisine" else check_plane)(model)
+    for name in arguments.get("input_weights", {}):
+        if name not in model.inputs:
+            raise SettingsError(f'input_weights names "{name}"; inputs are {", ".join(model.inputs)}')

@@ -308,7 +308,9 @@ def changed(table: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
         *way, last = path.split(".")
         inner = whole
         for key in way:
-            inner = inner.setdefault(key, {})
+            if inner.get(key) is None:  # what has no value yet may become a table
+                inner[key] = {}
+            inner = inner[key]
             if not isinstance(inner, dict):
                 raise SettingsError(f'"{path}" leads nowhere: {key} is {inner!r:.60}, not a table')
         inner[last] = copy.deepcopy(value)

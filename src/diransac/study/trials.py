@@ -38,7 +38,7 @@ from diransac.study.data import (
     trial_seed,
 )
 from diransac.study.library import load
-from diransac.study.specification import TRAJECTORIES, TRUE, Study
+from diransac.study.specification import TRUE, ControlChoice, Study, planned_path
 
 __all__ = ["STAGES", "run_trials"]
 
@@ -185,7 +185,9 @@ class _Case:
             raise PlanningError(f"{shape}: {error}") from error
         self.figures |= {f"{shape}_{name}": error for name, error in tracking_error(trajectory, log).items()}
         if self.point.study.evaluation.keep_paths:
-            self.paths[shape] = np.column_stack([log[name] for name in self.point.plant.model.coordinates])
+            names = list(self.point.plant.model.coordinates)
+            self.paths[shape] = np.column_stack([log[name] for name in names])
+            self.paths[planned_path(shape)] = trajectory.columns(names)
 
     def row(self) -> dict[str, Any]:
         """The row of the case, by column of the store."""
@@ -209,7 +211,7 @@ def _evaluate(point: _Point, cases: Sequence[_Case], shape: str) -> None:
     """Plan a trajectory with the parameters of each case, and fly it on the plant under feedback."""
     plans = _plans(cases, shape)
     planned = [case for case in cases if id(case) in plans]
-    controllers = _controllers(planned, plans)
+    controllers = _controllers(planned, plans, point.study.control)
     steered = [case for case in planned if id(case) in controllers]
     begin = time.perf_counter()
     seeds = [derived_seed(case.seed, shape) for case in steered]
@@ -242,29 +244,31 @@ def _planned(point: _Point, shape: str, parameters: tuple[float, ...]) -> Trajec
     model = point.plant.model
     plant = Plant(model, dict(zip(model.parameters, parameters, strict=True)))
     try:
-        return TRAJECTORIES[shape](plant, time_limit=PLANNING_TIME_LIMIT)
+        return point.study.missions.planned(shape, plant, time_limit=PLANNING_TIME_LIMIT)
     except DiransacError as error:
         return error
 
 
-def _controllers(cases: Sequence[_Case], plans: dict[int, Trajectory]) -> dict[int, Controller]:
+def _controllers(cases: Sequence[_Case], plans: dict[int, Trajectory], control: ControlChoice) -> dict[int, Controller]:
     """Controller of each case that has one: all in one sweep, or each on its own if that fails."""
     begin = time.perf_counter()
     plants = [case.found for case in cases if case.found is not None]
     try:
-        steering = tvlqr_batch(plants, [plans[id(case)] for case in cases], threads=1)
+        steering = tvlqr_batch(plants, [plans[id(case)] for case in cases], **control.weights, threads=1)
     except Exception:  # noqa: BLE001  it is raised again for the case that it belongs to
-        return _controllers_alone(cases, plans)
+        return _controllers_alone(cases, plans, control)
     _share(cases, "steer", time.perf_counter() - begin)
-    return {id(case): controller for case, controller in zip(cases, steering, strict=True)}
+    return {id(case): control.limited(controller) for case, controller in zip(cases, steering, strict=True)}
 
 
-def _controllers_alone(cases: Sequence[_Case], plans: dict[int, Trajectory]) -> dict[int, Controller]:
+def _controllers_alone(
+    cases: Sequence[_Case], plans: dict[int, Trajectory], control: ControlChoice
+) -> dict[int, Controller]:
     found = {}
     for case in cases:
         assert case.found is not None
         with case.attempt("steer"):
-            found[id(case)] = tvlqr(case.found, plans[id(case)])
+            found[id(case)] = control.limited(tvlqr(case.found, plans[id(case)], **control.weights))
     return found
 
 

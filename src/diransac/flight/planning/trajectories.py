@@ -2,13 +2,13 @@
 
 The paper leaves these choices open; they were fixed before any result was computed:
 
-- a segment lasts as long as its length takes at a mean speed of `MEAN_SPEED`, rounded to rows of 0.01 s;
+- a segment lasts as long as its length takes at a mean speed of 1.6 m/s, rounded to rows of 0.01 s;
 - the plan starts and ends at rest and follows the straight line between waypoints weakly: an error of 1 m costs as much
   as full use of an input (`ROUTE_WEIGHT`). This is a regularisation. Lateral motion costs a rotorcraft almost nothing;
   without the weight several plans have about the same cost, some overshoot by more than 3 m, and the solver and its
   first guess decide which one is found;
-- the sine has two periods of `WAVELENGTH` along x, from the origin, in `SINE_DURATION`; an error of 0.1 m costs as much
-  as full use of an input (`POSITION_WEIGHT`);
+- the sine has two periods of 4 m along x, from the origin, in 12 s; an error of 0.1 m costs as much as full use of an
+  input (`POSITION_WEIGHT`);
 - the inputs of a rotorcraft stay within `ROTORCRAFT_LIMITS`, of which a plan uses the fraction
   `INPUT_LIMIT_FRACTION`, counted from hover: feedback keeps authority for any identified mass.
 """
@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -60,17 +61,6 @@ ROTORCRAFT_LIMITS = {"thrust": (0.0, 5.0), "moment": (-1.0, 1.0)}
 
 INPUT_LIMIT_FRACTION = 0.8
 
-AMPLITUDE = 2.0
-"""m."""
-
-WAVELENGTH = 4.0
-"""m."""
-
-PERIODS = 2
-
-SINE_DURATION = 12.0
-"""s."""
-
 POSITION_WEIGHT = 1.0 / 0.1**2
 """1/(m^2 s)."""
 
@@ -89,17 +79,30 @@ _SMOOTHED_ROWS = 11
 _N_SINES = 5
 """Sines per coordinate."""
 
+_EQUAL: Mapping[str, float] = MappingProxyType({})
+
 InputLimits = Mapping[str, tuple[float, float]]
 
 
 # The paper's evaluation ----------------------------------------------------------------------------------------------
-def square(plant: ModelWithParameters, *, input_limits: InputLimits | None = None, **options: Any) -> Trajectory:
+def square(
+    plant: ModelWithParameters,
+    *,
+    speed: float = MEAN_SPEED,
+    input_weights: Mapping[str, float] = _EQUAL,
+    input_limits: InputLimits | None = None,
+    **options: Any,
+) -> Trajectory:
     """Trajectory from the origin to the four corners of a square of 4 m and back to the first: 5 segments, 12 s.
 
     Parameters
     ----------
     plant : Plant or Result
         With coordinates x and z, m.
+    speed : float
+        Mean speed of each segment, m/s.
+    input_weights : mapping of str to float
+        Cost of full use of an input, 1/s; 1 where not named.
     input_limits : mapping of str to (float, float), optional
         Smallest and largest value of each input, in its unit. By default thrust 0 to 5 N and moment -1 to 1 N for a
         model with these inputs, none for others.
@@ -114,13 +117,13 @@ def square(plant: ModelWithParameters, *, input_limits: InputLimits | None = Non
     Raises
     ------
     SettingsError
-        The model has no coordinates x and z.
+        The model has no coordinates x and z, or an argument has no meaning.
     PlanningError
         There is no such trajectory.
 
     Notes
     -----
-    The duration of each segment is its length over a mean speed of 1.6 m/s. The plan uses 80 % of the range from hover
+    The duration of each segment is its length over the speed. The plan uses 80 % of the range from hover
     to each input limit. Deviations from the straight line between waypoints have a weak cost, 1 m as much as full use
     of an input; without it the problem has several minima of about equal cost.
 
@@ -128,10 +131,18 @@ def square(plant: ModelWithParameters, *, input_limits: InputLimits | None = Non
     ----------
     Dimmig et al. 2023, section V-A.
     """
-    return _at_mean_speed(plant, [(0.0, 0.0), *CORNERS, CORNERS[0]], input_limits, options)
+    options = {"input_weights": input_weights, **options}
+    return _at_mean_speed(plant, [(0.0, 0.0), *CORNERS, CORNERS[0]], speed, input_limits, options)
 
 
-def star(plant: ModelWithParameters, *, input_limits: InputLimits | None = None, **options: Any) -> Trajectory:
+def star(
+    plant: ModelWithParameters,
+    *,
+    speed: float = MEAN_SPEED,
+    input_weights: Mapping[str, float] = _EQUAL,
+    input_limits: InputLimits | None = None,
+    **options: Any,
+) -> Trajectory:
     """Trajectory along the square, back to the origin, and along the square turned by 45 degrees: 11 segments, 25 s.
 
     Parameters, exceptions and choices are those of `square`.
@@ -143,32 +154,68 @@ def star(plant: ModelWithParameters, *, input_limits: InputLimits | None = None,
     half = np.sqrt(0.5)
     turned = [(half * (x - z), half * (x + z)) for x, z in CORNERS]
     first = [(0.0, 0.0), *CORNERS, CORNERS[0], (0.0, 0.0)]
-    return _at_mean_speed(plant, [*first, *turned, turned[0]], input_limits, options)
+    options = {"input_weights": input_weights, **options}
+    return _at_mean_speed(plant, [*first, *turned, turned[0]], speed, input_limits, options)
 
 
-def sine(plant: ModelWithParameters, *, input_limits: InputLimits | None = None, **options: Any) -> Trajectory:
+def sine(
+    plant: ModelWithParameters,
+    *,
+    amplitude: float = 2.0,
+    wavelength: float = 4.0,
+    periods: float = 2.0,
+    duration: float = 12.0,
+    input_weights: Mapping[str, float] = _EQUAL,
+    input_limits: InputLimits | None = None,
+    **options: Any,
+) -> Trajectory:
     """Trajectory along ``z = 2 sin(2 pi x / 4 m)`` over two periods in x, from rest to rest in 12 s.
 
-    Parameters and exceptions are those of `square`. The reference moves along x at constant speed; an error of 0.1 m in
-    x or z costs as much as full use of an input. The plan uses 80 % of the range from hover to each input limit.
+    Parameters
+    ----------
+    plant, input_weights, input_limits, **options
+        As for `square`.
+    amplitude, wavelength : float
+        m.
+    periods : float
+        Number of wavelengths.
+    duration : float
+        s.
+
+    Returns
+    -------
+    Trajectory
+        At 100 Hz, at rest at both ends.
+
+    Raises
+    ------
+    SettingsError, PlanningError
+        As `square`.
+
+    Notes
+    -----
+    The reference moves along x at constant speed; an error of 0.1 m in x or z costs as much as full use of an input.
+    The plan uses 80 % of the range from hover to each input limit.
 
     References
     ----------
     Dimmig et al. 2023, section V-A.
     """
     check_plane(plant.model)
-    speed = PERIODS * WAVELENGTH / SINE_DURATION
+    _check_positive(amplitude=amplitude, wavelength=wavelength, periods=periods, duration=duration)
+    speed = periods * wavelength / duration
 
     def along(time: FloatArray) -> FloatArray:
         return speed * time
 
     def height(time: FloatArray) -> FloatArray:
-        return AMPLITUDE * np.sin(2.0 * np.pi * speed * time / WAVELENGTH)
+        return amplitude * np.sin(2.0 * np.pi * speed * time / wavelength)
 
     fixed: dict[str, Any] = {
         "reference": {"x": along, "z": height},
-        "duration": SINE_DURATION,
+        "duration": duration,
         "state_weights": {"x": POSITION_WEIGHT, "z": POSITION_WEIGHT},
+        "input_weights": input_weights,
     }
     return plan(plant, **fixed, **_limits(plant.model, input_limits), **options)
 
@@ -176,12 +223,14 @@ def sine(plant: ModelWithParameters, *, input_limits: InputLimits | None = None,
 def _at_mean_speed(
     plant: ModelWithParameters,
     points: Sequence[tuple[float, float]],
+    speed: float,
     input_limits: InputLimits | None,
     options: Mapping[str, Any],
 ) -> Trajectory:
-    """Plan through points in the plane, the duration of each segment in proportion to its length."""
+    """Plan through points in the plane at a mean speed, m/s, in each segment."""
+    _check_positive(speed=speed)
     lengths = np.linalg.norm(np.diff(np.array(points), axis=0), axis=1)
-    rows = np.rint(lengths / MEAN_SPEED / TIME_STEP)
+    rows = np.rint(lengths / speed / TIME_STEP)
     return _through(plant, points, TIME_STEP * np.concatenate([[0.0], np.cumsum(rows)]), input_limits, options)
 
 
@@ -398,6 +447,11 @@ def check_numbers(seed: object, duration: float, **values: float) -> None:
         raise SettingsError(f"seed is {seed!r:.60}; give a whole number of at least 0")
     if not TIME_STEP <= duration <= MAX_DURATION:
         raise SettingsError(f"duration is {duration!r:.60}; give {TIME_STEP:g} to {MAX_DURATION:g} s")
+    _check_positive(**values)
+
+
+def _check_positive(**values: float) -> None:
+    """Raise SettingsError unless values are finite and above 0."""
     for name, value in values.items():
         if not 0.0 < value < np.inf:
             raise SettingsError(f"{name} is {value!r:.60}; give a finite number above 0")

@@ -15,7 +15,10 @@ from diransac.identification.settings import EXECUTION, Settings
 if TYPE_CHECKING:
     from diransac.identification.method import Method
 
-__all__ = ["DEFAULT", "METHODS", "WITH_ESTIMATOR", "configured", "default_options", "factory", "setting_names"]
+__all__ = [
+    "DEFAULT", "ESTIMATORS", "METHODS", "WITH_ESTIMATOR", "configured", "default_options", "estimator_named", "factory",
+    "setting_names",
+]  # fmt: skip
 
 _REGISTRY = {
     "ols": "least_squares:ordinary",
@@ -31,6 +34,14 @@ METHODS = tuple(_REGISTRY)
 DEFAULT = "lo-diransac"
 WITH_ESTIMATOR = ("diransac", "i-diransac")
 """Names of the methods with an estimator inside."""
+
+_ESTIMATORS = {
+    "ols": "estimators:OrdinaryLeastSquares",
+    "tls": "estimators:TotalLeastSquares",
+    "nls": "nonlinear:NonlinearLeastSquares",
+}
+ESTIMATORS = tuple(_ESTIMATORS)
+"""Names of these estimators, those of the methods that fit all rows with them."""
 
 
 def factory(name: str) -> Callable[..., Method]:
@@ -52,9 +63,36 @@ def factory(name: str) -> Callable[..., Method]:
     """
     if name not in _REGISTRY:
         raise SettingsError(f'there is no method "{name}"; there are {", ".join(METHODS)}')
-    module, _, attribute = _REGISTRY[name].partition(":")
-    found: Any = getattr(importlib.import_module(f"diransac.identification.methods.{module}"), attribute)
-    return found  # type: ignore[no-any-return]
+    found: Callable[..., Method] = _imported(f"methods.{_REGISTRY[name]}")
+    return found
+
+
+def estimator_named(name: str) -> object:
+    """Estimator for the inside of a RANSAC method.
+
+    Parameters
+    ----------
+    name : str
+        One of `ESTIMATORS`.
+
+    Returns
+    -------
+    Estimator
+
+    Raises
+    ------
+    SettingsError
+        There is no estimator of that name; the message lists all.
+    """
+    if name not in _ESTIMATORS:
+        raise SettingsError(f'there is no estimator "{name}"; there are {", ".join(ESTIMATORS)}')
+    return _imported(_ESTIMATORS[name])()
+
+
+def _imported(place: str) -> Any:
+    """An attribute of a module of this package, by ``module:attribute``."""
+    module, _, attribute = place.partition(":")
+    return getattr(importlib.import_module(f"diransac.identification.{module}"), attribute)
 
 
 def default_options(name: str) -> Mapping[str, Any]:
