@@ -43,6 +43,8 @@ from diransac.cli.robot_options import LimbResults, RobotOptions, of_limb
 from diransac.cli.views import CacheState, Equations, ModelList, Recorded, compare_methods
 from diransac.data.readers import read_fields, read_topics
 from diransac.data.suggested_mapping import suggest_mapping
+from diransac.errors import SettingsError
+from diransac.export import FORMATS, format_of
 from diransac.identification.identify import identify
 from diransac.identification.inspection import inspect
 from diransac.identification.methods import DEFAULT, METHODS
@@ -304,18 +306,31 @@ def _design(
 @app.command("export")
 def _export(
     models: Annotated[list[Path], typer.Argument(metavar="MODEL.json...", help="What identify saved, of each limb.")],
-    into: Annotated[Path, typer.Option("--into", metavar="FILE.xml|FILE.urdf", help="The robot's description.")],
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", parser=output_file, metavar="FILE", help="Where to write the calibrated one."),
+        typer.Option(
+            "--output", "-o", parser=output_file, metavar="FILE", help="Where to write it; the ending names the format."
+        ),
     ],
+    into: Annotated[
+        Path | None, typer.Option("--into", metavar="FILE.xml|FILE.urdf", help="A robot's description to calibrate.")
+    ] = None,
+    to: Annotated[
+        str | None, typer.Option("--to", metavar="FORMAT", help=f"One of {', '.join(FORMATS)}, if not by the ending.")
+    ] = None,
 ) -> None:
-    """Write a robot's description with the identified values in it."""
+    """Write an identified model for other programs, or a robot's description with the identified values in it."""
+    try:
+        chosen = format_of(output, to)
+    except SettingsError as error:
+        raise typer.BadParameter(str(error)) from error
+    if len(models) > 1 and into is None:
+        raise typer.BadParameter("several models are limbs of a robot; give its description, --into FILE")
     with staged([output], [*models, into]) as (written,):
         results = [Result.load(path) for path in models]
         left_out = list[str]()
         for k, result in enumerate(results):
-            left_out += result.export(written, into=written if k else into)
+            left_out += result.export(written, written if k else into, to=chosen)
     typer.echo(f"wrote {output}")
     if left_out:
         typer.echo(f"without {', '.join(left_out)}: not identifiable, or the format has no place for them")

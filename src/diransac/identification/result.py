@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,11 +26,16 @@ from diransac.model import Model
 from diransac.plain_data import json_data, read_text
 from diransac.text_table import aligned, telling_digits
 
+if TYPE_CHECKING:
+    from diransac.export import PortableModel
+
 __all__ = ["MARKS", "Result"]
 
 _FORMAT = 7
 _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
+_N_EXPORTED = 1000
+"""Draws of the parameters in a YAML file."""
 MARKS = {"bad": "!", "care": "·"}
 """Marks of the findings that are printed."""
 
@@ -241,33 +246,62 @@ class Result:
         )
         return dict(zip(self.parameters, draws, strict=True))
 
-    def export(self, path: str | Path, *, into: str | Path) -> tuple[str, ...]:
-        """Write a robot's description with the estimates in it, atomically.
+    def export(self, path: str | Path, into: str | Path | None = None, *, to: str | None = None) -> tuple[str, ...]:
+        """Write the model for other programs, atomically; the ending of the file names the format.
 
-        The file is that of ``into`` but for the values that were identified. Parameters of joints are the estimates;
-        inertials are the physically consistent ones nearest to those of the description, of all that explain the
-        estimated base parameters. What is not identifiable stays as it is.
+        =====================  =============================================================================
+        ``dynamics.c``         C99 without allocation: state derivative and Runge-Kutta step
+        ``dynamics.py``        the same in Python with NumPy, vectorised over leading axes
+        ``dynamics.casadi``    serialised CasADi function with an argument for each parameter
+        ``model.yaml``         estimates, standard errors, covariance, 1000 draws, delay and lag of the inputs
+        ``.xml``, ``.urdf``    robot description of ``into`` with the estimates in it
+        =====================  =============================================================================
+
+        A description is that of ``into`` but for the values that were identified. Parameters of joints are the
+        estimates; inertials are the physically consistent ones nearest to those of the description, of all that explain
+        the estimated base parameters. What is not identifiable stays as it is there.
 
         Parameters
         ----------
         path : str or Path
             File to be written.
-        into : str or Path
-            MJCF or URDF file from which `diransac.models.robot` made the model.
+        into : str or Path, optional
+            MJCF or URDF file from which `diransac.models.robot` made the model; for a description only.
+        to : str, optional
+            Format, "c", "python", "casadi", "yaml", "mjcf" or "urdf"; by default that of the ending.
 
         Returns
         -------
         tuple of str
-            Names of the parameters that are not in the file: those that are not identifiable, and those for which the
-            format has no place, such as the bias of an encoder.
+            Names of the parameters that are not in the file: those of which a description has no value, because they
+            are not identifiable, or the format has no place for them, such as the bias of an encoder.
 
         Raises
         ------
+        SettingsError
+            There is no such format, or ``into`` is missing or has no use.
         ModelError
-            The description cannot be read, or is not that of the model.
+            The description cannot be read, or is not that of the model; the format lacks an operation of the equations.
         ResultError
             The file cannot be written.
         """
+        from diransac.export import format_of, write_model
+
+        chosen = format_of(path, to)
+        if chosen in ("mjcf", "urdf"):
+            if into is None:
+                raise SettingsError(f"{chosen} is a robot's description with the estimates in it; give it, as into=")
+            return self._export_description(path, into)
+        if into is not None:
+            raise SettingsError(f'"{into}" has no use: only mjcf and urdf are written into a description')
+        try:
+            write_model(self._portable(), path, chosen)
+        except OSError as error:
+            raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
+        return ()
+
+    def _export_description(self, path: str | Path, into: str | Path) -> tuple[str, ...]:
+        """Write a description; return the parameters that are not in it."""
         from diransac.model.robots.calibration import calibrated
 
         found = self.parameters.items()
@@ -275,6 +309,25 @@ class Result:
         text, left_out = calibrated(into, self.model.parameters, values, self.covariance)
         _write(path, text)
         return left_out
+
+    def _portable(self) -> PortableModel:
+        """The model as it is exported; without draws where a parameter has no finite variance."""
+        from diransac.export import PortableModel
+
+        try:
+            samples = self.sample(_N_EXPORTED)
+        except ResultError:
+            samples = {}
+        resolution = self.estimate.resolution
+        return PortableModel(
+            self.model,
+            self.parameters,
+            self.standard_errors,
+            self.covariance,
+            samples,
+            resolution.timing,
+            resolution.hold,
+        )
 
     @property
     def violations(self) -> tuple[str, ...]:

@@ -1,0 +1,13 @@
+"""Identified models as files for other programs: C, Python, CasADi and YAML.
+
+| file | contents |
+|---|---|
+| `portable.py` | `PortableModel`: what is written of a model, and its description in words |
+| `statements.py` | expression graph of a function as assignments in C or Python |
+| `formats.py` | the text of each format, and the formats by the endings of files |
+"""
+
+from diransac.export.formats import FORMATS, format_of, write_model
+from diransac.export.portable import PortableModel
+
+__all__ = ["FORMATS", "PortableModel", "format_of", "write_model"]
