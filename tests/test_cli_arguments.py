@@ -184,3 +184,8 @@ def test_models_shows_equations_bounds_and_units_of_one(folder: Path):
     assert "0 = " in shown
     assert "N s^2/m^2" in shown
     assert "0 < value" in shown
+
+
+def test_completion_is_installed_by_the_command_itself_and_by_no_part_of_it():
+    assert "--install-completion" in run("--help").stdout
+    assert "completion" not in run("study", "--help").stdout

@@ -61,7 +61,6 @@ app = typer.Typer(
     help="Turn a messy log of a moving machine into a dynamical model, and say how far it can be trusted.",
     invoke_without_command=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
 )
 
 

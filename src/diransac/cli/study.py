@@ -27,7 +27,9 @@ from diransac.text_table import aligned
 
 __all__ = ["study"]
 
-study = typer.Typer(name="study", help="Run grids of Monte-Carlo trials, such as the paper's figures.")
+study = typer.Typer(
+    name="study", add_completion=False, help="Run grids of Monte-Carlo trials, such as the paper's figures."
+)
 
 StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="Store of study run.")]
 
