@@ -100,9 +100,7 @@ OptionalLogOutput = Annotated[
 ]
 FlightPicture = Annotated[
     Path | None,
-    typer.Option(
-        "--plot", parser=_picture_file, metavar="FILE.png", help="Figure of the flight, without noise, to write."
-    ),
+    typer.Option("--plot", parser=_picture_file, metavar="FILE.png", help="Figure to write, of signals without noise."),
 ]
 FlightSeed = Annotated[int, typer.Option("--seed", min=0, help="Seed of flight and noise.")]
 

@@ -151,11 +151,15 @@ class Result:
 
     def parameters_in(self, log: Log) -> dict[str, float]:
         """Parameters that hold in a log: per-log ones of that log if it was identified from, else their mean."""
-        known = [(one.fingerprint, one.prepared_fingerprint) for one in self.logs]
-        index = next((i for i, own in enumerate(known) if log.fingerprint in own), None)
+        index = self.index_of(log)
         if index is None:
             return self.parameters
         return {**self.parameters, **{name: values[index] for name, values in self.per_log.items()}}
+
+    def index_of(self, log: Log) -> int | None:
+        """Index of a log among those identified from; None if it is not one of them."""
+        known = [(one.fingerprint, one.prepared_fingerprint) for one in self.logs]
+        return next((i for i, own in enumerate(known) if log.fingerprint in own), None)
 
     @property
     def per_log_standard_errors(self) -> dict[str, tuple[float, ...]]:
