@@ -252,13 +252,11 @@ class Result:
     def export(self, path: str | Path, into: str | Path | None = None, *, to: str | None = None) -> tuple[str, ...]:
         """Write the model for other programs, atomically; the ending of the file names the format.
 
-        =====================  =============================================================================
-        ``dynamics.c``         C99 without allocation: state derivative and Runge-Kutta step
-        ``dynamics.py``        the same in Python with NumPy, vectorised over leading axes
-        ``dynamics.casadi``    serialised CasADi function with an argument for each parameter
-        ``model.yaml``         estimates, standard errors, covariance, 1000 draws, delay and lag of the inputs
-        ``.xml``, ``.urdf``    robot description of ``into`` with the estimates in it
-        =====================  =============================================================================
+        - ``dynamics.c``: C99 without allocation, the derivative of the state and a Runge-Kutta step
+        - ``dynamics.py``: the same in Python with NumPy, over leading axes
+        - ``dynamics.casadi``: serialised CasADi function with an argument for each parameter
+        - ``model.yaml``: estimates, standard errors, covariance, 1000 draws, delay and lag of the inputs
+        - ``.xml``, ``.urdf``: the robot description ``into`` with the estimates in it
 
         A description is that of ``into`` but for the values that were identified. Parameters of joints are the
         estimates; inertials are the physically consistent ones nearest to those of the description, of all that explain
