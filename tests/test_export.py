@@ -194,6 +194,14 @@ def test_equations_without_a_form_in_a_language_leave_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_parameter_that_hides_an_argument_is_refused(tmp_path):
+    model = dr.Model("m", {"x": "m"}, {"u": "N"}, {"state": dr.Parameter("kg", positive=True)}, lambda q, v, a, u, p: [
+        p.state * a.x - u.u
+    ])  # fmt: skip
+    with pytest.raises(ModelError, match="named state or inputs"):
+        write_model(portable(model), tmp_path / "dynamics.casadi", "casadi")
+
+
 def test_export_from_the_command_line(result, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result.save("model.json")

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac import LoDiransac
     from diransac.identification.methods.ransac import Diransac, IDiransac
     from diransac.identification.nonlinear import NonlinearLeastSquares
+    from diransac.identification.open_loop import simulate
     from diransac.identification.result import Result
     from diransac.identification.settings import Settings
     from diransac.identification.suggestions import Suggestion
@@ -123,6 +124,7 @@ __all__ = [
     "scale",
     "sensors",
     "shift",
+    "simulate",
     "sine",
     "square",
     "star",
@@ -161,6 +163,7 @@ _FOUND_IN = {
     "identification.methods.lo_diransac": ("LoDiransac",),
     "identification.methods.ransac": ("Diransac", "IDiransac"),
     "identification.nonlinear": ("NonlinearLeastSquares",),
+    "identification.open_loop": ("simulate",),
     "identification.result": ("Result",),
     "identification.settings": ("Settings",),
     "identification.suggestions": ("Suggestion",),

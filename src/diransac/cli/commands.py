@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from diransac.cli import screen
-from diransac.cli.arguments import load_model, model_file
+from diransac.cli.arguments import load_model, model_file, numbers
 from diransac.cli.design import DesignedModel, DesignOptions, designed, source_of
 from diransac.cli.flight_options import (
     FlightPicture,
@@ -48,6 +48,7 @@ from diransac.export import FORMATS, format_of
 from diransac.identification.identify import identify
 from diransac.identification.inspection import inspect
 from diransac.identification.methods import DEFAULT, METHODS
+from diransac.identification.open_loop import simulate
 from diransac.identification.result import Result
 from diransac.identification.validation import cross_validate, validate
 from diransac.simulation.compiler.code_cache import CodeCache
@@ -168,6 +169,36 @@ def _validate(
     result, derivation = Result.load(model), preparation.completed(derivation)
     logs = [derivation.derive(log, result.model) for log in preparation.read_all(files)]
     screen.show(validate(result, logs, horizon), as_json)
+
+
+@app.command("predict")
+@grouped
+def _predict(
+    model: ResultFile,
+    file: LogFile,
+    output: LogOutput,
+    derivation: Derivation,
+    preparation: Preparation,
+    horizon: Annotated[
+        float | None, typer.Option(metavar="S", help="Restart from the log's states after so long.")
+    ] = None,
+    initial: Annotated[
+        list[str] | None, typer.Option("--initial", metavar="NAME=VALUE,...", help="Initial states: x=0,x_dot=0.")
+    ] = None,
+    plot: FlightPicture = None,
+) -> None:
+    """Simulate an identified model over the inputs of a log, and write the simulated signals."""
+    start = numbers("--initial", initial) if initial else None
+    with staged([output, plot], [model, file]) as (written, picture):
+        result = Result.load(model)
+        log = derivation.derive(preparation.read(file), result.model)
+        simulated = simulate(result, log, initial_state=start, horizon=horizon)
+        simulated.write(written)
+        if plot:
+            from diransac.plots.prediction import plot_prediction
+
+            plot_prediction(simulated, log, result.model.state, tuple(result.model.inputs), picture)
+    typer.echo("\n".join([f"wrote {output}: {len(simulated)} rows", *simulated.notes]))
 
 
 @app.command("cross-validate")

@@ -101,7 +101,10 @@ OptionalLogOutput = Annotated[
 FlightPicture = Annotated[
     Path | None,
     typer.Option(
-        "--plot", parser=_picture_file, metavar="FILE.png", help="Figure of the flight, without noise, to write."
+        "--plot",
+        parser=_picture_file,
+        metavar="FILE.png",
+        help="Figure to write: .png, .svg or .pdf; of flights, without noise.",
     ),
 ]
 FlightSeed = Annotated[int, typer.Option("--seed", min=0, help="Seed of flight and noise.")]

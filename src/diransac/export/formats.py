@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from diransac.atomic import write_text, write_with
-from diransac.errors import SettingsError
+from diransac.errors import ModelError, SettingsError
 from diransac.export.portable import PortableModel
 from diransac.export.statements import PYTHON, C, statements
 
@@ -227,12 +227,17 @@ def python_source(model: PortableModel) -> str:
 def casadi_function(model: PortableModel) -> ca.Function:
     """Function ``(state, inputs, NAME=estimate, ...) -> derivative``, an argument for each parameter."""
     x, u = ca.SX.sym("x", len(model.model.state)), ca.SX.sym("u", model.model.n_u)
+    arguments = ["state", "inputs", *model.parameters]
+    if len(set(arguments)) < len(arguments):
+        raise ModelError(
+            "a parameter is named state or inputs, as another argument of the CasADi function is; rename it"
+        )
     p = [ca.SX.sym(name) for name in model.parameters]
     return ca.Function(
         model.identifier,
         [x, u, *p],
         [model.model.dynamics(x, u, ca.vertcat(*p))[0]],
-        ["state", "inputs", *model.parameters],
+        arguments,
         ["derivative"],
         {"default_in": [0.0, 0.0, *model.parameters.values()]},
     )

@@ -152,11 +152,15 @@ class Result:
 
     def parameters_in(self, log: Log) -> dict[str, float]:
         """Parameters that hold in a log: per-log ones of that log if it was identified from, else their mean."""
-        known = [(one.fingerprint, one.prepared_fingerprint) for one in self.logs]
-        index = next((i for i, own in enumerate(known) if log.fingerprint in own), None)
+        index = self.index_of(log)
         if index is None:
             return self.parameters
         return {**self.parameters, **{name: values[index] for name, values in self.per_log.items()}}
+
+    def index_of(self, log: Log) -> int | None:
+        """Index of a log among those identified from; None if it is not one of them."""
+        known = [(one.fingerprint, one.prepared_fingerprint) for one in self.logs]
+        return next((i for i, own in enumerate(known) if log.fingerprint in own), None)
 
     @property
     def per_log_standard_errors(self) -> dict[str, tuple[float, ...]]:
@@ -249,13 +253,11 @@ class Result:
     def export(self, path: str | Path, into: str | Path | None = None, *, to: str | None = None) -> tuple[str, ...]:
         """Write the model for other programs, atomically; the ending of the file names the format.
 
-        =====================  =============================================================================
-        ``dynamics.c``         C99 without allocation: state derivative and Runge-Kutta step
-        ``dynamics.py``        the same in Python with NumPy, vectorised over leading axes
-        ``dynamics.casadi``    serialised CasADi function with an argument for each parameter
-        ``model.yaml``         estimates, standard errors, covariance, 1000 draws, delay and lag of the inputs
-        ``.xml``, ``.urdf``    robot description of ``into`` with the estimates in it
-        =====================  =============================================================================
+        - ``dynamics.c``: C99 without allocation, the derivative of the state and a Runge-Kutta step
+        - ``dynamics.py``: the same in Python with NumPy, over leading axes
+        - ``dynamics.casadi``: serialised CasADi function with an argument for each parameter
+        - ``model.yaml``: estimates, standard errors, covariance, 1000 draws, delay and lag of the inputs
+        - ``.xml``, ``.urdf``: the robot description ``into`` with the estimates in it
 
         A description is that of ``into`` but for the values that were identified. Parameters of joints are the
         estimates; inertials are the physically consistent ones nearest to those of the description, of all that explain

@@ -17,10 +17,11 @@ from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.identification.driven_states import DrivenStates, least_squares
 from diransac.identification.estimate import Resolution
 from diransac.identification.evaluation import Simulation
-from diransac.identification.identify import checked_hold, identify
+from diransac.identification.identify import identify
 from diransac.identification.inverse_dynamics import force_errors
 from diransac.identification.method import Callback, Method, within
 from diransac.identification.methods import DEFAULT
+from diransac.identification.open_loop import resolution_of
 from diransac.identification.result import Result
 from diransac.model.plant import ModelWithParameters, as_plant
 from diransac.text_table import aligned
@@ -182,13 +183,7 @@ def validate(
     if horizon is not None and not isinstance(horizon, (int, float, np.number)):
         raise SettingsError(f"horizon is {horizon!r:.60}; give seconds")
     known = as_plant(plant)
-    fitted = plant.estimate.resolution if isinstance(plant, Result) else Resolution()
-    resolution = Resolution(
-        integrator or fitted.integrator,
-        substeps or fitted.substeps,
-        checked_hold(input_hold) or fitted.hold,
-        fitted.timing,
-    )
+    resolution = resolution_of(plant, integrator, substeps, input_hold)
     dataset = Dataset.of(known.model, several, pointwise=False)
     own = [plant.parameters_in(log) if isinstance(plant, Result) else known.parameters for log in several]
     predictions = [_OpenLoop(dataset, i, parameters, resolution) for i, parameters in enumerate(own)]

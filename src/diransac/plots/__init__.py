@@ -3,6 +3,7 @@
 | file | content |
 |---|---|
 | `flight.py` | `plot_flight`: path, states and inputs of flights |
+| `prediction.py` | simulated signals beside the measured ones |
 | `study.py` | tracking errors and failures of a study, by level and method |
 | `estimates.py` | parameter errors of a study |
 | `paths.py` | flown paths of a study |
