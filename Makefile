@@ -26,8 +26,8 @@ lint: $(ENVIRONMENT)
 bench: $(ENVIRONMENT)  ## measured figures; each benchmark prints its table
 	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
 
-docs: $(ENVIRONMENT)
-	$(BIN)/mkdocs build --strict --quiet --site-dir out/site
+docs: $(ENVIRONMENT)  ## the pages; --quiet would let warnings pass
+	$(BIN)/mkdocs build --strict --site-dir out/site
 
 coverage: $(ENVIRONMENT)
 	$(BIN)/pytest -q --cov --cov-report=term
