@@ -85,7 +85,10 @@ def estimator_named(name: str) -> object:
         There is no estimator of that name; the message lists all.
     """
     if name not in _ESTIMATORS:
-        raise SettingsError(f'there is no estimator "{name}"; there are {", ".join(ESTIMATORS)}')
+        raise SettingsError(
+            f"estimator is {name!r:.60}; give {', '.join(ESTIMATORS)}, an estimator such as dr.TotalLeastSquares(), or a "
+            "scikit-learn linear regressor"
+        )
     return _imported(_ESTIMATORS[name])()
 
 
