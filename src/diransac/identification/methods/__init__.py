@@ -86,7 +86,7 @@ def estimator_named(name: str) -> object:
     """
     if name not in _ESTIMATORS:
         raise SettingsError(
-            f"estimator is {name!r:.60}; give {', '.join(ESTIMATORS)}, an estimator such as dr.TotalLeastSquares(), or a "
+            f"estimator is {name!r:.60}; give {', '.join(ESTIMATORS)}, an object such as dr.TotalLeastSquares(), or a "
             "scikit-learn linear regressor"
         )
     return _imported(_ESTIMATORS[name])()
