@@ -358,15 +358,15 @@ def main() -> None:
                 gaps(summary, shape)
                 flatness(summary, shape)
         parameters(given.stores / f"{name}.db")
-    if given.only:
-        return
-    print("\n## Without studies")
-    show_gamma()
-    show_wrong_start()
-    show_excitation()
-    show_conventions()
-    print("\n## Time")
-    show_time(found, wall)
+    if not given.only:
+        print("\n## Without studies")
+        show_gamma()
+        show_wrong_start()
+        show_excitation()
+        show_conventions()
+    if found.keys() & set(FIGURES):
+        print("\n## Time")
+        show_time(found, wall)
 
 
 if __name__ == "__main__":
