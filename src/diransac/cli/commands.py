@@ -42,13 +42,10 @@ from diransac.cli.outputs import PAGE, RESULT, check_ending, checked, staged
 from diransac.cli.robot_options import LimbResults, RobotOptions, of_limb
 from diransac.cli.views import CacheState, Equations, ModelList, Recorded, compare_methods
 from diransac.data.readers import read_fields, read_topics
-from diransac.data.suggested_mapping import suggest_mapping
 from diransac.errors import SettingsError
-from diransac.export import FORMATS, format_of
 from diransac.identification.identify import identify
 from diransac.identification.inspection import inspect
 from diransac.identification.methods import DEFAULT, METHODS
-from diransac.identification.open_loop import simulate
 from diransac.identification.result import Result
 from diransac.identification.validation import cross_validate, validate
 from diransac.simulation.compiler.code_cache import CodeCache
@@ -188,6 +185,8 @@ def _predict(
     plot: FlightPicture = None,
 ) -> None:
     """Simulate an identified model over the inputs of a log, and write the simulated signals."""
+    from diransac.identification.open_loop import simulate
+
     start = numbers("--initial", initial) if initial else None
     with staged([output, plot], [model, file]) as (written, picture):
         result = Result.load(model)
@@ -254,6 +253,8 @@ def _map(
     as_json: JsonFlag = False,
 ) -> None:
     """Write a first guess of a mapping from a log's topics or columns to a model's signals."""
+    from diransac.data.suggested_mapping import suggest_mapping
+
     with staged([output], [file, model_file(model)]) as (written,):
         fields, elements = read_fields(file)
         found = suggest_mapping(fields, elements, robot.load(model), f'log "{file}"')
@@ -346,10 +347,12 @@ def _export(
         Path | None, typer.Option("--into", metavar="FILE.xml|FILE.urdf", help="A robot's description to calibrate.")
     ] = None,
     to: Annotated[
-        str | None, typer.Option("--to", metavar="FORMAT", help=f"One of {', '.join(FORMATS)}, if not by the ending.")
+        str | None, typer.Option("--to", metavar="c|python|casadi|yaml|mjcf|urdf", help="Format, if not by the ending.")
     ] = None,
 ) -> None:
     """Write an identified model for other programs, or a robot's description with the identified values in it."""
+    from diransac.export import format_of
+
     try:
         chosen = format_of(output, to)
     except SettingsError as error:

@@ -19,8 +19,6 @@ from diransac.identification.method import Progress
 from diransac.identification.result import Result
 from diransac.model import Model
 from diransac.model.plant import Plant
-from diransac.model.robots import drive_forces
-from diransac.model.robots.actuation import FORCE
 
 if TYPE_CHECKING:
     from diransac.flight.planning import Experiment
@@ -102,6 +100,8 @@ def _of_joints(given: Mapping[str, Any], limbs: Mapping[str, Model]) -> dict[str
 
 def _own(values: Mapping[str, Any], limbs: Mapping[str, Model], limb: str) -> dict[str, Any]:
     """Values of a limb's quantities: those whose names do not belong to another limb."""
+    from diransac.model.robots.actuation import FORCE
+
     models = [model for other, model in limbs.items() if other != limb]
     others = {n for model in models for n in (*model.units, *map(FORCE.format, model.coordinates))}
     return {n: x for n, x in values.items() if n not in others}
@@ -170,6 +170,7 @@ def designed(model: str, robot: RobotOptions, options: DesignOptions) -> Designs
     Raises as `diransac.design_experiment`; typer.BadParameter: an option cannot be read.
     """
     from diransac.flight.planning import design_experiment
+    from diransac.model.robots import drive_forces
 
     assumed, known = numbers("--parameter", options.assignments or ()), dict[str, float]()
     if _is_result(model):

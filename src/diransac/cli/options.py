@@ -13,7 +13,6 @@ import typer
 from diransac.cli.arguments import fixed_parameters, load_methods, load_settings, names, numbers, pairs, prior_pairs
 from diransac.data import preprocessing
 from diransac.data.log import Log
-from diransac.data.mapping import BUILT_IN, load_mapping
 from diransac.data.readers import read_log
 from diransac.data.readers.repair import REPAIRS
 from diransac.errors import LogError, SettingsError
@@ -221,7 +220,7 @@ class Preparation:
 
     mapping: Annotated[
         str | None,
-        _option("--mapping", metavar="NAME|FILE.toml", help=f"Topics to signals; built in: {', '.join(BUILT_IN)}."),
+        _option("--mapping", metavar="NAME|FILE.toml", help="Topics to signals: a file, or px4-multirotor, ..."),
     ] = None
     columns: Annotated[
         str | None, _option("--columns", metavar="NAME,...", help="Names of the columns of a CSV file without header.")
@@ -287,6 +286,8 @@ class Preparation:
         """
         if self.mapping is None:
             return derivation
+        from diransac.data.mapping import load_mapping
+
         mapping = load_mapping(self.mapping)
         bandwidth = derivation.bandwidth if derivation.bandwidth is not None else mapping.option("bandwidth")
         return Derivation(derivation.differentiate or bool(mapping.option("differentiate")), bandwidth)

@@ -6,12 +6,10 @@ import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from diransac.cli.screen import bar
 from diransac.data.log import Log
-from diransac.data.readers import TopicTable
-from diransac.data.suggested_mapping import Coverage, suggest_mapping
 from diransac.errors import DiransacError
 from diransac.identification.identify import identify
 from diransac.identification.method import Method
@@ -20,6 +18,10 @@ from diransac.model import Model, Parameter
 from diransac.model.library import BUILTIN
 from diransac.simulation.compiler.code_cache import CodeCache
 from diransac.text_table import aligned
+
+if TYPE_CHECKING:
+    from diransac.data.readers.topics import TopicTable
+    from diransac.data.suggested_mapping import Coverage
 
 __all__ = ["CacheState", "Comparison", "Equations", "ModelList", "Recorded", "compare_methods"]
 
@@ -243,6 +245,8 @@ class Recorded:
         """Topics, and the coverage of a model."""
         if model is None:
             return cls(topics)
+        from diransac.data.suggested_mapping import suggest_mapping
+
         return cls(topics, suggest_mapping(topics.fields, topics.elements, model, topics.source))
 
     def to_dict(self) -> dict[str, Any]:

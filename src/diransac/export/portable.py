@@ -72,7 +72,7 @@ class PortableModel:
 
     @property
     def remarks(self) -> list[str]:
-        """What a caller must apply to the inputs, a sentence each."""
+        """Duties of a caller towards the inputs, a sentence each."""
         found = [f"In the identification, {_HOLDS[self.hold]}."]
         if self.input_delays:
             delays = ", ".join(f"{n} by {1e3 * x:.3g} ms" for n, x in self.input_delays.items())

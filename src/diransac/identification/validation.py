@@ -18,7 +18,6 @@ from diransac.identification.driven_states import DrivenStates, least_squares
 from diransac.identification.estimate import Resolution
 from diransac.identification.evaluation import Simulation
 from diransac.identification.identify import identify
-from diransac.identification.inverse_dynamics import force_errors
 from diransac.identification.method import Callback, Method, within
 from diransac.identification.methods import DEFAULT
 from diransac.identification.open_loop import resolution_of
@@ -196,6 +195,8 @@ def validate(
     scores = [_pooled(dataset.signals, h, predictions) for h in (*horizons, np.inf)]
     asked = 0 if horizon is not None else len(scores) - 1
     units = {n: known.model.units[n] for n in dataset.signals}
+    from diransac.identification.inverse_dynamics import force_errors  # which needs all of lo-diransac
+
     forces = force_errors(dataset, own, resolution)
     return Validation(dataset.source, units, tuple(scores), asked, dataset.notes, forces)
 

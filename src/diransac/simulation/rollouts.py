@@ -50,7 +50,7 @@ OutputName: TypeAlias = Literal[
     "ScoreOutput", "ErrorOutput", "SignalOutput", "GaussNewtonOutput", "LinearizedErrorOutput", "ClosedLoopOutput"
 ]
 InputName: TypeAlias = Literal["inputs_from_log", "inputs_by_feedback", "inputs_by_shared_feedback"]
-"""What a time loop writes, and where its inputs are from: names in modules that are imported only to emit code."""
+"""Outputs of a time loop and sources of its inputs: names in modules that are imported only to emit code."""
 
 
 def rollouts(

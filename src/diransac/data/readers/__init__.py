@@ -1,7 +1,8 @@
-"""Readers of logs: one module per format, and `read_log` for all formats."""
+"""Readers of logs: one module per format, imported at its first use, and `read_log` for all formats."""
 
 from __future__ import annotations
 
+import importlib
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -13,50 +14,41 @@ from diransac.arrays import FloatArray
 from diransac.data import preprocessing
 from diransac.data.checks import check_clock, check_even, check_names, check_time_order
 from diransac.data.log import Log
-from diransac.data.mapping import LogMapping, load_mapping
 from diransac.data.preprocessing.steps import check_factor, origins_of, rename_columns, resample_columns
-from diransac.data.readers import crazyflie
-from diransac.data.readers.bags import open_bag, open_mcap
-from diransac.data.readers.comma_separated import joined, read_csv, read_csv_gz
-from diransac.data.readers.crazyflie import CrazyflieRecording
-from diransac.data.readers.hdf5 import read_hdf5
-from diransac.data.readers.mat import read_mat
-from diransac.data.readers.npz import read_npz
-from diransac.data.readers.parquet import read_parquet
-from diransac.data.readers.recording import Recording, Samples
+from diransac.data.readers.recording import Samples
 from diransac.data.readers.repair import Repairs
 from diransac.data.readers.table import Table
-from diransac.data.readers.topics import (
-    TopicTable,
-    is_one_table,
-    list_topics,
-    mapped_table,
-    table_of_topics,
-    whole_topic,
-)
-from diransac.data.readers.ulog import UlogRecording
 from diransac.data.units import conversion, split_unit
 from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-__all__ = ["TopicTable", "read_fields", "read_log", "read_topics"]
+    from diransac.data.mapping import LogMapping
+    from diransac.data.readers.recording import Recording
+    from diransac.data.readers.topics import TopicTable
 
-_TABLES: dict[str, Callable[[bytes, str], Table]] = {
-    ".parquet": read_parquet,
-    ".npz": read_npz,
-    ".mat": read_mat,
-    ".h5": read_hdf5,
-    ".hdf5": read_hdf5,
+__all__ = ["read_fields", "read_log", "read_topics"]
+
+_TABLES = {
+    ".parquet": "parquet:read_parquet",
+    ".npz": "npz:read_npz",
+    ".mat": "mat:read_mat",
+    ".h5": "hdf5:read_hdf5",
+    ".hdf5": "hdf5:read_hdf5",
 }
-_TEXTS = {".csv": read_csv, ".csv.gz": read_csv_gz, ".txt": read_csv}
-_RECORDINGS: dict[str, Callable[[Path, str], Recording]] = {
-    ".ulg": UlogRecording,
-    ".ulog": UlogRecording,
-    ".mcap": open_mcap,
-    ".bag": open_bag,
+_TEXTS = {
+    ".csv": "comma_separated:read_csv",
+    ".csv.gz": "comma_separated:read_csv_gz",
+    ".txt": "comma_separated:read_csv",
 }
+_RECORDINGS = {
+    ".ulg": "ulog:UlogRecording",
+    ".ulog": "ulog:UlogRecording",
+    ".mcap": "bags:open_mcap",
+    ".bag": "bags:open_bag",
+}
+"""Ending -> module of this package, and what opens or reads a file there."""
 _ENDINGS = (*_TEXTS, *_TABLES, *_RECORDINGS)
 
 
@@ -117,21 +109,26 @@ def read_log(
     """
     path = Path(path)
     source = f'log "{path}"'
-    chosen = None if mapping is None else load_mapping(mapping)
+    chosen = None if mapping is None else _mapping(mapping)
     repairs = Repairs.of(_given(repair, chosen, "repair"))
     resample = _given(resample, chosen, "resample")
     opened = _opened(path, source, columns, repairs)
     if isinstance(opened, Table):
         table = repairs.in_si(_with_clock(opened, rate, source))
         rename = _stripped(rename, table)
-    elif chosen is None and is_one_table(opened, rename or {}):
-        table = whole_topic(opened, repairs)
     else:
-        table, resample = table_of_topics(opened, chosen, rename or {}, resample, repairs)
-        rename = None
+        from diransac.data.readers.topics import is_one_table, table_of_topics, whole_topic
+
+        if chosen is None and is_one_table(opened, rename or {}):
+            table = whole_topic(opened, repairs)
+        else:
+            table, resample = table_of_topics(opened, chosen, rename or {}, resample, repairs)
+            rename = None
     if rename:
         table = _renamed(table, rename, source)
     if chosen is not None and isinstance(opened, Table):
+        from diransac.data.readers.topics import mapped_table
+
         table = mapped_table(table, chosen, source)
     log = _log(table, scale or {}, resample, repairs, source)
     return log if chosen is None else _prepared(log, chosen)
@@ -146,6 +143,8 @@ def read_topics(path: str | Path) -> TopicTable | None:
     is_folder_of_tables = path.is_dir() and not (path / "metadata.yaml").exists()
     if is_folder_of_tables or _ending(path) in (*_TEXTS, *_TABLES):
         return None
+    from diransac.data.readers.topics import list_topics
+
     opened = _opened(path, f'log "{path}"', None, Repairs())
     return None if isinstance(opened, Table) else list_topics(opened)
 
@@ -159,6 +158,12 @@ def read_fields(path: str | Path) -> tuple[dict[str, tuple[str, ...]], dict[str,
     if isinstance(opened, Table):
         return {"": tuple(name for name in opened.columns if name != "t")}, {}
     return dict(opened.fields), opened.elements
+
+
+def _mapping(mapping: str | Path) -> LogMapping:
+    from diransac.data.mapping import load_mapping
+
+    return load_mapping(mapping)
 
 
 def _given(value: Any, mapping: LogMapping | None, name: str) -> Any:
@@ -228,19 +233,28 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
     ending = _ending(path)
     if ending in _RECORDINGS:
         _check_content(path, source)
-        return _RECORDINGS[ending](path, source)
+        return _imported(_RECORDINGS[ending])(path, source)
     if columns is not None and ending not in _TEXTS:
         raise LogError(f"{source}: names of columns are those of CSV text without a header; leave them out")
     if ending in _TEXTS:
-        return _TEXTS[ending](_content(path, source), source, columns, repairs)
+        return _imported(_TEXTS[ending])(_content(path, source), source, columns, repairs)
     if ending is not None:
-        return _TABLES[ending](_content(path, source), source)
+        return _imported(_TABLES[ending])(_content(path, source), source)
+    from diransac.data.readers.crazyflie import MAGIC, CrazyflieRecording
+
     _check_content(path, source)
     with path.open("rb") as file:
-        is_crazyflie = file.read(1) == crazyflie.MAGIC
+        is_crazyflie = file.read(1) == MAGIC
     if is_crazyflie:
         return CrazyflieRecording(_content(path, source), source)
     raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}')
+
+
+def _imported(place: str) -> Callable[..., Table | Recording]:
+    """The function of a module of this package, by ``module:function``."""
+    module, _, attribute = place.partition(":")
+    found: Callable[..., Table | Recording] = getattr(importlib.import_module(f"{__name__}.{module}"), attribute)
+    return found
 
 
 def _ending(path: Path) -> str | None:
@@ -251,10 +265,12 @@ def _ending(path: Path) -> str | None:
 def _opened_folder(path: Path, source: str, repairs: Repairs) -> Table | Recording:
     """A ROS 2 bag, or a table of the CSV files in a folder."""
     if (path / "metadata.yaml").exists():
-        return open_bag(path, source)
+        return _imported(_RECORDINGS[".bag"])(path, source)
     files = sorted(x for x in path.iterdir() if x.name.lower().endswith(tuple(_TEXTS)))
     if len(files) < 2:  # one file is a log of its own
         raise LogError(f"{source}: it is a folder without a bag or several CSV files; name a file in it")
+    from diransac.data.readers.comma_separated import joined
+
     return joined([(x.name.split(".")[0], _content(x, f'log "{x}"')) for x in files], source, repairs)
 
 

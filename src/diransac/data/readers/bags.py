@@ -81,7 +81,7 @@ class BagRecording:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Where the file ended early, and topics without a time in their messages."""
+        """Places where the file ended early, and topics without a time in their messages."""
         return tuple(dict.fromkeys(self._file.notes))
 
     def read(self, wanted: Mapping[str, Sequence[str]], stamps: Stamps) -> dict[str, Samples]:
@@ -172,7 +172,7 @@ def _decoded(raw: Raw, source: str) -> Any:
     """The message.  Raises LogError: it does not follow its definition."""
     try:
         return raw.decode()
-    except Exception as error:
+    except Exception as error:  # decoders raise errors of all kinds on damaged messages
         why = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise LogError(f'{source}: a message of "{raw.topic}" cannot be decoded ({why:.150})') from error
 
@@ -430,7 +430,7 @@ class RosBag:
         try:
             with self._open() as reader:
                 self.topics: Collection[str] | None = {x.topic for x in reader.connections if x.msgcount}
-        except Exception as error:
+        except Exception as error:  # the library raises errors of all kinds on damaged bags
             raise self._damaged(error) from error
 
     def _damaged(self, error: Exception) -> LogError:
@@ -447,6 +447,6 @@ class RosBag:
                     connection, time, data = next(messages)
                 except StopIteration:
                     return
-                except Exception as error:
+                except Exception as error:  # as above
                     raise self._damaged(error) from error
                 yield Raw(connection.topic, time, partial(reader.deserialize, data, connection.msgtype))

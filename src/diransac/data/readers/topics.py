@@ -114,7 +114,7 @@ def table_of_topics(
 
 
 _KEPT = ("sys_name", "ver_hw", "ver_sw", "ver_sw_branch", "sys_uuid")
-"""What a log's history keeps of the machine's description."""
+"""Facts of the machine's description that a log's history keeps."""
 
 
 def _signals_of(

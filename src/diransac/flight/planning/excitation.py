@@ -340,7 +340,7 @@ class Search:
 
     @property
     def reason(self) -> str:
-        """Why the search ended."""
+        """Reason for the end of the search."""
         if self.out_of_time:
             return f"the time limit was reached after {self.taken} iterations"
         return f"converged after {self.taken} iterations" if self.converged else f"{self.taken} iterations, the limit"

@@ -61,7 +61,7 @@ _OF_ROBOTS = ("drive_forces", "robot", "robot_limits")
 
 
 def __getattr__(name: str) -> Any:
-    """What reads descriptions of robots, imported at its first use."""
+    """Functions that read descriptions of robots, imported at their first use."""
     if name not in _OF_ROBOTS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from diransac.model import robots

@@ -64,7 +64,7 @@ _RIDGES = 10.0 ** np.arange(-14.0, 1.0)
 
 @dataclass(frozen=True)
 class Instrumented:
-    """What set-points as instruments tell of an estimate.
+    """Outcome of set-points as instruments.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def _columns(dataset: Dataset, names: Sequence[str]) -> list[FloatArray]:
 def _predicted(
     intervals: ShootingIntervals, motion: Sequence[FloatArray], set_points: Sequence[FloatArray]
 ) -> list[FloatArray]:
-    """What set-points predict of q, v, a and u, each (N, n), where rows count."""
+    """Predictions of q, v, a and u from set-points, each (N, n), where rows count."""
     counted = intervals.counted
     longest = max(len(x) for x in set_points)
     n_times = max(1, int(np.log2(_LONGEST * longest / _SHORTEST)) + 1)
@@ -240,7 +240,7 @@ def _tests(names: Sequence[str], contrast: Contrast) -> list[HausmanTest]:
 
 
 def _findings(tests: Sequence[HausmanTest], names: Sequence[str], replaced: BoolArray) -> Iterator[Finding]:
-    """What the tests say, in words."""
+    """Outcomes of the tests in words."""
     by = f"with the set-points {listed(names)} as instruments"
     for one, taken in zip(tests, replaced, strict=True):
         if one.outcome in ("rejected", "differs"):

@@ -1,4 +1,4 @@
-"""What explains the unmodelled forces over the fitted motion: errors of inputs, or terms that the model lacks."""
+"""Causes of the unmodelled forces over the fitted motion: errors of inputs, or terms that the model lacks."""
 
 from __future__ import annotations
 

@@ -280,7 +280,7 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
 
 @dataclass(frozen=True)
 class EffectOfIntervals:
-    """What each interval's measurements change of the parameters of a fit, to first order.
+    """Change of a fit's parameters by each interval's measurements, to first order.
 
     Parameters
     ----------
@@ -433,7 +433,7 @@ def _covariance_of_fit(
 
 
 def _parts(intervals: ShootingIntervals, rows: _Rows, gains: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """What the unmodelled forces of each interval that parameters leave contribute to their error, (W, n)."""
+    """Contributions of each interval's unmodelled forces to the error of the parameters, (W, n)."""
     by_rows, by_means = gains
     unmade = rows.latent - rows.means @ np.einsum("pwi,wi->p", by_means, rows.latent)
     unpushed = rows.push - rows.W @ np.einsum("pni,ni->p", by_rows, rows.push)

@@ -30,7 +30,7 @@ _WORTH_THREADS = 4e6
 
 @dataclass(frozen=True)
 class ErrorKind:
-    """What a recording has wrong, that of one signal or input, or of a group alike.
+    """Kind of error of a recording, of one signal or input, or of a group alike.
 
     Parameters
     ----------
