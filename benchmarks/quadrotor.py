@@ -93,10 +93,12 @@ def count_coverage(seeds: range) -> None:
         for seed in seeds:
             flight = flights.fly(seed, SHORT, late=0.0)
             result = identified(flight)
-            for parameter, (low, high) in result.intervals(0.95).items():
-                if parameter != "mass":
-                    inside.setdefault(parameter, []).append(low <= flight.truth[parameter] <= high)
-            print(f"seed {seed}: {result.verdict}", file=sys.stderr)
+            intervals = {n: x for n, x in result.intervals(0.95).items() if n != "mass"}
+            holds = {n: low <= flight.truth[n] <= high for n, (low, high) in intervals.items()}
+            for parameter, held in holds.items():
+                inside.setdefault(parameter, []).append(held)
+            outside = ", ".join(n for n, held in holds.items() if not held) or "none"
+            print(f"seed {seed}: {result.verdict}; outside: {outside}", file=sys.stderr, flush=True)
     except KeyboardInterrupt:
         print("ended early", file=sys.stderr)
     for parameter, held in inside.items():

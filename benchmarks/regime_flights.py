@@ -28,7 +28,8 @@ class Fault:
     force : ``rngs -> Force``; None: no force
     changed : ``(share of the log, p) -> p``, parameters in the course of the log
     supply : ``share of the log -> gain`` of the inputs
-    lag : time constant of each actuator, s
+    actuator : ``u -> u`` (n_u, L), what the actuators make of their inputs
+    lag : time constants of the actuators, s, one of each or one of all; (): they answer at once, as with 0
     later : by input, how much later it acts, s, whole samples of inputs that are held
     late : by signal, how much later it is logged, s
     corrupted : ``(rng, columns, inputs)`` corrupts the columns of a log in place
@@ -37,7 +38,8 @@ class Fault:
     force: Callable[[Rngs], Force] | None = None
     changed: Callable[[float, SimpleNamespace], SimpleNamespace] = lambda _, p: p
     supply: Callable[[float], float] = lambda _: 1.0
-    lag: float = 0.0
+    actuator: Callable[[Array], Array] = lambda u: u
+    lag: tuple[float, ...] = ()
     later: Mapping[str, float] = field(default_factory=dict)
     late: Mapping[str, float] = field(default_factory=dict)
     corrupted: Callable[[np.random.Generator, dict[str, Array], Sequence[str]], None] | None = None
@@ -116,16 +118,16 @@ def _simulated(
     x = _start(regime, reference, control)
     n_rows = round(machine.duration / machine.dt)
     h = machine.dt / machine.substeps
-    rows = []
+    rows, inputs = [], []
     for k in range(n_rows):
         t = k * machine.dt
-        u = control(t, x)
-        acting = _delayed(regime, [*(row[2] for row in rows), u])
-        rows.append((x[: machine.n_q + machine.n_v], acceleration(t, x, acting), u))
+        inputs.append(control(t, x))
+        acting = _delayed(regime, inputs)
+        rows.append((x[: machine.n_q + machine.n_v], acceleration(t, x, acting)))
         for i in range(machine.substeps):
             x = rk4(rate, t + i * h, x, acting if regime.held else None, h)
-    states, accelerations, inputs = (np.stack(parts) for parts in zip(*rows, strict=True))
-    return machine.dt * np.arange(n_rows), _named(machine, states, accelerations, inputs)
+    states, accelerations = (np.stack(parts) for parts in zip(*rows, strict=True))
+    return machine.dt * np.arange(n_rows), _named(machine, states, accelerations, np.stack(inputs))
 
 
 def _delayed(regime: Regime, inputs: Sequence[Array]) -> Array:
@@ -145,7 +147,7 @@ def _plant(
     machine, fault = regime.machine, regime.fault
     n_q, n_x = machine.n_q, machine.n_q + machine.n_v
     force = fault.force(rngs) if fault.force else None
-    none = np.zeros((machine.n_v, len(rngs)))
+    none, lag = np.zeros((machine.n_v, len(rngs))), np.reshape(fault.lag, (-1, 1))
     kinematics = machine.kinematics or (lambda q, v: v)
 
     def control(t: float, x: Array) -> Array:
@@ -154,13 +156,13 @@ def _plant(
     def acceleration(t: float, x: Array, u: Array) -> Array:
         share = t / machine.duration
         q, v, p = x[:n_q], x[n_q:n_x], fault.changed(share, drawn)
-        acting = (x[n_x:] if fault.lag else u) * fault.supply(share)
+        acting = fault.actuator(np.where(lag > 0.0, x[n_x:], u) if fault.lag else u) * fault.supply(share)
         return machine.accelerations(q, v, acting, p, force(t, q, v, acting, p) if force else none)
 
     def rate(t: float, x: Array, held: Array | None) -> Array:
         u = control(t, x) if held is None else held
         parts = [kinematics(x[:n_q], x[n_q:n_x]), acceleration(t, x, u)]
-        return np.concatenate([*parts, (u - x[n_x:]) / fault.lag] if fault.lag else parts)
+        return np.concatenate([*parts, (u - x[n_x:]) / np.where(lag > 0.0, lag, np.inf)] if fault.lag else parts)
 
     return rate, control, acceleration
 
@@ -233,6 +235,22 @@ def _missing(rows: int, *, inputs_too: bool) -> Callable[[np.random.Generator, d
                 values[begin : begin + rows] = np.nan
 
     return lose
+
+
+# ---------------------------------------------------------------------- actuators
+
+
+def _dead_band(width: float) -> Callable[[Array], Array]:
+    return lambda u: u - np.clip(u, -width, width)
+
+
+def _curved(curvatures: Sequence[float]) -> Callable[[Array], Array]:
+    """Gains that grow with their input."""
+    return lambda u: u * (1.0 + np.reshape(curvatures, (-1, 1)) * np.abs(u))
+
+
+def _saturated(level: float) -> Callable[[Array], Array]:
+    return lambda u: np.clip(u, -level, level)
 
 
 # ---------------------------------------------------------------------- forces
@@ -340,10 +358,16 @@ _ALL = [
     Regime("underwater waves", machines.UNDERWATER, exact=False, fault=Fault(force=gusts((1.3,), 0.1, 0.3))),
     Regime("underwater slow current", machines.UNDERWATER, exact=False, fault=Fault(force=_slow_current(0.05))),
     *(
-        Regime(f"rotor motor lag {1e3 * lag:.0f} ms", _ROTOR, exact=False, fault=Fault(lag=lag))
+        Regime(f"rotor motor lag {1e3 * lag:.0f} ms", _ROTOR, exact=False, fault=Fault(lag=(lag,)))
         for lag in (0.03, 0.05, 0.08)
     ),
-    Regime("underwater lag .5 s", machines.UNDERWATER, exact=False, fault=Fault(lag=0.5)),
+    Regime("rotor lags 30 and 80 ms", _ROTOR, exact=False, fault=Fault(lag=(0.03, 0.08))),
+    Regime("rotor moment lag 50 ms", _ROTOR, exact=False, fault=Fault(lag=(0.0, 0.05))),
+    Regime("underwater lag .5 s", machines.UNDERWATER, exact=False, fault=Fault(lag=(0.5,))),
+    Regime("pendulum dead band", machines.PENDULUM, exact=False, fault=Fault(actuator=_dead_band(0.06))),
+    Regime("motor dead band", machines.MOTOR, exact=False, fault=Fault(actuator=_dead_band(0.3))),
+    Regime("cart-pole saturation", machines.CART, exact=False, fault=Fault(actuator=_saturated(5.0))),
+    Regime("rotor curved thrust", _ROTOR, exact=False, fault=Fault(actuator=_curved((0.015, 0.0)))),
     Regime("motor backlash", machines.GEARED_MOTOR, exact=False),
     Regime("arm Stribeck", _ARM, exact=False, fault=Fault(force=_stribeck)),
     Regime("arm ripple", _ARM, exact=False, fault=Fault(force=_ripple)),

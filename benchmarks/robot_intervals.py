@@ -45,11 +45,11 @@ def model_of(path: Path, *further: str) -> dr.Model:
     return dr.models.robot(path, joints="{}_joint", unknown=(*TRUTH, *further), actuation=control)
 
 
-def recorded(path: Path, seed: int = 0, bias: Sequence[float] = BIAS) -> dr.Log:
+def recorded(path: Path, seed: int = 0, bias: Sequence[float] = BIAS, duration: float = 12.0) -> dr.Log:
     """Log of a leg with other joints than its file has, whose targets act late and whose encoders have a bias."""
     machine, rng = mujoco.MjModel.from_xml_path(str(path)), np.random.default_rng(seed)
     machine.dof_armature[:], machine.dof_damping[:], machine.dof_frictionloss[:] = *list(TRUTH.values())[:2], 0.0
-    data, t = mujoco.MjData(machine), np.arange(0.0, 12.0, DT)
+    data, t = mujoco.MjData(machine), np.arange(0.0, duration, DT)
     slow, fast = (2.1, 3.3, 2.7), (11.0, 14.0, 9.0)
     targets = 0.5 * np.sin(np.outer(t + 0.05 * t**2, slow)) + 0.2 * np.sin(np.outer(t + 0.02 * t**2, fast))
     late = np.vstack([targets[:1].repeat(round(DELAY / DT), axis=0), targets])

@@ -20,6 +20,7 @@ import numpy as np
 
 import diransac as dr
 
+Actuator = Callable[[float], float]
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 G = 9.81
 Array = np.ndarray
@@ -77,7 +78,7 @@ def parameters(units: dict[str, str]) -> dict[str, dr.Parameter]:
 # ---------------------------------------------------------------------- machines
 
 
-def pendulum(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
+def pendulum(seed: int, missing: bool, actuator: Actuator = float) -> tuple[dr.Model, list[dr.Log]]:
     """A driven pendulum; missing: Coulomb friction of 1 to 4 % of its weight's moment."""
     rng = np.random.default_rng([1, seed])
     p = drawn(rng, inertia=0.05, damping=0.03, moment=1.2)
@@ -86,7 +87,7 @@ def pendulum(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
 
     def rates(x: Array, u: Array) -> Array:
         friction = p["damping"] * x[1] + coulomb * np.tanh(x[1] / 0.005)
-        return np.array([x[1], (u[0] - friction - p["moment"] * np.sin(x[0])) / p["inertia"]])
+        return np.array([x[1], (actuator(u[0]) - friction - p["moment"] * np.sin(x[0])) / p["inertia"]])
 
     states, inputs = simulate(rates, [0, 0], lambda t, x: [wave(t)], 2000, 0.01, 10)
     model = dr.Model(
@@ -99,7 +100,7 @@ def pendulum(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
     return model, [log_of(rng, 0.01, {"q": states[:, 0]}, {"q": 3e-4}, {"torque": inputs[:, 0]}, f"pendulum {seed}")]
 
 
-def cart_pole(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
+def cart_pole(seed: int, missing: bool, actuator: Actuator = float) -> tuple[dr.Model, list[dr.Log]]:
     """A hanging pole on a cart; missing: Coulomb friction of the cart."""
     rng = np.random.default_rng([2, seed])
     p = drawn(rng, cart=1.2, pole=0.25, length=0.4, damping=0.8, hinge=0.005)
@@ -110,7 +111,7 @@ def cart_pole(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
         ml, sine, cosine = p["pole"] * p["length"], np.sin(x[1]), np.cos(x[1])
         M = np.array([[p["cart"] + p["pole"], ml * cosine], [ml * cosine, ml * p["length"]]])
         friction = p["damping"] * x[2] + coulomb * np.tanh(x[2] / 0.005)
-        force = [u[0] + ml * x[3] ** 2 * sine - friction, -ml * G * sine - p["hinge"] * x[3]]
+        force = [actuator(u[0]) + ml * x[3] ** 2 * sine - friction, -ml * G * sine - p["hinge"] * x[3]]
         return np.array([x[2], x[3], *np.linalg.solve(M, force)])
 
     states, inputs = simulate(rates, [0, 0, 0, 0], lambda t, x: [wave(t) - 4 * x[0] - x[2]], 2000, 0.01, 10)
@@ -187,7 +188,7 @@ def arm(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
     return model, [log_of(rng, 0.005, signals, {"q1": 1e-4, "q2": 1e-4}, torques, f"arm {seed}")]
 
 
-def rotorcraft(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
+def rotorcraft(seed: int, missing: bool, actuator: Actuator = float) -> tuple[dr.Model, list[dr.Log]]:
     """The planar rotorcraft under feedback; missing: quadratic drag, 3 to 10 % of its weight at 2 m/s."""
     rng = np.random.default_rng([4, seed])
     p = drawn(rng, mass=0.25, inertia=0.004, drag=0.025)
@@ -196,9 +197,10 @@ def rotorcraft(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
 
     def rates(x: Array, u: Array) -> Array:
         sine, cosine = np.sin(x[2]), np.cos(x[2])
-        induced = p["drag"] * abs(u[0])
-        fx = -u[0] * sine - induced * x[3] * cosine - quadratic * abs(x[3]) * x[3]
-        fz = u[0] * cosine - induced * x[4] * sine - quadratic * abs(x[4]) * x[4]
+        thrust = actuator(u[0])
+        induced = p["drag"] * abs(thrust)
+        fx = -thrust * sine - induced * x[3] * cosine - quadratic * abs(x[3]) * x[3]
+        fz = thrust * cosine - induced * x[4] * sine - quadratic * abs(x[4]) * x[4]
         return np.array([x[3], x[4], x[5], fx / p["mass"], fz / p["mass"] - G, 0.177 * u[1] / p["inertia"]])
 
     def control(t: float, x: Array) -> list[float]:
@@ -283,15 +285,34 @@ def double_pendulum(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
 DEFAULT = dr.LoDiransac()
 
 
+def dead_band(width: float) -> Actuator:
+    """An actuator that does not answer inputs below a width."""
+    return lambda u: float(u - np.clip(u, -width, width))
+
+
+def curved(curvature: float) -> Actuator:
+    """An actuator whose gain grows with its input."""
+    return lambda u: float(u * (1.0 + curvature * abs(u)))
+
+
+def saturated(level: float) -> Actuator:
+    """An actuator with a limit."""
+    return lambda u: float(np.clip(u, -level, level))
+
+
 @dataclass(frozen=True)
 class Case:
-    """A machine, the suggestion that is right for it, and settings that its motion needs."""
+    """A machine, the suggestion that is right for it, and settings that its motion needs.
 
-    make: Callable[[int, bool], tuple[dr.Model, list[dr.Log]]]
+    With an actuator, that of one input is missing, and nothing else.
+    """
+
+    make: Callable[..., tuple[dr.Model, list[dr.Log]]]
     kinds: tuple[str, ...]
     equations: tuple[str, ...]
     data: str = ""
     method: dr.LoDiransac = DEFAULT
+    actuator: Actuator | None = None
 
 
 CASES = {
@@ -302,6 +323,11 @@ CASES = {
     "arm without Stribeck friction": Case(arm, ("Stribeck friction",), ("q1", "q2")),
     "rotorcraft without quadratic drag": Case(rotorcraft, ("quadratic drag",), ("x", "z")),
     "underwater vehicle in a current": Case(underwater_vehicle, ("asymmetric drag",), ("x",)),
+    "pendulum with a dead band": Case(pendulum, ("dead band",), ("torque",), actuator=dead_band(0.05)),
+    "pendulum with a curved torque": Case(pendulum, ("curved input",), ("torque",), actuator=curved(0.1)),
+    "cart-pole with a dead band": Case(cart_pole, ("dead band",), ("force",), actuator=dead_band(0.4)),
+    "cart-pole with saturation": Case(cart_pole, ("saturation",), ("force",), actuator=saturated(3.5)),
+    "rotorcraft with a curved thrust": Case(rotorcraft, ("curved input",), ("thrust",), actuator=curved(0.02)),
     "EMPS without dry friction (real)": Case(emps, ("Coulomb friction",), ("position",), "emps"),
     "double pendulum without dry friction (real)": Case(
         double_pendulum, ("Coulomb friction",), ("q1", "q2"), "dfki_double_pendulum"
@@ -311,7 +337,7 @@ CASES = {
 
 def identified(case: Case, seed: int, missing: bool) -> tuple[dr.Suggestion, ...] | str:
     """Suggestions for one log, or the error in a word."""
-    model, logs = case.make(seed, missing)
+    model, logs = case.make(seed, False, case.actuator) if case.actuator else case.make(seed, missing)
     try:
         result = dr.identify(model, logs, case.method, differentiate=True, compare_logs=False)
     except dr.DiransacError as error:
@@ -358,7 +384,7 @@ def main() -> None:
         else:
             row(name, case, seeds)
     if not given.words or "exact" in given.words:
-        exact([case for case in CASES.values() if not case.data], seeds)
+        exact([case for case in CASES.values() if not case.data and not case.actuator], seeds)
 
 
 if __name__ == "__main__":

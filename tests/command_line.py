@@ -41,9 +41,10 @@ model = Model(
 """
 
 
-def run(*words: object) -> Result:
+def run(*words: object, stdin: bytes | None = None) -> Result:
     """Run a command line in this process; an unexpected exception, or a message of more than three lines, fails."""
-    done = CliRunner().invoke(app, [str(word) for word in words], prog_name="diransac", catch_exceptions=False)
+    texts = [str(word) for word in words]
+    done = CliRunner().invoke(app, texts, input=stdin, prog_name="diransac", catch_exceptions=False)
     assert done.exit_code == 0 or len(done.stderr.splitlines()) <= 3, done.stderr
     return done
 

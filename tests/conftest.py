@@ -1,5 +1,6 @@
 """Fixtures that every test may use, one thread per worker of pytest-xdist, and machine code kept for this run alone."""
 
+import gc
 import os
 import tempfile
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -19,9 +20,15 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # there is a worker per core; BLAS read
 if "PYTEST_XDIST_WORKER" not in os.environ:  # workers and child processes inherit the folder
     MACHINE_CODE = tempfile.TemporaryDirectory(prefix="diransac-tests-", ignore_cleanup_errors=True)
     os.environ["DIRANSAC_CACHE"] = MACHINE_CODE.name
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # without byte code, each of them compiles the whole package again
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
+
+
+def pytest_collection_finish() -> None:
+    """Take the modules and tests, which live to the end, out of every later search for garbage."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
@@ -34,10 +41,11 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def trials_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run trials of studies in a thread of this process where they would run in processes of this machine."""
-    from diransac.study.run import Given, Workers, workers_of
+    """Run trials of studies, and logs of fleets, in a thread of this process in place of processes."""
+    from diransac.study.engine import Given, Workers, workers_of
 
     def workers(executor: Executor | None, jobs: int | None, tasks: int | None) -> Workers:
         return Given(ThreadPoolExecutor(1), 1) if executor is None else workers_of(executor, jobs, tasks)
 
-    monkeypatch.setattr("diransac.study.run.workers_of", workers)
+    for module in ("run", "fleet"):
+        monkeypatch.setattr(f"diransac.study.{module}.workers_of", workers)

@@ -43,12 +43,13 @@ def panda_like(seed=0, couplings=True):
     return "".join([*parts, "</body>", "</body>" * 8, f"</worldbody><equality>{equality}</equality></mujoco>"])
 
 
-def quadruped(seed=0, base=""):
-    """Four legs of three hinges: MJCF."""
+def quadruped(seed=0, base="", legs=("FL", "FR", "RL", "RR")):
+    """Four legs of three hinges, or some of them: MJCF."""
     rng = np.random.default_rng(seed)
     parts = ['<mujoco model="quadruped"><compiler angle="radian"/><worldbody>']
     parts.append(f'<body name="trunk" pos="0 0 0.5">{mjcf_inertial(rng, 4.0)}{base}')
-    for leg, (x, y) in {"FL": (1, 1), "FR": (1, -1), "RL": (-1, 1), "RR": (-1, -1)}.items():
+    for leg in legs:
+        x, y = (1 if leg[0] == "F" else -1), (1 if leg[1] == "L" else -1)
         places = [(0.19 * x, 0.05 * y, 0), (0, 0.09 * y, 0), (0, 0, -0.21)]
         for part, place, axis in zip(("hip", "thigh", "calf"), places, ("1 0 0", "0 1 0", "0 1 0"), strict=True):
             parts.append(f'<body name="{leg}_{part}" pos="{text(place)}">{mjcf_inertial(rng, 0.3)}')

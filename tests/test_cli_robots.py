@@ -13,6 +13,7 @@ pytest.importorskip("mujoco", reason="ROBOTS ON THE COMMAND LINE NOT CHECKED: mu
 
 CONTROL = ["--control", "kp=20,kd=1.5,target=des_{}"]
 ROBOT = ["--model", "dog.xml", "--joints", "{}_joint", *CONTROL]
+LEGS = ["FL", "RR"]
 TRUTH = {"armature": 0.03, "damping": 0.4, "friction": 0.2}
 
 
@@ -20,14 +21,14 @@ TRUTH = {"armature": 0.03, "damping": 0.4, "friction": 0.2}
 def folder(tmp_path, monkeypatch):
     """Working directory with ``dog.xml`` and ``run.csv``, an exact motion under position control with other joints."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "dog.xml").write_text(robots.quadruped())
+    (tmp_path / "dog.xml").write_text(robots.quadruped(legs=LEGS))
     model = dr.models.robot("dog.xml", joints="{}_joint", actuation=dr.JointTorques())
     rng, t = np.random.default_rng(0), np.arange(0.0, 3.0, 0.01)
-    w, phase = rng.uniform(2.0, 8.0, 12), rng.uniform(0.0, 6.0, 12)
+    w, phase = rng.uniform(2.0, 8.0, 6), rng.uniform(0.0, 6.0, 6)
     q, v, a = (x(t[:, None] * w + phase) for x in (np.sin, np.cos, np.sin))
     v, a = w * v, -(w**2) * a
     p = [TRUTH[n.partition("_")[0]] for n in model.parameters]
-    tau = np.array(model.residual(q.T, v.T, a.T, np.zeros((12, len(t))), np.tile(p, (len(t), 1)).T)).T
+    tau = np.array(model.residual(q.T, v.T, a.T, np.zeros((6, len(t))), np.tile(p, (len(t), 1)).T)).T
     columns = {"t": t}
     for k, n in enumerate(model.coordinates):
         columns |= {
@@ -45,12 +46,10 @@ def test_limbs_are_identified_side_by_side_and_written_into_the_description(fold
     done = run("identify", "run.csv", *ROBOT, "--method", "ols", "-o", "dog.json", "--report", "dog.html")
     assert done.exit_code == 0, done.stderr
     header, first = done.stdout.splitlines()[:2]
-    assert header.split() == ["parameter", "±", "95", "%", "FL", "FR", "RL", "RR", "unit"]
+    assert header.split() == ["parameter", "±", "95", "%", *LEGS, "unit"]
     assert first.split()[0] == "armature_hip"
-    assert {x.name for x in folder.glob("dog-*")} == {
-        f"dog-{x}.{y}" for x in ("FL", "FR", "RL", "RR") for y in ("json", "html")
-    }
-    for leg in ("FL", "FR", "RL", "RR"):
+    assert {x.name for x in folder.glob("dog-*")} == {f"dog-{x}.{y}" for x in LEGS for y in ("json", "html")}
+    for leg in LEGS:
         found = dr.Result.load(f"dog-{leg}.json").parameters
         assert found == pytest.approx({n: TRUTH[n.partition("_")[0]] for n in found}, rel=1e-6)
     done = run("export", *sorted(folder.glob("dog-*.json")), "--into", "dog.xml", "-o", "calibrated.xml")
@@ -70,7 +69,7 @@ def test_chosen_joints_and_unknowns_are_one_result(folder):
 
 def test_json_has_every_limb(folder):
     done = run("identify", "run.csv", *ROBOT, "--method", "ols", "--json")
-    assert list(json.loads(done.stdout)["limbs"]) == ["FL", "FR", "RL", "RR"]
+    assert list(json.loads(done.stdout)["limbs"]) == LEGS
 
 
 @pytest.mark.parametrize(
@@ -137,6 +136,7 @@ def test_experiments_of_limbs_are_one_log_of_targets_within_the_limits_of_the_fi
     ("words", "message"),
     [
         (["--limit", "FL_hip=far"], "--limit: FL_hip='far' is neither a number nor LOW:HIGH"),
+        (["--limit", "{}_{dot}=2"], 'limits: there is no quantity "FL_hip_{dot}"'),
         (["--limit", "knee=2"], 'limits: there is no quantity "knee"'),
         (["--parameter", "armature=2"], "--parameter: there is no 'armature'"),
     ],

@@ -1,5 +1,6 @@
-"""examples/, each run as a script in an empty folder."""
+"""examples/, each run as a script, or cell by cell, in an empty folder."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -15,3 +16,15 @@ def test_example_runs(example: Path, tmp_path: Path):
     words = [sys.executable, str(example)]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_notebook_runs_from_its_first_cell_to_its_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    notebook = json.loads((EXAMPLES[0].parent / "first_model.ipynb").read_text())
+    monkeypatch.chdir(tmp_path)
+    namespace: dict[str, object] = {"__name__": "__main__"}
+    for k, cell in enumerate(notebook["cells"]):
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), f"cell {k}", "exec"), namespace)
+            assert not cell["outputs"]  # it is kept without them
+    assert {x.name for x in tmp_path.iterdir()} == {"report.html", "model.json", "dynamics.c", "dynamics.py"}

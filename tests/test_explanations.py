@@ -11,9 +11,22 @@ from regime_judging import METHODS
 SEED = 1000
 
 
+def recorded(regime, seed=SEED):
+    """One log of a regime, made by a simulation that is not the package's, in fewer steps than the table's: they
+    change motions by less than a tenth of the noise, which `test_regimes` checks.
+    """
+    coarse = replace(regime.machine, substeps=max(1, regime.machine.substeps // 4))
+    return flights.recordings(replace(regime, machine=coarse), [seed])[0]
+
+
+def fresh(regime, seed=SEED):
+    """The record of one log of a regime."""
+    return METHODS["lo"](regime, seed, recorded(regime, seed))
+
+
 def judged(name, seed=SEED):
-    """The record of one log of a regime, made by simulations that are not the package's."""
-    return METHODS["lo"](flights.REGIMES[name], seed, flights.recordings(flights.REGIMES[name], [seed])[0])
+    """The record of one log of a regime of the table."""
+    return fresh(flights.REGIMES[name], seed)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +86,7 @@ def test_late_positions_beside_timely_velocities_leave_the_parameters_exact():
     arm = flights.REGIMES["arm noisy"]
     machine = replace(arm.machine, noise={**arm.machine.noise, "q1_dot": 2e-3, "q2_dot": 2e-3})
     regime = replace(arm, machine=machine, exact=False, fault=flights.Fault(late={"q1": 0.01, "q2": 0.01}))
-    found = METHODS["lo"](regime, SEED + 1, flights.recordings(regime, [SEED + 1])[0])
+    found = fresh(regime, SEED + 1)
     assert found.worst < 0.05
     assert all(found.inside.values())
     said = [x for x in found.findings if x.startswith("q1 and q2 are recorded")]
@@ -96,11 +109,6 @@ def test_a_battery_that_sags_is_named_and_leaves_the_parameters_exact():
         "The gain of moment falls by 15 % during ",
     ]
     assert found.verdict == "usable with care"
-
-
-def fresh(regime, seed=SEED):
-    """The record of one log of a regime that is not in the table."""
-    return METHODS["lo"](regime, seed, flights.recordings(regime, [seed])[0])
 
 
 def test_a_drift_in_noise_is_found_because_held_out_parts_of_the_log_are_predicted_worse():
@@ -157,7 +165,7 @@ def test_the_seed_does_not_matter():
     import diransac as dr
 
     regime = flights.REGIMES["cart-pole 40 Hz"]
-    log = flights.recordings(regime, [SEED])[0].log
+    log = recorded(regime).log
     results = [dr.identify(regime.machine.model, log, differentiate=True, seed=seed) for seed in range(3)]
     for name, error in results[0].standard_errors.items():
         values = [result.parameters[name] for result in results]

@@ -153,7 +153,7 @@ def test_yaml_has_estimates_covariance_draws_and_timing(result, tmp_path):
     assert list(document["covariance"].values()) == result.covariance.tolist()
     assert document["samples"] == {n: x.tolist() for n, x in result.sample(1000).items()}
     assert document["input_timing"]["delay_s"] == {"thrust": 0.012, "moment": 0.012}
-    assert document["input_timing"]["lag_s"] == 0.03
+    assert document["input_timing"]["lag_s"] == {"thrust": 0.03, "moment": 0.03}
 
 
 def test_delay_and_lag_are_said_to_be_the_callers(result, tmp_path):
@@ -161,7 +161,7 @@ def test_delay_and_lag_are_said_to_be_the_callers(result, tmp_path):
         assert result.export(tmp_path / name) == ()
         text = (tmp_path / name).read_text()
         assert "the caller delays thrust by 12 ms, moment by 12 ms" in text
-        assert "time constant 30 ms" in text
+        assert "first-order lags with the time constants 30 ms of thrust, 30 ms of moment" in text
 
 
 @pytest.mark.parametrize(
@@ -222,3 +222,38 @@ def test_export_from_the_command_line(result, tmp_path, monkeypatch):
 def test_a_folder_that_is_missing_is_said(result, tmp_path):
     with pytest.raises(ResultError, match="cannot be written"):
         result.export(tmp_path / "none" / "dynamics.c")
+
+
+def test_means_over_logs_and_parameters_of_sensors_are_said(tmp_path):
+    yaml = pytest.importorskip("yaml", reason="EXPORTED YAML NOT READ: PyYAML is missing")
+    model = dr.Model(
+        "slope",
+        {"x": "m"},
+        {"push": "N"},
+        {"mass": dr.Parameter("kg", positive=True), "tilt": dr.Parameter("N", per_log=True)},
+        lambda q, v, a, u, p: [p.mass * a.x + p.tilt - u.push],
+        sensors=dr.sensors.encoder("x", unit="m", name="encoder"),
+    )
+    exported = portable(model, per_log={"tilt": (1.0, 2.5)})
+    (of_sensor,) = exported.of_sensors
+    for to, ending in (("c", "c"), ("python", "py"), ("yaml", "yaml")):
+        write_model(exported, tmp_path / f"model.{ending}", to)
+        text = (tmp_path / f"model.{ending}").read_text()
+        assert "tilt has a value for each log (1, 2.5); what stands here is their mean." in text
+        assert f"The motion does not depend on {of_sensor}" in text
+    document = yaml.safe_load((tmp_path / "model.yaml").read_text())["parameters"]
+    assert document["tilt"]["per_log"] == [1.0, 2.5]
+    assert [name for name, x in document.items() if x.get("sensor_only")] == [of_sensor]
+
+
+def test_two_results_of_one_model_are_linked_together_under_names_of_their_own(tmp_path):
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("EXPORTED C NOT LINKED: there is no C compiler, cc")
+    for name in ("left wheel", "right wheel"):
+        write_model(portable(MODELS["servo-axis"], name=name), tmp_path / f"{name}.c", "c")
+    words = [compiler, "-std=c99", "-shared", "-fPIC", "-o", tmp_path / "both.so"]
+    subprocess.run([*words, *sorted(tmp_path.glob("*.c")), "-lm"], check=True)
+    both = ctypes.CDLL(str(tmp_path / "both.so"))
+    assert both.left_wheel_step
+    assert both.right_wheel_step

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import gauntlet
@@ -20,6 +21,7 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 WORST = {"servo-axis": "cogging", "double-pendulum": "ripple", "pendulum": "ripple"}
 
 
+@cache
 def recorded(vehicle, scenario="clean"):
     """A plant, and the data of its first trial."""
     study = studies.study_of(vehicle)

@@ -72,14 +72,14 @@ def pendulum_log(delay=0.0, lag=0.0, n_rows=1500, seed=0, biases=None, gaps=()):
 
 def test_inputs_without_delay_and_lag_are_the_recorded_ones():
     recorded = np.random.default_rng(0).standard_normal((50, 2))
-    assert InputTiming().acting(recorded, DT) is recorded
+    assert InputTiming().acting(recorded, DT, "zero-order") is recorded
 
 
 @pytest.mark.parametrize("delay", [-7, -1, 3, 60])
 def test_whole_samples_of_delay_shift_the_inputs_whose_ends_continue(delay):
     recorded = np.random.default_rng(0).standard_normal((50, 2))
     rows = np.clip(np.arange(50) - delay, 0, 49)
-    np.testing.assert_array_equal(acting_inputs(recorded, np.full(2, delay), 0.0, np.zeros(2)), recorded[rows])
+    np.testing.assert_array_equal(acting_inputs(recorded, np.full(2, delay), np.zeros(2), np.zeros(2)), recorded[rows])
 
 
 @pytest.mark.parametrize("delay", [0.3, 2.7, -1.6])
@@ -88,32 +88,40 @@ def test_a_fraction_of_delay_is_the_mean_of_the_held_signal_over_each_sample(del
     held = np.repeat(recorded, fine, axis=0)
     late = held[np.clip(np.arange(len(held)) - round(delay * fine), 0, len(held) - 1)]
     mean = late.reshape(40, fine, 1).mean(axis=1)
-    found = acting_inputs(recorded, np.array([delay]), 0.0, np.zeros(1))
+    found = acting_inputs(recorded, np.array([delay]), np.zeros(1), np.zeros(1))
     np.testing.assert_allclose(found[4:-4], mean[4:-4], rtol=1e-12, atol=1e-14)
 
 
 def test_a_ramp_is_delayed_exactly():
     ramp = np.arange(30.0)[:, None]
-    np.testing.assert_allclose(InputTiming(0.0123).acting(ramp, DT)[2:], ramp[2:] - 1.23, rtol=1e-12)
+    np.testing.assert_allclose(InputTiming(0.0123).acting(ramp, DT, "linear")[2:], ramp[2:] - 1.23, rtol=1e-12)
 
 
-def test_a_lag_answers_a_step_with_an_exponential():
-    step = np.r_[np.zeros(10), np.ones(90)][:, None]
-    time = DT * np.maximum(np.arange(100) - 10, 0)
-    np.testing.assert_allclose(InputTiming(lag=0.07).acting(step, DT)[:, 0], 1.0 - np.exp(-time / 0.07), atol=1e-12)
+@pytest.mark.parametrize("hold", ["zero-order", "linear"])
+def test_a_lag_has_the_mean_of_its_exponential_response_over_each_sample(hold):
+    rows, constants, fine = np.arange(200), np.array([0.03, 0.08]), 1000
+    recorded = np.column_stack([np.sin(0.05 * rows), np.cos(0.08 * rows)])
+    response, means = np.array([0.0, 1.0]), []
+    for u in recorded:
+        decays = np.exp(-(DT / fine * (np.arange(fine) + 0.5))[:, None] / constants)
+        means.append((u + (response - u) * decays).mean(axis=0))
+        response = u + (response - u) * np.exp(-DT / constants)
+    acting = InputTiming(0.0, 0.02, own_lags=(0.01, 0.06)).acting(recorded, DT, hold)
+    found = acting if hold == "zero-order" else 0.5 * (acting[:-1] + acting[1:])
+    np.testing.assert_allclose(found[2:-2], means[2 : len(found) - 2], atol=1e-8 if hold == "zero-order" else 4e-5)
 
 
 def test_inputs_have_delays_of_their_own_besides_the_common_one():
     recorded = np.random.default_rng(0).standard_normal((50, 2))
-    found = acting_inputs(recorded, np.array([2, 5]), 0.0, np.zeros(2))
+    found = acting_inputs(recorded, np.array([2, 5]), np.zeros(2), np.zeros(2))
     np.testing.assert_array_equal(found[5:], np.column_stack([recorded[3:-2, 0], recorded[:-5, 1]]))
-    own = InputTiming(0.5, own_delays=(0.5, 1.0)).acting(recorded, 0.25)
-    np.testing.assert_array_equal(own, InputTiming(own_delays=(1.0, 1.5)).acting(recorded, 0.25))
+    own = InputTiming(0.5, own_delays=(0.5, 1.0)).acting(recorded, 0.25, "zero-order")
+    np.testing.assert_array_equal(own, InputTiming(own_delays=(1.0, 1.5)).acting(recorded, 0.25, "zero-order"))
 
 
 def test_a_gain_drifts_in_proportion_to_time_and_no_further_than_the_log():
     recorded = np.ones((8, 2))
-    found = acting_inputs(recorded, np.zeros(2), 0.0, np.array([-0.4, 0.0]), n_rows=4)
+    found = acting_inputs(recorded, np.zeros(2), np.zeros(2), np.array([-0.4, 0.0]), n_rows=4)
     np.testing.assert_allclose(found[:, 0], [0.95, 0.85, 0.75, 0.65, 0.6, 0.6, 0.6, 0.6], rtol=1e-12)
     np.testing.assert_array_equal(found[:, 1], 1.0)
 
@@ -179,20 +187,24 @@ GIMBAL = dr.Model(
 )
 
 
-def gimbal_log(late=0, drift=0.0, seed=0, n_rows=1000):
-    """A log of both, whose force acts so many rows late, and whose torque loses a part of its gain over the log."""
+def gimbal_log(late=0, drift=0.0, lag=0.0, seed=0, n_rows=1000):
+    """A log of both, whose force acts so many rows late or after a lag, and whose torque loses a part of its gain."""
     rng, p = np.random.default_rng(seed), GIMBAL_TRUE
     recorded = np.column_stack([commands(n_rows, seed), 3.0 * commands(n_rows, seed + 50)])
     gain = 1.0 + drift * (np.arange(n_rows * FINE) + 0.5) / (n_rows * FINE)
     force = recorded[np.maximum(np.arange(n_rows) - late, 0), 1]
-    states, x = [], np.array([0.2, 0.0, 0.0, 0.0])
+    states, x, acting_force = [], np.array([0.2, 0.0, 0.0, 0.0]), force[0]
 
     def slope(x, torque, force):
         turn = (torque - p["damping"] * x[2] - p["weight"] * np.sin(x[0])) / p["inertia"]
         return np.array([x[2], x[3], turn, (force - p["drag"] * x[3]) / p["mass"]])
 
     for k, u in enumerate(np.repeat(np.column_stack([recorded[:, 0], force]), FINE, axis=0)):  # the midpoint rule
-        acting, h = (gain[k] * u[0], u[1]), DT / FINE
+        h = DT / FINE
+        decay = np.exp(-h / lag) if lag else 0.0
+        mean = u[1] + (acting_force - u[1]) * (1.0 - decay) * lag / h
+        acting_force = u[1] + (acting_force - u[1]) * decay
+        acting = (gain[k] * u[0], mean)
         if k % FINE == 0:
             states.append(x)
         x = x + h * slope(x + 0.5 * h * slope(x, *acting), *acting)
@@ -226,6 +238,22 @@ def test_an_input_that_is_later_than_the_other_is_found_and_named(tmp_path):
     assert dr.Result.load(tmp_path / "result.json").estimate.resolution.timing == timing
     held_out, undelayed = gimbal_log(late=4, seed=1), dr.Plant(GIMBAL, result.parameters)
     assert dr.validate(result, held_out).rmse["slide_dot"] < 0.3 * dr.validate(undelayed, held_out).rmse["slide_dot"]
+
+
+def test_a_lag_of_one_actuator_is_found_and_named(tmp_path):
+    result = identified(gimbal_log(lag=0.05))
+    timing = result.estimate.resolution.timing
+    np.testing.assert_allclose(timing.lags, [0.0, 0.05], atol=1e-3)
+    assert timing.delay == 0.0
+    assert timing.own_delays == ()
+    assert_right(result)
+    (said,) = [x for x in result.findings if "acts" in x]
+    assert said.startswith("force acts after a first-order lag of ")
+    assert float(said.split()[7]) == pytest.approx(50.0, abs=1.0)
+    result.save(tmp_path / "result.json")
+    assert dr.Result.load(tmp_path / "result.json").estimate.resolution.timing == timing
+    held_out, at_once = gimbal_log(lag=0.05, seed=1), dr.Plant(GIMBAL, result.parameters)
+    assert dr.validate(result, held_out).rmse["slide_dot"] < 0.3 * dr.validate(at_once, held_out).rmse["slide_dot"]
 
 
 def test_a_gain_that_drifts_is_found_and_named():

@@ -1,5 +1,6 @@
 """Mapping files, repairs, and tables in other shapes: what is done, what is said, and what is refused."""
 
+import dataclasses
 import gzip
 import struct
 
@@ -9,9 +10,11 @@ import scipy.io
 
 import diransac as dr
 from command_line import run
-from diransac.data.mapping import BUILT_IN, load_mapping
+from diransac.data.mapping import BUILT_IN, LogMapping, MappedSignals, load_mapping
 from diransac.data.readers import read_fields
-from diransac.data.readers.repair import REPAIRS
+from diransac.data.readers.recording import Samples
+from diransac.data.readers.repair import REPAIRS, Repairs
+from diransac.data.readers.topics import table_of_topics
 from diransac.data.suggested_mapping import suggest_mapping
 from diransac.errors import LogError, SettingsError
 
@@ -121,6 +124,37 @@ def test_a_wrong_mapping_is_refused_with_one_sentence(tmp_path, case):
     with pytest.raises((LogError, SettingsError), match=said) as caught:
         dr.read_log(path, mapping=written(tmp_path, text))
     assert "\n" not in str(caught.value)
+
+
+def test_a_placeholder_stands_for_the_joints_of_a_topic_and_is_refused_without_one():
+    entry = MappedSignals(("{joint}",), ("position[{joint}]",))
+    mapping, fields = LogMapping("mapping", (entry,)), {"/joints": ["position[0]", "position[1]"]}
+    found, _ = mapping.chosen(fields, {"/joints": ["hip", "knee"]}, "log")  # the only topic needs no name
+    assert [x.fields for x in found] == [("position[hip]",), ("position[knee]",)]
+    named = LogMapping("mapping", (dataclasses.replace(entry, topic="/arm"), MappedSignals(("t1",), ("position[0]",))))
+    with pytest.raises(LogError, match=r'has "\{joint\}" from topic "/arm", which the log has not'):
+        named.chosen(fields, {}, "log")
+
+
+class TwoTopics:
+    """A recording whose fields are constant."""
+
+    source, fields, elements, metadata, notes = "log", {"a": ("y", "f"), "b": ("x", "z")}, {}, {}, ()
+
+    def read(self, wanted, stamps):
+        """Samples, the same by either clock."""
+        values = {"y": 1.0, "f": 2.0, "x": 3.0, "z": 4.0}
+        return {topic: Samples(T, {n: np.full(len(T), values[n]) for n in names}) for topic, names in wanted.items()}
+
+
+def test_a_renamed_field_replaces_that_of_the_mapping():
+    y, x = MappedSignals(("y",), ("y",), "a"), MappedSignals(("x",), ("x",), "b", ("deg",))
+    table, _ = table_of_topics(TwoTopics(), LogMapping("mapping", (y, x)), {"x": "a.f"}, None, Repairs())
+    assert (table.columns["x"] == 2.0).all()
+    assert "x" not in table.units
+    pair = LogMapping("mapping", (MappedSignals(("x", "z"), ("x", "z"), "b"),))
+    with pytest.raises(LogError, match='has "x" with x, z; rename all of these'):
+        table_of_topics(TwoTopics(), pair, {"x": "a.f"}, None, Repairs())
 
 
 def test_a_mapping_that_is_not_there_names_the_built_in_ones(tmp_path):

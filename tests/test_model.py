@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from diransac.errors import ModelError, ResultError
 from diransac.model import Model, Parameter
+from diransac.model.expressions import printed
 from diransac.model.library import BUILTIN, builtin
 from diransac.model.plant import Plant
 from simulated import MACHINES
@@ -576,3 +577,9 @@ def test_damaged_model_with_a_right_checksum_is_refused_too(path_and_value, monk
 
 
 tumbling_checksum = tumbling().to_dict()["checksum"]
+
+
+def test_an_expression_that_reports_its_value_is_printed_as_itself():
+    x = ca.SX.sym("x")
+    function = ca.Function("f", [x], [ca.sin(x.printme(1))], ["x"], ["r"])
+    assert printed(function, {"x": ["x"]}) == ([], ["sin(x)"])

@@ -117,7 +117,10 @@ def test_divergence_names_the_time():
         ({"initial_state": {"y": 1.0}}, 'names "y"; the state is x, z'),
         ({"initial_state": {"x": np.nan}}, "x is nan; give a finite number"),
         ({"initial_state": {"x": 1.0}, "horizon": 1.0}, "give one"),
+        ({"initial_state": {"x": "1.0"}}, "x is '1.0'; give a finite number"),
         ({"horizon": 0.001}, "at least one sample, 0.02 s"),
+        ({"horizon": "1"}, "horizon is '1'; give a finite number"),
+        ({"substeps": 0}, "at least 1 integration step"),
         ({"input_hold": "none"}, "choose zero-order"),
     ],
 )

@@ -132,6 +132,28 @@ def test_a_ulog_is_read_in_the_axes_of_the_model(ulog):
     np.testing.assert_allclose(found, ned_to_enu @ rotation(q) @ flu_to_frd, atol=1e-12)
 
 
+def test_rows_on_the_ground_are_left_out_by_the_logs_own_topic(tmp_path):
+    data, enu, _ = flight()
+    file = Ulog()
+    file.data = data
+    file.format("vehicle_land_detected", "uint64_t timestamp;bool landed;uint8_t[7] _padding0;")
+    file.subscribe(9, "vehicle_land_detected")
+    for k, landed in ((0, True), (10, False), (20, True), (30, False), (len(T) - 5, True)):
+        file.record(9, "?", T[k] - 1e-4, landed)
+    path = tmp_path / "flight.ulg"
+    path.write_bytes(file.data)
+    log = dr.read_log(path, mapping="px4-multirotor", resample=None)
+    inside = np.isin(np.arange(len(T)), [*range(10, 20), *range(30, len(T) - 5)])
+    np.testing.assert_array_equal(log["airborne"][1:], inside[1:])
+    kept = dr.keep_while(log, ["airborne"])
+    np.testing.assert_allclose(kept.time[[0, -1]], T[[10, len(T) - 6]])
+    np.testing.assert_array_equal(np.isfinite(kept["wx"]), inside[10 : len(T) - 5])
+    np.testing.assert_array_equal(kept["wx"][:10], enu["wx"][10:20])
+    assert kept.history[-1]["left_out"][1] == pytest.approx([T[20], T[29]])
+    with pytest.raises(LogError, match="armed"):
+        dr.keep_while(log, ["armed"])
+
+
 def test_a_slow_topic_has_its_samples_where_they_are_valid_and_nothing_between(ulog):
     path, enu, _ = ulog
     log = dr.read_log(path, mapping="px4-multirotor")
@@ -202,8 +224,9 @@ def outcome(path, **options):
         return str(error)
 
 
-def test_damaged_ulogs_end_in_a_log_or_in_one_sentence(tmp_path):
-    data = shared("px4_ulog/sample_appended_multiple.ulg").read_bytes()
+@pytest.mark.parametrize("name", ["px4_ulog/sample_log_small.ulg", "px4_ulog/sample_appended_multiple.ulg"])
+def test_damaged_ulogs_end_in_a_log_or_in_one_sentence(tmp_path, name):
+    data = shared(name).read_bytes()
     rng, file = random.Random(5), tmp_path / "cut.ulg"
     for k in range(20):
         file.write_bytes(data[: 10 + (len(data) - 10) * k // 20])

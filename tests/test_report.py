@@ -342,7 +342,8 @@ def test_findings_over_several_logs_are_on_the_worst_one_and_on_all_rows(model, 
 def test_findings_on_a_held_out_log_join_those_of_the_result(result, log, other, tmp_path):
     page = Page(written(result, [log, other], tmp_path))
     assert all(str(finding) in page.text for finding in result.findings)
-    assert "Held out: 90 % of 500 rows agree with the simulation." in page.text
+    assert "Held out: outliers are left out of robust scores:" in page.text
+    assert "Held out: over the whole log the prediction of x_dot is off by" in page.text
     assert "Not used for identification (held-out validation): another dive." in page.text
     assert "Held out" not in Page(written(result, log, tmp_path)).text
 

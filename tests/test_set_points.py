@@ -148,6 +148,12 @@ def test_predictions_of_a_tenth_of_a_log_do_not_depend_on_it():
     np.testing.assert_allclose(_cross_fitted(columns, exact, folds), exact, atol=1e-9)
 
 
+def test_set_points_that_are_constant_but_in_one_tenth_of_a_log_predict_the_mean():
+    signals, folds = np.random.default_rng(0).normal(size=(100, 2)), np.arange(100) // 10
+    found = _cross_fitted((folds == 9)[:, None].astype(float), signals, folds)
+    np.testing.assert_allclose(found[90:], np.tile(signals[:90].mean(axis=0), (10, 1)))
+
+
 @pytest.mark.parametrize("n_batches", [6, 20])
 def test_critical_values_are_those_of_students_t(n_batches):
     none = np.zeros(1)

@@ -67,7 +67,7 @@ def abs_of(x):
 def sailed(bias, start, n_rows=500, dt=DT, mass=60.0):
     """Signals and inputs of the vehicle with such a bias, from such a state."""
     truth = dict(VEHICLE.truth) | {"bias": bias, "mass": mass}
-    return flight(replace(VEHICLE, start=start), n_rows, dt, truth, substeps=10)
+    return flight(replace(VEHICLE, start=start), n_rows, dt, truth, substeps=4)
 
 
 def biased_logs(noise=0.0, biases=BIASES, masses=(60.0,) * 9, **options):
@@ -150,7 +150,7 @@ def test_fit_error_and_inliers_of_several_logs_are_those_of_simulations_that_sta
 
 @pytest.mark.parametrize("method", dr.METHODS)
 def test_every_method_returns_the_truth_from_clean_logs(method):
-    signals, inputs = flight(PLANE, 900, 0.01, substeps=20)
+    signals, inputs = flight(PLANE, 900, 0.01, substeps=4)
     logs = pieces(PLANE, signals, inputs, 3, 0.01)
     result = dr.identify(builtin("planar-rotorcraft"), logs, method, settings=settings_of(method))
     assert result.parameters == pytest.approx(PLANE.truth, rel=1e-6)
@@ -162,7 +162,7 @@ def test_every_method_returns_the_truth_from_clean_logs(method):
 
 @pytest.mark.parametrize("method", ["i-diransac", "lo-diransac"])
 def test_outliers_in_several_logs_leave_the_parameters_exact(method):
-    signals, inputs = flight(PLANE, 1500, 0.01, substeps=20)
+    signals, inputs = flight(PLANE, 1500, 0.01, substeps=4)
     rng = np.random.default_rng(3)
     hit = rng.random(signals.shape) < 0.1
     hit[[0, 500, 1000]] = False
@@ -403,7 +403,7 @@ def test_validation_pools_the_errors_of_several_logs():
 def test_validation_predicts_with_the_integration_steps_that_fitted():
     """Dry friction: one step per sample and five differ."""
     machine = MACHINES["servo-axis"]
-    signals, inputs = flight(machine, 400, 0.02, substeps=20)
+    signals, inputs = flight(machine, 400, 0.02, substeps=5)
     log = named_log(machine, signals, inputs, "axis")
     result = dr.identify(builtin("servo-axis"), log)
     plant = dr.Plant(result.model, result.parameters)

@@ -485,7 +485,7 @@ def test_a_cluster_whose_worker_is_killed_gives_the_same_rows(whole: dict, tmp_p
 
 def test_a_scheduler_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("diransac.study.run._CONNECTION_TIMEOUT", "0.2s")
+    monkeypatch.setattr("diransac.study.engine._CONNECTION_TIMEOUT", "0.2s")
     with (
         pytest.raises(dr.StudyError, match=r"no scheduler at tcp://127.0.0.1:9: .*dask scheduler"),
         connected("tcp://127.0.0.1:9"),

@@ -169,7 +169,7 @@ def crane(sign=1):
 
 def all_suggested(model, library=None):
     """Every candidate as a suggestion."""
-    candidates = candidate_terms(model, np.ones(model.n_v), library)
+    candidates = candidate_terms(model, np.ones(model.n_v), np.full(model.n_u, 0.8), library)
     chosen = [SelectedTerm(k, 0.5, 0.01, 0.9) for k in range(len(candidates))]
     return candidates, suggestions_of(candidates, chosen)
 
@@ -189,15 +189,15 @@ def test_printed_code_is_the_term_that_with_terms_adds(model):
         extended = with_terms(model, [one])
         assert list(extended.parameters) == [*model.parameters, one.parameter]
         after = np.array(extended.residual(*motion[:4], np.vstack([motion[4], np.full(7, 0.7)])))
-        if term.is_input_gain:
-            more = motion[3].copy()
-            more[list(model.inputs).index(term.place)] *= 1.7
-            np.testing.assert_allclose(after, np.array(model.residual(*motion[:3], more, motion[4])), rtol=1e-9)
-            continue
         named = dict(zip("qvau", model.named(q, v, a, u), strict=True))
         coefficient = type("Parameters", (), {one.parameter: ca.SX(0.7)})
-        written = eval(f"0 {one.code}", {"ca": ca, "p": coefficient, **named})
+        written = eval(one.code if term.is_of_input else f"0 {one.code}", {"ca": ca, "p": coefficient, **named})
         values = np.array(ca.Function("written", [q, v, a, u, p], [written])(*motion))
+        if term.is_of_input:
+            changed = motion[3].copy()
+            changed[list(model.inputs).index(term.place)] = values
+            np.testing.assert_allclose(after, np.array(model.residual(*motion[:3], changed, motion[4])), rtol=1e-9)
+            continue
         np.testing.assert_allclose((after - before)[term.equation], np.ravel(values), rtol=1e-9, atol=1e-12)
 
 
@@ -244,7 +244,7 @@ def test_means_of_candidates_are_those_of_numpy():
 )
 def test_a_wrong_library_is_refused_by_its_fault(library, reason):
     with pytest.raises(dr.ModelError, match=reason):
-        candidate_terms(crane(), np.ones(2), library)
+        candidate_terms(crane(), np.ones(2), np.ones(1), library)
 
 
 # ---------------------------------------------------------------------- from a log to a suggestion
@@ -267,8 +267,8 @@ def pendulum():
     )
 
 
-def swing(friction, seed=0, rows=1500, dt=0.01):
-    """A log of the pendulum with another friction of its speed, by midpoint steps of a tenth of a sample."""
+def swing(friction=lambda w: 0.0, actuator=lambda u: u, seed=0, rows=1500, dt=0.01):
+    """A log of the pendulum with another friction and its torque by an actuator, by midpoint steps of a millisecond."""
     rng, x = np.random.default_rng(seed), np.zeros((rows + 1, 2))
     t = dt * np.arange(rows)
     torque = sum(0.3 * np.sin(w * t + rng.uniform(0, 6)) for w in rng.uniform(1.0, 9.0, 5))
@@ -276,7 +276,7 @@ def swing(friction, seed=0, rows=1500, dt=0.01):
     def rate(x, u):
         return np.array([x[1], (u - DAMPING * x[1] - friction(x[1]) - MOMENT * np.sin(x[0])) / INERTIA])
 
-    for k, u in enumerate(torque):
+    for k, u in enumerate(actuator(torque)):
         y = x[k]
         for begin, end in pairwise(np.linspace(0.0, dt, 11)):
             y = y + (end - begin) * rate(y + 0.5 * (end - begin) * rate(y, u), u)
@@ -321,10 +321,25 @@ def test_the_refit_has_the_parameters_of_the_machine(with_dry_friction):
 
 
 def test_of_an_exact_model_nothing_is_suggested_and_nothing_added():
-    found = dr.identify(pendulum(), swing(lambda w: 0.0), differentiate=True, with_suggestions=True)
+    found = dr.identify(pendulum(), swing(), differentiate=True, with_suggestions=True)
     assert not found.suggestions
     assert list(found.parameters) == ["inertia", "damping", "moment"]
     assert "no terms were suggested" in found.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "actuator"),
+    [
+        ("dead band", lambda u: u - 0.08 * np.clip(u / 0.08, -1.0, 1.0)),
+        ("curved input", lambda u: u * (1.0 + 0.15 * np.abs(u))),
+        ("saturation", lambda u: np.clip(u, -0.6, 0.6)),
+    ],
+)
+def test_what_an_actuator_does_to_its_input_is_suggested(kind, actuator):
+    found = dr.identify(pendulum(), swing(actuator=actuator), differentiate=True, with_suggestions=True)
+    assert f"terms were added to the model as suggested: {kind[0].upper()}{kind[1:]} of torque" in found.notes[0]
+    true = {"inertia": INERTIA, "damping": DAMPING, "moment": MOMENT}
+    assert {name: found.parameters[name] for name in true} == pytest.approx(true, rel=0.05)
 
 
 def test_a_users_own_term_is_suggested_where_it_explains_more():

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 import diransac as dr
+from diransac.data.dataset import Dataset
+from diransac.data.input_timing import InputTiming
 from diransac.errors import LogError, SettingsError
+from diransac.identification.estimate import Resolution
+from diransac.identification.inverse_dynamics import force_errors
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight, rollout
 
@@ -57,7 +61,7 @@ def test_true_plant_predicts_a_clean_flight_exactly():
 @pytest.mark.parametrize("plant", [TRUE, WRONG], ids=["true", "wrong"])
 def test_scores_are_those_of_windows_that_start_at_the_measured_state(plant):
     signals, inputs = noisy_flight()
-    validation = dr.validate(plant, as_log(PLANE, signals, inputs, DT), horizon=0.25)
+    validation = dr.validate(plant, as_log(PLANE, signals, inputs, DT), 0.25, start="measured")
     windows, whole = validation.horizons
     assert (windows.horizon, windows.windows) == (pytest.approx(0.25), 11)
     assert_scores(windows, by_hand(plant, signals, inputs, 25, range(0, N - 25, 25)))
@@ -72,17 +76,17 @@ def test_asked_horizon_is_the_one_on_top():
     assert validation.r_squared == validation.horizons[0].r_squared
 
 
-def test_without_a_horizon_two_that_suit_the_log_are_scored_and_the_whole_log_is_on_top():
+def test_without_a_horizon_those_that_suit_the_log_and_the_whole_log_are_scored():
     validation = dr.validate(WRONG, as_log(PLANE, *noisy_flight(), DT))
     assert [scores.horizon for scores in validation.horizons] == pytest.approx([0.05, 0.2, np.inf])
-    assert validation.rmse == validation.horizons[-1].rmse
+    assert validation.rmse == validation.judged.rmse
 
 
 def test_horizon_of_one_sample_is_one_step():
     signals, inputs = noisy_flight()
     log = as_log(PLANE, signals, inputs, DT)
     for horizon in (DT, log.dt, np.nextafter(DT, 0.0)):
-        scores = dr.validate(TRUE, log, horizon=horizon).horizons[0]
+        scores = dr.validate(TRUE, log, horizon, start="measured").horizons[0]
         assert_scores(scores, by_hand(TRUE, signals, inputs, 1, range(N - 1)))
 
 
@@ -118,7 +122,7 @@ def test_missing_samples_are_not_scored_and_windows_that_start_at_one_are_left_o
     signals, inputs = noisy_flight()
     signals[[30, 31], 8] = np.nan  # an acceleration: not scored there
     signals[50, 3] = np.nan  # a velocity at the start of the third window
-    scores = dr.validate(WRONG, as_log(PLANE, signals, inputs, DT), horizon=0.25).horizons[0]
+    scores = dr.validate(WRONG, as_log(PLANE, signals, inputs, DT), 0.25, start="measured").horizons[0]
     starts = [row for row in range(0, N - 25, 25) if row != 50]
     assert scores.windows == len(starts)
     assert_scores(scores, by_hand(WRONG, signals, inputs, 25, starts))
@@ -127,7 +131,7 @@ def test_missing_samples_are_not_scored_and_windows_that_start_at_one_are_left_o
 def test_log_is_scored_from_its_first_complete_state_on():
     signals, inputs = noisy_flight()
     signals[:4, 5] = np.nan
-    windows, whole = dr.validate(WRONG, as_log(PLANE, signals, inputs, DT), horizon=0.25).horizons
+    windows, whole = dr.validate(WRONG, as_log(PLANE, signals, inputs, DT), 0.25, start="measured").horizons
     assert_scores(windows, by_hand(WRONG, signals, inputs, 25, range(4, N - 25, 25)))
     assert_scores(whole, by_hand(WRONG, signals, inputs, N - 5, [4]))
 
@@ -139,7 +143,7 @@ def test_signals_that_the_log_lacks_are_not_scored():
     assert list(validation.rmse) == ["z", "theta", "x_dot", "z_dot", "theta_dot"]
 
 
-@pytest.mark.parametrize(("missing", "says"), [("thrust", '"thrust" is missing'), ("theta_dot", '"theta_dot"')])
+@pytest.mark.parametrize(("missing", "says"), [("thrust", '"thrust" is missing'), ("theta", '"theta"')])
 def test_log_that_cannot_be_simulated_is_refused_by_name(missing, says):
     log = as_log(PLANE, *noisy_flight(), DT)
     columns = {n: log[n] for n in log.names if n != missing}
@@ -151,7 +155,7 @@ def test_log_without_one_complete_state_is_refused():
     signals, inputs = noisy_flight()
     signals[:-1:2, 4], signals[1:-1:2, 5] = np.nan, np.nan  # the last row, whole, starts nothing
     with pytest.raises(LogError, match="complete state"):
-        dr.validate(TRUE, as_log(PLANE, signals, inputs, DT))
+        dr.validate(TRUE, as_log(PLANE, signals, inputs, DT), start="measured")
 
 
 def test_divergence_is_counted_and_infinitely_bad():
@@ -161,8 +165,9 @@ def test_divergence_is_counted_and_infinitely_bad():
     )
     validation = dr.validate(plant, as_log(VEHICLE, signals, inputs, 0.1))
     assert validation.horizons[-1].diverged == 1
-    assert validation.rmse["x_dot"] == np.inf
-    assert validation.to_dict()["rmse"]["x_dot"] is None
+    assert validation.horizons[-1].rmse["x_dot"] == np.inf
+    assert validation.to_dict()["horizons"][-1]["rmse"]["x_dot"] is None
+    assert validation.verdict == "do not rely on this"
 
 
 def test_prediction_whose_square_overflows_is_infinitely_bad():
@@ -170,7 +175,7 @@ def test_prediction_whose_square_overflows_is_infinitely_bad():
     plant = dr.Plant(
         builtin("underwater-vehicle"), {"mass": 1e-180, "linear_drag": 0.0, "quadratic_drag": 0.0, "bias": 0.0}
     )
-    assert dr.validate(plant, as_log(VEHICLE, signals, inputs, 0.1)).rmse["x_ddot"] == np.inf
+    assert dr.validate(plant, as_log(VEHICLE, signals, inputs, 0.1), start="measured").rmse["x_ddot"] == np.inf
 
 
 def test_signal_that_never_changes_has_no_fit():
@@ -201,9 +206,10 @@ def test_validation_is_ready_for_json_and_prints_every_signal_with_its_unit():
     assert data["rmse"] == validation.rmse
     assert [row["windows"] for row in data["horizons"]] == [11, 1]
     lines = str(validation).splitlines()
-    assert "RMSE 0.25 s" in lines[0]
-    assert "RMSE whole log" in lines[0]
-    assert [line.split()[:2] for line in lines[1:4]] == [["x", "m"], ["z", "m"], ["theta", "rad"]]
+    assert lines[0].startswith(validation.verdict)
+    assert "whole log (1 window)" in lines
+    table = lines[lines.index("0.25 s (11 windows)") + 2 :]
+    assert [line.split()[:2] for line in table[:3]] == [["x", "m"], ["z", "m"], ["theta", "rad"]]
 
 
 @pytest.mark.parametrize("stiffness", [None, 400.0], ids=["measured force", "target"])
@@ -230,3 +236,90 @@ def test_relative_error_of_the_predicted_force_is_that_of_a_wrong_mass(stiffness
     assert validation.force_error_percent["x"] == pytest.approx(expected, rel=0.02)
     assert "force of the inputs" in str(validation)
     assert validation.to_dict()["force_error_percent"]["x"] == validation.force_error_percent["x"]
+
+
+def test_spikes_of_an_input_are_in_no_predicted_force():
+    signals, inputs = flight(VEHICLE, 600, 0.02, substeps=4)
+    rng = np.random.default_rng(0)
+    noisy = signals + 1e-3 * signals.std(axis=0) * rng.normal(size=signals.shape)
+    late = np.vstack([inputs[1:], inputs[-1:]]) + 0.5 * rng.normal(size=inputs.shape)
+    spiked = late.copy()
+    spiked[17::40] += 60.0
+    delayed, plant = Resolution(timing=InputTiming(delay=0.02)), dr.Plant(builtin("underwater-vehicle"), VEHICLE.truth)
+    clean, found = (
+        force_errors(Dataset.of(plant.model, as_log(VEHICLE, noisy, u, 0.02)), [plant.parameters], delayed)["x"]
+        for u in (late, spiked)
+    )
+    assert found == pytest.approx(clean, rel=0.05)
+
+
+# ---------------------------------------------------------------------- windows that begin at smoothed states
+
+
+UNSTABLE = dr.Model(
+    "inverted pendulum",
+    {"q": "rad"},
+    {"u": "N m"},
+    {n: dr.Parameter("1", positive=True) for n in ("J", "k")},
+    lambda q, v, a, u, p: [p.J * a.q - p.k * q.q - u.u],
+)
+BALANCED = {"J": 0.05, "k": 0.8}
+
+
+def balanced(seed, outliers=0.0, noise=2e-4):
+    """An unstable machine under a noisy stabilising law, by exact steps of its equation; positions alone."""
+    rng, dt, n = np.random.default_rng(seed), 0.01, 1500
+    J, k = BALANCED.values()
+    w = np.sqrt(k / J)
+    c, s = np.cosh(w * dt), np.sinh(w * dt)
+    x, q, torque = np.array([0.05, 0.0]), np.zeros(n), np.zeros(n)
+    for j in range(n):
+        wave = sum(np.sin(f * j * dt + f) for f in (0.9, 2.3, 4.1, 7.7))
+        q[j], torque[j] = x[0], -3.0 * x[0] - 0.4 * x[1] + 0.15 * wave
+        e = torque[j] / k
+        x = np.array([c * (x[0] + e) + s / w * x[1] - e, s * w * (x[0] + e) + c * x[1]])
+    measured = q + noise * rng.normal(size=n)
+    hit = rng.random(n) < outliers
+    measured[hit] += rng.choice([-1.0, 1.0], hit.sum()) * rng.uniform(0.2, 3.0, hit.sum())
+    return dr.Log.from_arrays(np.arange(n) * dt, {"q": measured, "u": torque})
+
+
+def scaled(J=1.0, k=1.0):
+    return dr.Plant(UNSTABLE, {"J": J * BALANCED["J"], "k": k * BALANCED["k"]})
+
+
+def test_outliers_in_the_log_do_not_change_robust_scores_and_one_percent_of_a_parameter_does():
+    clean, hit = (dr.validate(scaled(), balanced(1, share)) for share in (0.0, 0.05))
+    assert hit.judged.horizon == clean.judged.horizon
+    assert hit.judged.robust_rmse["q"] == pytest.approx(clean.judged.robust_rmse["q"], rel=0.05)
+    assert hit.judged.rmse["q"] > 50.0 * hit.judged.robust_rmse["q"]
+    assert hit.outlier_fraction["q"] == pytest.approx(0.05, abs=0.015)
+    worse = dr.validate(scaled(J=1.01, k=1.01), balanced(1, 0.05))
+    assert worse.judged.relative_error["q"] > max(0.005, 3.0 * hit.judged.relative_error["q"])
+
+
+def test_an_unstable_machine_is_judged_over_horizons_at_which_prediction_means_something():
+    right, wrong = (dr.validate(plant, balanced(2, 0.05)) for plant in (scaled(), scaled(J=1.4, k=0.6)))
+    assert right.verdict == "usable"
+    assert wrong.verdict == "do not rely on this"
+    assert right.judged.horizon < 2.0
+    assert right.horizons[-1].robust_rmse["q"] > 1e6
+    assert any("whole log is not judged" in text for text in right.findings)
+
+
+def test_one_step_innovations_of_the_true_model_are_white_and_of_unit_variance():
+    (right,) = dr.validate(scaled(), balanced(3, 0.05)).innovations
+    assert right.standard_deviation["q"] == pytest.approx(1.0, abs=0.1)
+    assert right.whiteness["q"] > 1e-3
+    f, density = right.spectrum("q")
+    assert np.trapezoid(density, f) == pytest.approx(1.0, abs=0.2)
+    (wrong,) = dr.validate(scaled(k=0.5), balanced(3, 0.05)).innovations
+    assert wrong.unmodelled > 3.0 * max(right.unmodelled, 1e-3)
+
+
+def test_trivial_predictions_are_scored_beside_the_model():
+    t = np.arange(0.0, 10.0, 0.01)
+    log = dr.Log.from_arrays(t, {"q": 2.0 * t, "u": -BALANCED["k"] * 2.0 * t})  # uniform motion
+    scores = dr.validate(scaled(), log, 0.5, input_hold="linear").judged
+    assert scores.constant_velocity["q"] < 1e-6
+    assert scores.hold_last["q"] == pytest.approx(np.sqrt(np.mean((2.0 * 0.01 * np.arange(1, 51)) ** 2)), rel=1e-3)

@@ -25,7 +25,7 @@ from diransac.model.parts import independent_parts
 if TYPE_CHECKING:
     from diransac.data.filters import FilterSpecification
     from diransac.data.log import Log
-    from diransac.data.preprocessing import despike, differentiate, rename, resample, scale, shift
+    from diransac.data.preprocessing import despike, differentiate, keep_while, rename, resample, scale, shift
     from diransac.data.readers import read_log, read_topics
     from diransac.flight.closed_loop import fly, fly_batch, tracking_error
     from diransac.flight.corruption import CorruptedLog, corrupt
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     )
     from diransac.flight.trajectory import Trajectory
     from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
+    from diransac.identification.cross_validation import CrossValidation, cross_validate
     from diransac.identification.estimate import Finding
     from diransac.identification.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
     from diransac.identification.identify import METHODS, identify
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
     from diransac.identification.result import Result
     from diransac.identification.settings import Settings
     from diransac.identification.suggestions import Suggestion
-    from diransac.identification.validation import CrossValidation, Validation, cross_validate, validate
+    from diransac.identification.validation import Validation, validate
     from diransac.model.robots import JointTorques, MotorCurrents, PositionControl
     from diransac.plots import plot_flight
     from diransac.report import write_report
@@ -111,6 +112,7 @@ __all__ = [
     "fly_batch",
     "identify",
     "independent_parts",
+    "keep_while",
     "models",
     "multisine",
     "plan",
@@ -138,7 +140,7 @@ __all__ = [
 _FOUND_IN = {
     "data.filters": ("FilterSpecification",),
     "data.log": ("Log",),
-    "data.preprocessing": ("despike", "differentiate", "rename", "resample", "scale", "shift"),
+    "data.preprocessing": ("despike", "differentiate", "keep_while", "rename", "resample", "scale", "shift"),
     "data.readers": ("read_log", "read_topics"),
     "flight.closed_loop": ("fly", "fly_batch", "tracking_error"),
     "flight.corruption": ("CorruptedLog", "corrupt"),
@@ -167,7 +169,8 @@ _FOUND_IN = {
     "identification.result": ("Result",),
     "identification.settings": ("Settings",),
     "identification.suggestions": ("Suggestion",),
-    "identification.validation": ("CrossValidation", "Validation", "cross_validate", "validate"),
+    "identification.cross_validation": ("CrossValidation", "cross_validate"),
+    "identification.validation": ("Validation", "validate"),
     "model.robots": ("JointTorques", "MotorCurrents", "PositionControl"),
     "plots": ("plot_flight",),
     "report": ("write_report",),

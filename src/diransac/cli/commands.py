@@ -10,6 +10,7 @@ import typer
 from diransac.cli import screen
 from diransac.cli.arguments import load_model, model_file, numbers
 from diransac.cli.design import DesignedModel, DesignOptions, designed, source_of
+from diransac.cli.fleet_options import FleetOptions
 from diransac.cli.flight_options import (
     FlightPicture,
     FlightSeed,
@@ -36,18 +37,19 @@ from diransac.cli.options import (
     Search,
     StrictFlag,
     known_methods,
-    output_file,
+    output_or_stdout,
 )
-from diransac.cli.outputs import PAGE, RESULT, check_ending, checked, staged
+from diransac.cli.outputs import PAGE, RESULT, STDOUT, check_ending, checked, staged
 from diransac.cli.robot_options import LimbResults, RobotOptions, of_limb
 from diransac.cli.views import CacheState, Equations, ModelList, Recorded, compare_methods
 from diransac.data.readers import read_fields, read_topics
 from diransac.errors import SettingsError
+from diransac.identification.cross_validation import cross_validate
 from diransac.identification.identify import identify
 from diransac.identification.inspection import inspect
 from diransac.identification.methods import DEFAULT, METHODS
 from diransac.identification.result import Result
-from diransac.identification.validation import cross_validate, validate
+from diransac.identification.validation import validate
 from diransac.simulation.compiler.code_cache import CodeCache
 from diransac.time_limit import time_limited
 
@@ -67,6 +69,12 @@ def _diransac(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
     _debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error, after any command.")] = False,
+    _config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE.toml", help="Options by name, anywhere; those that are given win."),
+    ] = None,
+    _quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no text; anywhere.")] = False,
+    _verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A line for every stage; anywhere.")] = False,
 ) -> None:
     if version:
         from importlib.metadata import version as version_of
@@ -86,6 +94,7 @@ def _identify(
     derivation: Derivation,
     preparation: Preparation,
     robot: RobotOptions,
+    each: FleetOptions,
     method: MethodName = DEFAULT,
     with_suggestions: Annotated[
         bool, typer.Option("--with-suggestions", help="Identify again with the terms that the model seems to lack.")
@@ -95,13 +104,21 @@ def _identify(
     as_json: JsonFlag = False,
     strict: StrictFlag = False,
 ) -> None:
-    """Identify the parameters of a model from one log, or from several logs of one machine."""
+    """Identify the parameters of a model from one log, from several logs of one machine, or from each by itself."""
     (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
     read = [*files, model_file(model), search.settings]
+    if each.asked():
+        if output or strict:
+            raise typer.BadParameter("--each keeps its results in --store; -o and --strict are of one result")
+        arguments = search.arguments() | derived | {"with_suggestions": with_suggestions}
+        each.run(files, robot.load(model), chosen, preparation, report, arguments, search.time_limit, as_json)
+        return
     checked([output, report], read)
     check_ending(output, RESULT)
     check_ending(report, PAGE)
     limbs, results = robot.load_limbs(model), dict[str, Result]()
+    if len(limbs) > 1 and output == STDOUT:
+        raise typer.BadParameter("-o - holds one result; this robot has several limbs, give a file")
     outputs = [of_limb(path, limb) for limb in limbs for path in (output, report)]
     with staged(outputs, read) as drafts:
         logs = preparation.read_all(files)
@@ -160,12 +177,22 @@ def _validate(
     derivation: Derivation,
     preparation: Preparation,
     horizon: Annotated[float | None, typer.Option(metavar="S", help="Restart the simulation after so long.")] = None,
+    report: Report = None,
     as_json: JsonFlag = False,
+    strict: StrictFlag = False,
 ) -> None:
     """Predict other logs with an identified model, open loop."""
-    result, derivation = Result.load(model), preparation.completed(derivation)
-    logs = [derivation.derive(log, result.model) for log in preparation.read_all(files)]
-    screen.show(validate(result, logs, horizon), as_json)
+    check_ending(report, PAGE)
+    with staged([report], [model, *files]) as (page,):
+        result, derivation = Result.load(model), preparation.completed(derivation)
+        logs = [derivation.derive(log, result.model) for log in preparation.read_all(files)]
+        found = validate(result, logs, horizon)
+        if report:
+            from diransac.report import write_report
+
+            write_report(result, logs, page)
+        screen.show(found, as_json)
+    screen.end(found.verdict, strict)
 
 
 @app.command("predict")
@@ -197,7 +224,7 @@ def _predict(
             from diransac.plots.prediction import plot_prediction
 
             plot_prediction(simulated, log, result.model.state, tuple(result.model.inputs), picture)
-    typer.echo("\n".join([f"wrote {output}: {len(simulated)} rows", *simulated.notes]))
+        screen.say("\n".join([f"wrote {output}: {len(simulated)} rows", *simulated.notes]))
 
 
 @app.command("cross-validate")
@@ -248,7 +275,9 @@ def _map(
     robot: RobotOptions,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", parser=output_file, metavar="FILE.toml", help="Where to write the mapping."),
+        typer.Option(
+            "--output", "-o", parser=output_or_stdout, metavar="FILE.toml|-", help="Where to write the mapping."
+        ),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -340,7 +369,11 @@ def _export(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", parser=output_file, metavar="FILE", help="Where to write it; the ending names the format."
+            "--output",
+            "-o",
+            parser=output_or_stdout,
+            metavar="FILE|-",
+            help="Where to write it; the ending, or --to, names the format.",
         ),
     ],
     into: Annotated[
@@ -348,6 +381,9 @@ def _export(
     ] = None,
     to: Annotated[
         str | None, typer.Option("--to", metavar="c|python|casadi|yaml|mjcf|urdf", help="Format, if not by the ending.")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", metavar="NAME", help="Beginning of C's functions, if not the model's name.")
     ] = None,
 ) -> None:
     """Write an identified model for other programs, or a robot's description with the identified values in it."""
@@ -363,10 +399,10 @@ def _export(
         results = [Result.load(path) for path in models]
         left_out = list[str]()
         for k, result in enumerate(results):
-            left_out += result.export(written, written if k else into, to=chosen)
-    typer.echo(f"wrote {output}")
-    if left_out:
-        typer.echo(f"without {', '.join(left_out)}: not identifiable, or the format has no place for them")
+            left_out += result.export(written, written if k else into, to=chosen, name=name)
+        screen.say(f"wrote {output}")
+        if left_out:
+            screen.say(f"without {', '.join(left_out)}: not identifiable, or the format has no place for them")
 
 
 @app.command("models")

@@ -94,7 +94,7 @@ def _of_joints(given: Mapping[str, Any], limbs: Mapping[str, Model]) -> dict[str
     """Values by name, those of patterns such as ``{}_dot`` for every coordinate; values of names themselves win."""
     patterns = {name: value for name, value in given.items() if "{}" in name}
     joints = [n for model in limbs.values() for n in model.coordinates]
-    found = {name.format(n): value for name, value in patterns.items() for n in joints}
+    found = {name.replace("{}", n): value for name, value in patterns.items() for n in joints}
     return found | {name: value for name, value in given.items() if name not in patterns}
 
 

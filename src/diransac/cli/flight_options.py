@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from diransac.cli.arguments import numbers
-from diransac.cli.options import output_file
+from diransac.cli.options import output_file, output_or_stdout
 from diransac.data.files import ENDINGS
 from diransac.errors import ModelError
 from diransac.flight.noise import Noise
@@ -71,8 +71,8 @@ def _steps(text: str) -> float | dict[str, float]:
 
 def _log_file(text: str) -> Path:
     """Path of a log."""
-    path = output_file(text)
-    if not path.name.lower().endswith(ENDINGS):
+    path = output_or_stdout(text)
+    if text != "-" and not path.name.lower().endswith(ENDINGS):
         raise typer.BadParameter(f"{text!r} has an ending that is not known; use one of {', '.join(ENDINGS)}")
     return path
 
@@ -86,7 +86,7 @@ def _picture_file(text: str) -> Path:
 
 
 _SHAPE = "|".join(SHAPES)
-_LOG_NAMES: dict[str, Any] = {"parser": _log_file, "metavar": "FILE.csv"}
+_LOG_NAMES: dict[str, Any] = {"parser": _log_file, "metavar": "FILE.csv|-"}
 
 TrajectoryArgument = Annotated[
     str, typer.Argument(metavar=_SHAPE, callback=_one_of(*SHAPES), help="Trajectory, section V of the paper.")

@@ -15,8 +15,9 @@ from typing import Any, NoReturn, get_args, get_type_hints
 import typer
 from typer.core import TyperGroup
 
-from diransac.cli import INTERRUPTED
-from diransac.errors import DiransacError
+from diransac.cli import INTERRUPTED, screen
+from diransac.cli.config import config_defaults
+from diransac.errors import DiransacError, SettingsError
 
 __all__ = ["Group", "grouped"]
 
@@ -27,8 +28,11 @@ UsageError: type[Any] = typer.BadParameter.__mro__[1]
 _PLAIN, _CHECKED = (str, Path, int, float), ("parser", "click_type", "min", "max")
 """Kinds of arguments that are converted by a call, and what makes Typer check or convert an argument otherwise."""
 
-_LATER = {"study": "diransac.cli.study"}
+_LATER = {"fleet": "diransac.cli.fleet", "study": "diransac.cli.study"}
 """Module of each group of commands that is imported on first use."""
+
+
+_VERBOSITY = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 
 
 class Group(TyperGroup):
@@ -52,23 +56,35 @@ class Group(TyperGroup):
             _convert_plainly(command, ctx)
         return command
 
+    def _all_commands(self, words: Sequence[str]) -> dict[str, Any]:
+        """Commands by name, with the groups that are imported on first use where one of these is given."""
+        for name in set(_LATER) & set(words):
+            self.get_command(typer.Context(self), name)
+        return {name: command for name, command in self.commands.items() if not getattr(command, "hidden", False)}
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Arguments that are left for the command."""
         _convert_plainly(self, ctx)
         return super().parse_args(ctx, args)
 
     def main(self, args: Sequence[str] | None = None, *positional: Any, **extra: Any) -> NoReturn:
-        """Run the command line; ``--debug`` may stand anywhere."""
+        """Run the command line; ``--debug``, ``--config FILE``, ``-q`` and ``-v`` may stand anywhere."""
         given = list(sys.argv[1:] if args is None else args)
-        words = [word for word in given if word != "--debug"]
+        words = [word for word in given if word not in ("--debug", *_VERBOSITY)]
         extra["standalone_mode"] = False
+        levels = [_VERBOSITY[word] for word in given if word in _VERBOSITY]
+        screen.set_verbosity(levels[-1] if levels else 0)
+        debugging = "--debug" in given
         try:
+            words, file = _without_config(words)
+            if file is not None:
+                extra["default_map"] = config_defaults(file, self._all_commands(words))
             code = super().main(words, *positional, **extra)
         except UsageError as error:
             where = error.ctx.command_path if error.ctx else "diransac"
             code = _say(f"{error.format_message()}\nSee '{where} --help'.", 2)
         except (DiransacError, OSError) as error:
-            if words != given:
+            if debugging:
                 raise
             code = _say(_message(error), 1)
         except (KeyboardInterrupt, typer.Abort):
@@ -76,6 +92,21 @@ class Group(TyperGroup):
         if code == INTERRUPTED:
             typer.echo("interrupted", err=True)
         sys.exit(code or 0)
+
+
+def _without_config(words: Sequence[str]) -> tuple[list[str], Path | None]:
+    """The words without ``--config FILE``, and the file.  Raises SettingsError: not one file."""
+    left, files, rest = list[str](), list[str](), iter(words)
+    for word in rest:
+        if word == "--config":
+            files.append(next(rest, ""))
+        elif word.startswith("--config="):
+            files.append(word.removeprefix("--config="))
+        else:
+            left.append(word)
+    if len(files) > 1 or "" in files:
+        raise SettingsError("--config takes one file, such as --config diransac.toml")
+    return left, Path(files[0]) if files else None
 
 
 def _convert_plainly(command: Any, ctx: Any) -> None:

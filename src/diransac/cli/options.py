@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, isnan
@@ -38,6 +39,7 @@ __all__ = [
     "TimeLimit",
     "known_methods",
     "output_file",
+    "output_or_stdout",
 ]
 
 
@@ -80,11 +82,18 @@ def known_methods(text: str) -> list[str]:
     return wanted
 
 
-def output_file(text: str) -> Path:
-    """Path of a file to write.  Raises typer.BadParameter: empty, which `Path` takes for the current folder."""
+def output_or_stdout(text: str) -> Path:
+    """Path of a file to write, or ``-``.  Raises typer.BadParameter: empty, for `Path` the current folder."""
     if not text:
         raise typer.BadParameter("the name is empty; give the name of a file")
     return Path(text)
+
+
+def output_file(text: str) -> Path:
+    """Path of a file to write.  Raises typer.BadParameter: empty, or ``-``."""
+    if text == "-":
+        raise typer.BadParameter("only --output can be -, which is stdout; give the name of a file")
+    return output_or_stdout(text)
 
 
 def _moment(seconds: float | None) -> float | None:
@@ -101,7 +110,7 @@ _MODEL = typer.Option(
     "--model", metavar="NAME|FILE.py[:NAME]|FILE.xml", help="A built-in model, one of yours, or a robot's MJCF or URDF."
 )
 
-LogFile = Annotated[Path, typer.Argument(metavar="LOG", help=_LOG_HELP)]
+LogFile = Annotated[Path, typer.Argument(metavar="LOG|-", help=_LOG_HELP)]
 LogFiles = Annotated[list[Path], typer.Argument(metavar="LOG...", help=f"{_LOG_HELP} Several are used together.")]
 ResultFile = Annotated[Path, typer.Argument(metavar="MODEL.json", help="What identify saved.")]
 ModelName = Annotated[str, _MODEL]
@@ -109,7 +118,7 @@ OptionalModelName = Annotated[str | None, _MODEL]
 MethodName = Annotated[str, typer.Option("--method", callback=known_method, help=f"One of {', '.join(METHODS)}.")]
 Output = Annotated[
     Path | None,
-    typer.Option("--output", "-o", parser=output_file, metavar="FILE.json", help="Where to save the result."),
+    typer.Option("--output", "-o", parser=output_or_stdout, metavar="FILE.json|-", help="Where to save the result."),
 ]
 Report = Annotated[
     Path | None,
@@ -248,6 +257,10 @@ class Preparation:
     stop: Annotated[
         float | None, _option("--until", callback=_moment, metavar="S", help="Leave out what comes after.")
     ] = None
+    events: Annotated[
+        str | None,
+        _option("--while", metavar="EVENT,...", help="Leave out rows where an event does not hold: airborne."),
+    ] = None
     despike: Annotated[
         str | None, _option("--despike", metavar="all|NAME,...", help="Signals to take spikes out of.")
     ] = None
@@ -263,6 +276,8 @@ class Preparation:
         """The prepared log of a file.  Raises LogError: it cannot be read or prepared."""
         rename, scale = pairs("--map", self.rename or ()), numbers("--scale", self.scale or ())
         delays, rate = numbers("--shift", self.shift or ()), _rate(self.resample)
+        if file == Path("-"):
+            return self._of_stdin()
         log = read_log(
             file,
             mapping=self.mapping,
@@ -275,9 +290,24 @@ class Preparation:
         )
         if self.start is not None or self.stop is not None:
             log = log.between(-inf if self.start is None else self.start, inf if self.stop is None else self.stop)
+        if self.events is not None:
+            log = preprocessing.keep_while(log, names(self.events))
         if self.despike is not None:
             log = preprocessing.despike(log, None if self.despike == "all" else names(self.despike))
         return preprocessing.shift(log, delays) if delays else log
+
+    def _of_stdin(self) -> Log:
+        """The prepared log of CSV text on stdin.  Raises LogError: as `read`, or there is none."""
+        data = typer.get_binary_stream("stdin").read()
+        if not data:
+            raise LogError('"-" is standard input, which is empty; pipe CSV text into this command')
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "stdin.csv"
+            file.write_bytes(data)
+            try:
+                return replace(self.read(file), source="standard input")
+            except LogError as error:
+                raise LogError(str(error).replace(f'log "{file}"', "standard input")) from error
 
     def completed(self, derivation: Derivation) -> Derivation:
         """The derivation with what the mapping file says of it and the command line does not.

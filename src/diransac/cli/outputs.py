@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import typer
+
 from diransac.atomic import draft
+from diransac.cli.screen import stdout_taken
 from diransac.errors import DiransacError, ResultError
 
-__all__ = ["PAGE", "RESULT", "check_ending", "checked", "staged"]
+__all__ = ["PAGE", "RESULT", "STDOUT", "check_ending", "checked", "staged"]
 
+STDOUT = Path("-")
+"""Name of stdout among outputs, and of stdin among logs."""
 RESULT = (".json",)
 PAGE = (".html", ".htm")
 """Endings of results and of pages."""
@@ -53,7 +59,7 @@ def check_ending(output: Path | None, endings: Sequence[str]) -> None:
     endings : sequence of str
         Of this format.
     """
-    if output is not None and output.suffix.lower() not in endings:
+    if output is not None and output != STDOUT and output.suffix.lower() not in endings:
         raise ResultError(f'output "{output}" does not end in {" or ".join(endings)}, the format that is written')
 
 
@@ -80,11 +86,15 @@ def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -
     """
     targets = checked(outputs, inputs)
     with ExitStack() as folders:
+        if STDOUT in outputs:
+            folders.enter_context(stdout_taken())
         drafts = [Path() if path is None else _made(path, folders) for path in targets]
         with _naming(dict(zip(drafts, outputs, strict=True))):
             yield drafts
         for written, target in zip(drafts, targets, strict=True):
-            if target is not None:
+            if target == STDOUT:
+                _print(written)
+            elif target is not None:
                 if target.exists():
                     written.chmod(target.stat().st_mode)
                 written.replace(target)
@@ -105,8 +115,15 @@ def _naming(outputs: Mapping[Path, Path | None]) -> Iterator[None]:
         raise type(error)(message) from error
 
 
+def _print(written: Path) -> None:
+    """Copy a file to stdout."""
+    typer.echo(written.read_bytes(), nl=False)
+
+
 def _made(target: Path, folders: ExitStack) -> Path:
-    """The draft of a file, empty."""
+    """The draft of a file, empty; of stdout, one that ends as a log of text does."""
+    if target == STDOUT:
+        return Path(folders.enter_context(tempfile.TemporaryDirectory())) / "stdout.csv"
     try:
         found = folders.enter_context(draft(target))
         found.touch()
@@ -116,6 +133,8 @@ def _made(target: Path, folders: ExitStack) -> Path:
 
 
 def _place(path: Path, sources: Set[Path]) -> Path:
+    if path == STDOUT:
+        return path
     target = path.resolve()
     if target.exists() and not target.is_file():
         raise ResultError(f'output "{path}" is not an ordinary file; give the name of a file')

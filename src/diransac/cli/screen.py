@@ -15,7 +15,10 @@ import typer
 
 from diransac.identification.method import Callback, Progress
 
-__all__ = ["Lines", "bar", "end", "show"]
+__all__ = ["Lines", "bar", "end", "say", "set_verbosity", "show", "stdout_taken"]
+
+_STATE = {"verbosity": 0, "taken": 0}
+"""Of the command that this process runs: -1 quiet, 1 verbose; number of outputs that are written to stdout."""
 
 UNRELIABLE = 3
 """Exit code of `end`."""
@@ -42,10 +45,44 @@ def show(shown: Showable, as_json: bool) -> None:
     as_json : bool
         Whether to print JSON, in which numbers that are not finite are null.
     """
-    if as_json:
-        typer.echo(json.dumps(_finite(shown.to_dict()), indent=1, ensure_ascii=False, allow_nan=False))
-    else:
-        typer.echo(str(shown))
+    if not as_json:
+        say(str(shown))
+        return
+    if _STATE["taken"]:
+        raise typer.BadParameter("-o - and --json both write to stdout; give one")
+    typer.echo(json.dumps(_finite(shown.to_dict()), indent=1, ensure_ascii=False, allow_nan=False))
+
+
+def say(text: str) -> None:
+    """Print text on stdout; on stderr where an output is written to stdout; nowhere if quiet.
+
+    Parameters
+    ----------
+    text : str
+    """
+    if _STATE["verbosity"] >= 0:
+        typer.echo(text, err=bool(_STATE["taken"]))
+
+
+def set_verbosity(level: int) -> None:
+    """Set how much is printed.
+
+    Parameters
+    ----------
+    level : int
+        -1: results that are asked for as JSON, and errors; 0: results and progress; 1: a line for every stage.
+    """
+    _STATE["verbosity"] = level
+
+
+@contextmanager
+def stdout_taken() -> Iterator[None]:
+    """Context in which an output is written to stdout, and all text goes to stderr."""
+    _STATE["taken"] += 1
+    try:
+        yield
+    finally:
+        _STATE["taken"] -= 1
 
 
 def end(verdict: str, strict: bool) -> None:
@@ -86,6 +123,12 @@ def bar(label: str) -> Iterator[Callback]:
     callable
         Takes a `Progress`.
     """
+    if _STATE["verbosity"] < 0:
+        yield lambda _: None
+        return
+    if _STATE["verbosity"] > 0:
+        yield Stages(label).show
+        return
     if sys.stderr is None or not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
         lines = Lines(label)
         yield lambda found: lines.show(found.stage, found.fraction)
@@ -107,6 +150,31 @@ def bar(label: str) -> Iterator[Callback]:
             shown.update(task, completed=found.fraction, description=f"{label}: {found.stage}{note}")
 
         yield update
+
+
+class Stages:
+    """Progress as a line on stderr for every stage.
+
+    Parameters
+    ----------
+    label : str
+        Name of the work.
+    """
+
+    def __init__(self, label: str) -> None:
+        self._label, self._begin, self._last = label, time.monotonic(), ""
+
+    def show(self, found: Progress) -> None:
+        """Print a line if the stage is another one.
+
+        Parameters
+        ----------
+        found : Progress
+        """
+        if found.stage != self._last:
+            self._last = found.stage
+            elapsed = time.monotonic() - self._begin
+            typer.echo(f"{self._label}: {elapsed:7.2f} s  {found.fraction:4.0%}  {found.stage}", err=True)
 
 
 class Lines:

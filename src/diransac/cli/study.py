@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-import math
-import os
-import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,10 +13,10 @@ from diransac.cli import screen
 from diransac.cli.arguments import names, toml_value
 from diransac.cli.options import JsonFlag
 from diransac.cli.outputs import PAGE, check_ending, checked, staged
+from diransac.cli.workers import Cluster, Jobs, running
 from diransac.errors import SettingsError
 from diransac.identification.identify import METHODS
-from diransac.study import Status, Study, builtin_names, connected, export, load, run_study, status, template
-from diransac.study.run import Progress
+from diransac.study import builtin_names, export, load, run_study, status, template
 from diransac.study.specification import TRUE
 from diransac.text_table import aligned
 
@@ -68,45 +63,19 @@ def _run(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change a value: plant.convention=printed; repeatable."),
     ] = None,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Number of processes; one per core by default.")
-    ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run the trials: tcp://host:8786."),
-    ] = None,
+    jobs: Jobs = None,
+    cluster: Cluster = None,
     time_limit: Annotated[
         float | None, typer.Option("--time-limit", metavar="S", help="End the run after so many seconds.")
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Run the trials that a store lacks; after an interruption, the same command runs the rest."""
-    if cluster is not None and jobs is not None:
-        raise typer.BadParameter(
-            "--jobs sets the processes of this machine, --cluster runs on others; give one of them"
-        )
     wanted = load(source, _changes(assignments or ()))
     wanted = wanted.subset(trials, _listed("--levels", levels), _listed("--methods", methods))
-    with _kept(store) as note, _bar(wanted.name) as show:
-
-        def progress(done: int, asked: int) -> None:
-            note(done, asked)
-            show(done, asked)
-
-        found = _everywhere(wanted, store, jobs, cluster, time_limit, progress)
+    with running(wanted.name, store, jobs, cluster) as how:
+        found = run_study(wanted, store=store, time_limit=time_limit, **how)
     screen.show(found, as_json)
-
-
-def _everywhere(
-    wanted: Study, store: Path, jobs: int | None, cluster: str | None, time_limit: float | None, progress: Progress
-) -> Status:
-    """Run on this machine or on a cluster."""
-    if cluster is None:
-        return run_study(wanted, store=store, jobs=jobs, time_limit=time_limit, progress=progress)
-    with connected(cluster) as (executor, tasks):
-        for talker in ("distributed", "concurrent.futures"):  # the error itself is one line
-            logging.getLogger(talker).setLevel(logging.CRITICAL)
-        return run_study(wanted, store=store, executor=executor, tasks=tasks, time_limit=time_limit, progress=progress)
 
 
 @study.command("new")
@@ -228,65 +197,3 @@ class _Studies:
             studies.setdefault(tuple(load(name).methods), []).append(name)
         yield from (f"methods of {', '.join(names)}: {', '.join(labels)}" for labels, names in studies.items())
         yield f"methods there are: {', '.join((TRUE, *METHODS))}"
-
-
-# Progress ---------------------------------------------------------------------------------------------------------
-def _lines(label: str) -> Progress:
-    """Progress callback without a terminal; rows of an earlier run do not count for the time left."""
-    lines, kept = screen.Lines(label), list[int]()
-
-    def update(done: int, asked: int) -> None:
-        kept[:] = kept or [done]
-        lines.show(f"{done} of {asked} rows", (done - kept[0]) / max(1, asked - kept[0]))
-
-    return update
-
-
-@contextmanager
-def _kept(store: Path) -> Iterator[Progress]:
-    """Callback that counts rows; a run that ends before all are done says how many there are, and how to resume."""
-    counts = [0, 0]
-
-    def update(done: int, asked: int) -> None:
-        counts[:] = done, asked
-
-    try:
-        yield update
-    finally:
-        done, asked = counts
-        if done < asked and isinstance(sys.exception(), KeyboardInterrupt | None):
-            typer.echo(f"{done} of {asked} rows are kept in {store}; the same command runs the rest", err=True)
-
-
-@contextmanager
-def _bar(label: str) -> Iterator[Progress]:
-    """Progress callback: a bar with rate and time left if stderr is a terminal, else a line every ten seconds."""
-    if sys.stderr is None or not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
-        yield _lines(label)
-        return
-    from rich import progress
-    from rich.console import Console
-
-    columns = (
-        progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        progress.TextColumn("rows, {task.fields[rate]}"),
-        progress.TimeRemainingColumn(),
-    )
-    # The rate is an average since the start, so that it is known from the first rows on.
-    options: dict[str, Any] = {"console": Console(stderr=True), "transient": True, "speed_estimate_period": math.inf}
-    with progress.Progress(*columns, **options) as shown:
-        task = shown.add_task(label, total=None, rate="starting")
-
-        def update(done: int, asked: int) -> None:
-            if shown.tasks[0].total is None:  # rows of an earlier run do not count for the rate
-                shown.reset(task, total=asked, completed=done)
-                shown.advance(task, 0)
-                return
-            shown.update(task, completed=done)
-            speed = shown.tasks[0].speed
-            if speed:
-                shown.update(task, rate=f"{speed:.1f}/s" if speed >= 1.0 else f"{60.0 * speed:.1f}/min")
-
-        yield update

@@ -16,6 +16,13 @@ A mapping is TOML.  Built-in ones, in ``mappings/``, are named without an ending
 
 A list of ``names`` may have one ``scale``, ``sign`` or ``offset`` for each.  ``frame`` then changes the axes of three
 components, or of the four of a quaternion whose ``order`` in the file is given.  ``where`` leaves samples out.
+
+::
+
+    [[events]]
+    name = "airborne"                 # a signal that is 1 where the conditions held last, else 0
+    topic = "vehicle_land_detected"
+    where = { field = "landed", below = 0.5 }
 """
 
 from __future__ import annotations
@@ -34,7 +41,7 @@ from diransac.errors import LogError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["BUILT_IN", "Condition", "LogMapping", "MappedSignals", "load_mapping"]
+__all__ = ["BUILT_IN", "Condition", "Event", "LogMapping", "MappedSignals", "held", "load_mapping"]
 
 _HALF = math.sqrt(0.5)
 _AXES: dict[str, FloatArray] = {
@@ -47,7 +54,7 @@ _ORDERS = ("wxyz", "xyzw")
 
 _KEYS = {"name", "topic", "field", "unit", "scale", "sign", "offset", "frame", "order", "optional", "where"}
 _STEPS = {"resample", "repair", "from", "until", "despike", "shift", "differentiate", "bandwidth"}
-_TOP = {"description", "time", "signals", *_STEPS}
+_TOP = {"description", "time", "signals", "events", *_STEPS}
 _LARGEST_FILE = 1_000_000
 _ANY = "{joint}"
 _FOLDER = Path(__file__).parent / "mappings"
@@ -136,6 +143,43 @@ class MappedSignals:
         return {name: unit for name, unit in zip(self.names, self.units, strict=False) if unit is not None}
 
 
+@dataclass(frozen=True)
+class Event:
+    """A state of the machine that holds or does not, such as airborne.
+
+    Parameters
+    ----------
+    name : str
+    topic : str
+        Empty for a table.
+    where : tuple of Condition
+        All of them must hold.
+    """
+
+    name: str
+    topic: str
+    where: tuple[Condition, ...]
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Fields that must be read."""
+        return tuple(dict.fromkeys(x.field for x in self.where))
+
+    def flags(self, columns: Mapping[str, FloatArray]) -> FloatArray:
+        """1 for each sample (n,) of the topic at which it holds, else 0."""
+        holds = np.logical_and.reduce([x.holds(columns[x.field]) for x in self.where])
+        return np.asarray(holds, np.float64)
+
+
+def held(time: FloatArray, flags: FloatArray, rows: FloatArray) -> FloatArray:
+    """Flag that was last known at each of the rows (N,), s; NaN before the first."""
+    if not len(time):
+        return np.full(len(rows), np.nan)
+    order = np.argsort(time, kind="stable")
+    last = np.searchsorted(time[order], rows, side="right") - 1
+    return np.asarray(np.where(last < 0, np.nan, flags[order][np.maximum(last, 0)]))
+
+
 def _signed_permutation(matrix: FloatArray, rows: Sequence[FloatArray]) -> list[FloatArray]:
     """Rows under a matrix of which each row has one entry, 1 or -1; their numbers keep their bits."""
     sources = np.abs(matrix).argmax(axis=1)
@@ -161,6 +205,8 @@ class LogMapping:
         Name in messages, such as ``mapping "rover.toml"``.
     signals : tuple of MappedSignals
         Of several entries for one signal, the first whose topic and fields a log has is used.
+    events : tuple of Event
+        Of several for one name, the first whose topic and fields a log has is used; a log may lack any.
     time : str
         ``"header"`` or ``"message"``: time at which a message was sampled, or recorded.
     time_column : str, optional
@@ -172,6 +218,7 @@ class LogMapping:
 
     source: str
     signals: tuple[MappedSignals, ...] = ()
+    events: tuple[Event, ...] = ()
     time: str = "header"
     time_column: str | None = None
     time_scale: float = 1.0
@@ -180,6 +227,15 @@ class LogMapping:
     def option(self, name: str) -> Any:
         """A step of the preparation, or None."""
         return (self.preparation or {}).get(name)
+
+    def events_in(self, fields: Mapping[str, Sequence[str]]) -> list[Event]:
+        """Events whose topic and fields a log has."""
+        found: dict[str, Event] = {}
+        for event in self.events:
+            topic = event.topic if event.topic in fields else f"{event.topic}_0"
+            if set(event.needs) <= set(fields.get(topic, ())):
+                found.setdefault(event.name, replace(event, topic=topic if event.topic else ""))
+        return list(found.values())
 
     def chosen(
         self, fields: Mapping[str, Sequence[str]], elements: Mapping[str, Sequence[str]], source: str
@@ -201,8 +257,9 @@ class LogMapping:
         """
         found: dict[str, MappedSignals] = {}
         lacking: dict[str, str] = {}
-        for entry in [one for whole in self.signals for one in _of_elements(whole, elements)]:
-            topic = entry.topic or (next(iter(fields)) if len(fields) == 1 else "")
+        only = next(iter(fields)) if len(fields) == 1 else ""
+        for entry in [one for whole in self.signals for one in _of_elements(whole, elements.get(whole.topic or only))]:
+            topic = entry.topic or only
             why = _why_not(entry, topic, fields, elements.get(topic, ()))
             if why is None:
                 for name in entry.names:
@@ -234,9 +291,9 @@ def _unique(absent: Mapping[str, str]) -> list[str]:
     return list(dict.fromkeys(absent.values()))
 
 
-def _of_elements(entry: MappedSignals, elements: Mapping[str, Sequence[str]]) -> list[MappedSignals]:
-    """The entry, once for each element where it has the placeholder ``{joint}``."""
-    if not any(_ANY in text for text in (*entry.names, *entry.fields)):
+def _of_elements(entry: MappedSignals, elements: Sequence[str] | None) -> list[MappedSignals]:
+    """The entry, once for each element where it has the placeholder ``{joint}`` and the topic has elements."""
+    if not elements or not any(_ANY in text for text in (*entry.names, *entry.fields)):
         return [entry]
     return [
         replace(
@@ -244,7 +301,7 @@ def _of_elements(entry: MappedSignals, elements: Mapping[str, Sequence[str]]) ->
             names=tuple(x.replace(_ANY, element) for x in entry.names),
             fields=tuple(x.replace(_ANY, element) for x in entry.fields),
         )
-        for element in elements.get(entry.topic, ())
+        for element in elements
     ]
 
 
@@ -333,6 +390,7 @@ def _parse(content: Mapping[str, Any], source: str) -> LogMapping:
     return LogMapping(
         source,
         tuple(_entry(x, f"{source}: signal {k + 1}") for k, x in enumerate(entries)),
+        _events(content.get("events", []), source),
         time,
         column,
         scale,
@@ -397,6 +455,20 @@ def _entry(table: Mapping[str, Any], source: str) -> MappedSignals:
         optional=optional,
         where=_conditions(table.get("where", []), source),
     )
+
+
+def _events(tables: Any, source: str) -> tuple[Event, ...]:
+    if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
+        raise LogError(f"{source}: events must be tables; write [[events]] before each")
+    found = []
+    for table in tables:
+        _check_keys(table, {"name", "topic", "where"}, f"{source}: events")
+        name = _string(table, "name", f"{source}: events")
+        where = _conditions(table.get("where", []), f'{source}: event "{name}"')
+        if name in (None, "t") or not where:
+            raise LogError(f'{source}: an event needs a name, and where = {{ field = "landed", below = 0.5 }}')
+        found.append(Event(name or "", _string(table, "topic", source) or "", where))
+    return tuple(found)
 
 
 def _ordered(table: Mapping[str, Any], fields: tuple[str, ...], source: str) -> tuple[tuple[str, ...], str | None]:

@@ -257,7 +257,7 @@ def yaml_document(model: PortableModel) -> str:
         "input_timing": {
             "hold": model.hold,
             "delay_s": model.input_delays or dict.fromkeys(model.model.inputs, 0.0),
-            "lag_s": model.timing.lag,
+            "lag_s": model.input_lags or dict.fromkeys(model.model.inputs, 0.0),
         },
         "parameters": {name: _estimate(model, name) for name in values},
         "covariance": dict(zip(values, model.covariance.tolist(), strict=True)),
@@ -275,6 +275,8 @@ def _estimate(model: PortableModel, name: str) -> dict[str, Any]:
         "unit": about.unit,
         "lower": max(about.lower, 0.0) if about.positive else about.lower,
         "upper": about.upper,
+        **({"per_log": list(model.per_log[name])} if name in model.per_log else {}),
+        **({"sensor_only": True} if name in model.of_sensors else {}),
     }
 
 

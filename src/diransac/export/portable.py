@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 
+import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray
@@ -42,6 +43,10 @@ class PortableModel:
         Delays and lag after which recorded inputs act, and the drift of their gains.
     hold : str, optional
         Inputs between samples: "zero-order", "linear" or "smooth".
+    per_log : mapping of str to tuple of float, optional
+        Values of each parameter that has one per log; what is exported is their mean.
+    name : str, optional
+        Name in the file, of which the names of C's functions begin; empty: that of the model.
     """
 
     model: Model
@@ -51,11 +56,23 @@ class PortableModel:
     samples: Mapping[str, FloatArray] = field(default_factory=dict)
     timing: InputTiming = field(default_factory=InputTiming)
     hold: str = "zero-order"
+    per_log: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    name: str = ""
+
+    @property
+    def of_sensors(self) -> tuple[str, ...]:
+        """Parameters of sensors alone, on which the motion does not depend."""
+        model = self.model
+        if not model.sensors:
+            return ()
+        x, u, p = ca.SX.sym("x", len(model.state)), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.n_p)
+        depends = ca.which_depends(model.dynamics(x, u, p)[0], p, 1, False)
+        return tuple(n for n, used in zip(model.parameters, depends, strict=True) if not used)
 
     @property
     def identifier(self) -> str:
         """Name of the model as an identifier of C and Python."""
-        name = re.sub(r"[^A-Za-z0-9]+", "_", self.model.name).strip("_")
+        name = re.sub(r"[^A-Za-z0-9]+", "_", self.name or self.model.name).strip("_")
         return name if name and not name[0].isdigit() else f"model_{name}".rstrip("_")
 
     @property
@@ -66,9 +83,16 @@ class PortableModel:
     @property
     def input_delays(self) -> dict[str, float]:
         """Delay of each input, s; empty if none is delayed."""
-        own = self.timing.own_delays or (0.0,) * self.model.n_u
-        delays = {n: self.timing.delay + x for n, x in zip(self.model.inputs, own, strict=True)}
-        return delays if any(delays.values()) else {}
+        return self._by_input(self.timing.delays)
+
+    @property
+    def input_lags(self) -> dict[str, float]:
+        """Time constant of each input's actuator, s; empty if none has a lag."""
+        return self._by_input(self.timing.lags)
+
+    def _by_input(self, times: tuple[float, ...]) -> dict[str, float]:
+        of_each = times if len(times) > 1 else times * self.model.n_u
+        return dict(zip(self.model.inputs, of_each, strict=True)) if any(times) else {}
 
     @property
     def remarks(self) -> list[str]:
@@ -77,17 +101,20 @@ class PortableModel:
         if self.input_delays:
             delays = ", ".join(f"{n} by {1e3 * x:.3g} ms" for n, x in self.input_delays.items())
             found.append(f"Recorded inputs act late; the caller delays {delays}.")
-        if self.timing.lag:
-            found.append(
-                f"Recorded inputs act through a first-order lag; the caller filters them: time constant "
-                f"{1e3 * self.timing.lag:.3g} ms."
-            )
+        if self.input_lags:
+            lags = ", ".join(f"{1e3 * x:.3g} ms of {n}" for n, x in self.input_lags.items())
+            found.append(f"The caller filters recorded inputs by first-order lags with the time constants {lags}.")
         if any(self.timing.gain_drifts):
             pairs = zip(self.model.inputs, self.timing.gain_drifts, strict=True)
             drifts = ", ".join(f"{n} by {100.0 * x:.2g} %" for n, x in pairs)
             found.append(f"Over the log, the gain of the inputs changed: {drifts}; this is not in the model.")
         if self.model.quaternions:
             found.append("A step normalises quaternions.")
+        for name, values in self.per_log.items():
+            each = ", ".join(f"{x:.6g}" for x in values)
+            found.append(f"{name} has a value for each log ({each}); what stands here is their mean.")
+        if self.of_sensors:
+            found.append(f"The motion does not depend on {', '.join(self.of_sensors)}: they describe sensors.")
         return found
 
     def description(self) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Candidate terms of equations of motion: friction, drag, stiffness, harmonics, products, input gains, a user's own.
+"""Candidate terms of equations of motion: friction, drag, stiffness, harmonics, products, inputs, a user's own.
 
 A candidate is an addition ``theta h(q, v, a, u, p)`` to the residuals of a model, with one new parameter theta.
 Friction switches smoothly over a hundredth of the RMS speed, so that columns, printed code and simulations are the same
@@ -7,7 +7,7 @@ function.
 References
 ----------
 Armstrong-Helouvry, Dupont, Canudas de Wit 1994 (models of friction); Brunton, Proctor, Kutz 2016 (libraries of
-candidate terms); Fossen 2011, section 8 (currents).
+candidate terms); Fossen 2011, section 8 (currents); Tao, Kokotovic 1996 (dead bands of actuators).
 """
 
 from __future__ import annotations
@@ -26,7 +26,11 @@ from diransac.errors import ModelError
 from diransac.model import Model
 from diransac.model.derivation import Symbols, call_user
 
-__all__ = ["CandidateTerm", "CandidateTerms", "TermLibrary", "candidate_terms"]
+__all__ = ["INPUT_CHANGES", "INPUT_GAIN", "CandidateTerm", "CandidateTerms", "TermLibrary", "candidate_terms"]
+
+INPUT_GAIN = "input gain"
+INPUT_CHANGES = (INPUT_GAIN, "input offset", "curved input", "dead band", "saturation")
+"""Kinds of the terms that change an input."""
 
 TermLibrary = Callable[[Symbols, Symbols, Symbols], Mapping[str, Any]]
 """A user's candidates: ``library(q, v, u)`` returns expressions by name, each of which is tried in every equation."""
@@ -34,6 +38,8 @@ TermLibrary = Callable[[Symbols, Symbols, Symbols], Mapping[str, Any]]
 # Speed over which sign(v) is smooth, and speeds of the Stribeck effect, over the RMS speed.
 _SMOOTH, _STRIBECK = 0.01, (0.03, 0.06, 0.12, 0.25)
 _HARMONICS = (1, 2, 3)
+# Widths of a dead band, and levels of saturation, over the RMS input.
+_DEAD_BANDS, _LEVELS = (0.02, 0.05, 0.1, 0.2, 0.4), (0.6, 0.8, 1.0, 1.3, 1.7)
 _FORCES = {"m": "N", "rad": "N m"}
 _BLOCK = 4096
 
@@ -47,13 +53,13 @@ class CandidateTerm:
     kind : str
         Effect, such as ``"Coulomb friction"``.
     equation : int
-        Index of the equation; -1 for an input gain, which acts in every equation that the input enters.
+        Index of the equation; -1 for a change of an input, which acts in every equation that the input enters.
     place : str
         Coordinate, velocity or input in the name of the parameter and in sentences.
     formula : str
         The term for readers, such as ``sign(x_dot)``.
     code : str
-        Python code, with CasADi as ``ca``: a summand of the residual with its sign, or the input with its gain.
+        Python code, with CasADi as ``ca``: a summand of the residual with its sign, or what replaces the input.
     parameter : str
         Name of the new parameter.
     unit : str
@@ -72,9 +78,14 @@ class CandidateTerm:
     residuals: ca.SX
 
     @property
+    def is_of_input(self) -> bool:
+        """True if the term changes an input."""
+        return self.equation < 0
+
+    @property
     def is_input_gain(self) -> bool:
         """True if the term scales an input."""
-        return self.equation < 0
+        return self.kind == INPUT_GAIN
 
 
 @dataclass(frozen=True)
@@ -139,18 +150,23 @@ class CandidateTerms:
         return found
 
 
-def candidate_terms(model: Model, speeds: FloatArray, library: TermLibrary | None = None) -> CandidateTerms:
+def candidate_terms(
+    model: Model, speeds: FloatArray, inputs: FloatArray, library: TermLibrary | None = None
+) -> CandidateTerms:
     """The library of candidates of a model.
 
     In the equation of each velocity v: ``sign(v)``, Stribeck friction at several speeds, ``v``, ``|v| v``, ``|v|``
     (drag in a current), a constant, the position, harmonics of every angle, other velocities and all products of
-    velocities; besides them a gain of each input, and the user's expressions.
+    velocities; besides them the user's expressions, and of each input a gain, an offset, ``|u| u``, a dead band of
+    several widths and a saturation at several levels.
 
     Parameters
     ----------
     model : Model
     speeds : (n_v,) array
         RMS of each velocity, its unit; velocities that are zero get no friction.
+    inputs : (n_u,) array
+        RMS of each input, its unit; inputs that are zero get a gain alone.
     library : callable, optional
         The user's expressions by name.
 
@@ -164,11 +180,11 @@ def candidate_terms(model: Model, speeds: FloatArray, library: TermLibrary | Non
         The user's library fails, or returns a name that cannot be that of a parameter.
     """
     symbols = tuple(ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup"))
-    maker = _Maker(model, symbols, speeds)
+    maker = _Maker(model, symbols, speeds, inputs)
     terms = [x for i in range(model.n_v) for x in maker.of_equation(i)]
     if library is not None:
         terms += maker.of_user(library)
-    return CandidateTerms(symbols, (*terms, *maker.gains()))
+    return CandidateTerms(symbols, (*terms, *maker.of_inputs()))
 
 
 @dataclass(frozen=True)
@@ -178,6 +194,7 @@ class _Maker:
     model: Model
     symbols: tuple[ca.SX, ...]
     speeds: FloatArray
+    inputs: FloatArray
 
     def of_equation(self, i: int) -> Iterator[CandidateTerm]:
         """Candidates in one equation, the simplest first."""
@@ -266,15 +283,36 @@ class _Maker:
             for i in range(self.model.n_v):
                 yield self._term(name, i, name, name, name, value, None)
 
-    def gains(self) -> Iterator[CandidateTerm]:
-        """A relative error of each input's gain, in every equation that it enters."""
+    def of_inputs(self) -> Iterator[CandidateTerm]:
+        """Changes of each input, in every equation that it enters, the simplest first."""
         q, v, a, u, p = self.symbols
         r = self.model.residual(q, v, a, u, p)
-        for j, name in enumerate(self.model.inputs):
+        for j, (name, unit) in enumerate(self.model.inputs.items()):
             slope = ca.jacobian(r, u[j])
-            parameter = self._free(f"gain_error_{name}")
-            code = f"u.{name} * (1 + p.{parameter})"
-            yield CandidateTerm("input gain", -1, name, name, code, parameter, "1", ca.densify(slope * u[j]))
+            for kind, label, formula, code, value, of_value in self._changes(name, u[j], unit, float(self.inputs[j])):
+                parameter = self._free(f"{label}_{name}")
+                line = f"u.{name}" + (" * (1 + p.{0})" if kind == INPUT_GAIN else f" + p.{{0}}{code}").format(parameter)
+                h = ca.densify(slope * value)
+                yield CandidateTerm(kind, -1, name, formula, line, parameter, of_value, h)
+
+    def _changes(self, name: str, u: ca.SX, unit: str, size: float) -> Iterator[tuple[str, str, str, str, ca.SX, str]]:
+        """Kind, label, formula, factor in code, value and unit of the coefficient of changes of one input."""
+        yield INPUT_GAIN, "gain_error", name, "", u, "1"
+        if not size > 0.0:
+            return
+        code, per_unit = f"u.{name}", _over("1", "" if unit == "1" else unit)
+        yield "input offset", "offset", "", "", ca.SX(1), unit
+        yield "curved input", "curvature", f"|{name}| {name}", f" * ca.fabs({code}) * {code}", ca.fabs(u) * u, per_unit
+        for factor in _DEAD_BANDS:
+            width = float(f"{factor * size:.2g}")
+            limited = f" * ca.fmax(-1, ca.fmin(1, {code} / {width:g}))"
+            value = ca.fmax(-1.0, ca.fmin(1.0, u / width))
+            yield "dead band", "dead_band", f"sign({name}) beyond {width:g}", limited, value, unit
+        for factor in _LEVELS:
+            level = float(f"{factor * size:.2g}")
+            beyond = f" * ({code} - ca.fmax(-{level:g}, ca.fmin({level:g}, {code})))"
+            value = u - ca.fmax(-level, ca.fmin(level, u))
+            yield "saturation", "saturation", f"({name} beyond {level:g})", beyond, value, "1"
 
     def _term(
         self, kind: str, i: int, label: str, formula: str, code: str, value: ca.SX, unit: str | None
@@ -302,7 +340,7 @@ class _Maker:
 _QUOTIENTS = {
     "m": "/m", "rad": "/rad", "m/s": " s/m", "rad/s": " s/rad", "(m/s)^2": " s^2/m^2", "(rad/s)^2": " s^2/rad^2",
     "(m/s) (m/s)": " s^2/m^2", "(rad/s) (rad/s)": " s^2/rad^2", "(m/s) (rad/s)": " s^2/(m rad)",
-    "(rad/s) (m/s)": " s^2/(m rad)",
+    "(rad/s) (m/s)": " s^2/(m rad)", "N": "/N",
 }  # fmt: skip
 
 

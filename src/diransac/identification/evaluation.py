@@ -301,7 +301,7 @@ class Simulation:
         self._measured = [
             Measurements(np.ascontiguousarray(one.measured[:, compared]), one.valid) for one in dataset.segments
         ]
-        self._inputs = [resolution.timing.acting(one.inputs, one.log.dt) for one in dataset.segments]
+        self._inputs = [resolution.timing.acting(one.inputs, one.log.dt, resolution.hold) for one in dataset.segments]
 
     @cached_property
     def starts(self) -> list[list[tuple[slice, FloatArray]]]:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from diransac.identification.result import Result
     from diransac.model import Parameter
 
-__all__ = ["Verdict", "bounds_text", "by_seriousness", "findings_of", "findings_on_held_out", "verdict_of"]
+__all__ = ["Verdict", "bounds_text", "by_seriousness", "findings_of", "verdict_of"]
 
 Verdict = Literal["usable", "usable with care", "do not rely on this"]
 
@@ -60,28 +60,6 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
     )
 
 
-def findings_on_held_out(result: Result, logs: Sequence[LogSummary]) -> tuple[Finding, ...]:
-    """Findings on the simulations of logs that a result was not identified from, the most serious first.
-
-    Parameters
-    ----------
-    result : Result
-    logs : sequence of LogSummary
-        The held-out logs, with their predictions and inlier fractions.
-    """
-    restarted = result.diagnosis is not None
-    counts = [one.prediction.n_rows for one in logs if one.prediction is not None]
-    fraction = float(np.average([one.inlier_fraction for one in logs if one.prediction is not None], weights=counts))
-    found = (
-        *_simulation(logs, restarts=restarted),
-        *_inliers(logs, fraction, restarted=restarted),
-        *_excluded(logs),
-    )
-    names = ", ".join(one.source for one in logs)
-    note = Finding("note", f"Not used for identification (held-out validation): {names}.")
-    return by_seriousness((*(Finding(x.level, f"Held out: {_lower(x)}") for x in found), note))
-
-
 def by_seriousness(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """The findings, the most serious first, in their order within a level."""
     return tuple(sorted(findings, key=lambda finding: -finding.seriousness))
@@ -103,10 +81,6 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
 def _graded(value: float, good: float, care: float) -> Level:
     """Level of a value of which less is better."""
     return "good" if value <= good else "care" if value <= care else "bad"
-
-
-def _lower(text: str) -> str:
-    return text[:1].lower() + text[1:]
 
 
 # ---------------------------------------------------------------------- bounds

@@ -44,7 +44,7 @@ class PredictedForces:
     errors : (N, n_v) array
         Predicted less these.
     counted : (N,) bool array
-        Rows without spikes of an input, and outside of gaps.
+        Rows on which no spike of an input acts, and outside of gaps.
     """
 
     velocities: FloatArray
@@ -58,7 +58,7 @@ def force_errors(
 ) -> dict[str, float]:
     """Relative error of the predicted force of the inputs in each equation: RMS error over the RMS of the force, %.
 
-    Rows with spikes of an input do not count.
+    Rows on which a spike of an input acts do not count.
 
     Parameters
     ----------
@@ -101,14 +101,20 @@ def predicted_forces(
         logged = np.arange(rows.start, rows.start + len(one))
         q, v, a, _ = motion.parts(model, logged)
         recorded = intervals.recorded[logged]
-        clean = (without_spikes(recorded, LoDiransac().input_threshold)[0] == recorded).all(axis=1)
-        u = resolution.timing.acting(recorded, one.log.dt)
-        if resolution.hold == "zero-order":  # accelerations at a row are those between two inputs
-            u = 0.5 * (u + np.concatenate([u[:1], u[:-1]]))
+        u = _acting(recorded, resolution, one.log.dt)
+        commanded, _ = without_spikes(recorded, LoDiransac().input_threshold)
+        clean = np.isclose(u, _acting(commanded, resolution, one.log.dt)).all(axis=1)
         p = np.repeat(model.parameter_vector(own)[:, None], len(one), axis=1)
         rest, errors = (np.array(model.residual(q.T, v.T, a.T, x.T, p)).T for x in (_without_force(model, q, v, u), u))
         found.append(PredictedForces(v, rest - errors, errors, clean & intervals.counted[logged]))
     return found
+
+
+def _acting(inputs: FloatArray, resolution: Resolution, dt: float) -> FloatArray:
+    """Inputs (N, n_u) that act around the instant of each row."""
+    u = resolution.timing.acting(inputs, dt, resolution.hold)
+    # Accelerations at a row are those between two inputs that are held.
+    return 0.5 * (u + np.concatenate([u[:1], u[:-1]])) if resolution.hold == "zero-order" else u
 
 
 def _without_force(model: Model, q: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:

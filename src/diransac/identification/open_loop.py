@@ -89,7 +89,9 @@ def resolution_of(
     """Resolution of a result's identification, or the default one, with those parts replaced that are given."""
     fitted = plant.estimate.resolution if isinstance(plant, Result) else Resolution()
     own_hold = checked_hold(hold) or fitted.hold
-    return Resolution(integrator or fitted.integrator, substeps or fitted.substeps, own_hold, fitted.timing)
+    own_integrator = fitted.integrator if integrator is None else integrator
+    own_substeps = fitted.substeps if substeps is None else substeps
+    return Resolution(own_integrator, own_substeps, own_hold, fitted.timing)
 
 
 @dataclass(frozen=True)
@@ -109,16 +111,22 @@ def _with_start(log: Log, model: Model, given: Mapping[str, float]) -> Log:
     unknown = [name for name in given if name not in model.state]
     if unknown:
         raise SettingsError(f'initial_state names "{unknown[0]}"; the state is {", ".join(model.state)}')
-    start = {name: float(given[name]) if name in given else _first(log, name) for name in model.state}
-    bad = [name for name, value in start.items() if not np.isfinite(value)]
-    if bad and bad[0] in given:
-        raise SettingsError(f"initial_state: {bad[0]} is {given[bad[0]]}; give a finite number")
-    if bad:
-        raise LogError(f"{log.source}: there is no initial value of {', '.join(bad)}; give it in initial_state")
+    known = {name: _finite(f"initial_state: {name}", value) for name, value in given.items()}
+    start = {name: known[name] if name in known else _first(log, name) for name in model.state}
+    absent = [name for name, value in start.items() if not np.isfinite(value)]
+    if absent:
+        raise LogError(f"{log.source}: there is no initial value of {', '.join(absent)}; give it in initial_state")
     inputs = {name: log[name] for name in model.inputs}
     constant = {name: np.full(len(log), value) for name, value in start.items()}
     units = {name: unit for name, unit in log.units.items() if name in inputs}
     return replace(log, signals={**inputs, **constant}, units=units, notes=())
+
+
+def _finite(what: str, value: object) -> float:
+    """A finite number.  Raises SettingsError: it is something else."""
+    if not isinstance(value, (int, float, np.number)) or not np.isfinite(value):
+        raise SettingsError(f"{what} is {value!r:.60}; give a finite number")
+    return float(value)
 
 
 def _first(log: Log, name: str) -> float:
@@ -134,7 +142,7 @@ def _starts(plant: ModelWithParameters, log: Log, simulation: _Bound, horizon: f
         rows = np.array([part.start for part in observations.stretches])
         return _measured_starts(observations, rows, len(observations))
     dt = observations.log.dt
-    if not 0.5 * dt < horizon < np.inf:
+    if not _finite("horizon", horizon) > 0.5 * dt:
         raise SettingsError(f"horizon is {horizon!r:.60}; give seconds, at least one sample, {dt:g} s")
     n_rows = round(horizon / dt)
     diagnosis = _diagnosis_of(plant, log)
@@ -221,8 +229,8 @@ def _note(restarts: Restarts, horizon: float | None, resolution: Resolution) -> 
     n = len(restarts.rows)
     starts = f"{n} start{'s' * (n > 1)}" + (f", every {horizon:g} s" if horizon is not None else "")
     timing = resolution.timing
-    delays = [1e3 * (timing.delay + own) for own in timing.own_delays or (0.0,)]
-    late = f"delayed by {', '.join(f'{x:.3g}' for x in delays)} ms" if any(delays) else ""
-    lag = f"after a lag of {1e3 * timing.lag:.3g} ms" if timing.lag else ""
+    delays, lags = (", ".join(f"{1e3 * x:.3g}" for x in times) for times in (timing.delays, timing.lags))
+    late = f"delayed by {delays} ms" if any(timing.delays) else ""
+    lag = f"after a lag of {lags} ms" if any(timing.lags) else ""
     how = ", ".join(x for x in (resolution.interpolation or "inputs held", late, lag) if x)
     return f"simulated from {starts}, {how}"

@@ -250,7 +250,9 @@ class Result:
         )
         return dict(zip(self.parameters, draws, strict=True))
 
-    def export(self, path: str | Path, into: str | Path | None = None, *, to: str | None = None) -> tuple[str, ...]:
+    def export(
+        self, path: str | Path, into: str | Path | None = None, *, to: str | None = None, name: str | None = None
+    ) -> tuple[str, ...]:
         """Write the model for other programs, atomically; the ending of the file names the format.
 
         - ``dynamics.c``: C99 without allocation, the derivative of the state and a Runge-Kutta step
@@ -271,6 +273,9 @@ class Result:
             MJCF or URDF file from which `diransac.models.robot` made the model; for a description only.
         to : str, optional
             Format, "c", "python", "casadi", "yaml", "mjcf" or "urdf"; by default that of the ending.
+        name : str, optional
+            Name with which the functions of C, and that of CasADi, begin, so that several results of one model can be
+            linked together; by default that of the model.
 
         Returns
         -------
@@ -297,7 +302,7 @@ class Result:
         if into is not None:
             raise SettingsError(f'"{into}" has no use: only mjcf and urdf are written into a description')
         try:
-            write_model(self._portable(), path, chosen)
+            write_model(self._portable(name), path, chosen)
         except OSError as error:
             raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
         return ()
@@ -312,7 +317,7 @@ class Result:
         _write(path, text)
         return left_out
 
-    def _portable(self) -> PortableModel:
+    def _portable(self, name: str | None = None) -> PortableModel:
         """The model as it is exported; without draws where a parameter has no finite variance."""
         from diransac.export import PortableModel
 
@@ -329,6 +334,8 @@ class Result:
             samples,
             resolution.timing,
             resolution.hold,
+            {} if self.layout.is_shared else self.per_log,
+            name or "",
         )
 
     @property

@@ -29,6 +29,7 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.identification.candidate_terms import INPUT_CHANGES
 from diransac.identification.serialization import Number
 from diransac.model import Model, Parameter, expressions
 
@@ -53,7 +54,6 @@ _EVIDENCE, _SHARE, _RELATIVE, _SIGNIFICANT = 3.0, 0.2, 1e-3, 4.0
 _INDEPENDENT, _IDENTITY = 1e-2, 1e-8
 _LARGEST_GAIN = 0.5
 _MOST = 5
-_GAIN = "input gain"
 # Weights of neighbouring intervals in the regression for coefficients; smallest number of intervals of a block.
 _KERNEL, _LEAST_BLOCK = (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9), 5
 # Parts of the log; part of the information that a part must have to count; smallest number of such parts.
@@ -70,7 +70,7 @@ class Suggestion:
     kind : str
         Effect, such as ``"Coulomb friction"``.
     equation : str
-        Coordinate or velocity whose equation lacks the term; the input, for an input gain.
+        Coordinate or velocity whose equation lacks the term; the input, for a change of one.
     text : str
         The finding in a sentence.
     parameter : str
@@ -82,7 +82,7 @@ class Suggestion:
     explained : float
         Fraction of the mean square unmodelled force of the equation that the term explains.
     code : str
-        Python code, with CasADi as ``ca``: a summand of the residual with its sign, or the input with its gain.
+        Python code, with CasADi as ``ca``: a summand of the residual with its sign, or what replaces the input.
     term : mapping of str to object
         The term without its coefficient, ``(q, v, a, u, p) -> h (n_v)``, as data.
     """
@@ -106,7 +106,11 @@ class Suggestion:
     @property
     def change(self) -> str:
         """Change of the model, in a sentence."""
-        where = f"replace u.{self.equation} by" if self.kind == _GAIN else f"add to the equation of {self.equation}:"
+        where = (
+            f"replace u.{self.equation} by"
+            if self.kind in INPUT_CHANGES
+            else f"add to the equation of {self.equation}:"
+        )
         return f"{where} {self.code}, with the parameter {self.declaration}"
 
 
@@ -561,7 +565,7 @@ def _suggestion(candidates: CandidateTerms, term: CandidateTerm, found: Selected
     else:
         effect = term.kind[0].upper() + term.kind[1:]
         formula = f" {term.formula}" if term.formula else ""
-        text = f"{effect} on {term.place}: {value} ± {error}{unit}{formula} {share}"
+        text = f"{effect} {'of' if term.is_of_input else 'on'} {term.place}: {value} ± {error}{unit}{formula} {share}"
     h = ca.Function("term", list(candidates.symbols), [ca.densify(term.residuals)], list("qvaup"), ["h"])
     return Suggestion(
         term.kind, term.place, text, term.parameter, found.value, found.standard_error, term.unit, found.explained,

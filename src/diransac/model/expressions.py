@@ -317,6 +317,8 @@ def printed(
             value = ca.SX.sym(names[step.place[0]][step.place[1]])
         elif step.operation == "const":
             value = ca.SX(step.constant)
+        elif step.operation in _SAME:
+            value = operands[0]
         else:
             apply = ca.SX.unary if len(operands) == 1 else ca.SX.binary
             value = apply(_CODES[step.operation], *operands)

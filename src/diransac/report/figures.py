@@ -14,7 +14,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.segment import runs
 
 __all__ = [
     "Figure",
@@ -232,6 +233,7 @@ def time_plot(
     levels: Sequence[float] = (),
     full: tuple[float, float] | None = None,
     still: bool = False,
+    left_out: BoolArray | None = None,
 ) -> Plot:
     """Plot of several traces over time.
 
@@ -243,11 +245,14 @@ def time_plot(
     levels : values marked by a horizontal line
     full : range of all measured samples, where it exceeds the scale
     still : True if the axis is no time
+    left_out : (n_rows,)   rows that are shaded
     """
     marks = ticks(scale.low, scale.high)
     heights = [int(y) for y in scale.height([x for x, _ in marks])]
     width = max(1, timeline.n_rows - 1)
-    paths = [("grid", "", "".join(f"M0 {y}h{width}" for y in heights))]
+    shaded = [] if left_out is None else [f"M{x.start} 0v{_HEIGHT}h{x.stop - x.start}V0z" for x in runs(left_out)]
+    paths = [("band", "", "".join(shaded))] if shaded else []
+    paths.append(("grid", "", "".join(f"M0 {y}h{width}" for y in heights)))
     if levels:
         paths.append(("level", "", "".join(f"M0 {y}h{width}" for y in scale.height(levels))))
     drawn = [(trace, path_data(trace, scale, timeline)) for trace in traces]

@@ -85,7 +85,7 @@ def _method(runs: Sequence[Run]) -> str:
     restarted = [run for run in runs if np.isfinite(run.restart_period)]
     if not restarted:
         return "Each simulation starts at the first row and depends on the inputs alone."
-    state = "measured" if restarted[0].diagnosis is None else "smoothed"
+    state = restarted[0].restart_state
     which = "" if len(restarted) == len(runs) else f" by {', '.join(run.label for run in restarted)}"
     period = number(restarted[0].restart_period)
     text = (
@@ -94,19 +94,23 @@ def _method(runs: Sequence[Run]) -> str:
     )
     if len(runs) > 1:
         return text
-    return f"{text} The faint line is one simulation of the whole log; the inliers are the rows that agree with it."
+    agreeing = "" if runs[0].held_out else "; the inliers are the rows that agree with it"
+    return f"{text} The faint line is one simulation of the whole log{agreeing}."
 
 
 def _legend(runs: Sequence[Run], marking: Run) -> list[tuple[str, str]]:
     keys = [("measured", "measured")]
-    if marking.diagnosis is not None:
+    if marking.screened:
         of = f" of {marking.label}" if len(runs) > 1 else ""
-        keys += [("fault", "outlier"), ("outlier", f"row that disagrees with the whole-log simulation{of}")]
+        which = "simulation" if marking.held_out else "whole-log simulation"
+        keys += [("fault", "outlier"), ("outlier", f"row that disagrees with the {which}{of}")]
     else:
         of = f" with {marking.label}" if len(runs) > 1 else ""
         keys.append(("outlier", f"row that disagrees{of} (outlier)"))
     keys += [(f"m{i}", f"simulated, {run.label}") for i, run in enumerate(runs)]
-    return [*keys, ("long", "whole-log simulation")] if _shows_both(runs) else keys
+    if _shows_both(runs):
+        keys.append(("long", "whole-log simulation"))
+    return [*keys, ("band", "left out")] if any(run.observations.gaps.any() for run in runs) else keys
 
 
 def _shows_both(runs: Sequence[Run]) -> bool:
@@ -127,7 +131,8 @@ def _signal(name: str, runs: Sequence[Run], marking: Run, timeline: Timeline) ->
     facts = [_median_error(name, run, unit, label=f"{run.label} " * (len(runs) > 1)) for _, run in having]
     beyond = _beyond(shown.observations.column(name), scale)
     about = f"{name} in {unit}, measured and simulated over {number(timeline.dt * (timeline.n_rows - 1))} s"
-    plot = time_plot(traces, scale, timeline, about, full=beyond and beyond[:2])
+    left_out = _left_out(shown, timeline)
+    plot = time_plot(traces, scale, timeline, about, full=beyond and beyond[:2], left_out=left_out)
     return Figure(
         title=name,
         unit=unit,
@@ -147,7 +152,7 @@ def _median_error(name: str, run: Run, unit: str, label: str) -> str:
 def _signal_traces(name: str, having: Sequence[tuple[int, Run]], shown: Run) -> list[Trace]:
     measured, outliers = shown.observations.column(name), shown.outliers[name]
     disagreeing = shown.observations.valid & ~shown.inliers & ~outliers
-    rejected = "measured (row disagrees)" if shown.diagnosis is not None else "measured (outlier)"
+    rejected = "measured (row disagrees)" if shown.screened else "measured (outlier)"
     return [
         _dots("measured", "measured", shown, measured, ~disagreeing & ~outliers),
         _dots(rejected, "outlier", shown, measured, disagreeing),
@@ -190,6 +195,13 @@ def _beyond_text(beyond: tuple[float, float, int] | None) -> str:
     return f"{plural(n_beyond, 'sample')} outside of this range, from {number(low)} to {number(high)}"
 
 
+def _left_out(run: Run, timeline: Timeline) -> BoolArray:
+    """Rows of the log ``(n_rows,)`` in gaps, which no simulation covers."""
+    rows = np.zeros(timeline.n_rows, bool)
+    rows[run.rows] = run.observations.gaps
+    return rows
+
+
 # ---------------------------------------------------------------------- residuals
 
 
@@ -215,15 +227,15 @@ def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timelin
 
 def _set_apart(name: str, run: Run, *, is_shown: bool) -> tuple[str, BoolArray]:
     """CSS class and mask (N,) of marked residuals: diagnosed outliers if known, else rows that disagree."""
-    if run.diagnosis is not None:
+    if run.screened:
         return "fault", run.outliers[name]
     return "outlier", run.observations.valid & ~run.inliers & is_shown
 
 
 def _level(name: str, run: Run) -> tuple[float, str]:
     """Reference value of the residuals, 0 without one, and its name."""
-    if run.diagnosis is not None:
-        return _NOISE * run.diagnosis.noise_std.get(name, 0.0), "three standard deviations of the noise"
+    if run.screened:
+        return _NOISE * run.noise.get(name, 0.0), "three standard deviations of the noise"
     return float(run.thresholds[run.observations.signals.index(name)]), "the inlier threshold"
 
 

@@ -16,11 +16,11 @@ from diransac.data.segment import Segment
 from diransac.errors import LogError, ResultError, SettingsError
 from diransac.identification.estimate import Diagnosis, LogSummary
 from diransac.identification.evaluation import Scoring, Simulation, as_estimated, choose_scoring, judged_signals
+from diransac.identification.horizons import OpenLoop
 from diransac.identification.prediction import (
     Restarts,
     SimulatedLog,
     diagnosed_parts,
-    restart_rows,
     restarts_of,
     simulated_parts,
     simulated_rows,
@@ -115,8 +115,10 @@ class Run(SimulatedLog):
     view : the result restricted to this log
     first_row : row of the log that is row 0 here
     diagnosis : of this log, from whichever result of the page has one; None if none has
-    open_loop : (N, n_s)   simulated through the whole log from its first row; the inliers are defined by it
+    open_loop : (N, n_s)   simulated through the whole log from its first row; inliers are defined by it, those of a
+        held-out log by the restarted simulation
     validation : open-loop scores at several horizons, or the reason why there are none
+    screened : True if the noise and the outliers of the log are known
     """
 
     label: str
@@ -127,6 +129,7 @@ class Run(SimulatedLog):
     diagnosis: Diagnosis | None
     open_loop: FloatArray
     validation: Validation | str
+    screened: bool
 
     @property
     def held_out(self) -> bool:
@@ -136,7 +139,7 @@ class Run(SimulatedLog):
     @property
     def restart_state(self) -> str:
         """Kind of the states from which the simulation restarts."""
-        return "measured" if self.diagnosis is None else "smoothed"
+        return "smoothed" if self.screened else "measured"
 
     @property
     def rows(self) -> IntArray:
@@ -224,13 +227,19 @@ def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | 
     simulation = Simulation(dataset, scoring.judged, result.estimate.resolution, stretches, threads=1)
     observations, parameters = dataset.segments[0], result.model.parameter_vector(view.parameters)
     first_row = observations.first_row_in(given)
-    whole = simulated_rows(simulation, 0, parameters, observations)
-    restarts = _restarts(result, view, observations, diagnosis)
+    validation = _validation(result, log)
+    held_out = OpenLoop(dataset, 0, view.parameters, result.estimate.resolution) if view.held_out else None
+    begin = None if held_out is None else _estimated_starts(held_out, len(observations))
+    whole = simulated_rows(simulation, 0, parameters, observations, begin)
+    restarts = _restarts(observations, diagnosis, held_out, validation)
     series = whole if restarts is None else simulated_rows(simulation, 0, parameters, observations, restarts)
     open_loop = simulated_parts(observations, whole, None)["simulated"]
     found = diagnosed_parts(observations, diagnosis, first_row)
-    if restarts is not None and diagnosis is None and result.diagnosis is not None:
-        found["noise"] = result.diagnosis.noise_std
+    screened = diagnosis is not None
+    if held_out is not None and held_out.smoothed is not None:
+        screened = True
+        found["noise"] = dict(zip(observations.signals, held_out.noise.tolist(), strict=True))
+        found["outliers"] = dict(zip(observations.signals, held_out.outliers.T, strict=True))
     run = Run(
         **simulated_parts(observations, series, restarts),
         **found,
@@ -242,36 +251,37 @@ def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | 
         first_row=first_row,
         diagnosis=diagnosis,
         open_loop=open_loop,
-        validation=_validation(result, log),
+        validation=validation,
+        screened=screened,
     )
     return replace(run, inliers=_inliers(run, scoring))
 
 
-def _restarts(result: Result, view: LogView, observations: Segment, diagnosis: Diagnosis | None) -> Restarts | None:
-    """States at which the simulation restarts: smoothed ones; in a held-out log, those measured.
-
-    A held-out log has no smoothed states.  Its simulation restarts as often as those of the logs of the identification,
-    so that the effect of unmodelled forces accumulates no longer, if its state is measured at all these times.
-    """
+def _restarts(
+    observations: Segment, diagnosis: Diagnosis | None, held_out: OpenLoop | None, validation: Validation | str
+) -> Restarts | None:
+    """States at which the simulation restarts; of a held-out log, those of its validation, at the judged horizon."""
     if diagnosis is not None:
         return restarts_of(diagnosis, observations)
-    periods = [x.prediction.restart_period for x in result.logs if x.prediction is not None]
-    if not view.held_out or not periods or not np.isfinite(min(periods)):
+    if held_out is None:
         return None
-    n_rows, names = max(1, round(min(periods) / observations.log.dt)), observations.model.state
-    if not set(names) <= set(observations.signals):
-        return None
-    rows = restart_rows(observations, n_rows, np.arange(len(observations)))
-    states = np.column_stack([observations.column(name)[rows] for name in names])
-    return Restarts(rows, states, n_rows) if np.isfinite(states).all() else None
+    horizon = np.inf if isinstance(validation, str) else validation.judged.horizon
+    n_rows = len(observations) if np.isinf(horizon) else max(1, round(horizon / observations.log.dt))
+    return _estimated_starts(held_out, n_rows)
+
+
+def _estimated_starts(held_out: OpenLoop, n_rows: int) -> Restarts:
+    """Initial states of windows of so many rows."""
+    found = [(rows, held_out.starts(part, rows)[0]) for part, rows in held_out.window_rows(n_rows)]
+    rows, states = (np.concatenate(x) for x in zip(*found, strict=True))
+    return Restarts(rows, states, n_rows)
 
 
 def _inliers(run: Run, scoring: Scoring) -> BoolArray:
     """Inliers (N,): the result's own, or those of a held-out log by the thresholds of its scoring."""
     if run.view.inliers is not None:
         return run.view.inliers[run.rows]
-    errors = replace(run, simulated=run.open_loop).errors
-    finite = np.where(np.isnan(errors), np.inf, errors)
+    finite = np.where(np.isnan(run.errors), np.inf, run.errors)
     return inlier_mask(finite, run.observations.valid, scoring.thresholds, scoring.min_inlier_signals)
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from diransac.data.log import Log
-from diransac.identification.estimate import Finding, Level, LogSummary
-from diransac.identification.findings import Verdict, bounds_text, by_seriousness, findings_on_held_out, verdict_of
+from diransac.identification.estimate import Finding, Level
+from diransac.identification.findings import Verdict, bounds_text, by_seriousness, verdict_of
+from diransac.identification.horizons import HorizonScores
+from diransac.identification.innovations import Innovations
 from diransac.identification.validation import Validation
 from diransac.report.figures import Scale, Tick, padded, ticks
 from diransac.report.rendering import Table
@@ -18,6 +20,7 @@ from diransac.text_table import number, percent, plural, telling_digits
 
 __all__ = [
     "card",
+    "correlations",
     "diagnosis",
     "differences",
     "lead",
@@ -33,6 +36,7 @@ _LEVELS: Mapping[Verdict, Level] = {"usable": "good", "usable with care": "care"
 """Look of each verdict."""
 _WIDEST = 2.0
 _LONG = 6
+_CORRELATED, _FEW_PAIRS = 0.5, 8
 
 
 # ---------------------------------------------------------------------- summary
@@ -78,26 +82,24 @@ class Card:
 
 def card(entry: Entry) -> Card:
     """The verdict on one result: its own findings, and those on held-out logs of the page."""
-    held_out = [_summary(run) for run in entry.runs if run.held_out]
+    held_out = [run for run in entry.runs if run.held_out]
     found = entry.result.findings
     if held_out:
-        found = by_seriousness((*found, *findings_on_held_out(entry.result, held_out)))
+        found = by_seriousness((*found, *_findings_on_held_out(held_out)))
     verdict = verdict_of(found)
     return Card(entry.label, _LEVELS[verdict], verdict, found)
 
 
-def _summary(run: Run) -> LogSummary:
-    """Summary of a held-out log."""
-    log = run.observations.log
-    return LogSummary(
-        run.log_name,
-        log.fingerprint,
-        float(log.time[0]),
-        log.dt,
-        len(run.observations) + run.observations.offset,
-        inlier_fraction=run.inlier_fraction,
-        prediction=run.summary(None),
-    )
+def _findings_on_held_out(runs: Sequence[Run]) -> Iterator[Finding]:
+    """Findings of the validation of each held-out log."""
+    for run in runs:
+        where = f" ({run.log_name})" if len(runs) > 1 else ""
+        if isinstance(run.validation, str):
+            yield Finding("care", f"Held out{where}: not scored: {run.validation}")
+        else:
+            found = run.validation.findings
+            yield from (Finding(x.level, f"Held out{where}: {x[:1].lower()}{x[1:]}") for x in found)
+    yield Finding("note", f"Not used for identification (held-out validation): {', '.join(x.log_name for x in runs)}.")
 
 
 def differences(entries: Sequence[Entry]) -> str:
@@ -279,6 +281,21 @@ def sensitivity(entries: Sequence[Entry]) -> Table | None:
     return Table(("Parameter", "By", "at half", "at twice"), rows, caption) if rows else None
 
 
+def correlations(entries: Sequence[Entry]) -> Table | None:
+    """Strongest correlations of the estimates; None where all are weak."""
+    rows = []
+    for entry in entries:
+        covariance, names = entry.result.covariance, list(entry.result.parameters)
+        known = [i for i, name in enumerate(names) if entry.identifies(name) and 0.0 < covariance[i, i] < np.inf]
+        deviations = np.sqrt(np.diag(covariance)[known])
+        matrix = covariance[np.ix_(known, known)] / np.outer(deviations, deviations)
+        pairs = [(i, j) for i in range(len(known)) for j in range(i) if abs(matrix[i, j]) >= _CORRELATED]
+        for i, j in sorted(pairs, key=lambda x: -abs(matrix[x]))[:_FEW_PAIRS]:
+            rows.append((f"{names[known[j]]}, {names[known[i]]}", entry.label, number(float(matrix[i, j]), 2)))
+    caption = "Strongest correlations: the log determines a combination of such a pair better than either."
+    return Table(("Parameters", "By", "Correlation"), rows, caption) if rows else None
+
+
 # ---------------------------------------------------------------------- diagnosis and scores
 
 
@@ -320,6 +337,8 @@ def _signal_table(entry: Entry, several: bool) -> Table:
         unmodelled = "" if values is None else number(float(np.sqrt(np.mean(np.square(values)))), 2)
         rows.append((name, units[name], noise, outliers, unmodelled))
     caption = f"By {entry.label}" if several else "By signal"
+    if any(run.held_out for run in entry.runs):
+        caption = f"{caption}, in the identification ({', '.join(s.source for s in summaries(entry.result))})"
     return Table(("Signal", "Unit", "Noise", "Outliers", "Unmodelled"), rows, caption)
 
 
@@ -358,13 +377,11 @@ def _regular_rms(run: Run, name: str) -> str:
 
 @dataclass(frozen=True)
 class ScoreTable:
-    """Open-loop scores of one run at several horizons, or the reason why there are none."""
+    """Open-loop scores of one run, a table for each horizon, or the reason why there are none."""
 
     label: str
     reason: str = ""
-    horizons: tuple[str, ...] = ()
-    rows: tuple[tuple[str, str, tuple[str, ...]], ...] = ()
-    forces: Table | None = None
+    tables: tuple[Table, ...] = ()
 
 
 def scores(run: Run) -> ScoreTable:
@@ -372,12 +389,49 @@ def scores(run: Run) -> ScoreTable:
     validation = run.validation
     if isinstance(validation, str):
         return ScoreTable(run.label, reason=validation)
-    horizons = []
-    for at in validation.horizons:
-        name = "whole log" if np.isinf(at.horizon) else f"{number(at.horizon)} s ({plural(at.windows, 'window')})"
-        horizons.append(f"{name}, {at.diverged} diverged" if at.diverged else name)
-    rows = [(name, validation.units[name], _score_cells(name, validation)) for name in validation.rmse]
-    return ScoreTable(run.label, "", tuple(horizons), tuple(rows), _force_table(run.label, validation))
+    tables = [_horizon_table(run.label, at, validation) for at in validation.horizons]
+    tables += [_innovation_table(run.label, one, validation) for one in validation.innovations]
+    forces = _force_table(run.label, validation)
+    return ScoreTable(run.label, "", (*tables, forces) if forces else tuple(tables))
+
+
+def _horizon_table(label: str, at: HorizonScores, validation: Validation) -> Table:
+    """Scores of one horizon, beside those of trivial predictions."""
+    rows = []
+    for name in at.rmse:
+        errors = (at.rmse, at.robust_rmse, at.hold_last, at.constant_velocity)
+        fits = (number(x[name], 3) for x in (at.fit_percent, at.robust_fit_percent))
+        ratios = (_r_squared(x[name]) for x in (at.r_squared, at.robust_r_squared))
+        off = percent(at.relative_error[name]) if name in at.relative_error else "–"
+        rows.append((name, validation.units[name], *(number(x[name]) for x in errors), off, *fits, *ratios))
+    judged = ", the judged horizon" if at is validation.judged else ""
+    lost = f", {at.diverged} diverged" if at.diverged else ""
+    header = (
+        "Signal",
+        "Unit",
+        "RMSE",
+        "robust",
+        "hold last",
+        "const. vel.",
+        "off by",
+        "fit %",
+        "robust",
+        "R²",
+        "robust",
+    )
+    return Table(header, rows, f"{label}: {at.name}{judged} ({plural(at.windows, 'window')}{lost})")
+
+
+def _innovation_table(label: str, one: Innovations, validation: Validation) -> Table:
+    """Consistency and whiteness of one-step innovations."""
+    rows = []
+    for name, x in one.autocorrelation.items():
+        largest = float(x[np.argmax(np.abs(x))])
+        probability = percent(one.whiteness[name])
+        rows.append((name, number(one.standard_deviation[name], 3), number(largest, 2), probability))
+    where = f" of {one.source}" if len(validation.innovations) > 1 else ""
+    caption = f"{label}: one-step innovations{where}; of a right model, of deviation 1 and white"
+    return Table(("Signal", "Normalised deviation", "Largest autocorrelation", "Probability, if white"), rows, caption)
 
 
 def _force_table(label: str, validation: Validation) -> Table | None:
@@ -385,14 +439,6 @@ def _force_table(label: str, validation: Validation) -> Table | None:
     caption = f"{label}: force of the inputs by inverse dynamics of the smoothed motion"
     rows = [(name, percent(x / 100.0)) for name, x in validation.force_error_percent.items()]
     return Table(("Equation", "RMS error over RMS force"), rows, caption) if rows else None
-
-
-def _score_cells(name: str, validation: Validation) -> tuple[str, ...]:
-    return tuple(
-        text
-        for at in validation.horizons
-        for text in (number(at.rmse[name]), number(at.fit_percent[name], 3), _r_squared(at.r_squared[name]))
-    )
 
 
 def _r_squared(x: float) -> str:

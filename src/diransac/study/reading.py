@@ -15,8 +15,9 @@ import numpy.typing as npt
 
 from diransac.errors import SettingsError, StudyError
 from diransac.plain_data import json_data
+from diransac.study.database import damage, quoted, word
 from diransac.study.specification import planned_path
-from diransac.study.store import Store, damage, quoted, whole, word
+from diransac.study.store import Store, whole
 from diransac.text_table import aligned
 
 if TYPE_CHECKING:

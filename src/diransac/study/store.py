@@ -19,48 +19,40 @@ from __future__ import annotations
 
 import json
 import sqlite3
-import time
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from diransac.errors import StudyError
 from diransac.plain_data import json_data
 from diransac.study.assessment import PlantFacts
+from diransac.study.database import (
+    Database,
+    check_plain,
+    connected_to,
+    copied,
+    damage,
+    is_empty,
+    quoted,
+    reported,
+    roll_back,
+    transaction,
+    word,
+)
 from diransac.study.specification import Study
 
-__all__ = ["Store", "damage", "quoted", "whole", "word"]
+__all__ = ["Store", "whole"]
 
 _APPLICATION = 0x6469726E
 """SQLite's application id: "dirn"."""
 
 _FORMAT = 2
-_LOCK_TIMEOUT = 120.0
-"""s to wait while another process writes."""
-
-_READ_TIMEOUT = 120.0
-"""s that one query may take."""
-
-_ANOTHER_JOURNAL = bytes.fromhex("d9d505f920a163d7")
-"""Last bytes of a journal of several databases, which names a file that is deleted when it is rolled back."""
-
-_LARGEST_VALUE = 64 * 2**20
-"""Bytes of the largest value in a store."""
-
 _MOST_TRIALS = 10_000_000
 """Trials of the largest study."""
 
 _TABLES = {"trials", "cells", "configuration", "about"}
-_DAMAGE = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, EOFError,
-           NotImplementedError, zipfile.BadZipFile, zlib.error)  # fmt: skip
-"""Errors of values that a store of diransac never holds."""
-
 _RENAMED_KEYS = {
     "noise.freeze_probability": "noise.stuck_probability",
     "noise.freeze_length": "noise.stuck_length",
@@ -87,7 +79,7 @@ _MANY = 6
 """Differences that an error message lists; it counts the others."""
 
 
-class Store:
+class Store(Database):
     """An open store.
 
     Parameters
@@ -103,13 +95,14 @@ class Store:
 
     def __init__(self, path: str | Path, study: Study) -> None:
         self.path = Path(path)
-        self._connection = _connected(self.path, "rwc")
+        self._connection = connected_to(self.path, "rwc")
         try:
-            with _transaction(self._connection, self.path):
-                if _is_empty(self._connection):
+            with transaction(self._connection, self.path):
+                if is_empty(self._connection):
                     _create(self._connection, study)
                 else:
-                    _check_tables(self._connection, self.path)
+                    _format(self._connection, self.path)
+                    check_plain(self._connection, self.path, _TABLES)
                 _upgrade(self._connection, self.path)
                 self._ask_for(study)
         except BaseException:
@@ -123,48 +116,40 @@ class Store:
         store.path = Path(path)
         if not store.path.is_file():
             raise StudyError(f'store "{path}" does not exist; make one with diransac study run NAME --store {path}')
-        _roll_back(store.path)
-        store._connection = _connected(store.path, "ro")
+        roll_back(store.path)
+        store._connection = connected_to(store.path, "ro")
         try:
-            with _reported(store.path):
-                _check_tables(store._connection, store.path)
-                if _format(store._connection, store.path) != _FORMAT:
-                    store._connection = _copied(store._connection)
+            with reported(store.path):
+                number = _format(store._connection, store.path)
+                check_plain(store._connection, store.path, _TABLES)
+                if number != _FORMAT:
+                    store._connection = copied(store._connection)
                     _upgrade(store._connection, store.path)
         except BaseException:
             store._connection.close()
             raise
         return store
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        self._connection.close()
-
     def finished(self, level: str, trials: Sequence[int]) -> set[tuple[str, int, str]]:
         """Level, trial and method of the rows of these trials that are present."""
         query = "SELECT level, trial, method FROM trials WHERE level = ? AND trial BETWEEN ? AND ?"
         return set(self.select(query, (level, min(trials), max(trials))))
 
+    def finished_in(self, batch: Any) -> set[tuple[str, int, str]]:
+        """As `finished`, of a batch with a level and trials."""
+        return self.finished(batch.level, batch.trials)
+
     def add(self, rows: Sequence[Mapping[str, Any]]) -> int:
         """Number of new rows, written in one transaction; rows that are present stay as they are."""
         before = self._connection.total_changes
         columns = {name: column for name, (column, _) in self.columns.items()}
-        with _transaction(self._connection, self.path):
+        with transaction(self._connection, self.path):
             for row in rows:
                 names = ", ".join(quoted(columns.get(name, name)) for name in row)
                 marks = ", ".join("?" * len(row))
                 values = [json.dumps(value) if isinstance(value, Mapping) else value for value in row.values()]
                 self._connection.execute(f"INSERT OR IGNORE INTO trials ({names}) VALUES ({marks})", values)
         return self._connection.total_changes - before
-
-    def select(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """Rows of a query."""
-        end = time.monotonic() + _READ_TIMEOUT
-        self._connection.set_progress_handler(lambda: time.monotonic() > end, 100_000)
-        with _reported(self.path):
-            return self._connection.execute(query, values).fetchall()
 
     @property
     def columns(self) -> dict[str, tuple[str, str]]:
@@ -241,24 +226,6 @@ def _differences(kept: Mapping[str, Mapping[str, Any]], wanted: Mapping[str, Map
                     yield f"{name} is {old} in the store, {new} was asked for"
 
 
-# Values --------------------------------------------------------------------------------------------------------------
-@contextmanager
-def damage(path: Path) -> Iterator[None]:
-    """Context in which values of a store are used.  Raises StudyError: one is none that a study writes."""
-    try:
-        yield
-    except _DAMAGE as error:
-        reason = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise StudyError(f'store "{path}" is damaged: {reason:.200}; run its study into a new one') from error
-
-
-def word(value: object) -> str:
-    """A text.  Raises TypeError: the value is none."""
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r:.40} is no text")
-    return value
-
-
 def whole(value: object) -> int:
     """A number of trials or of one.  Raises TypeError, ValueError: it is none, or beyond sense."""
     if type(value) is not int:
@@ -266,93 +233,6 @@ def whole(value: object) -> int:
     if not 0 <= value <= _MOST_TRIALS:
         raise ValueError(f"{value} trials")
     return value
-
-
-# SQLite --------------------------------------------------------------------------------------------------------------
-def _connected(path: Path, mode: str) -> sqlite3.Connection:
-    """A connection without implicit transactions.  Raises StudyError: the file cannot be opened."""
-    try:
-        uri = f"{path.absolute().as_uri()}?mode={mode}"
-        connection = sqlite3.connect(uri, timeout=_LOCK_TIMEOUT, isolation_level=None, uri=True)
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST_VALUE)
-        connection.execute("PRAGMA trusted_schema = OFF")
-        connection.execute("PRAGMA cell_size_check = ON")
-        return connection
-    except sqlite3.Error as error:
-        raise StudyError(
-            f'store "{path}" cannot be opened: {error}; does its folder exist, may you write there?'
-        ) from error
-
-
-@contextmanager
-def _reported(path: Path) -> Iterator[None]:
-    """Raises StudyError in place of SQLite's errors."""
-    try:
-        yield
-    except (sqlite3.Error, UnicodeError) as error:
-        raise StudyError(f'store "{path}": {error}; give a file that diransac study made, or a new one') from error
-
-
-@contextmanager
-def _transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
-    """One transaction, with the file locked for other writers."""
-    with _reported(path):
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            yield
-        except BaseException:
-            connection.execute("ROLLBACK")
-            raise
-        connection.execute("COMMIT")
-
-
-def _roll_back(path: Path) -> None:
-    """Undo what a killed process has left half written, which needs the right to write.
-
-    Raises StudyError: the journal names a further file, which a study's never does and SQLite would delete.
-    """
-    journal = path.with_name(f"{path.name}-journal")
-    if not journal.is_file():
-        return
-    with closing(_connected(path, "ro")) as connection:
-        try:
-            connection.execute("SELECT count(*) FROM sqlite_master")
-            return
-        except sqlite3.Error as error:
-            if error.sqlite_errorname != "SQLITE_READONLY_ROLLBACK":
-                return  # said when the store is read
-    if journal.read_bytes().endswith(_ANOTHER_JOURNAL):
-        raise StudyError(f'store "{path}" has a journal that no study writes; give the store without it')
-    with closing(_connected(path, "rw")) as connection, _reported(path):
-        connection.execute("SELECT count(*) FROM sqlite_master")
-
-
-def _check_tables(connection: sqlite3.Connection, path: Path) -> None:
-    """Raises StudyError: the file is no store, or has views, triggers or virtual tables, which run as they are read."""
-    _format(connection, path)
-    tables = set()
-    for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
-        is_plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE ")
-        if not is_plain and (kind != "index" or sql is not None):
-            raise StudyError(f'store "{path}" has {kind} "{name!s:.40}", which no study makes; give another store')
-        if is_plain:
-            tables.add(name)
-    if not tables >= _TABLES:
-        missing = ", ".join(sorted(_TABLES - tables))
-        raise StudyError(f'store "{path}" is damaged: it has no {missing}; run its study into a new one')
-
-
-def _copied(connection: sqlite3.Connection) -> sqlite3.Connection:
-    """A copy of a database in memory, which may be changed."""
-    copy = sqlite3.connect(":memory:", isolation_level=None)
-    connection.backup(copy)
-    connection.close()
-    return copy
-
-
-def _is_empty(connection: sqlite3.Connection) -> bool:
-    """True for a file without tables: it is new, or the process that made it was killed at once."""
-    return not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
 
 
 def _format(connection: sqlite3.Connection, path: Path) -> int:
@@ -431,8 +311,3 @@ def _apart(names: Iterable[str]) -> Iterator[str]:
     for name in names:
         yield name + _AGAIN * before[name.lower()]
         before[name.lower()] += 1
-
-
-def quoted(name: str) -> str:
-    """An identifier of SQL."""
-    return '"' + name.replace('"', '""') + '"'

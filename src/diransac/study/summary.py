@@ -15,9 +15,10 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import StudyError
 from diransac.study.assessment import PlantFacts, covers, differ, relative_errors
+from diransac.study.database import damage
 from diransac.study.plants import PlantChoice, is_builtin
 from diransac.study.reading import Status, read, status
-from diransac.study.store import Store, damage
+from diransac.study.store import Store
 from diransac.study.tables import changed
 
 if TYPE_CHECKING:

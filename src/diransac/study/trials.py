@@ -40,7 +40,7 @@ from diransac.study.data import (
 from diransac.study.library import load
 from diransac.study.specification import TRUE, ControlChoice, Study, planned_path
 
-__all__ = ["STAGES", "run_trials"]
+__all__ = ["STAGES", "run_trials", "versions"]
 
 STAGES = ("record", "identify", "plan", "steer", "fly")
 """Stages that `seconds` is divided by."""
@@ -200,7 +200,7 @@ class _Case:
             "seed": self.seed,
             **{name: _plain(value) for name, value in self.figures.items()},
             "paths": _packed(self.paths) if self.paths else None,
-            "versions": _versions(),
+            "versions": versions(),
             "seconds": dict(self.seconds),
             "host": platform.node(),
         }
@@ -303,7 +303,7 @@ def _packed(paths: dict[str, Any]) -> bytes:
 
 
 @lru_cache(maxsize=1)
-def _versions() -> str:
+def versions() -> str:
     """Versions of Python and of the packages that results depend on."""
     found = [("python", platform.python_version()), *((name, version(name)) for name in _PACKAGES)]
     return " ".join(f"{name} {number}" for name, number in found)

@@ -14,7 +14,7 @@ from diransac.data.preprocessing.continuity import interpolated
 from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from diransac.data.log import Log
 
@@ -22,6 +22,7 @@ __all__ = [
     "check_factor",
     "describe_resampling",
     "interpolate_at",
+    "keep_while",
     "origins_of",
     "rename",
     "rename_columns",
@@ -116,6 +117,42 @@ def scale(log: Log, factors: Mapping[str, float]) -> Log:
     units = {name: unit for name, unit in log.units.items() if abs(factors.get(name, 1.0)) == 1.0}
     step = {"step": "scale", "factors": {name: float(factor) for name, factor in factors.items()}}
     return log.with_step(step, signals=signals, units=units)
+
+
+def keep_while(log: Log, events: Sequence[str]) -> Log:
+    """Log without the rows at which an event does not hold, such as those on the ground.
+
+    Rows before the first and after the last are cut; of those between, every sample is missing.
+
+    Parameters
+    ----------
+    log : Log
+    events : sequence of str
+        Signals that are 1 where an event holds; all of them must.
+
+    Returns
+    -------
+    Log
+
+    Raises
+    ------
+    LogError
+        The log has no such signal, or they hold together in fewer than 2 rows.
+    """
+    kept = np.logical_and.reduce([log[name] == 1.0 for name in events])
+    rows, together = np.flatnonzero(kept), " and ".join(events)
+    if len(rows) < 2:
+        raise LogError(f"{log.source}: no stretch of it is {together}; leave that out, or look at the event's topic")
+    part, inside = log[int(rows[0]) : int(rows[-1]) + 1], kept[rows[0] : rows[-1] + 1]
+    signals = {n: x if n in events else np.where(inside, x, np.nan) for n, x in part.signals.items()}
+    edges = np.flatnonzero(np.diff(np.r_[True, kept, True].astype(int)))
+    stretches = [[float(log.time[a]), float(log.time[b - 1])] for a, b in edges.reshape(-1, 2)]
+    step = {"step": "keep_while", "events": list(events), "left_out": stretches}
+    if not stretches:
+        return log.with_step(step)
+    said = ", ".join(f"{a:.4g} to {b:.4g} s" for a, b in stretches[:5]) + ", ..." * (len(stretches) > 5)
+    note = f"{int((~kept).sum())} of {len(kept)} rows are left out, not {together}: {said}"
+    return part.with_step(step, notes=[note], signals=signals)
 
 
 def check_factor(name: str, factor: float) -> None:

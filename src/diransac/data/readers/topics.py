@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.data.mapping import LogMapping, MappedSignals
+from diransac.data.mapping import LogMapping, MappedSignals, held
 from diransac.data.readers.recording import Recording, Samples, align, find_field
 from diransac.data.readers.table import Table
 from diransac.errors import LogError
@@ -49,7 +50,11 @@ def mapped_table(table: Table, mapping: LogMapping, source: str) -> Table:
             raise LogError(f'{source}: column "{name}" {why}')
         mapped |= entry.apply({name: x for name, x in columns.items() if not isinstance(x, str)})
         units |= entry.known_units()
+    numeric = {name: x for name, x in columns.items() if not isinstance(x, str)}
+    events = [x for x in mapping.events_in({"": list(numeric)}) if not x.topic]
+    mapped |= {x.name: x.flags(numeric) for x in events}
     step = {"step": "map", "mapping": mapping.source, "signals": _origins(entries)}
+    step |= {"events": [x.name for x in events]} if events else {}
     history = (*table.history, step)
     return replace(table, columns=mapped, units=units, notes=(*table.notes, *notes), history=history, filter=None)
 
@@ -75,15 +80,21 @@ def table_of_topics(
 ) -> tuple[Table, float | str | None]:
     """Table of the signals that a mapping, and ``rename`` by ``topic.field``, take from a recording's topics.
 
-    Returned beside it is the resampling that is left to do: that of the samples of a single topic.
+    A signal of both is that of ``rename``.  Returned beside the table is the resampling that is left to do: that of the
+    samples of a single topic.
 
-    Raises LogError: neither is given; a topic or field is missing; as `align`.
+    Raises LogError: neither is given; a topic or field is missing; ``rename`` has a part of a vector; as `align`.
     """
     source, fields = recording.source, recording.fields
     entries, notes = ([], []) if mapping is None else mapping.chosen(fields, recording.elements, source)
+    entries = [x for x in entries if not set(x.names) <= set(rename)]
     for name, path in rename.items():
         if name == "t":
             raise LogError(f'{source}: each topic has its own time; leave out "t", and give the signals')
+        together = next((x.names for x in entries if name in x.names), None)
+        if together is not None:
+            whole = ", ".join(together)
+            raise LogError(f'{source}: the mapping has "{name}" with {whole}; rename all of these, or none')
         topic, label = find_field(path, fields, source)
         entries.append(MappedSignals((name,), (label,), topic))
     if not entries:
@@ -105,16 +116,29 @@ def table_of_topics(
     step["signals"] = _origins(entries)
     information = recording.metadata.get("information", {})
     step |= {"log": {name: information[name] for name in _KEPT if name in information}} if information else {}
+    flags = {} if mapping is None else _flags(recording, mapping, made.time)
+    step |= {"events": list(flags)} if flags else {}
     history = (step,) if made.step is None else (step, made.step)
     said = (*recording.notes, *notes, *(made.notes if len(parts) > 1 else ()))
     unusable = {name: why for samples in parts.values() for name, why in samples.unusable.items()}
-    return Table({"t": made.time, **made.signals, **unusable}, units, said, history), None if len(
+    return Table({"t": made.time, **made.signals, **unusable, **flags}, units, said, history), None if len(
         parts
     ) > 1 else resample
 
 
 _KEPT = ("sys_name", "ver_hw", "ver_sw", "ver_sw_branch", "sys_uuid")
 """Facts of the machine's description that a log's history keeps."""
+
+
+def _flags(recording: Recording, mapping: LogMapping, rows: FloatArray) -> dict[str, FloatArray]:
+    """Flags (N,) of the events of a mapping at the rows of a log, without those whose topic has no message."""
+    found = {}
+    for event in mapping.events_in(recording.fields):
+        with suppress(LogError):
+            samples = recording.read({event.topic: event.needs}, mapping.time)[event.topic]
+            if not samples.unusable:
+                found[event.name] = held(samples.time, event.flags(samples.columns), rows)
+    return found
 
 
 def _signals_of(

@@ -29,7 +29,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     means_of_windows,
     residuals_of_motion,
 )
-from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs
+from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs, lags_of_inputs
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.text_table import number, percent
 
@@ -158,7 +158,7 @@ def findings_of_fit(found: Explanation, motion: Motion, result: ProjectedEstimat
 
 
 def _of_recordings(intervals: ShootingIntervals, fit: Fit) -> Iterator[Finding]:
-    """Delays and biases of sensors, own delays of inputs, and drifts of their gains."""
+    """Delays and biases of sensors, own delays and lags of inputs, and drifts of their gains."""
     errors = intervals.all_errors
     signals = np.array(intervals.model.signals)
     for delay in dict.fromkeys(errors.delay[errors.delay != 0.0].tolist()):
@@ -171,11 +171,18 @@ def _of_recordings(intervals: ShootingIntervals, fit: Fit) -> Iterator[Finding]:
         if bias:
             size, unit = number(bias, 3), intervals.model.units[name]
             yield Finding("care", f"{name} has a sensor bias of {size} {unit}, which the estimate includes.")
-    own = delays_of_inputs(intervals, fit) if errors.input_delay.any() else np.zeros(len(intervals.model.inputs))
-    for name, delay, drift in zip(intervals.model.inputs, own, errors.gain_drift, strict=True):
+    delays, lags = np.zeros((2, len(intervals.model.inputs)))
+    if errors.input_delay.any():
+        delays = delays_of_inputs(intervals, fit)
+    if errors.input_lag.any():
+        lags = lags_of_inputs(intervals, fit)
+    for name, delay, lag, drift in zip(intervals.model.inputs, delays, lags, errors.gain_drift, strict=True):
         if abs(delay) > _SMALL_DELAY:
             time, sense = number(1e3 * abs(delay) * intervals.dt, 3), "later" if delay > 0.0 else "earlier"
             yield Finding("care", f"{name} acts {time} ms {sense} than recorded, a delay that the estimate includes.")
+        if lag > _SMALL_DELAY:
+            time = number(1e3 * lag * intervals.dt, 3)
+            yield Finding("care", f"{name} acts after a first-order lag of {time} ms, which the estimate includes.")
         if drift:
             moves = f"{'rises' if drift > 0.0 else 'falls'} by {percent(abs(drift))} during the log"
             holds = "the estimate includes this drift, and its parameters are those of the beginning"

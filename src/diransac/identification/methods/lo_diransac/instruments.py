@@ -54,7 +54,7 @@ __all__ = ["Instrumented", "check_set_points", "instrumented_estimate"]
 # First-stage F below which instruments are weak (Staiger, Stock 1997); levels of Hausman's test from which on the
 # estimate is the instrumented one, and from which on the difference widens the interval.
 _STRONG, _REJECTED, _SIGNIFICANT = 10.0, 1e-3, 0.05
-# Difference of two estimates over the parameter that is none.
+# Difference of two estimates over the parameter that is none; divisor in place of 0.
 _NEGLIGIBLE, _TINY = 1e-3, 1e-300
 # Folds of a cross-fit; shortest time constant of the filter, samples, and longest, over the log.
 _FOLDS, _SHORTEST, _LONGEST = 10, 2.0, 0.1
@@ -194,7 +194,7 @@ def _predicted(
 def _lagged(set_points: FloatArray, times: FloatArray) -> FloatArray:
     """Set-points (N, k), and behind lags of time constants in samples, (N, k (1 + n_times))."""
     none = np.zeros(set_points.shape[1])
-    return np.hstack([set_points, *(acting_inputs(set_points, none, float(time), none) for time in times)])
+    return np.hstack([set_points, *(acting_inputs(set_points, none, none + time, none) for time in times)])
 
 
 def _cross_fitted(
@@ -212,7 +212,8 @@ def _cross_fitted(
         U, S, Vt = np.linalg.svd(normal[others], full_matrices=False)
         scores, slopes = normal[~others] @ Vt.T, U.T @ (signals[others] - mean)
         for predicted, ridge in zip(found, ridges, strict=True):
-            predicted[~others] = mean + scores @ ((S / (S**2 + ridge * S[0] ** 2))[:, None] * slopes)
+            gains = S / np.maximum(S**2 + ridge * S[0] ** 2, _TINY)  # 0 where the set-points are constant
+            predicted[~others] = mean + scores @ (gains[:, None] * slopes)
     best = np.square(found - signals).sum(axis=1).argmin(axis=0)
     return np.stack([found[k, :, j] for j, k in enumerate(best)], axis=1)
 

@@ -232,6 +232,8 @@ class LocalSearch:
         model, settings = best.intervals.model, self.settings
         named = {"delay": settings.sensor_delays, "bias": settings.sensor_biases, "drift": settings.gain_drifts}
         kinds = [kind for kind, names in named.items() if names is None]
+        if "delay" in kinds and settings.input_lag is not False:
+            kinds.append("lag")
         alone = np.full(len(model.signals), not best.exact)
         alone[len(model.signals) - len(model.sensors) :] = True
         for k in range(settings.max_sensor_errors):
@@ -240,8 +242,13 @@ class LocalSearch:
             errors = clear_errors(best.intervals, fit, alone, kinds, worth=_WORTH)
             if not best.exact:
                 errors += clear_errors_of_inputs(best.intervals, fit, kinds)
+            lag_may_help = True
             for error in errors:
+                if error.kind.what == "lag" and not lag_may_help:
+                    continue
                 trial = self._with_errors(best, [error], to_beat=likelier.cost)
+                if error.kind.of_inputs and error.kind.what == "delay":  # which acts much like a lag
+                    lag_may_help = trial.cost < best.cost
                 share = _EXPLAINS_DRIFT if error.kind.what == "drift" else _EXPLAINS
                 if trial.cost < likelier.cost and self._better(best, [trial], _WORTH, share, of_one=True) is trial:
                     likelier = trial

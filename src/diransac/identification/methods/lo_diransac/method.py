@@ -40,7 +40,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     parameter_units,
     residuals_of_motion,
 )
-from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs
+from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs, lags_of_inputs
 from diransac.identification.methods.lo_diransac.refinement import make_prior
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
@@ -125,7 +125,8 @@ class LoDiransac(LoDiransacSettings):
         Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation.
     input_delay, input_lag : bool, optional
         Whether inputs act after a delay, or after a first-order lag of the actuators: True, always; False, never; None,
-        where that is the likelier explanation of the log.
+        where that is the likelier explanation of the log.  Where the model is not exact, an actuator may have a lag of
+        its own.
     max_delay_shifts : int, optional
         Rounds in which other delays, a lag and another hold of the inputs are tried after the first optimisations.
     sensor_delays, sensor_biases, gain_drifts : sequence of str, optional
@@ -550,23 +551,26 @@ class _Found:
 
     @property
     def is_late(self) -> bool:
-        """True for a significant delay that all inputs have."""
+        """True for a significant delay or lag that all inputs have."""
+        errors = self.intervals.all_errors
         clear = abs(self.late) > max(_SIGNIFICANT * self.refinement.delay_error, _SMALL_DELAY)
-        return clear and (bool(self.intervals.lag) or not self.intervals.all_errors.input_delay.any())
+        own = errors.input_lag if self.intervals.lag else errors.input_delay
+        return clear and not own.any()
 
     @property
     def timing(self) -> InputTiming:
         """Delay or lag of the inputs where it is significant, or forced, and the inputs' own errors."""
-        dt, errors = self.intervals.dt, self.intervals.all_errors
-        drifts = tuple(errors.gain_drift.tolist()) if errors.gain_drift.any() else ()
+        intervals, fit, errors = self.intervals, self.refinement.fit, self.intervals.all_errors
+        delays, lags = np.zeros((2, intervals.model.n_u))
         if errors.input_delay.any():
-            delays, lag = delays_of_inputs(self.intervals, self.refinement.fit) * dt, self.intervals.lag * dt
-            return InputTiming(0.0, lag, tuple(delays.tolist()), drifts)
-        if not (self.is_late or self.forced):
-            return InputTiming(gain_drifts=drifts)
-        if self.intervals.lag:
-            return InputTiming(lag=max(self.late, LEAST_LAG) * dt, gain_drifts=drifts)
-        return InputTiming(self.late * dt, gain_drifts=drifts)
+            delays = delays_of_inputs(intervals, fit)
+        elif not intervals.lag and (self.is_late or self.forced):
+            delays = delays + self.late
+        if errors.input_lag.any():
+            lags = lags_of_inputs(intervals, fit)
+        elif intervals.lag and (self.is_late or self.forced):
+            lags = lags + max(self.late, LEAST_LAG)
+        return InputTiming.of(delays * intervals.dt, lags * intervals.dt, errors.gain_drift)
 
 
 def _estimate(

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 __all__ = ["MissingTerms", "clear_errors_of_inputs", "missing_terms"]
 
 # Part of the force of an equation that an error of inputs must explain: a payload that is dropped is half a drift.
-_EXPLAINS = {"delay": 0.3, "drift": 0.9}
+_EXPLAINS = {"delay": 0.3, "lag": 0.3, "drift": 0.9}
 # Part of an error's effect that parameters must leave; relative change of a gain that leaves none.
 _INDEPENDENT, _NO_GAIN = 1e-2, 1.0
 _SMALLEST, _TINY = 1e-6, 1e-300
@@ -89,14 +89,16 @@ def missing_terms(
     """
     rows = _Rows(intervals, result.windows, *residuals_of_motion(intervals, fit, result.parameters))
     speeds = np.sqrt(np.square(rows.motion[1][intervals.counted]).mean(axis=0))
-    candidates = candidate_terms(intervals.model, speeds, library)
+    sizes = np.sqrt(np.square(rows.motion[3][intervals.counted]).mean(axis=0))
+    candidates = candidate_terms(intervals.model, speeds, sizes, library)
     means = _mean_forces(rows, fit, candidates)
     selected = select_terms(means)
-    return MissingTerms(suggestions_of(candidates, selected), changes_beside(means, selected)[: intervals.n_p])
+    helpful = [x for x in selected if x.explained > 0.0]
+    return MissingTerms(suggestions_of(candidates, helpful), changes_beside(means, selected)[: intervals.n_p])
 
 
 def clear_errors_of_inputs(intervals: ShootingIntervals, fit: Fit, kinds: Container[str]) -> list[RecordingError]:
-    """The drift of gains and the delay of inputs that explain most of the unmodelled forces, where that is much.
+    """The drift of gains, the delay and the lag of inputs that explain most of the unmodelled forces, if much.
 
     Parameters
     ----------
@@ -104,12 +106,12 @@ def clear_errors_of_inputs(intervals: ShootingIntervals, fit: Fit, kinds: Contai
     fit : Fit
         With unmodelled accelerations.
     kinds : container of str
-        Which of "delay" and "drift" are sought.
+        Which of "delay", "lag" and "drift" are sought.
 
     Returns
     -------
     list of RecordingError
-        At most one of each.
+        At most one of each, a delay before a lag.
     """
     tried = [x for x in errors_of_inputs(intervals) if x.what in kinds]
     if not tried:
@@ -123,8 +125,15 @@ def clear_errors_of_inputs(intervals: ShootingIntervals, fit: Fit, kinds: Contai
     means = means / np.maximum(scale, _SMALLEST * scale.max() + _TINY)[:, None]
     own = means[:, :, 1 + len(tried) :]
     found = [_error_of_inputs(x, means[:, :, 0], means[:, :, 1 + k], own) for k, x in enumerate(tried)]
-    likeliest = {x.kind.what: x for x in sorted(filter(None, found), key=lambda x: x.gain)}
-    return list(likeliest.values())
+    possible = (x for x in found if x and _is_possible(intervals, x))
+    likeliest = {x.kind.what: x for x in sorted(possible, key=lambda x: x.gain)}
+    return [likeliest[what] for what in _EXPLAINS if what in likeliest]
+
+
+def _is_possible(intervals: ShootingIntervals, error: RecordingError) -> bool:
+    """False for a time constant below zero."""
+    lags = intervals.lag + intervals.all_errors.input_lag[list(error.kind.columns)]
+    return error.kind.what != "lag" or bool((lags + error.size > 0.0).all())
 
 
 def _error_of_inputs(kind: ErrorKind, force: FloatArray, effect: FloatArray, own: FloatArray) -> RecordingError | None:

@@ -1,4 +1,4 @@
-"""Systematic errors of recordings: delays and biases of sensors, delays of single inputs, and gains that drift.
+"""Systematic errors of recordings: delays and biases of sensors, delays and lags of single inputs, gains that drift.
 
 A sensor is here whatever measures a signal, with a measurement equation or without.
 
@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -39,6 +39,7 @@ __all__ = [
     "effect_on",
     "errors_of",
     "errors_of_inputs",
+    "lags_of_inputs",
     "signal_rates",
     "with_errors",
 ]
@@ -55,7 +56,9 @@ _FEWEST = 50
 # intervals that continuity holds, more than rounding.
 _DETERMINED, _ROUNDED = 1e-6, 1e-12
 # Errors of inputs by which simulations are compared: samples, relative change of a gain.
-_STEPS = {"delay": 0.5, "drift": 0.01}
+_STEPS = {"delay": 0.5, "lag": 0.5, "drift": 0.01}
+# Kinds of errors by which an input acts later than others.
+_LATE: tuple[Literal["delay", "lag"], ...] = ("delay", "lag")
 # Change of a signal over its size that is a rounding error.
 _ROUNDING, _TINY = 1e-9, 1e-300
 
@@ -352,7 +355,7 @@ def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[ErrorKin
 
 
 def errors_of_inputs(intervals: ShootingIntervals) -> list[ErrorKind]:
-    """Errors that inputs may have: drifts of each gain, of those of one unit, and of all; delays of some but not all.
+    """Errors that inputs may have: drifts of each gain, of those of one unit, and of all; delays and lags of some.
 
     Parameters
     ----------
@@ -368,8 +371,9 @@ def errors_of_inputs(intervals: ShootingIntervals) -> list[ErrorKind]:
     masks = [moving, *(moving & (unit == u) for u in dict.fromkeys(unit.tolist())), *np.eye(len(unit), dtype=bool)]
     some = [x for x in masks if (x & moving).any()]
     drifts = [ErrorKind(_places(x), "drift", of_inputs=True) for x in some]
-    delays = [ErrorKind(_places(x), "delay", of_inputs=True) for x in some if not (x == moving).all()]
-    return list(dict.fromkeys([*drifts, *delays]))
+    some = [x for x in some if not (x == moving).all()]
+    late = [ErrorKind(_places(x), what, of_inputs=True) for what in _LATE for x in some]
+    return list(dict.fromkeys([*drifts, *late]))
 
 
 def change_of_inputs(intervals: ShootingIntervals, kind: ErrorKind) -> FloatArray:
@@ -403,6 +407,22 @@ def delays_of_inputs(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     """
     common = 0.0 if intervals.lag else intervals.delay + fit.shared[-1]
     return np.asarray(intervals.all_errors.input_delay + common)
+
+
+def lags_of_inputs(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+    """Time constants ``(n_u,)`` of the actuators, samples; 0 without a lag.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    (n_u,) array
+    """
+    common = intervals.lag + fit.shared[-1] if intervals.lag else 0.0
+    return np.asarray(np.maximum(intervals.all_errors.input_lag + common, 0.0))
 
 
 def _places(mask: BoolArray) -> tuple[int, ...]:

@@ -37,14 +37,24 @@ class ErrorKind:
     columns : tuple of int
         Indices of the signals, or of the inputs.
     what : str
-        "delay", in samples; of signals "bias", in their unit; of inputs "drift", the relative change of their gain over
-        a log.
+        "delay", in samples; of signals "bias", in their unit; of inputs "lag", the time constant of a first-order lag
+        in samples, and "drift", the relative change of their gain over a log.
     of_inputs : bool, optional
     """
 
     columns: tuple[int, ...]
-    what: Literal["delay", "bias", "drift"]
+    what: Literal["delay", "bias", "lag", "drift"]
     of_inputs: bool = False
+
+
+_FIELDS = {
+    ("delay", False): "delay",
+    ("bias", False): "bias",
+    ("delay", True): "input_delay",
+    ("lag", True): "input_lag",
+    ("drift", True): "gain_drift",
+}
+"""Fields of `RecordingErrors` by kind, and whether it is one of inputs."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +72,8 @@ class RecordingErrors:
         Constant error of each signal, its unit.
     input_delay : (n_u,) array
         Samples by which each input acts later than the others.
+    input_lag : (n_u,) array
+        Samples by which the time constant of each actuator is longer than that of all.
     gain_drift : (n_u,) array
         Relative change of each input's gain over a log.
     kinds : tuple of ErrorKind
@@ -73,6 +85,7 @@ class RecordingErrors:
     delay: FloatArray
     bias: FloatArray
     input_delay: FloatArray
+    input_lag: FloatArray
     gain_drift: FloatArray
     kinds: tuple[ErrorKind, ...]
 
@@ -87,10 +100,9 @@ class RecordingErrors:
         -------
         RecordingErrors
         """
-        names = {("delay", False): "delay", ("bias", False): "bias", ("delay", True): "input_delay"}
-        sizes = {name: getattr(self, name).copy() for name in (*names.values(), "gain_drift")}
+        sizes = {name: getattr(self, name).copy() for name in _FIELDS.values()}
         for kind, size in more.items():
-            sizes[names.get((kind.what, kind.of_inputs), "gain_drift")][list(kind.columns)] += size
+            sizes[_FIELDS[kind.what, kind.of_inputs]][list(kind.columns)] += size
         return replace(self, **sizes, kinds=tuple(dict.fromkeys([*self.kinds, *more])))
 
 
@@ -288,11 +300,18 @@ class ShootingIntervals:
 
     def _acting(self, lag: float) -> FloatArray:
         """Recorded inputs of each log after their delays and a lag, in samples."""
-        none = np.zeros(self.recorded.shape[1])
-        own, drifts = (self.errors.input_delay, self.errors.gain_drift) if self.errors else (none, none)
+        errors = self.all_errors
+        lags = np.maximum(lag + errors.input_lag, 0.0)
         return np.concatenate(
             [
-                acting_inputs(self.recorded[rows], self.delay + own, lag, drifts, int(self.is_logged[rows].sum()))
+                acting_inputs(
+                    self.recorded[rows],
+                    self.delay + errors.input_delay,
+                    lags,
+                    errors.gain_drift,
+                    self.hold,
+                    int(self.is_logged[rows].sum()),
+                )
                 for rows in self.rows_of_logs
             ]
         )
@@ -306,9 +325,11 @@ class ShootingIntervals:
     @property
     def all_errors(self) -> RecordingErrors:
         """Errors of the recordings, none of which may be known."""
+        if self.errors is not None:
+            return self.errors
         n_s, n_u = len(self.model.signals), self.recorded.shape[1]
-        of_signals, of_inputs = (np.zeros(n_s), np.zeros(n_s)), (np.zeros(n_u), np.zeros(n_u))
-        return self.errors or RecordingErrors(self.measured, self.sampled, *of_signals, *of_inputs, ())
+        none = {name: np.zeros(n_u if of_inputs else n_s) for (_, of_inputs), name in _FIELDS.items()}
+        return RecordingErrors(self.measured, self.sampled, **none, kinds=())
 
     def corrected(self, more: Mapping[ErrorKind, float], rates: FloatArray) -> ShootingIntervals:
         """The intervals with recordings that are corrected of further errors.

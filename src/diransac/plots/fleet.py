@@ -1,0 +1,142 @@
+"""Figure of a fleet: each parameter over the vehicles' lives, and by vehicle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.plots.figure import (
+    COLOURS,
+    INK,
+    PAPER,
+    REFERENCE,
+    WIDTH,
+    LegendEntry,
+    check_ending,
+    draw_heading,
+    header_height,
+    name_panel,
+    panel,
+    write,
+)
+from diransac.study.fleet_findings import FleetSummary, ParameterInFleet
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_fleet"]
+
+_ROW = 1.9
+_MOST_NAMED = len(COLOURS)
+"""Vehicles with a colour of their own, those with the largest distances."""
+_MARGIN = 0.15
+"""Free part of a panel beyond the central values."""
+
+
+def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: str | None = None) -> Figure:
+    """Figure with a row per parameter: estimates over the logs of each vehicle, and values by vehicle.
+
+    Vehicles with a finding have a colour; the band is the fleet's mean with two standard deviations between vehicles.
+
+    Parameters
+    ----------
+    summary : FleetSummary
+    path : str or Path, optional
+        ``.png``, ``.svg`` or ``.pdf`` file, written completely or not at all; None writes none.
+    title : str, optional
+        By default the model's name and the number of vehicles.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Points of vehicles without findings are one image, so that the size of the file does not grow with the fleet.
+
+    Raises
+    ------
+    SettingsError
+        The file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    if path is not None:
+        check_ending(Path(path))
+    colours = _colours(summary)
+    text = f"{summary.rows.model}: {summary.n_vehicles} vehicles" if title is None else title
+    entries: list[LegendEntry] = [("fleet", {"color": REFERENCE, "marker": ".", "linestyle": ""})]
+    entries += [(vehicle, {"color": colour, "marker": "."}) for vehicle, colour in colours.items()]
+    header = header_height(entries, text)
+    figure = Figure(figsize=(WIDTH, header + _ROW * len(summary.parameters) + 0.35), facecolor=PAPER)
+    draw_heading(figure, entries, text)
+    for k, parameter in enumerate(summary.parameters):
+        last, top = k == len(summary.parameters) - 1, header + k * _ROW
+        over_life = panel(figure, 0.0, top, 0.55 * WIDTH, _ROW, last=last)
+        by_vehicle = panel(figure, 0.55 * WIDTH, top, 0.45 * WIDTH, _ROW, last=last)
+        name_panel(over_life, parameter.name, parameter.unit)
+        name_panel(by_vehicle, f"{parameter.name} by vehicle", parameter.unit)
+        _draw_lives(over_life, summary, parameter, colours)
+        _draw_vehicles(by_vehicle, parameter, colours)
+        if last:
+            over_life.set_xlabel("log of the vehicle", fontsize=8, color=INK)
+            by_vehicle.set_xlabel("vehicle, sorted by value", fontsize=8, color=INK)
+    if path is not None:
+        write(figure, Path(path))
+    return figure
+
+
+def _colours(summary: FleetSummary) -> dict[str, str]:
+    """Colour of each vehicle with a finding, as far as there are colours."""
+    found = sorted(summary.findings, key=lambda x: -x.distance)
+    named = list(dict.fromkeys(x.vehicle for x in found))[:_MOST_NAMED]
+    return dict(zip(named, COLOURS, strict=False))
+
+
+def _draw_lives(axes: Axes, summary: FleetSummary, parameter: ParameterInFleet, colours: dict[str, str]) -> None:
+    """Estimates over the number of the log in the vehicle's life."""
+    vehicles, y = summary.rows.vehicles, summary.rows.values[parameter.name]
+    begins = np.flatnonzero(np.r_[True, vehicles[1:] != vehicles[:-1]])
+    place = np.arange(len(y)) - np.repeat(begins, np.diff(np.r_[begins, len(y)])) + 1
+    axes.plot(place, y, ".", color=REFERENCE, markersize=3, rasterized=True)
+    for vehicle, colour in colours.items():
+        own = vehicles == vehicle
+        axes.errorbar(
+            place[own],
+            y[own],
+            yerr=2.0 * summary.rows.standard_errors[parameter.name][own],
+            color=colour,
+            marker=".",
+            linewidth=0.9,
+            markersize=4,
+        )
+    named = y[np.isin(vehicles, list(colours))]
+    low, high = np.nanquantile(y, [0.005, 0.995])
+    low, high = min(low, *named[np.isfinite(named)], high), max(high, *named[np.isfinite(named)], low)
+    margin = _MARGIN * (high - low or abs(high) or 1.0)
+    axes.set_ylim(low - margin, high + margin)
+
+
+def _draw_vehicles(axes: Axes, parameter: ParameterInFleet, colours: dict[str, str]) -> None:
+    """Value of each vehicle at its beginning, with two standard errors."""
+    order = np.argsort(parameter.values)
+    axes.axhspan(
+        parameter.mean - 2.0 * parameter.between, parameter.mean + 2.0 * parameter.between, color=REFERENCE, alpha=0.25
+    )
+    axes.axhline(parameter.mean, color=REFERENCE, linewidth=0.9)
+    shown = np.arange(len(order)) + 1
+    axes.vlines(
+        shown,
+        (parameter.values - 2.0 * parameter.standard_errors)[order],
+        (parameter.values + 2.0 * parameter.standard_errors)[order],
+        color=REFERENCE,
+        linewidth=0.8,
+        rasterized=True,
+    )
+    axes.plot(shown, parameter.values[order], ".", color=REFERENCE, markersize=3, rasterized=True)
+    for k, i in zip(shown, order, strict=True):
+        colour = colours.get(parameter.vehicles[i])
+        if colour is not None:
+            axes.errorbar(
+                k, parameter.values[i], yerr=2.0 * parameter.standard_errors[i], color=colour, marker=".", markersize=5
+            )

@@ -1,0 +1,179 @@
+"""SQLite files of studies and fleets: opened without trust, written in whole transactions.
+
+A file may come from anyone: it is opened for reading without the right to write, its tables must be tables, queries
+have a time limit, every value is checked, and none of them names code that reading would run.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from contextlib import closing, contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from diransac.errors import StudyError
+
+__all__ = [
+    "Database",
+    "check_plain",
+    "connected_to",
+    "copied",
+    "damage",
+    "is_empty",
+    "quoted",
+    "reported",
+    "roll_back",
+    "transaction",
+    "word",
+]
+
+_LOCK_TIMEOUT = 120.0
+"""s to wait while another process writes."""
+
+_READ_TIMEOUT = 120.0
+"""s that one query may take."""
+
+_ANOTHER_JOURNAL = bytes.fromhex("d9d505f920a163d7")
+"""Last bytes of a journal of several databases, which names a file that is deleted when it is rolled back."""
+
+_LARGEST_VALUE = 64 * 2**20
+"""Bytes of the largest value in a store."""
+
+_DAMAGE = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, EOFError,
+           NotImplementedError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+"""Errors of values that a store of diransac never holds."""
+
+
+class Database:
+    """An open file; a context that closes it."""
+
+    path: Path
+    _connection: sqlite3.Connection
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self._connection.close()
+
+    def select(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """Rows of a query."""
+        end = time.monotonic() + _READ_TIMEOUT
+        self._connection.set_progress_handler(lambda: time.monotonic() > end, 100_000)
+        with reported(self.path):
+            return self._connection.execute(query, values).fetchall()
+
+
+# Values --------------------------------------------------------------------------------------------------------------
+@contextmanager
+def damage(path: Path) -> Iterator[None]:
+    """Context in which values of a store are used.  Raises StudyError: one is none that a study writes."""
+    try:
+        yield
+    except _DAMAGE as error:
+        reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise StudyError(f'store "{path}" is damaged: {reason:.200}; run its study into a new one') from error
+
+
+def word(value: object) -> str:
+    """A text.  Raises TypeError: the value is none."""
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r:.40} is no text")
+    return value
+
+
+# SQLite --------------------------------------------------------------------------------------------------------------
+def connected_to(path: Path, mode: str) -> sqlite3.Connection:
+    """A connection without implicit transactions.  Raises StudyError: the file cannot be opened."""
+    try:
+        uri = f"{path.absolute().as_uri()}?mode={mode}"
+        connection = sqlite3.connect(uri, timeout=_LOCK_TIMEOUT, isolation_level=None, uri=True)
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST_VALUE)
+        connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute("PRAGMA cell_size_check = ON")
+        return connection
+    except sqlite3.Error as error:
+        raise StudyError(
+            f'store "{path}" cannot be opened: {error}; does its folder exist, may you write there?'
+        ) from error
+
+
+@contextmanager
+def reported(path: Path) -> Iterator[None]:
+    """Raises StudyError in place of SQLite's errors."""
+    try:
+        yield
+    except (sqlite3.Error, UnicodeError) as error:
+        raise StudyError(f'store "{path}": {error}; give a file that diransac study made, or a new one') from error
+
+
+@contextmanager
+def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
+    """One transaction, with the file locked for other writers."""
+    with reported(path):
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+        except BaseException:
+            connection.execute("ROLLBACK")
+            raise
+        connection.execute("COMMIT")
+
+
+def roll_back(path: Path) -> None:
+    """Undo what a killed process has left half written, which needs the right to write.
+
+    Raises StudyError: the journal names a further file, which a study's never does and SQLite would delete.
+    """
+    journal = path.with_name(f"{path.name}-journal")
+    if not journal.is_file():
+        return
+    with closing(connected_to(path, "ro")) as connection:
+        try:
+            connection.execute("SELECT count(*) FROM sqlite_master")
+            return
+        except sqlite3.Error as error:
+            if error.sqlite_errorname != "SQLITE_READONLY_ROLLBACK":
+                return  # said when the store is read
+    if journal.read_bytes().endswith(_ANOTHER_JOURNAL):
+        raise StudyError(f'store "{path}" has a journal that no study writes; give the store without it')
+    with closing(connected_to(path, "rw")) as connection, reported(path):
+        connection.execute("SELECT count(*) FROM sqlite_master")
+
+
+def check_plain(connection: sqlite3.Connection, path: Path, needed: AbstractSet[str]) -> None:
+    """Raises StudyError: tables are missing, or there are views, triggers or virtual tables, which run when read."""
+    tables = set()
+    for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
+        is_plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE ")
+        if not is_plain and (kind != "index" or sql is not None):
+            raise StudyError(f'store "{path}" has {kind} "{name!s:.40}", which no study makes; give another store')
+        if is_plain:
+            tables.add(name)
+    if not tables >= needed:
+        missing = ", ".join(sorted(needed - tables))
+        raise StudyError(f'store "{path}" is damaged: it has no {missing}; run its study into a new one')
+
+
+def copied(connection: sqlite3.Connection) -> sqlite3.Connection:
+    """A copy of a database in memory, which may be changed."""
+    copy = sqlite3.connect(":memory:", isolation_level=None)
+    connection.backup(copy)
+    connection.close()
+    return copy
+
+
+def is_empty(connection: sqlite3.Connection) -> bool:
+    """True for a file without tables: it is new, or the process that made it was killed at once."""
+    return not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+
+
+def quoted(name: str) -> str:
+    """An identifier of SQL."""
+    return '"' + name.replace('"', '""') + '"'

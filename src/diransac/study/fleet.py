@@ -1,0 +1,531 @@
+"""A fleet of logs: one identification per log, on the workers of studies, kept as rows of one SQLite file.
+
+| table | contents |
+|---|---|
+| ``logs`` | one row per log that was identified, or failed |
+| ``asked`` | logs that were asked for, with vehicle and order |
+| ``configuration`` | the values that determine rows, as JSON; only the same values may add rows |
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import pickle
+import platform
+import re
+import sqlite3
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.atomic import write_with
+from diransac.blas import single_threaded
+from diransac.data.log import Log
+from diransac.data.readers import read_log
+from diransac.errors import DiransacError, SettingsError, StudyError
+from diransac.identification.identify import METHODS, identify
+from diransac.identification.method import Method
+from diransac.identification.methods import DEFAULT
+from diransac.identification.result import Result
+from diransac.model import Model
+from diransac.plain_data import json_data
+from diransac.study.database import (
+    Database,
+    check_plain,
+    connected_to,
+    damage,
+    is_empty,
+    quoted,
+    reported,
+    roll_back,
+    transaction,
+    word,
+)
+from diransac.study.engine import Progress, distribute, workers_of
+from diransac.study.trials import versions
+from diransac.time_limit import time_limited
+
+__all__ = ["FleetRows", "FleetStatus", "export_fleet", "fleet_status", "identify_each", "read_fleet"]
+
+_APPLICATION = 0x64697266
+"""SQLite's application id: "dirf"."""
+
+_FORMAT = 1
+_TABLES = {"logs", "asked", "configuration"}
+_UNKNOWN = "unknown"
+"""Vehicle of a log that names none."""
+
+_MANY = 6
+"""Differences that an error message lists."""
+
+
+def identify_each(
+    model: Model,
+    logs: Sequence[str | Path],
+    method: str | Method = DEFAULT,
+    *,
+    store: str | Path,
+    vehicle: str | None = None,
+    read: Callable[[Path], Log] = read_log,
+    configuration: Mapping[str, Any] | None = None,
+    executor: Executor | None = None,
+    jobs: int | None = None,
+    batch_size: int = 4,
+    tasks: int | None = None,
+    time_limit: float | None = None,
+    progress: Progress | None = None,
+    **arguments: Any,
+) -> FleetStatus:
+    """Identify a model from each of many logs by itself; those that a store has are not identified again.
+
+    Parameters
+    ----------
+    model : Model
+    logs : sequence of str or Path
+        Files, in the order of the vehicles' lives; a worker reads them under these names.
+    method : str or Method, optional
+        As in `identify`.
+    store : str or Path
+        SQLite file; made if it does not exist.
+    vehicle : str, optional
+        Regular expression that is searched in the name of each file, with a group ``(?P<vehicle>...)`` and, where the
+        order of the files is not that of time, ``(?P<time>...)``: a number, or a text that sorts by time.  None: the
+        identity that a log's own metadata has (``sys_uuid`` of a ULog), else ``"unknown"``.
+    read : callable, optional
+        Log of a file; a function of a module or an object that can be pickled, as workers call it.
+    configuration : mapping of str to object, optional
+        Further values on which rows depend, ready for JSON, such as those of `read`; a store is resumed only with the
+        same.
+    executor, jobs, tasks, time_limit, progress
+        As in `run_study`.
+    batch_size : int, optional
+        Logs that a worker identifies before it hands over rows.
+    **arguments
+        Of `identify`, such as ``seed`` and ``differentiate``.
+
+    Returns
+    -------
+    FleetStatus
+
+    Raises
+    ------
+    SettingsError
+        The pattern or a number has no meaning; a file is named twice.
+    StudyError
+        The store has another configuration, or workers are lost repeatedly.
+    KeyboardInterrupt
+        Rows that were done are kept.
+
+    Notes
+    -----
+    The row of a log depends on its file and the configuration alone.  A log that cannot be read or identified is a row
+    with the reason.  Rows are committed as batches end; the same call after an interruption runs the others.  To run
+    logs that failed again, delete their rows or begin another store.
+    """
+    if batch_size < 1:
+        raise SettingsError(f"batch_size is {batch_size}; give at least 1")
+    if isinstance(method, str) and method not in METHODS:
+        raise SettingsError(f"there is no method {method!r}; there are {', '.join(METHODS)}")
+    asked = _asked(logs, vehicle)
+    work = pickle.dumps((model, method, read, arguments))
+    wanted = {
+        "model": model.fingerprint,
+        "method": method if isinstance(method, str) else [method.name, repr(method)],
+        "arguments": repr(sorted(arguments.items())),
+        **(configuration or {}),
+    }
+    workers = workers_of(executor, jobs, tasks)
+    with FleetStore(store, model, wanted) as kept, time_limited(time_limit):
+        kept.ask_for(asked)
+        finished = kept.finished()
+        missing = [name for name, *_ in asked if name not in finished]
+        batches = [_Batch(work, tuple(missing[k : k + batch_size])) for k in range(0, len(missing), batch_size)]
+        distribute(batches, kept, workers, asked=len(asked), progress=progress)
+    return fleet_status(store)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Logs that one call identifies, one after the other."""
+
+    work: bytes
+    logs: tuple[str, ...]
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """Name of each log."""
+        return self.logs
+
+    @property
+    def task(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """The call that identifies them."""
+        return identify_logs, (self.work, self.logs)
+
+    def without(self, finished: AbstractSet[str]) -> list[_Batch]:
+        """The batch of the logs that are not finished, if any."""
+        left = tuple(name for name in self.logs if name not in finished)
+        return [_Batch(self.work, left)] if left else []
+
+    def __str__(self) -> str:
+        return f"logs {', '.join(self.logs)}"
+
+
+def _asked(logs: Sequence[str | Path], pattern: str | None) -> list[tuple[str, int, str | None, str | None]]:
+    """Name, place, vehicle and time of each file, as far as the pattern finds them.
+
+    Raises SettingsError: the pattern is wrong, or a file is named twice.
+    """
+    names = [str(path) for path in logs]
+    twice = [name for name, other in zip(sorted(names), sorted(names)[1:], strict=False) if name == other]
+    if twice or not names:
+        raise SettingsError(f'log "{twice[0]}" is named twice' if twice else "no log is named; give files")
+    if pattern is None:
+        return [(name, k, None, None) for k, name in enumerate(names)]
+    try:
+        search = re.compile(pattern)
+    except re.error as error:
+        raise SettingsError(f"vehicle pattern {pattern!r}: {error}; see Python's re") from error
+    if "vehicle" not in search.groupindex:
+        raise SettingsError(f"vehicle pattern {pattern!r} has no group (?P<vehicle>...); add one")
+    found = []
+    for k, name in enumerate(names):
+        match = search.search(name)
+        if match is None:
+            raise SettingsError(f'vehicle pattern {pattern!r} does not match log "{name}"')
+        groups = match.groupdict()
+        found.append((name, k, groups["vehicle"], groups.get("time")))
+    return found
+
+
+# Worker --------------------------------------------------------------------------------------------------------------
+def identify_logs(work: bytes, logs: Sequence[str]) -> list[dict[str, Any]]:
+    """One row per log, by column of the store; a log that fails is a row with the error.
+
+    Parameters
+    ----------
+    work : pickle of model, method, reader and arguments of `identify`
+    logs : names of files
+
+    Raises
+    ------
+    StudyError
+        This machine cannot do the work at all.
+    """
+    model, method, read, arguments = _unpickled(work)
+    with single_threaded():  # all cores run logs
+        return [_row(name, model, method, read, arguments) for name in logs]
+
+
+@lru_cache(maxsize=4)
+def _unpickled(work: bytes) -> tuple[Model, str | Method, Callable[[Path], Log], Mapping[str, Any]]:
+    try:
+        found: tuple[Model, str | Method, Callable[[Path], Log], Mapping[str, Any]] = pickle.loads(work)
+        return found
+    except Exception as error:
+        raise StudyError(f"a worker on {platform.node()} cannot load the work: {error}") from error
+
+
+def _row(
+    name: str,
+    model: Model,
+    method: str | Method,
+    read: Callable[[Path], Log],
+    arguments: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The row of one log."""
+    begin, row = time.perf_counter(), dict[str, Any](log=name, status="done", error=None)
+    try:
+        log = read(Path(name))
+        row |= {"own_vehicle": _identity(log), "duration": float(log.time[-1] - log.time[0])}
+        row |= _figures(identify(model, log, method, **arguments))
+    except Exception as error:  # noqa: BLE001  one log must not end a fleet; its row says what it was
+        known = isinstance(error, DiransacError | OSError)
+        row |= {"status": "failed", "error": str(error) if known else f"{type(error).__name__}: {error}"}
+    return {**row, "versions": versions(), "seconds": time.perf_counter() - begin, "host": platform.node()}
+
+
+def _identity(log: Log) -> str | None:
+    """Identity of the vehicle in a log's metadata."""
+    found = [step["log"]["sys_uuid"] for step in log.history if "sys_uuid" in step.get("log", {})]
+    return str(found[-1]) if found else None
+
+
+def _figures(result: Result) -> dict[str, Any]:
+    """Columns of a result; values that are not finite are null."""
+    values = {f"parameter_{name}": x for name, x in result.parameters.items()}
+    values |= {f"standard_error_{name}": x for name, x in result.standard_errors.items()}
+    values |= {"fit_error": result.fit_error, "inlier_fraction": result.inlier_fraction}
+    finite = {name: float(x) if np.isfinite(x) else None for name, x in values.items()}
+    against = "; ".join(finding for finding in result.findings if finding.level == "bad")
+    return {**finite, "verdict": result.verdict, "stop_reason": result.stop_reason, "findings": against or None}
+
+
+# Store ---------------------------------------------------------------------------------------------------------------
+class FleetStore(Database):
+    """An open store of a fleet.
+
+    Parameters
+    ----------
+    path : of the file, which is made if it does not exist
+    model : its parameters are columns
+    wanted : values that determine rows
+
+    Raises
+    ------
+    StudyError
+        The file is no store of a fleet, or has another configuration.
+    """
+
+    def __init__(self, path: str | Path, model: Model, wanted: Mapping[str, Any]) -> None:
+        self.path = Path(path)
+        self._connection = connected_to(self.path, "rwc")
+        try:
+            with transaction(self._connection, self.path):
+                if is_empty(self._connection):
+                    _create(self._connection, model, wanted)
+                _check(self._connection, self.path)
+            self._compare(json_data(json.dumps(wanted)))
+        except BaseException:
+            self._connection.close()
+            raise
+
+    @classmethod
+    def existing(cls, path: str | Path) -> Self:
+        """An existing store, for reading alone.  Raises StudyError: there is none."""
+        store = cls.__new__(cls)
+        store.path = Path(path)
+        if not store.path.is_file():
+            raise StudyError(f'store "{path}" does not exist; make one with diransac identify --each --store {path}')
+        roll_back(store.path)
+        store._connection = connected_to(store.path, "ro")
+        try:
+            with reported(store.path):
+                _check(store._connection, store.path)
+        except BaseException:
+            store._connection.close()
+            raise
+        return store
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """Values that determine rows, and the units of the parameters."""
+        rows = self.select("SELECT key, value FROM configuration")
+        with damage(self.path):
+            return {word(key): json_data(value) for key, value in rows}
+
+    def ask_for(self, logs: Iterable[tuple[str, int, str | None, str | None]]) -> None:
+        """Add logs, or give those that are known another place, vehicle and time."""
+        with transaction(self._connection, self.path):
+            self._connection.executemany("INSERT OR REPLACE INTO asked VALUES (?, ?, ?, ?)", logs)
+
+    def finished(self) -> set[str]:
+        """Names of the logs whose rows are present."""
+        return {name for (name,) in self.select("SELECT log FROM logs")}
+
+    def finished_in(self, batch: _Batch) -> set[str]:
+        """Names of the logs of a batch whose rows are present."""
+        marks = ", ".join("?" * len(batch.logs))
+        return {name for (name,) in self.select(f"SELECT log FROM logs WHERE log IN ({marks})", batch.logs)}
+
+    def add(self, rows: Sequence[Mapping[str, Any]]) -> int:
+        """Number of new rows, written in one transaction; rows that are present stay as they are."""
+        before = self._connection.total_changes
+        with transaction(self._connection, self.path):
+            for row in rows:
+                names, marks = ", ".join(map(quoted, row)), ", ".join("?" * len(row))
+                self._connection.execute(f"INSERT OR IGNORE INTO logs ({names}) VALUES ({marks})", [*row.values()])
+        return self._connection.total_changes - before
+
+    def _compare(self, wanted: Mapping[str, Any]) -> None:
+        """Raises StudyError: the store has another configuration."""
+        kept = self.configuration
+        differing = [key for key, value in wanted.items() if kept.get(key) != value]
+        if differing:
+            raise StudyError(
+                f'store "{self.path}" has another {", ".join(differing[:_MANY])}: give the same, or another store'
+            )
+
+
+def _create(connection: sqlite3.Connection, model: Model, wanted: Mapping[str, Any]) -> None:
+    """Make the tables of a new store."""
+    of_parameters = [f"{quoted(f'{kind}_{n}')} REAL" for n in model.parameters for kind in ("parameter", _ERROR)]
+    about = {**wanted, "model_name": model.name, "units": {name: x.unit for name, x in model.parameters.items()}}
+    for statement in (
+        f"PRAGMA application_id = {_APPLICATION}",
+        f"PRAGMA user_version = {_FORMAT}",
+        "CREATE TABLE logs (log TEXT PRIMARY KEY, own_vehicle TEXT, status TEXT NOT NULL, error TEXT, verdict TEXT, "
+        f"findings TEXT, duration REAL, {', '.join(of_parameters)}, fit_error REAL, inlier_fraction REAL, "
+        "stop_reason TEXT, versions TEXT NOT NULL, seconds REAL NOT NULL, host TEXT NOT NULL)",
+        "CREATE TABLE asked (log TEXT PRIMARY KEY, place INTEGER NOT NULL, vehicle TEXT, time TEXT)",
+        "CREATE TABLE configuration (key TEXT PRIMARY KEY, value TEXT NOT NULL)",
+    ):
+        connection.execute(statement)
+    values = [(key, json.dumps(value)) for key, value in about.items()]
+    connection.executemany("INSERT INTO configuration VALUES (?, ?)", values)
+
+
+_ERROR = "standard_error"
+
+
+def _check(connection: sqlite3.Connection, path: Path) -> None:
+    """Raises StudyError: the file is no store of a fleet that this version reads."""
+    application = connection.execute("PRAGMA application_id").fetchone()[0]
+    if application != _APPLICATION:
+        raise StudyError(f'"{path}" is no store of a fleet; give one of diransac identify --each, or a new one')
+    number = connection.execute("PRAGMA user_version").fetchone()[0]
+    if number != _FORMAT:
+        raise StudyError(f'store "{path}" has format {number}, this version reads {_FORMAT}; begin another')
+    check_plain(connection, path, _TABLES)
+
+
+# Reading -------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class FleetStatus:
+    """Number of logs of a store.
+
+    Parameters
+    ----------
+    done, failed, missing : int
+    reasons : mapping of str to int
+        Number of failed logs by reason, the names of the files left out.
+    """
+
+    done: int
+    failed: int
+    missing: int
+    reasons: Mapping[str, int]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        head = f"{self.done} logs identified, {self.failed} failed, {self.missing} missing"
+        return "\n".join([head, *(f"  {count} failed: {reason}" for reason, count in self.reasons.items())])
+
+
+@dataclass(frozen=True, eq=False)
+class FleetRows:
+    """Estimates of a fleet as arrays, each vehicle's logs together in the order of its life.
+
+    Parameters
+    ----------
+    model : str
+        Name of the model.
+    units : mapping of str to str
+        Unit of each parameter.
+    logs : tuple of str
+        Name of each log that was identified, (n,).
+    vehicles : (n,) array of str
+    values, standard_errors : mapping of str to (n,) array
+        By parameter, in its unit; NaN where the log does not determine it.
+    verdicts : tuple of str
+        As `Result.verdict`.
+    status : FleetStatus
+    """
+
+    model: str
+    units: Mapping[str, str]
+    logs: tuple[str, ...]
+    vehicles: np.ndarray[Any, np.dtype[np.str_]]
+    values: Mapping[str, FloatArray]
+    standard_errors: Mapping[str, FloatArray]
+    verdicts: tuple[str, ...]
+    status: FleetStatus
+
+
+def fleet_status(store: str | Path) -> FleetStatus:
+    """Number of logs that a store has, lacks, or that failed.  Raises StudyError: there is no such store."""
+    with FleetStore.existing(store) as kept:
+        return _status(kept)
+
+
+def _status(kept: FleetStore) -> FleetStatus:
+    counts = dict(kept.select("SELECT status, count(*) FROM logs JOIN asked USING (log) GROUP BY status"))
+    ((asked,),) = kept.select("SELECT count(*) FROM asked")
+    failures = kept.select(
+        "SELECT replace(error, log, 'LOG') AS reason, count(*) AS n FROM logs WHERE status = 'failed' "
+        "GROUP BY reason ORDER BY n DESC, reason LIMIT 20"
+    )
+    with damage(kept.path):
+        done, failed = int(counts.get("done", 0)), int(counts.get("failed", 0))
+        return FleetStatus(done, failed, asked - done - failed, {word(text): int(n) for text, n in failures})
+
+
+def read_fleet(store: str | Path) -> FleetRows:
+    """Estimates of all logs of a store.
+
+    Raises
+    ------
+    StudyError
+        There is no such store, or it is damaged.
+    """
+    with FleetStore.existing(store) as kept:
+        about, status = kept.configuration, _status(kept)
+        with damage(kept.path):
+            units = {word(name): word(unit) for name, unit in about["units"].items()}
+            model = word(about["model_name"])
+        columns = [quoted(f"{kind}_{name}") for kind in ("parameter", _ERROR) for name in units]
+        rows = kept.select(
+            "SELECT log, coalesce(vehicle, own_vehicle, ?), time, place, verdict, "
+            f"{', '.join(columns)} FROM logs JOIN asked USING (log) WHERE status = 'done'",
+            (_UNKNOWN,),
+        )
+    with damage(Path(store)):
+        rows.sort(key=lambda row: (word(row[1]), _moment(row[2]), int(row[3])))
+        numbers = np.array([row[5:] for row in rows], np.float64).reshape(len(rows), 2 * len(units))
+        vehicles = np.array([row[1] for row in rows], np.str_)
+        return FleetRows(
+            model,
+            units,
+            tuple(word(row[0]) for row in rows),
+            vehicles,
+            dict(zip(units, numbers.T[: len(units)], strict=True)),
+            dict(zip(units, numbers.T[len(units) :], strict=True)),
+            tuple(word(row[4]) for row in rows),
+            status,
+        )
+
+
+def _moment(text: str | None) -> tuple[float, str]:
+    """Key that sorts times: numbers by value, other texts as texts after them."""
+    if text is None:
+        return 0.0, ""
+    try:
+        return float(text), ""
+    except ValueError:
+        return np.inf, word(text)
+
+
+def export_fleet(store: str | Path, path: str | Path) -> None:
+    """Write the rows of a store as CSV, one per log, in the order in which logs were asked for.
+
+    Raises
+    ------
+    StudyError
+        There is no such store.
+    """
+    with FleetStore.existing(store) as kept:
+        names = [name for _, name, *_ in kept.select("PRAGMA table_info(logs)") if name != "own_vehicle"]
+        columns = ", ".join(map(quoted, names[1:]))
+        rows = kept.select(
+            f"SELECT log, coalesce(vehicle, own_vehicle), time, {columns} FROM asked LEFT JOIN logs USING (log) "
+            "ORDER BY place"
+        )
+
+    def write(temporary: Path) -> None:
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            table.writerow(["log", "vehicle", "time", *names[1:]])
+            table.writerows(rows)
+
+    write_with(path, write)
