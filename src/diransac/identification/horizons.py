@@ -15,9 +15,9 @@ from diransac.errors import LogError
 from diransac.identification.driven_states import DrivenStates, least_squares
 from diransac.identification.estimate import Resolution
 from diransac.identification.evaluation import Simulation
-from diransac.identification.window_starts import SmoothedLog, WindowStarts, smoothed_log, window_starts
 
 if TYPE_CHECKING:
+    from diransac.identification.window_starts import SmoothedLog, WindowStarts
     from diransac.model import Model
 
 __all__ = ["HorizonScores", "OpenLoop", "StartRule", "pooled_scores"]
@@ -160,7 +160,7 @@ class OpenLoop:
         self.segment: Segment = alone.segments[0]
         self.simulation = Simulation(alone, resolution=resolution)
         self.parameters = dataset.model.parameter_vector(parameters)
-        self.smoothed = smoothed_log(alone) if start == "smoothed" else None
+        self.smoothed = _smoothed(alone) if start == "smoothed" else None
         self.states = _states(self.segment, layout, self.parameters, self.smoothed)
         n_s = self.segment.measured.shape[1]
         found = self.smoothed
@@ -187,6 +187,8 @@ class OpenLoop:
 
     def _estimated(self, stretch: slice, rows: IntArray) -> WindowStarts:
         """Estimated initial states of windows from some rows of a stretch."""
+        from diransac.identification.window_starts import window_starts  # which needs all of lo-diransac
+
         assert self.smoothed is not None
         filled, measured = self.filled_states(), self.segment.measured
         return window_starts(self.simulation, self.parameters, filled, self.smoothed, measured, stretch, rows)
@@ -374,6 +376,13 @@ def _spread(measured: FloatArray) -> FloatArray:
 
 
 # ---------------------------------------------------------------------- states of a log
+
+
+def _smoothed(alone: Dataset) -> SmoothedLog | None:
+    """One log, smoothed without the model; None where it is too short."""
+    from diransac.identification.window_starts import smoothed_log  # which needs all of lo-diransac
+
+    return smoothed_log(alone)
 
 
 def _states(
