@@ -1,6 +1,8 @@
 """The command line: files that it writes, complete or not at all."""
 
 import errno
+import html
+import shlex
 from pathlib import Path
 
 import pytest
@@ -90,3 +92,5 @@ def test_report_is_one_page(folder: Path):
     assert done.exit_code == both.exit_code == 0
     for page in ("page.html", "both.html"):
         assert "quadratic_drag" in Path(page).read_text()
+    words = shlex.join(["diransac", "identify", "swim.csv", *MODEL, *QUICK, "--report", "page.html"])
+    assert f"<code>{html.escape(words)}</code>" in Path("page.html").read_text()

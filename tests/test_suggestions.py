@@ -303,6 +303,25 @@ def test_missing_dry_friction_is_suggested_with_its_size(result):
     assert "sign(q_dot) explains" in found.text
 
 
+def test_the_suggested_term_lies_over_the_unmodelled_force(with_dry_friction, result, tmp_path):
+    found = result.diagnosis
+    force, term = found.unmodelled_forces["q_ddot"], found.suggested_terms["q_ddot"]
+    assert np.var(force - term) < 0.15 * np.var(force)
+    assert np.ptp(term) > 1.5 * COULOMB  # friction steps by twice its size
+    again = dr.Result.from_dict(result.to_dict()).diagnosis.suggested_terms
+    np.testing.assert_array_equal(again["q_ddot"], term)
+    dr.write_report(result, with_dry_friction, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "Dashed: what the suggested terms explain of it." in page
+    assert 'class="trace line suggested"' in page
+
+
+def test_without_suggestions_nothing_lies_over_the_unmodelled_forces():
+    found = dr.identify(pendulum(), swing(), differentiate=True).diagnosis
+    assert not found.suggested_terms
+    assert not found.of_log(0, slice(None)).suggested_terms
+
+
 def test_suggestions_are_printed_and_survive_json(result):
     (found,) = result.suggestions
     assert found.text in str(result)

@@ -133,7 +133,7 @@ def _identify(
             if report:
                 from diransac.report import write_report
 
-                write_report(found, logs, page)
+                write_report(found, logs, page, command=screen.command())
         screen.show(LimbResults(results) if len(results) > 1 else results[""], as_json)
     for found in results.values():
         screen.end(found.verdict, strict)
@@ -165,7 +165,7 @@ def _compare(
         if report:
             from diransac.report import write_report
 
-            write_report(comparison.results, logs, page)
+            write_report(comparison.results, logs, page, command=screen.command())
         screen.show(comparison, as_json)
 
 
@@ -190,7 +190,7 @@ def _validate(
         if report:
             from diransac.report import write_report
 
-            write_report(result, logs, page)
+            write_report(result, logs, page, command=screen.command())
         screen.show(found, as_json)
     screen.end(found.verdict, strict)
 

@@ -72,6 +72,7 @@ class Group(TyperGroup):
         given = list(sys.argv[1:] if args is None else args)
         words = [word for word in given if word not in ("--debug", *_VERBOSITY)]
         extra["standalone_mode"] = False
+        screen.set_command(given)
         levels = [_VERBOSITY[word] for word in given if word in _VERBOSITY]
         screen.set_verbosity(levels[-1] if levels else 0)
         debugging = "--debug" in given

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
@@ -15,10 +16,12 @@ import typer
 
 from diransac.identification.method import Callback, Progress
 
-__all__ = ["Lines", "bar", "end", "say", "set_verbosity", "show", "stdout_taken"]
+__all__ = ["Lines", "bar", "command", "end", "say", "set_command", "set_verbosity", "show", "stdout_taken"]
 
 _STATE = {"verbosity": 0, "taken": 0}
 """Of the command that this process runs: -1 quiet, 1 verbose; number of outputs that are written to stdout."""
+_WORDS: list[str] = []
+"""Of the same command."""
 
 UNRELIABLE = 3
 """Exit code of `end`."""
@@ -62,6 +65,22 @@ def say(text: str) -> None:
     """
     if _STATE["verbosity"] >= 0:
         typer.echo(text, err=bool(_STATE["taken"]))
+
+
+def set_command(words: Sequence[str]) -> None:
+    """Keep the command for `command`.
+
+    Parameters
+    ----------
+    words : sequence of str
+        After the program's name.
+    """
+    _WORDS[:] = words
+
+
+def command() -> str:
+    """The command that this process runs, as a shell takes it."""
+    return shlex.join(["diransac", *_WORDS])
 
 
 def set_verbosity(level: int) -> None:

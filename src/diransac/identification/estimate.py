@@ -200,6 +200,9 @@ class Diagnosis:
         Sentences about these parameters: the combinations that are determined, the reason, the remedy.
     hausman_tests : tuple of HausmanTest, optional
         Of each parameter, where set-points are named and the model is not exact.
+    suggested_terms : mapping of str to (W,) array, optional
+        What suggested terms explain of each unmodelled force, or of each acceleration where there are no forces, beside
+        the parameters that would change with them; empty without suggestions.
     """
 
     noise_std: Values
@@ -217,6 +220,7 @@ class Diagnosis:
     unidentifiable: tuple[str, ...]
     combinations: tuple[str, ...] = ()
     hausman_tests: tuple[HausmanTest, ...] = ()
+    suggested_terms: Series = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         series = [self.window_log, self.unmodelled_time, self.smoothed_time]
@@ -226,6 +230,7 @@ class Diagnosis:
             "outliers",
             "unmodelled_accelerations",
             "unmodelled_forces",
+            "suggested_terms",
             "smoothed_states",
         ):
             values = dict(getattr(self, name))
@@ -248,6 +253,7 @@ class Diagnosis:
             unmodelled_time=self.unmodelled_time[windows],
             unmodelled_accelerations={n: x[windows] for n, x in self.unmodelled_accelerations.items()},
             unmodelled_forces={n: x[windows] for n, x in self.unmodelled_forces.items()},
+            suggested_terms={n: x[windows] for n, x in self.suggested_terms.items()},
             smoothed_time=self.smoothed_time[windows],
             smoothed_states={n: x[windows] for n, x in self.smoothed_states.items()},
         )

@@ -20,7 +20,11 @@ __all__ = ["write_report"]
 
 
 def write_report(
-    results: Result | Sequence[Result] | Mapping[str, Result], logs: Log | Sequence[Log], path: str | Path
+    results: Result | Sequence[Result] | Mapping[str, Result],
+    logs: Log | Sequence[Log],
+    path: str | Path,
+    *,
+    command: str = "",
 ) -> None:
     """Write one HTML page about one or several results, evaluated on one or several logs.
 
@@ -29,6 +33,7 @@ def write_report(
     results : one result, several, or several by label
     logs : the logs that were given to `identify`, or others: the page is then a held-out validation
     path : file of the page, written whole or not at all
+    command : shell command that writes the page, to be shown on it
 
     Raises
     ------
@@ -42,7 +47,7 @@ def write_report(
     """
     named, several = labelled(results), _as_list(logs)
     entries = simulate_all(named, several)
-    write_page(path, "report.html", ["page.css"], "page.js", **_content(entries, several))
+    write_page(path, "report.html", ["page.css"], "page.js", command=command, **_content(entries, several))
 
 
 def labelled(results: Result | Sequence[Result] | Mapping[str, Result]) -> dict[str, Result]:

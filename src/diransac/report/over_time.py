@@ -255,7 +255,8 @@ def _unmodelled_about(found: Diagnosis) -> str:
     time = found.smoothed_time
     window = f"{number(float(time[1] - time[0]), 3)} s" if len(time) > 1 else "the log"
     what = "Unmodelled generalised forces" if found.unmodelled_forces else "Unmodelled accelerations"
-    return f"{what}: zero where the model explains the motion. Each step is the mean over {window}."
+    text = f"{what}: zero where the model explains the motion. Each step is the mean over {window}."
+    return f"{text} Dashed: what the suggested terms explain of it." if found.suggested_terms else text
 
 
 def _unmodelled(run: Run, found: Diagnosis, i: int, timeline: Timeline) -> list[Figure]:
@@ -275,9 +276,12 @@ def _unmodelled_figure(run: Run, name: str, values: FloatArray, found: Diagnosis
     relative = "no motion" if fraction is None else f"{percent(fraction)} of the acceleration"
     least = _VISIBLE * rms / fraction if fraction else 0.0
     scale = padded(min(-least, float(values.min())), max(least, float(values.max())))
-    trace = Trace(what, f"m{i}", "line", *_steps(found, values, timeline))
+    traces = [Trace(what, f"m{i}", "line", *_steps(found, values, timeline))]
+    if np.any(found.suggested_terms.get(name, 0.0)):
+        explained = _steps(found, found.suggested_terms[name], timeline)
+        traces.append(Trace("suggested terms", "suggested", "line", *explained))
     label = f"Unmodelled {what}{f' in {unit}' if unit else ''}"
-    plot = time_plot([trace], scale, timeline, label, levels=(0.0,))
+    plot = time_plot(traces, scale, timeline, label, levels=(0.0,))
     return Figure(
         what, unit, (f"RMS {number(rms, 2)} {unit}".strip() + f", {relative}",), (Panel(plot),), time_axis(timeline)
     )

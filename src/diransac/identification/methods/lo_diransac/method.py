@@ -263,11 +263,10 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), parts),
     )
     forced = bool(settings.input_delay or settings.input_lag)
-    found = _Found(dataset, intervals, motion, refined, result, ambiguity, forced, instrumented.tests)
+    found = _Found(dataset, intervals, motion, refined, result, ambiguity, forced, instrumented.tests, lacks)
     end = "converged" if refined.converged else "limit of steps"
     end = end if likeliest.complete else TIME_LIMIT
-    estimate = _estimate(settings, found, best.n_hypotheses, end, notes, checks)
-    return estimate if lacks is None else replace(estimate, suggestions=lacks.suggestions)
+    return _estimate(settings, found, best.n_hypotheses, end, notes, checks)
 
 
 @dataclass(frozen=True)
@@ -532,7 +531,8 @@ def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sa
 class _Found:
     """Parts of an estimate; a forced delay or lag of the inputs need not be significant.
 
-    ``ambiguity (n, n)`` is a covariance besides that of the result, for what one set of parameters cannot be.
+    ``ambiguity (n, n)`` is a covariance besides that of the result, for what one set of parameters cannot be; ``lacks``
+    is None where terms that the model lacks were not sought.
     """
 
     dataset: Dataset
@@ -543,6 +543,7 @@ class _Found:
     ambiguity: FloatArray
     forced: bool
     hausman_tests: tuple[HausmanTest, ...]
+    lacks: MissingTerms | None
 
     @property
     def late(self) -> float:
@@ -606,6 +607,7 @@ def _estimate(
         notes=notes,
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),
         checks=checks,
+        suggestions=found.lacks.suggestions if found.lacks else (),
     )
 
 
@@ -622,7 +624,10 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
     window_log = intervals.log_of[shown]
     begins = np.array([one.log.time[one.offset] for one in dataset.segments])[window_log]
     place = intervals.starts[shown] - intervals.first_of_log[window_log]
-    forces = _unmodelled_forces(intervals, fit, result)
+    accelerations = [result.unexplained]
+    if found.lacks and found.lacks.suggestions:
+        accelerations.append(found.lacks.accelerations)
+    forces = _forces_of(intervals, fit, result.parameters, accelerations)
     per_equation: Callable[[FloatArray], dict[str, FloatArray]] = lambda x: dict(  # noqa: E731
         zip(model.accelerations, x[shown].T.copy(), strict=True)
     )
@@ -633,7 +638,7 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
         window_log=window_log,
         unmodelled_time=begins + dt * (place + 0.5 * (intervals.length - 1)),
         unmodelled_accelerations=per_equation(result.unexplained),
-        unmodelled_forces={} if forces is None else per_equation(forces),
+        unmodelled_forces=per_equation(forces[0]) if forces else {},
         smoothed_time=begins + dt * place.astype(float),
         smoothed_states=dict(zip(model.state, fit.x[shown].T.copy(), strict=True)),
         input_delay=found.late * dt,
@@ -642,6 +647,7 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
         unidentifiable=lost,
         combinations=combinations,
         hausman_tests=found.hausman_tests,
+        suggested_terms=per_equation((forces or accelerations)[1]) if len(accelerations) > 1 else {},
     )
 
 
@@ -651,14 +657,16 @@ def _on_given_logs(dataset: Dataset, intervals: ShootingIntervals, mask: BoolArr
     return dataset.on_given_logs(parts)
 
 
-def _unmodelled_forces(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate) -> FloatArray | None:
-    """Generalised forces (W, n_v) of the unmodelled accelerations at the intervals' starts, or None."""
+def _forces_of(
+    intervals: ShootingIntervals, fit: Fit, parameters: FloatArray, accelerations: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Generalised forces (W, n_v) of accelerations at the intervals' starts; none if nothing is a balance of forces."""
     model = intervals.model
     try:
         response = model.force_response
     except ModelError:
-        return None
-    p = np.broadcast_to(intervals.parameters_of(result.parameters, intervals.log_of), (len(fit.x), model.n_p))
+        return []
+    p = np.broadcast_to(intervals.parameters_of(parameters, intervals.log_of), (len(fit.x), model.n_p))
     motion = (fit.x[:, : model.n_q].T, fit.x[:, model.n_q :].T, intervals.inputs[intervals.starts].T, p.T)
     columns = [np.array(response(*motion, np.repeat(f[:, None], len(fit.x), axis=1))).T for f in np.eye(model.n_v)]
-    return np.asarray(np.linalg.solve(np.stack(columns, axis=-1), result.unexplained[:, :, None])[:, :, 0])
+    return list(np.linalg.solve(np.stack(columns, axis=-1), np.stack(accelerations)[..., None])[..., 0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -62,10 +62,13 @@ class MissingTerms:
         The one that explains most first; empty where none is supported by the logs.
     change : (n,) array
         Change of the parameters in a regression that has the terms, too.
+    accelerations : (W, n_v) array
+        What the suggested terms explain of the unmodelled acceleration of each interval, beside such changes.
     """
 
     suggestions: tuple[Suggestion, ...]
     change: FloatArray
+    accelerations: FloatArray
 
 
 def missing_terms(
@@ -91,10 +94,15 @@ def missing_terms(
     speeds = np.sqrt(np.square(rows.motion[1][intervals.counted]).mean(axis=0))
     sizes = np.sqrt(np.square(rows.motion[3][intervals.counted]).mean(axis=0))
     candidates = candidate_terms(intervals.model, speeds, sizes, library)
-    means = _mean_forces(rows, fit, candidates)
+    terms = candidates.means(rows.motion, rows.weights, intervals.length)
+    means = _mean_forces(rows, fit, candidates, terms)
     selected = select_terms(means)
     helpful = [x for x in selected if x.explained > 0.0]
-    return MissingTerms(suggestions_of(candidates, helpful), changes_beside(means, selected)[: intervals.n_p])
+    forces = rows.of_intervals(rows.own) @ changes_beside(means, helpful)
+    forces += terms[:, :, [x.index for x in helpful]] @ np.array([x.value for x in helpful])
+    accelerations = -np.einsum("wij,wj->wi", np.linalg.pinv(rows.M[intervals.starts]), forces)
+    change = changes_beside(means, selected)[: intervals.n_p]
+    return MissingTerms(suggestions_of(candidates, helpful), change, accelerations)
 
 
 def clear_errors_of_inputs(intervals: ShootingIntervals, fit: Fit, kinds: Container[str]) -> list[RecordingError]:
@@ -175,23 +183,29 @@ class _Rows:
         window = np.searchsorted(windows, np.flatnonzero(intervals.occupied), side="right")
         self.windows = np.flatnonzero(np.diff(window, prepend=-1))
 
+    def of_intervals(self, values: FloatArray) -> FloatArray:
+        """Mean of each interval (W, ...)."""
+        weighted = values * self.weights.reshape(-1, *(1,) * (values.ndim - 1))
+        return np.asarray(weighted.reshape(len(self.intervals), -1, *values.shape[1:]).sum(axis=1))
+
     def mean(self, values: FloatArray) -> FloatArray:
         """Mean of each window that has any, (n, ...)."""
-        weighted = values * self.weights.reshape(-1, *(1,) * (values.ndim - 1))
-        sums = weighted.reshape(len(self.intervals), -1, *values.shape[1:]).sum(axis=1)
-        return self.over_windows(sums)
+        return self.over_windows(self.of_intervals(values))
 
     def over_windows(self, values: FloatArray) -> FloatArray:
         """Means of values of intervals ``(W, ...)``."""
         return means_of_windows(values[self.intervals.occupied], self.windows)
 
-    def input_rates(self) -> FloatArray:
-        """``dr/du_j du_j/dt`` (N, n_v, n_u): the effect of a delay of each input."""
+    @cached_property
+    def own(self) -> FloatArray:
+        """Columns (N, n_v, n + n_u) of the parameters, and of a delay of each input, ``dr/du_j du_j/dt``."""
         rates = self.intervals.moving_inputs[:, self.intervals.model.n_u :]
-        return _input_slopes(self.intervals.model, self.motion) * rates[:, None, :]
+        delays = _input_slopes(self.intervals.model, self.motion) * rates[:, None, :]
+        return np.concatenate([self.W, delays], axis=2)
 
 
-def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForces:
+def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms, terms: FloatArray) -> MeanForces:
+    """Means over windows, of the terms from those over intervals ``(W, n_v, K)``."""
     intervals, n_x = rows.intervals, fit.x.shape[1]
     n_p, n_v, n_u = intervals.n_p, intervals.model.n_v, intervals.model.n_u
     at = linearize(intervals, fit, weights_of(intervals, fit))
@@ -200,7 +214,7 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForce
     of_force = np.einsum("wij,wjk,wik->wi", M, rows.over_windows(found.alone[:, n_x:, n_x:]), M) / sizes[:, None]
     inertial = np.einsum("nij,nj->ni", rows.M, rows.motion[2])[intervals.counted]
     force = rows.mean(rows.r)
-    own = rows.mean(np.concatenate([rows.W, rows.input_rates()], axis=2))
+    own = rows.mean(rows.own)
     level = rows.mean(np.hstack([np.ones((len(rows.r), 1)), intervals.inputs]))
     discrepancies = _discrepancies(force, own, level)
     place = slice(n_p, n_p + n_v * (n_u + 1))
@@ -211,7 +225,7 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms) -> MeanForce
         own=own,
         discrepancies=discrepancies,
         discrepancy_covariance=found.var_p[place, place],
-        terms=rows.over_windows(candidates.means(rows.motion, rows.weights, intervals.length)),
+        terms=rows.over_windows(terms),
         is_input_gain=candidates.is_input_gain,
         groups=candidates.groups,
         log_of=intervals.log_of[intervals.occupied][rows.windows],
