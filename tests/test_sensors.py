@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import diransac as dr
-from diransac.data.dataset import Dataset
+from diransac.data.dataset import Dataset, ParameterLayout
+from diransac.identification.driven_states import DrivenStates
 from diransac.identification.inspection import inspect
 from diransac.identification.suggestions import Suggestion, with_terms
 from diransac.model import expressions
@@ -494,6 +495,29 @@ def test_an_attitude_that_only_sensors_show_is_estimated(model, columns):
     assert np.abs(result.diagnosis.smoothed_states["theta"] - angles).max() < 0.02
     with pytest.raises(dr.LogError, match="theta"):
         dr.identify(model, as_log(log), "ols", differentiate=True)
+
+
+@pytest.mark.parametrize(("stiffness", "turns"), [(0.0, 1), (0.3, 0)])
+def test_an_attitude_that_nothing_measures_is_the_one_within_half_a_turn_of_zero_if_turns_have_no_effect(
+    stiffness, turns
+):
+    """A spring tells one turn from the next."""
+    model = dr.Model(
+        "tilting",
+        {"x": "m", "tilt": "rad"},
+        {"moment": "N m"},
+        {"drag": dr.Parameter("1/s")},
+        lambda q, v, a, u, p: [a.x + p.drag * v.x - ca.sin(q.tilt), a.tilt + stiffness * q.tilt - u.moment],
+    )
+    n, begin = 50, np.array([2.0 * np.pi + 0.2, 0.1, -4.0 * np.pi - 0.2, 0.0])
+    rows = [slice(0, n), slice(n, 2 * n)]
+    layout = ParameterLayout(dict(model.parameters), 2)
+    zeros = [np.zeros((2 * n, k)) for k in (len(model.state), 1, 0, 1)]
+    problem = DrivenStates(model, layout, ("tilt", "tilt_dot"), *zeros, rows, 0.01, 10.0, np.array([0.5]))
+    found = problem.trajectories(begin)["tilt"]
+    assert_allclose(found[[0, n]], [0.2 + 2.0 * np.pi * (1 - turns), -0.2 - 4.0 * np.pi * (1 - turns)])
+    if turns:
+        assert_allclose(found[n - 1], 0.2 + 0.1 * 0.01 * (n - 1))
 
 
 def test_the_lag_of_a_thrust_is_identified_from_an_accelerometer_alone():

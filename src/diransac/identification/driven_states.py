@@ -34,6 +34,8 @@ __all__ = ["DrivenStates", "least_squares"]
 _N_STARTS = 256
 # Largest factor of a positive parameter in a step; integration steps per sample.
 _LARGEST_FACTOR, _SUBSTEPS = 10.0, 2
+# Points at which equations are compared after a turn, and the difference up to which they are the same.
+_TURN, _N_POINTS, _SAME = 2.0 * np.pi, 16, 1e-9
 # Damping at the start, its bounds, and its factors after a step down and after one up; the least gain of a step.
 _DAMPING, _DAMPING_BOUNDS, _LESS, _MORE, _CONVERGED = 1e-2, (1e-9, 1e9), 0.2, 6.0, 1e-9
 
@@ -76,6 +78,28 @@ def _driven_model(model: Model, hidden: tuple[str, ...], observed: tuple[str, ..
         first_order={name: model.units[n] for name, n in zip(names, (*hidden, *observed), strict=True)},
         sensors=model.sensors_of(of_sensors),
     )
+
+
+@lru_cache(maxsize=64)
+def _free_of_turns(model: Model) -> frozenset[str]:
+    """Coordinates in rad that may gain a whole turn with no effect on the equations, tried at random points."""
+    symbols = [ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup")]
+    parts = [model.residual(*symbols)]
+    if model.kinematics is not None:
+        parts.append(model.kinematics(*symbols[:2]))
+    if model.measurement is not None:
+        parts.append(model.measurement(*symbols))
+    equations, rng = ca.Function("equations", symbols, [ca.vertcat(*parts)]), np.random.default_rng(0)
+    points = [rng.uniform(0.5, 2.0, (x.numel(), _N_POINTS)) for x in symbols]
+    before = np.array(equations(*points))
+
+    def is_free(k: int) -> bool:
+        turned = points[0].copy()
+        turned[k] += _TURN
+        after = np.array(equations(turned, *points[1:]))
+        return np.allclose(before, after, rtol=_SAME, atol=_SAME, equal_nan=True)
+
+    return frozenset(n for k, n in enumerate(model.coordinates) if model.units[n] == "rad" and is_free(k))
 
 
 @dataclass(frozen=True)
@@ -204,12 +228,18 @@ class DrivenStates:
         return cost, gradient, matrix
 
     def trajectories(self, z: FloatArray) -> dict[str, FloatArray]:
-        """Unmeasured states and their derivatives (N,) by name, for one vector of unknowns (n,)."""
+        """Unmeasured states and their derivatives (N,) by name, for one vector of unknowns (n,).
+
+        Of angles that are the same after a whole turn, those that start within half a turn of zero.
+        """
         model, n, n_driven = self.model, len(self.hidden), len(self._driven.state)
         logs = range(len(self.rows_of_logs))
         series = np.concatenate([self._simulator.trajectories(self._batch(z[None], i))[0] for i in logs])
         rate_of = dict(zip(model.velocities, model.accelerations, strict=True))
-        states = dict(zip(self.hidden, series[:, :n].T, strict=True))
+        states = dict(zip(self.hidden, series[:, :n].T.copy(), strict=True))
+        for name in _free_of_turns(model).intersection(self.hidden):
+            for rows in self.rows_of_logs:
+                states[name][rows] -= _TURN * np.rint(states[name][rows.start] / _TURN)
         rates = zip(self.hidden, series[:, n_driven : n_driven + n].T, strict=True)
         return {**states, **{rate_of[name]: values for name, values in rates if name in rate_of}}
 
