@@ -24,14 +24,33 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.model.plant import DisturbedModel
     from diransac.simulation.compiler.sensitivities import ColumnGroup, DerivativeSpecification
+    from diransac.simulation.compiler.stage_function import StageFunction
     from diransac.simulation.compiler.time_loop import LoopSpecification
 
     SimulatedModel: TypeAlias = Model | DisturbedModel
 
-__all__ = ["HOLDS", "INTEGRATORS", "Hold", "Sensitivities", "linearized_step", "loop_specification", "sensitivities_of"]
+__all__ = [
+    "CALLED",
+    "HOLDS",
+    "INTEGRATORS",
+    "Hold",
+    "Sensitivities",
+    "called_dynamics",
+    "calls_dynamics",
+    "linearized_step",
+    "loop_specification",
+    "sensitivities_of",
+]
 
 Dynamics = Callable[[ca.SX, float], ca.SX]
 """(state and its derivatives, in columns; fraction of the step that has elapsed) -> their rates."""
+
+
+CALLED = "dynamics"
+"""Name of the function that stages call."""
+
+_LONG = 400
+"""Number of instructions of the dynamics from which on stages call them: code and its compilation are a quarter."""
 
 
 # Inputs between rows -------------------------------------------------------------------------------------------------
@@ -245,11 +264,23 @@ def loop_specification(
     sizes = {"x": len(model.state), "u": model.n_u + n_changes, "p": model.n_p, "h": 1}
     arguments = [ca.SX.sym(name, n) for name, n in sizes.items()]
     scored = tuple(model.signals.index(name) for name in signals)
-    after, simulated, points = _expressions(model, integrator, HOLDS[hold], arguments)
+    dynamics, results = called_dynamics(model) if calls_dynamics(model) else None, list[ca.SX]()
+
+    def inlined(x: ca.SX, u: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX]:
+        rates, acceleration = model.dynamics(x, u, p)
+        return rates, acceleration
+
+    def called(_x: ca.SX, _u: ca.SX, _p: ca.SX) -> tuple[ca.SX, ca.SX]:
+        results.append(ca.SX.sym("r", len(model.state) + model.n_v))
+        return results[-1][: len(model.state)], results[-1][len(model.state) :]
+
+    after, simulated, points = _expressions(model, called if dynamics else inlined, integrator, HOLDS[hold], arguments)
     derivatives = _derivatives(model, integrator, scored, sensitivities, points[0].size2()) if sensitivities else None
-    step = ca.Function("step", arguments, [after, simulated, *(points if sensitivities else ())])
+    outputs = [after, simulated, *(points if sensitivities or dynamics else ())]
+    step = ca.Function("step", [*arguments, ca.vertcat(*results)], outputs)
     return LoopSpecification(
         step=read_graph(step, (PARAMETER, STEP), reciprocals=True),
+        dynamics=dynamics,
         substeps=substeps,
         n_states=len(model.state),
         n_inputs=model.n_u + n_changes,
@@ -262,24 +293,44 @@ def loop_specification(
     )
 
 
+def calls_dynamics(model: SimulatedModel) -> bool:
+    """True if stages call one function for the dynamics, false if each has their expressions, where these are short."""
+    return bool(model.dynamics.n_instructions() >= _LONG)
+
+
+def called_dynamics(model: SimulatedModel) -> StageFunction:
+    """Function of (x, u, p) -> (dx/dt, accelerations) that stages call."""
+    from diransac.simulation.compiler.stage_function import StageFunction
+    from diransac.simulation.compiler.time_loop import PARAMETER
+
+    graph = read_graph(model.dynamics, (PARAMETER,), reciprocals=True)
+    return StageFunction(CALLED, graph, tuple(chain(*graph.outputs)), len(model.state), model.n_u)
+
+
 def _expressions(
-    model: SimulatedModel, integrator: str, hold: Hold, arguments: Sequence[ca.SX]
+    model: SimulatedModel,
+    dynamics: Callable[[ca.SX, ca.SX, ca.SX], tuple[ca.SX, ca.SX]],
+    integrator: str,
+    hold: Hold,
+    arguments: Sequence[ca.SX],
 ) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX, ca.SX]]:
-    """State after a step, all signals before it, and the points of the step.
+    """State after a step, all signals before it, and the points of the step, from dynamics (x, u, p) -> (dx/dt, a).
 
     The points are the states (n_x, n_stages) and inputs (n_u, n_stages) at which the dynamics are evaluated, and the
     components of the quaternions after the step before they are scaled.
     """
     x, inputs, p, h = arguments
-    states, held = [], []
+    states, held, accelerations = [], [], []
 
     def rates(state: ca.SX, fraction: float) -> ca.SX:
         states.append(state)
         held.append(hold.at(inputs, fraction))
-        return model.dynamics(state, held[-1], p)[0]
+        found, acceleration = dynamics(state, held[-1], p)
+        accelerations.append(acceleration)
+        return found
 
     raw = INTEGRATORS[integrator](rates, x, h, rates(x, 0.0), model.n_q)
-    acceleration = model.dynamics(x, held[0], p)[1]
+    acceleration = accelerations[0]
     sensors = model.readings(x, acceleration, held[0], p)
     quaternions = ca.vertcat(*(raw[k] for four in model.quaternions for k in four))
     points = (ca.horzcat(*states), ca.horzcat(*held), quaternions)

@@ -36,8 +36,17 @@ from diransac.simulation.compiler.lanes import (
     run_time_loop,
     squared_thresholds,
 )
-from diransac.simulation.compiler.machine_code import LANES, MachineCode, Target, compile_function
-from diransac.simulation.integrators import HOLDS, INTEGRATORS, Sensitivities, loop_specification, sensitivities_of
+from diransac.simulation.compiler.machine_code import LANES, MachineCode, Part, Target, compile_function
+from diransac.simulation.integrators import (
+    CALLED,
+    HOLDS,
+    INTEGRATORS,
+    Sensitivities,
+    called_dynamics,
+    calls_dynamics,
+    loop_specification,
+    sensitivities_of,
+)
 
 if TYPE_CHECKING:
     from diransac.simulation.compiler.time_loop import LoopSpecification
@@ -336,9 +345,23 @@ class Rollouts(Simulator):
         with self._lock:
             if variant not in self._code:
                 definition = (*self._definition(unknowns), output, inputs, repr(windows))
-                code = compile_function(emit, definition, "time_loop", ARGUMENTS.values(), self._target)
-                self._code[variant] = code
+                self._code[variant] = compile_function(
+                    emit, definition, "time_loop", ARGUMENTS.values(), self._target, self._parts
+                )
             return self._code[variant]
+
+    @property
+    def _parts(self) -> tuple[Part, ...]:
+        """The dynamics, where the loop calls them: the same machine code for all variants."""
+        model = self._model
+
+        def emit() -> Value:
+            from diransac.simulation.compiler.stage_function import stage_module
+
+            return stage_module(called_dynamics(model))
+
+        sizes = repr((len(model.state), model.n_u))
+        return (Part(emit, (sizes, model.dynamics.serialize()), CALLED),) if calls_dynamics(model) else ()
 
     def _definition(self, unknowns: tuple[str, ...]) -> list[str]:
         """Texts that determine `loop_specification`: all that it reads of the model, and its other arguments."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Sequence
     from concurrent.futures import ThreadPoolExecutor
 
-__all__ = ["LANES", "MachineCode", "Target", "compile_function", "default_threads", "run_blocks"]
+__all__ = ["LANES", "MachineCode", "Part", "Target", "compile_function", "default_threads", "run_blocks"]
 
 LANES = 8
 """Lanes of a vector, on every processor: results do not depend on the width of its registers."""
@@ -83,6 +83,22 @@ class MachineCode:
     engine: LLVM
 
 
+@dataclass(frozen=True)
+class Part:
+    """A function in a module of its own.
+
+    Attributes
+    ----------
+    emit : returns the llvmlite `ir.Module`; called only if the code is not in the cache
+    definition : texts that, with the sources of this package, determine the module
+    name : the function
+    """
+
+    emit: Callable[[], LLVM]
+    definition: Iterable[str]
+    name: str
+
+
 @cache
 def _binding() -> LLVM:
     """LLVM, set up for this processor; loaded when first asked for."""
@@ -99,6 +115,7 @@ def compile_function(
     name: str,
     signature: Collection[str],
     target: Target | None = None,
+    parts: Sequence[Part] = (),
 ) -> MachineCode:
     """Machine code of one function of an LLVM module, from the cache if it is there.
 
@@ -109,11 +126,13 @@ def compile_function(
     name : the function
     signature : kind of each argument, `pointer`, `integer` (64 bits) or `number` (float64)
     target : processor to compile for; this one by default
+    parts : functions of other modules that the module declares and calls
     """
     binding, machine = _binding(), _machine(target or Target.host())
-    code = _object_code(emit, _key(target or Target.host(), name, definition), machine)
     engine = binding.create_mcjit_compiler(binding.parse_assembly(""), machine)
-    engine.add_object_file(binding.ObjectFileRef.from_data(code))
+    for part in (*parts, Part(emit, definition, name)):
+        code = _object_code(part.emit, _key(target or Target.host(), part.name, part.definition), machine)
+        engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()
     kinds = {"pointer": ctypes.c_void_p, "integer": ctypes.c_int64, "number": ctypes.c_double}
     prototype = ctypes.CFUNCTYPE(None, *(kinds[kind] for kind in signature))

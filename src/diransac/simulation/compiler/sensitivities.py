@@ -14,19 +14,17 @@ from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING
 
-from llvmlite import ir
-
 from diransac.simulation.compiler.operations import evaluate, numbers
-from diransac.simulation.compiler.vectors import POINTER, Value, Vectors
+from diransac.simulation.compiler.stage_function import StageFunction
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from diransac.simulation.compiler.graph import Graph
+    from diransac.simulation.compiler.vectors import Value, Vectors
 
 __all__ = ["ColumnGroup", "Columns", "DerivativeSpecification", "Points"]
 
-_POINT, _INPUT, _PARAMETER = range(3)
 _COLUMN, _SHARED, _DRIVING, _STEP = range(4)
 
 
@@ -110,7 +108,15 @@ class Columns:
     slopes : for each group, the array of its derivatives of the scored signals before the last sub-step
     """
 
-    def __init__(self, v: Vectors, specification: DerivativeSpecification, step: Value, n_quaternions: int) -> None:
+    def __init__(
+        self,
+        v: Vectors,
+        specification: DerivativeSpecification,
+        step: Value,
+        sizes: tuple[int, int],
+        n_quaternions: int,
+    ) -> None:
+        """Sizes are those of the state and of the inputs of a stage."""
         self.v, self.specification, self.groups = v, specification, specification.groups
         self.step = step
         graph = specification.jacobians
@@ -119,20 +125,17 @@ class Columns:
         self._driving = [
             [places.add(elements) for elements in _rows_of(group, graph.outputs[1])] for group in self.groups
         ]
-        needed = graph.needed(places.varying)
-        operands = set(chain(*(graph.instructions[k].operands for k in needed if not graph.invariant[k])))
-        self._constants = sorted(
-            k
-            for k in operands | set(places.varying)
-            if graph.invariant[k] and graph.instructions[k].operation != "CONST"
-        )
         self._places = places
-        self._fixed = v.array(len(places.fixed) + len(self._constants))
+        self._stage = StageFunction("jacobians", graph, tuple(places.varying), *sizes)
+        self._function = self._stage.declare(v.builder.module)
+        self._function.linkage = "internal"
+        self._stage.emit(self._function)
+        self._constants = v.array(len(self._stage.constants))
+        self._fixed = v.array(len(places.fixed))
         self._varying = [v.array(len(places.varying)) for _ in range(specification.n_stages)]
         self._quaternions = v.array(n_quaternions)
         self.state = [v.array(len(group.unknowns) * len(group.rows)) for group in self.groups]
         self.slopes = [v.array(len(group.unknowns) * len(group.signals)) for group in self.groups]
-        self._function: Value = None
 
     # A block ---------------------------------------------------------------------------------------------------------
     def start(self, parameter: Callable[[int], Value]) -> None:
@@ -141,9 +144,10 @@ class Columns:
         for group, array in zip(self.groups, self.state, strict=True):
             for k, value in enumerate(chain(*group.initial)):
                 v.put(v.number(value), array, k)
-        kept = [*self._places.fixed, *self._constants]
-        results = evaluate(v, graph, kept, lambda _argument, element: parameter(element))
-        for k, value in enumerate(numbers(v, results, kept)):
+        self._stage.put_constants(v, parameter, self._constants)
+        fixed = self._places.fixed
+        results = evaluate(v, graph, fixed, lambda _argument, element: parameter(element))
+        for k, value in enumerate(numbers(v, results, fixed)):
             v.put(value, self._fixed, k)
 
     # A sub-step ------------------------------------------------------------------------------------------------------
@@ -151,41 +155,11 @@ class Columns:
         """Emit the derivatives of the signals before a sub-step, and those of the state after it."""
         v = self.v
         for x, u, varying in zip(points.states, points.inputs, self._varying, strict=True):
-            self._jacobians(x, u, varying)
+            self._stage.call(v, self._function, [*x, *u], self._constants, varying)
         for k, value in enumerate(points.quaternions):
             v.put(value, self._quaternions, k)
         for number in range(len(self.groups)):
             self._advance_group(number)
-
-    def _jacobians(self, x: list[Value], u: list[Value], varying: Value) -> None:
-        """Emit the call that computes the Jacobians of a stage."""
-        v = self.v
-        if self._function is None:
-            self._function = self._emit_function(len(x), len(u))
-        point = v.array(len(x) + len(u))
-        for k, value in enumerate((*x, *u)):
-            v.put(value, point, k)
-        v.builder.call(self._function, [point, self._fixed, varying])
-
-    def _emit_function(self, n_states: int, n_inputs: int) -> Value:
-        """Function of (state and inputs of a stage, fixed values) that writes the varying values."""
-        module = self.v.builder.module
-        function = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER] * 3), "jacobians")
-        function.linkage = "internal"
-        for argument in function.args:
-            argument.add_attribute("noalias")
-        point, fixed, varying = function.args
-        v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
-        v.align_frame()
-        values = [v.pick(point, k) for k in range(n_states + n_inputs)]
-        sources = {_POINT: values[:n_states], _INPUT: values[n_states:]}
-        first, places = len(self._places.fixed), self._places.varying
-        known = {k: v.pick(fixed, first + i) for i, k in enumerate(self._constants)}
-        results = evaluate(v, self.specification.jacobians, places, lambda argument, k: sources[argument][k], known)
-        for k, value in enumerate(numbers(v, results, places)):
-            v.put(value, varying, k)
-        v.builder.ret_void()
-        return function
 
     def _advance_group(self, number: int) -> None:
         """Emit the loop over a group's columns."""

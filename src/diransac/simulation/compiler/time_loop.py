@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar
 
 from llvmlite import ir
 
@@ -30,10 +30,11 @@ from diransac.simulation.compiler.vectors import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     from diransac.simulation.compiler.graph import Graph
     from diransac.simulation.compiler.sensitivities import DerivativeSpecification
+    from diransac.simulation.compiler.stage_function import StageFunction
 
 __all__ = [
     "Block",
@@ -48,7 +49,9 @@ __all__ = [
     "inputs_from_log",
 ]
 
-STATE, INPUT, PARAMETER, STEP = range(4)
+T = TypeVar("T")
+
+STATE, INPUT, PARAMETER, STEP, RESULT = range(5)
 
 
 @dataclass(frozen=True)
@@ -57,8 +60,9 @@ class LoopSpecification:
 
     Attributes
     ----------
-    step : graph of (x, u, p, h) -> (x after one sub-step, signals before it); where derivatives are simulated, it also
-        returns the states and inputs of each stage, and the components of the quaternions before they are scaled
+    step : graph of (x, u, p, h) -> (x after one sub-step, signals before it); where derivatives are simulated, or the
+        dynamics are called, it also returns the states and inputs of each stage, and the components of the quaternions
+        before they are scaled.  Where the dynamics are called, it has a further argument, their results in each stage
     substeps : sub-steps per row
     n_states, n_inputs, n_signals : sizes of x, u, and all signals
     n_changes : number of trailing elements of u that the leading ones change by with each sub-step: those are the
@@ -67,6 +71,8 @@ class LoopSpecification:
     quaternions : positions of whole quaternions among the scored signals; their sign is arbitrary
     state_quaternions : positions of all quaternions in x
     derivatives : expressions of the derivatives of x, if they are simulated
+    dynamics : function that the stages call for (dx/dt, accelerations), in a module of its own; None where the step
+        holds their expressions
     """
 
     step: Graph
@@ -79,6 +85,7 @@ class LoopSpecification:
     state_quaternions: tuple[tuple[int, ...], ...]
     n_changes: int = 0
     derivatives: DerivativeSpecification | None = None
+    dynamics: StageFunction | None = None
 
 
 @dataclass(frozen=True)
@@ -176,8 +183,14 @@ class TimeLoop:
         self.columns: Columns | None = None
         """Derivatives of the state, if they are simulated."""
         if specification.derivatives is not None:
+            sizes = specification.n_states, specification.n_inputs - specification.n_changes
             n_quaternions = 4 * len(specification.state_quaternions)
-            self.columns = Columns(self.v, specification.derivatives, self.arguments["step"], n_quaternions)
+            self.columns = Columns(self.v, specification.derivatives, self.arguments["step"], sizes, n_quaternions)
+        self._called: _Called | None = None
+        """The dynamics, if stages call them."""
+        if specification.dynamics is not None:
+            n_stages = len(specification.step.outputs[2]) // specification.n_states
+            self._called = _Called(self.v, specification.dynamics, n_stages)
 
     def emit(self, variant: type[Output], inputs: InputSource) -> None:
         """Emit the whole function."""
@@ -204,8 +217,13 @@ class TimeLoop:
                 return self._lane_vector("parameters", element, first)
             return v.splat(self.arguments["step"])
 
+        def parameter(element: int) -> Value:
+            return load(PARAMETER, element)
+
         if self.columns is not None:
-            self.columns.start(lambda element: self._lane_vector("parameters", element, first))
+            self.columns.start(parameter)
+        if self._called is not None:
+            self._called.start(parameter)
         graph = specification.step
         constant = [k for k in graph.needed(chain(*graph.outputs)) if graph.invariant[k]]
         starts = self.whole_numbers("start_rows", first) if self.windows else []
@@ -231,18 +249,25 @@ class TimeLoop:
 
     def _substep(self, block: Block, u: list[Value]) -> tuple[list[Value], list[Value]]:
         """Signals before a sub-step, and the state after it; derivatives are advanced in their arrays."""
-        n_states = self.specification.n_states
-        after, signals, *points = self._results(self.specification.step, u, block.step)
+        specification, graph = self.specification, self.specification.step
+        known = block.step if self._called is None else self._call(self._called, u, block.step)
+        results = self._evaluate(graph, chain(*graph.outputs), u, known)
+        after, signals, *points = (numbers(self.v, results, positions) for positions in graph.outputs)
         if self.columns is not None:
             states, inputs, quaternions = points
-            n_u = len(inputs) // (len(states) // n_states)
-            self.columns.advance(Points(_parts(states, n_states), _parts(inputs, n_u), quaternions))
+            n_stages = len(states) // specification.n_states
+            self.columns.advance(Points(_split(states, n_stages), _split(inputs, n_stages), quaternions))
         return signals, after
 
-    def _results(self, graph: Graph, u: list[Value], known: dict[int, Value]) -> list[list[Value]]:
-        """Outputs of a graph at the current state."""
-        results = self._evaluate(graph, chain(*graph.outputs), u, known)
-        return [numbers(self.v, results, positions) for positions in graph.outputs]
+    def _call(self, called: _Called, u: list[Value], known: dict[int, Value]) -> dict[int, Value]:
+        """Emit the calls of the dynamics, each at a point that depends on the results before; what is known then."""
+        graph, n_stages = self.specification.step, len(called.results)
+        states, inputs = (_split(graph.outputs[k], n_stages) for k in (2, 3))
+        for stage, point in enumerate(zip(states, inputs, strict=True)):
+            wanted = list(chain(*point))
+            known = self._evaluate(graph, wanted, u, known)
+            called.at(stage, numbers(self.v, known, wanted))
+        return known
 
     def _output(self, output: Output, block: Block, rows: Loop, u: list[Value], signals: list[Value]) -> None:
         """Emit the output of one row."""
@@ -282,9 +307,15 @@ class TimeLoop:
     def _evaluate(
         self, graph: Graph, wanted: Iterable[int], u: list[Value], known: dict[int, Value]
     ) -> dict[int, Value]:
-        """Evaluate a graph at the current state."""
+        """Evaluate a graph at the current state, where its stages have been called as far as it needs them."""
         x = [self.v.get(variable) for variable in self.state]
-        return evaluate(self.v, graph, list(wanted), lambda argument, k: (x if argument == STATE else u)[k], known)
+
+        def load(argument: int, element: int) -> Value:
+            if argument == RESULT and self._called is not None:
+                return self._called.result(element)
+            return (x if argument == STATE else u)[element]
+
+        return evaluate(self.v, graph, list(wanted), load, known)
 
     def _still_finite(self, signals: list[Value]) -> Value:
         """Lanes in which every signal has been finite in all rows so far: zero times it stays zero."""
@@ -308,9 +339,37 @@ class TimeLoop:
         return self.v.load(self.arguments[name], index, NUMBERS)
 
 
-def _parts(values: list[Value], size: int) -> list[list[Value]]:
-    """Consecutive parts of a size."""
-    return [values[first : first + size] for first in range(0, len(values), size)]
+class _Called:
+    """Emitter of the calls of a function by the stages of a sub-step.
+
+    Attributes
+    ----------
+    results : array of the results in each stage
+    """
+
+    def __init__(self, v: Vectors, function: StageFunction, n_stages: int) -> None:
+        self._v, self._stage, self._function = v, function, function.declare(v.builder.module)
+        self._constants = v.array(len(function.constants))
+        self.results = [v.array(len(function.results)) for _ in range(n_stages)]
+
+    def start(self, parameter: Callable[[int], Value]) -> None:
+        """Emit what the parameters of a block's lanes determine."""
+        self._stage.put_constants(self._v, parameter, self._constants)
+
+    def at(self, stage: int, point: Sequence[Value]) -> None:
+        """Emit the call of a stage, at a state and inputs."""
+        self._stage.call(self._v, self._function, point, self._constants, self.results[stage])
+
+    def result(self, element: int) -> Value:
+        """Emit the load of an element of all stages' results."""
+        stage, place = divmod(element, len(self._stage.results))
+        return self._v.pick(self.results[stage], place)
+
+
+def _split(values: Sequence[T], n: int) -> list[list[T]]:
+    """Consecutive parts of equal size."""
+    size = len(values) // n
+    return [list(values[k * size : (k + 1) * size]) for k in range(n)]
 
 
 # Sources of the inputs ------------------------------------------------------------------------------------------------
