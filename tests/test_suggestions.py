@@ -36,10 +36,13 @@ def means(rng, n=120, n_terms=40, noise=None, **changes):
         "noise": np.full(2, 0.1),
         "inertial": np.ones(2),
         "own": rng.standard_normal((n, 2, 2)),
+        "inertia": np.tile(np.eye(2), (3, 1, 1)),
+        "inertia_slopes": np.zeros((3, 2, 2, 2)),
         "discrepancies": np.zeros((n, 2, 0)),
         "discrepancy_covariance": np.zeros((0, 0)),
         "terms": terms,
         "is_input_gain": np.zeros(n_terms, bool),
+        "bounds": np.tile([-np.inf, np.inf], (n_terms, 1)),
         "groups": np.arange(n_terms),
         "log_of": np.zeros(n, np.int64),
     }
@@ -59,7 +62,8 @@ def test_parameters_change_by_what_a_missing_term_had_biased_them():
     made = means(rng, n=2000, noise=0.01 * rng.standard_normal((2000, 2)))
     own = np.concatenate([made.own, np.zeros((2000, 2, 1))], axis=2)  # nothing depends on the last parameter
     own[:, 0, 0] += made.terms[:, 0, 6]  # of unit variance, as the rest of the column
-    made = replace(made, own=own, force=made.force - 0.8 * made.terms[:, :, 6])
+    slopes = np.zeros((*made.inertia.shape, 3))
+    made = replace(made, own=own, inertia_slopes=slopes, force=made.force - 0.8 * made.terms[:, :, 6])
     change = changes_beside(made, select_terms(made))
     assert change[0] == pytest.approx(-0.4, abs=0.15)  # the equation where the term acts has less weight
     assert abs(change[1]) < 0.05
@@ -137,6 +141,46 @@ def test_an_input_gain_that_satisfies_an_equation_with_its_parameters_identicall
     assert [x.index for x in found] == [2]
 
 
+def test_a_term_that_makes_all_forces_smaller_explains_none():
+    """The inertial force is the first own column; the term is the second, and takes the inertia with it."""
+    rng = np.random.default_rng(9)
+    made = means(rng, n=400)
+    terms, own = made.terms.copy(), made.own.copy()
+    own[:, 1], terms[:, 1, 4] = 0.0, 0.0
+    terms[:, 0, 4] = 0.8 * own[:, 0, 0] - 0.8 * made.force[:, 0] + 0.1 * rng.standard_normal(400)
+    slopes = np.zeros((3, 2, 2, 2))
+    alone = replace(made, own=own, terms=terms)
+    assert 4 in {x.index for x in select_terms(alone)}
+    slopes[:, 0, 0, 0] = 1.0  # the coefficient of the first own column is the inertia, and the term takes 1 from it
+    assert 4 not in {x.index for x in select_terms(replace(alone, inertia_slopes=slopes))}
+
+
+def test_a_coefficient_beyond_its_bounds_is_not_suggested():
+    made = means(np.random.default_rng(3))
+    force = 0.1 * made.force + made.terms[:, :, 4] - made.terms[:, :, 9]  # coefficients -1 and 1
+    bounds = made.bounds.copy()
+    bounds[4] = -1.5, 0.0
+    assert {x.index for x in select_terms(replace(made, force=force, bounds=bounds))} == {4, 9}
+    bounds[4] = 0.0, np.inf
+    assert {x.index for x in select_terms(replace(made, force=force, bounds=bounds))} == {9}
+
+
+def test_what_actuators_make_of_inputs_has_bounds_within_which_it_grows_with_the_input():
+    model = crane()
+    candidates = candidate_terms(model, np.ones(model.n_v), np.full((model.n_u, 2), [0.8, 1.6]))
+    u = np.linspace(-1.6, 1.6, 200)
+    for term in (x for x in candidates.terms if x.is_of_input):
+        low, high = term.bounds
+        effect = ca.Function("effect", list(candidates.symbols), [term.residuals])
+        motion = [np.ones((x.numel(), len(u))) for x in candidates.symbols]
+        motion[3][:] = u
+        change = -np.array(effect(*motion))[0]  # the force enters the equation of x with a minus
+        assert low < 0.0 <= high
+        possible = (1.0 / 1.5 * low if np.isfinite(low) else -1.0, min(high, 1.0))
+        for coefficient in possible:  # but for an error of the coefficient
+            assert (np.diff(u + coefficient * change) > -1e-9).all(), term.kind
+
+
 def test_of_one_group_only_one_form_is_suggested():
     rng = np.random.default_rng(5)
     made = means(rng)
@@ -169,7 +213,7 @@ def crane(sign=1):
 
 def all_suggested(model, library=None):
     """Every candidate as a suggestion."""
-    candidates = candidate_terms(model, np.ones(model.n_v), np.full(model.n_u, 0.8), library)
+    candidates = candidate_terms(model, np.ones(model.n_v), np.full((model.n_u, 2), [0.8, 1.6]), library)
     chosen = [SelectedTerm(k, 0.5, 0.01, 0.9) for k in range(len(candidates))]
     return candidates, suggestions_of(candidates, chosen)
 
@@ -244,7 +288,7 @@ def test_means_of_candidates_are_those_of_numpy():
 )
 def test_a_wrong_library_is_refused_by_its_fault(library, reason):
     with pytest.raises(dr.ModelError, match=reason):
-        candidate_terms(crane(), np.ones(2), np.ones(1), library)
+        candidate_terms(crane(), np.ones(2), np.ones((1, 2)), library)
 
 
 # ---------------------------------------------------------------------- from a log to a suggestion

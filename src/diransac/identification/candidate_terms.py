@@ -39,7 +39,9 @@ TermLibrary = Callable[[Symbols, Symbols, Symbols], Mapping[str, Any]]
 _SMOOTH, _STRIBECK = 0.01, (0.03, 0.06, 0.12, 0.25)
 _HARMONICS = (1, 2, 3)
 # Widths of a dead band, and levels of saturation, over the RMS input.
-_DEAD_BANDS, _LEVELS = (0.02, 0.05, 0.1, 0.2, 0.4), (0.6, 0.8, 1.0, 1.3, 1.7)
+_DEAD_BANDS, _LEVELS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8), (0.6, 0.8, 1.0, 1.3, 1.7)
+# Largest change of an input's gain; how far a coefficient may leave what an actuator can do, as a part of it.
+_LARGEST_GAIN, _BEYOND = 0.5, 0.5
 _FORCES = {"m": "N", "rad": "N m"}
 _BLOCK = 4096
 
@@ -66,6 +68,8 @@ class CandidateTerm:
         Unit of its coefficient; empty if unknown.
     residuals : casadi.SX
         ``h (n_v)`` of the symbols of `CandidateTerms`.
+    bounds : (float, float), optional
+        Smallest and largest coefficient that is possible.
     """
 
     kind: str
@@ -76,6 +80,7 @@ class CandidateTerm:
     parameter: str
     unit: str
     residuals: ca.SX
+    bounds: tuple[float, float] = (-np.inf, np.inf)
 
     @property
     def is_of_input(self) -> bool:
@@ -109,6 +114,11 @@ class CandidateTerms:
     def is_input_gain(self) -> BoolArray:
         """Mask of the terms that scale an input."""
         return np.array([x.is_input_gain for x in self.terms])
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Smallest and largest coefficient (n_terms, 2) of each term."""
+        return np.array([x.bounds for x in self.terms])
 
     @property
     def groups(self) -> IntArray:
@@ -165,8 +175,8 @@ def candidate_terms(
     model : Model
     speeds : (n_v,) array
         RMS of each velocity, its unit; velocities that are zero get no friction.
-    inputs : (n_u,) array
-        RMS of each input, its unit; inputs that are zero get a gain alone.
+    inputs : (n_u, 2) array
+        RMS of each input, its unit, and the size up to which it mostly goes; inputs that are zero get a gain alone.
     library : callable, optional
         The user's expressions by name.
 
@@ -289,30 +299,39 @@ class _Maker:
         r = self.model.residual(q, v, a, u, p)
         for j, (name, unit) in enumerate(self.model.inputs.items()):
             slope = ca.jacobian(r, u[j])
-            for kind, label, formula, code, value, of_value in self._changes(name, u[j], unit, float(self.inputs[j])):
+            for kind, label, formula, code, value, of_value, bounds in self._changes(name, u[j], unit, *self.inputs[j]):
                 parameter = self._free(f"{label}_{name}")
                 line = f"u.{name}" + (" * (1 + p.{0})" if kind == INPUT_GAIN else f" + p.{{0}}{code}").format(parameter)
                 h = ca.densify(slope * value)
-                yield CandidateTerm(kind, -1, name, formula, line, parameter, of_value, h)
+                yield CandidateTerm(kind, -1, name, formula, line, parameter, of_value, h, bounds)
 
-    def _changes(self, name: str, u: ca.SX, unit: str, size: float) -> Iterator[tuple[str, str, str, str, ca.SX, str]]:
-        """Kind, label, formula, factor in code, value and unit of the coefficient of changes of one input."""
-        yield INPUT_GAIN, "gain_error", name, "", u, "1"
+    def _changes(
+        self, name: str, u: ca.SX, unit: str, size: float, largest: float
+    ) -> Iterator[tuple[str, str, str, str, ca.SX, str, tuple[float, float]]]:
+        """Kind, label, formula, factor in code, value, and unit and bounds of the coefficient of changes of one input.
+
+        Within the bounds, but for an error of the coefficient, what the actuator gives does not fall with its input; a
+        dead band and saturation take from it.
+        """
+        most = 1.0 + _BEYOND
+        yield INPUT_GAIN, "gain_error", name, "", u, "1", (-_LARGEST_GAIN, _LARGEST_GAIN)
         if not size > 0.0:
             return
         code, per_unit = f"u.{name}", _over("1", "" if unit == "1" else unit)
-        yield "input offset", "offset", "", "", ca.SX(1), unit
-        yield "curved input", "curvature", f"|{name}| {name}", f" * ca.fabs({code}) * {code}", ca.fabs(u) * u, per_unit
+        yield "input offset", "offset", "", "", ca.SX(1), unit, (-np.inf, np.inf)
+        curve, least = f" * ca.fabs({code}) * {code}", -most / (2.0 * largest)
+        yield "curved input", "curvature", f"|{name}| {name}", curve, ca.fabs(u) * u, per_unit, (least, np.inf)
         for factor in _DEAD_BANDS:
             width = float(f"{factor * size:.2g}")
             limited = f" * ca.fmax(-1, ca.fmin(1, {code} / {width:g}))"
             value = ca.fmax(-1.0, ca.fmin(1.0, u / width))
-            yield "dead band", "dead_band", f"sign({name}) beyond {width:g}", limited, value, unit
+            formula = f"sign({name}) beyond {width:g}"
+            yield "dead band", "dead_band", formula, limited, value, unit, (-most * width, 0.0)
         for factor in _LEVELS:
             level = float(f"{factor * size:.2g}")
             beyond = f" * ({code} - ca.fmax(-{level:g}, ca.fmin({level:g}, {code})))"
             value = u - ca.fmax(-level, ca.fmin(level, u))
-            yield "saturation", "saturation", f"({name} beyond {level:g})", beyond, value, "1"
+            yield "saturation", "saturation", f"({name} beyond {level:g})", beyond, value, "1", (-most, 0.0)
 
     def _term(
         self, kind: str, i: int, label: str, formula: str, code: str, value: ca.SX, unit: str | None

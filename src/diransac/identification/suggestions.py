@@ -5,8 +5,9 @@ Over every interval of a log the equations leave a mean force r.  A missing term
 that the fit could use instead, the parameters' own and the inputs' rates (a delay), are projected out of both sides
 (Frisch-Waugh-Lovell).
 
-Terms are added one at a time, the one with the largest gain of the likelihood first, which is a sum over equations of
-logarithms of residual variances.  One is accepted if
+Terms are added one at a time, the one with the largest gain of the likelihood of the accelerations first: a sum over
+equations of logarithms of residual variances, and of the logarithm of the determinant of the inertia that goes with the
+term.  Without it, a term that takes from an input explains forces by making all of them smaller.  One is accepted if
 
 - the gain exceeds what the choice among all candidates gives by chance, with as many independent intervals as the
   residuals' autocorrelation leaves;
@@ -52,7 +53,6 @@ __all__ = [
 _EVIDENCE, _SHARE, _RELATIVE, _SIGNIFICANT = 3.0, 0.2, 1e-3, 4.0
 # Part of a column's square that own columns must leave; part of the force that inputs must leave unexplained.
 _INDEPENDENT, _IDENTITY = 1e-2, 1e-8
-_LARGEST_GAIN = 0.5
 _MOST = 5
 # Weights of neighbouring intervals in the regression for coefficients; smallest number of intervals of a block.
 _KERNEL, _LEAST_BLOCK = (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9), 5
@@ -183,6 +183,10 @@ class MeanForces:
         RMS of the inertial force of each equation.
     own : (n, e, m) array
         Columns that explain r at no price: derivatives with respect to parameters, and inputs' rates.
+    inertia : (r, e, e) array
+        Derivatives of the equations with respect to the accelerations, in some rows.
+    inertia_slopes : (r, e, e, m) array
+        Their derivatives with respect to the coefficients of the own columns.
     discrepancies : (n, e, k) array
         Columns of the forces that the fit attributes to discrepancies, whose coefficients have an error.
     discrepancy_covariance : (k, k) array
@@ -190,6 +194,8 @@ class MeanForces:
     terms : (n, e, K) array
         Candidates.
     is_input_gain : (K,) bool array
+    bounds : (K, 2) array
+        Smallest and largest coefficient of each candidate that is possible.
     groups : (K,) int array
         Candidates of one group are forms of one effect, of which at most one is accepted.
     log_of : (n,) int array
@@ -200,10 +206,13 @@ class MeanForces:
     noise: FloatArray
     inertial: FloatArray
     own: FloatArray
+    inertia: FloatArray
+    inertia_slopes: FloatArray
     discrepancies: FloatArray
     discrepancy_covariance: FloatArray
     terms: FloatArray
     is_input_gain: BoolArray
+    bounds: FloatArray
     groups: IntArray
     log_of: IntArray
 
@@ -280,7 +289,8 @@ def _slopes(A: FloatArray, b: FloatArray) -> FloatArray:
     """Coefficients of least squares of b on the columns of A; 0 for columns of zeros."""
     norm = np.linalg.norm(A, axis=0)
     norm[norm == 0.0] = 1.0
-    return np.asarray(np.linalg.lstsq(A / norm, b, rcond=_RANK)[0] / norm)
+    found = np.linalg.lstsq(A / norm, b, rcond=_RANK)[0]
+    return np.asarray(found / norm.reshape(-1, *(1,) * (b.ndim - 1)))
 
 
 def _averaged(means: MeanForces) -> MeanForces:
@@ -349,6 +359,10 @@ class _Step:
         Interval after interval.
     terms : (n e, K) array
     discrepancies : (n e, k) array
+    inertia : (r, e, e) array
+        With the own columns' coefficients that fit best.
+    beside : (m, K) array
+        Coefficients of the own columns in a regression of each term on what was projected out.
     independent : (K,) bool array
         Candidates that the columns which were projected out do not span.
     """
@@ -358,6 +372,8 @@ class _Step:
     force: FloatArray
     terms: FloatArray
     discrepancies: FloatArray
+    inertia: FloatArray
+    beside: FloatArray
     independent: BoolArray
 
     @classmethod
@@ -372,21 +388,35 @@ class _Step:
 
     @classmethod
     def _projected(cls, means: MeanForces, out: Sequence[int], scale: FloatArray) -> _Step:
-        basis = _basis(np.concatenate([means.own, means.terms[:, :, out]], axis=2), scale)
+        columns, m = np.concatenate([means.own, means.terms[:, :, out]], axis=2), means.own.shape[2]
+        basis = _basis(columns, scale)
         whole, force = _rows(means.terms, scale), _rows(means.force[:, :, None], scale)
         terms = _left(basis, whole)
         independent = np.square(terms).sum(axis=0) > _INDEPENDENT * np.square(whole).sum(axis=0) + _TINY
         discrepancies = _left(basis, _rows(means.discrepancies, scale))
-        return cls(means, scale, _left(basis, force)[:, 0], terms, discrepancies, independent)
+        beside = _slopes(_rows(columns, scale), np.hstack([-force, whole]))[:m]
+        inertia = means.inertia + means.inertia_slopes @ beside[:, 0]
+        return cls(
+            means, scale, _left(basis, force)[:, 0], terms, discrepancies, inertia, beside[:, 1:], independent
+        )
 
     def _by_equation(self, rows: FloatArray) -> FloatArray:
         """Rows (n e, ...) as (n, e, ...)."""
         return rows.reshape(*self.means.force.shape, *rows.shape[1:])
 
     def _after(self, k: int) -> FloatArray:
-        """The force (n, e) that a candidate leaves."""
+        """The force (n, e) that a candidate leaves, over what its inertia is of that without it."""
         h = self.terms[:, k]
-        return self._by_equation(self.force - h * (h @ self.force / (h @ h)))
+        slope = h @ self.force / (h @ h)
+        return self._by_equation(self.force - h * slope) / self._shrinkage(np.array([k]), np.array([slope]))
+
+    def _shrinkage(self, candidates: IntArray, slopes: FloatArray) -> FloatArray:
+        """Geometric mean (K,) of the factors by which the inertia changes with candidates, of all its directions."""
+        changed = self.means.inertia_slopes @ (self.beside[:, candidates] * slopes)
+        after = np.moveaxis(self.inertia[..., None] + changed, 3, 0)
+        before, e = np.abs(np.linalg.det(self.inertia)), self.inertia.shape[1]
+        logarithms = np.log((np.abs(np.linalg.det(after)) + _TINY) / (before + _TINY))
+        return np.asarray(np.exp(logarithms.mean(axis=1) / e))
 
     @property
     def _noise(self) -> FloatArray:
@@ -401,8 +431,10 @@ class _Step:
             return None
         h = self.terms[:, usable]
         slopes = (h.T @ self.force) / np.square(h).sum(axis=0)
-        possible = ~self.means.is_input_gain[usable] | (np.abs(slopes) < _LARGEST_GAIN)
+        lowest, highest = self.means.bounds[usable].T
+        possible = (lowest < -slopes) & (-slopes < highest)
         squares = np.square(self._by_equation(self.force[:, None] - h * slopes)).sum(axis=0)
+        squares = squares / np.square(self._shrinkage(usable, slopes))
         gains = np.where(possible, self._gain(squares), -np.inf)
         groups = self.means.groups[usable]
         order = np.argsort(-gains, kind="stable")

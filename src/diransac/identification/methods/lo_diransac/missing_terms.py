@@ -14,6 +14,7 @@ from diransac.arrays import FloatArray, IntArray
 from diransac.identification.candidate_terms import TermLibrary, candidate_terms
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.projection import (
+    inertia_slopes,
     means_of_intervals,
     means_of_windows,
     projected_parameters,
@@ -49,6 +50,10 @@ __all__ = ["MissingTerms", "clear_errors_of_inputs", "missing_terms"]
 _EXPLAINS = {"delay": 0.3, "lag": 0.3, "drift": 0.9}
 # Part of an error's effect that parameters must leave; relative change of a gain that leaves none.
 _INDEPENDENT, _NO_GAIN = 1e-2, 1.0
+# Part of the samples of an input that its size bounds.
+_MOSTLY = 0.99
+# Number of rows at which the inertia is compared.
+_SOME = 20
 _SMALLEST, _TINY = 1e-6, 1e-300
 
 
@@ -92,7 +97,8 @@ def missing_terms(
     """
     rows = _Rows(intervals, result.windows, *residuals_of_motion(intervals, fit, result.parameters))
     speeds = np.sqrt(np.square(rows.motion[1][intervals.counted]).mean(axis=0))
-    sizes = np.sqrt(np.square(rows.motion[3][intervals.counted]).mean(axis=0))
+    inputs = rows.motion[3][intervals.counted]
+    sizes = np.stack([np.sqrt(np.square(inputs).mean(axis=0)), np.quantile(np.abs(inputs), _MOSTLY, axis=0)], axis=1)
     candidates = candidate_terms(intervals.model, speeds, sizes, library)
     terms = candidates.means(rows.motion, rows.weights, intervals.length)
     means = _mean_forces(rows, fit, candidates, terms)
@@ -208,8 +214,8 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms, terms: Float
     """Means over windows, of the terms from those over intervals ``(W, n_v, K)``."""
     intervals, n_x = rows.intervals, fit.x.shape[1]
     n_p, n_v, n_u = intervals.n_p, intervals.model.n_v, intervals.model.n_u
-    at = linearize(intervals, fit, weights_of(intervals, fit))
-    found = at.system.solve(at.right_z, at.right_s)
+    quadratic = linearize(intervals, fit, weights_of(intervals, fit))
+    found = quadratic.system.solve(quadratic.right_z, quadratic.right_s)
     M, sizes = rows.mean(rows.M), np.diff(rows.windows, append=intervals.occupied.sum())
     of_force = np.einsum("wij,wjk,wik->wi", M, rows.over_windows(found.alone[:, n_x:, n_x:]), M) / sizes[:, None]
     inertial = np.einsum("nij,nj->ni", rows.M, rows.motion[2])[intervals.counted]
@@ -218,15 +224,21 @@ def _mean_forces(rows: _Rows, fit: Fit, candidates: CandidateTerms, terms: Float
     level = rows.mean(np.hstack([np.ones((len(rows.r), 1)), intervals.inputs]))
     discrepancies = _discrepancies(force, own, level)
     place = slice(n_p, n_p + n_v * (n_u + 1))
+    some = np.unique(np.linspace(0, len(rows.windows) - 1, _SOME).astype(int))
+    at = intervals.starts[intervals.occupied][rows.windows[some]]
+    slopes = inertia_slopes(intervals, rows.motion, at)
     return MeanForces(
         force=force,
         noise=np.sqrt(np.maximum(of_force, 0.0).mean(axis=0)),
         inertial=np.sqrt(np.square(inertial).mean(axis=0)),
         own=own,
+        inertia=rows.M[at],
+        inertia_slopes=np.pad(slopes, [(0, 0)] * 3 + [(0, own.shape[2] - slopes.shape[3])]),
         discrepancies=discrepancies,
         discrepancy_covariance=found.var_p[place, place],
         terms=rows.over_windows(terms),
         is_input_gain=candidates.is_input_gain,
+        bounds=candidates.bounds,
         groups=candidates.groups,
         log_of=intervals.log_of[intervals.occupied][rows.windows],
     )

@@ -67,6 +67,7 @@ __all__ = [
     "effect_of_intervals",
     "estimate_parameters",
     "fitted_parameters",
+    "inertia_slopes",
     "inertial_forces",
     "instrumented_contrast",
     "least_squares_gains",
@@ -81,6 +82,8 @@ __all__ = [
 
 
 _TINY, _UPPER, _NORMAL_UPPER = 1e-300, 0.975, 1.959963984540054
+# Relative change of a parameter for derivatives of the inertia, and the smallest parameter of which it is one.
+_DIFFERENCE = 1e-4
 # Factor of the standard deviations of priors in the covariance that is combined with them.
 _WIDER = 100.0
 # Equations per parameter in the longest windows; difference of estimates, standard errors, and relative, that is none;
@@ -700,6 +703,35 @@ def residuals_of_motion(
     r, W, M = _residual_map(model)(*motion, p)
     rows = np.broadcast_to(p, (len(r), model.n_p))
     return (*motion, rows), r, _regressors(intervals, W), _matrices(M, model.n_v)
+
+
+def inertia_slopes(intervals: ShootingIntervals, motion: Sequence[FloatArray], rows: IntArray) -> FloatArray:
+    """Derivatives of ``M = dr/da`` with respect to the parameters in some rows, by differences.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : sequence of (N, ...) array
+        q, v, a, the inputs as they act, and the model's parameters in every row.
+    rows : (R,) int array
+
+    Returns
+    -------
+    (R, n_v, n_v, n) array
+        Columns in the places of each log's parameters.
+    """
+    model, (*at, p) = intervals.model, (x[rows] for x in motion)
+
+    def inertia(changed: FloatArray) -> FloatArray:
+        return _residual_map(model)(*at, changed)[2]
+
+    before, columns = inertia(p), []
+    for j in range(model.n_p):
+        changed = p.copy()
+        changed[:, j] += _DIFFERENCE * np.maximum(np.abs(p[:, j]), _DIFFERENCE)
+        columns.append((inertia(changed) - before) / (changed - p)[:, j : j + 1])
+    slopes = _by_log(intervals, np.stack(columns, axis=2), intervals.log_of_row[rows])
+    return np.asarray(slopes.reshape(len(rows), model.n_v, model.n_v, -1).swapaxes(1, 2))
 
 
 def mean_regressors(intervals: ShootingIntervals, motion: Sequence[FloatArray], parameters: FloatArray) -> FloatArray:
