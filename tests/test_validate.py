@@ -380,3 +380,19 @@ def test_a_log_that_is_too_short_for_its_noise_to_be_known_convicts_no_model():
     assert found.verdict == "usable with care"
     assert "10 rows" in found.findings[0]
     assert dr.validate(plant, hit, start="measured").verdict == "do not rely on this"
+
+
+def test_a_signal_that_ends_while_the_filter_settles_has_no_innovations():
+    log = sledge_log()
+    speed = np.gradient(log["x"], log.time)
+    speed[80:] = np.nan  # of 1000 rows, the first 99 do not count
+    beside = dr.Log.from_arrays(log.time, {**log.signals, "x_dot": speed})
+    (found,) = dr.validate(dr.Plant(SENSED, {"m": 2.0, "d": 1.0, "scale": 1.0}), beside).innovations
+    assert set(found.normalized) == {"x", "acc"}
+    assert set(found.standard_deviation) == set(found.coloured) | {"x", "acc"}
+
+
+def test_a_log_in_which_nothing_moves_says_so():
+    still = dr.Log.from_arrays(0.01 * np.arange(500), {n: np.zeros(500) for n in ("x", "x_dot", "u")})
+    found = dr.validate(dr.Plant(SENSED, {"m": 2.0, "d": 1.0, "scale": 1.0}), still)
+    assert found.findings[0].startswith("No state moves")

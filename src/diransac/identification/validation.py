@@ -157,11 +157,11 @@ def _prediction(found: Validation) -> Iterator[Finding]:
     over = "the whole log" if np.isinf(scores.horizon) else scores.name
     if scores.diverged:
         yield Finding("bad", f"The simulation diverges ({scores.name}): check signs, units and terms of the model.")
-    elif found.unsmoothed:
-        names = listed(found.unsmoothed)
-        yield Finding("care", f"Noise and starts are unknown where a log is too short ({names}): give longer logs.")
     elif not scores.relative_error:
         yield Finding("care", "No state moves ten times as far as its noise: this log tells little of the model.")
+    elif found.unsmoothed:
+        where = f"a log, or its stretches between gaps, are too short ({listed(found.unsmoothed)})"
+        yield Finding("care", f"Noise and starts are unknown where {where}: give longer ones.")
     elif unseen or _FAR < worst <= _BEYOND * effect:
         advice = "a shorter horizon, less noise or more motion tells more"
         yield Finding("care", f"Prediction over {over} tells little of the model: {_cause(effect)}; {advice}.")
