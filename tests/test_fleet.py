@@ -167,9 +167,7 @@ def test_parameters_that_differ_in_case_alone_have_columns_of_their_own(logs, tm
     assert (float(row["parameter_M"]), float(row["parameter_m"])) == tuple(alone.parameters.values())
 
 
-def test_a_store_resumes_with_other_threads_and_a_method_by_name_or_as_an_object_but_with_nothing_else(
-    logs, tmp_path
-):
+def test_a_store_resumes_with_other_threads_and_a_method_by_name_or_as_an_object_but_with_nothing_else(logs, tmp_path):
     store = tmp_path / "fleet.db"
     identified(store, logs[:1], "i-diransac", settings=dr.Settings(max_iterations=20, threads=1), seed=3)
     same = dr.IDiransac(dr.Settings(max_iterations=20, threads=2, batch_size=64))

@@ -15,7 +15,7 @@ import typer
 
 from diransac.identification.method import Callback, Progress
 
-__all__ = ["Lines", "bar", "end", "say", "set_verbosity", "show", "stdout_taken"]
+__all__ = ["Lines", "bar", "end", "is_quiet", "say", "set_verbosity", "show", "stdout_taken"]
 
 _STATE = {"verbosity": 0, "taken": 0}
 """Of the command that this process runs: -1 quiet, 1 verbose; number of outputs that are written to stdout."""
@@ -60,7 +60,7 @@ def say(text: str) -> None:
     ----------
     text : str
     """
-    if _STATE["verbosity"] >= 0:
+    if not is_quiet():
         typer.echo(text, err=bool(_STATE["taken"]))
 
 
@@ -73,6 +73,11 @@ def set_verbosity(level: int) -> None:
         -1: results that are asked for as JSON, and errors; 0: results and progress; 1: a line for every stage.
     """
     _STATE["verbosity"] = level
+
+
+def is_quiet() -> bool:
+    """True if there is no progress and no text."""
+    return _STATE["verbosity"] < 0
 
 
 @contextmanager
@@ -123,7 +128,7 @@ def bar(label: str) -> Iterator[Callback]:
     callable
         Takes a `Progress`.
     """
-    if _STATE["verbosity"] < 0:
+    if is_quiet():
         yield lambda _: None
         return
     if _STATE["verbosity"] > 0:
