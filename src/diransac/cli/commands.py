@@ -190,7 +190,7 @@ def _validate(
         if report:
             from diransac.report import write_report
 
-            write_report(result, logs, page)
+            write_report(result, logs, page, horizon=horizon)
         screen.show(found, as_json)
     screen.end(found.verdict, strict)
 

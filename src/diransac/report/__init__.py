@@ -20,7 +20,11 @@ __all__ = ["write_report"]
 
 
 def write_report(
-    results: Result | Sequence[Result] | Mapping[str, Result], logs: Log | Sequence[Log], path: str | Path
+    results: Result | Sequence[Result] | Mapping[str, Result],
+    logs: Log | Sequence[Log],
+    path: str | Path,
+    *,
+    horizon: float | None = None,
 ) -> None:
     """Write one HTML page about one or several results, evaluated on one or several logs.
 
@@ -29,6 +33,7 @@ def write_report(
     results : one result, several, or several by label
     logs : the logs that were given to `identify`, or others: the page is then a held-out validation
     path : file of the page, written whole or not at all
+    horizon : of the open-loop scores and of the verdict on held-out logs, s, as in `validate`
 
     Raises
     ------
@@ -41,7 +46,7 @@ def write_report(
     results and logs give the same page.
     """
     named, several = labelled(results), _as_list(logs)
-    entries = simulate_all(named, several)
+    entries = simulate_all(named, several, horizon)
     write_page(path, "report.html", ["page.css"], "page.js", **_content(entries, several))
 
 
