@@ -105,8 +105,9 @@ def test_each_log_is_a_row_a_failed_one_with_its_reason_and_a_store_resumes(logs
         found = identify_each(MODEL, logs[::-1], "ols", progress=lambda *n: counts.append(n), **options)
         with pytest.raises(StudyError, match="has another arguments"):
             identify_each(MODEL, logs, "ols", seed=1, **options)
-        with pytest.raises(SettingsError, match="does not match"):
-            identify_each(MODEL, logs, "ols", **options | {"vehicle": "(?P<vehicle>z+)"})
+        for pattern in ("(?P<vehicle>z+)", "(?P<vehicle>z*)"):
+            with pytest.raises(SettingsError, match="finds no vehicle in log"):
+                identify_each(MODEL, logs, "ols", **options | {"vehicle": pattern})
     assert (found.done, found.failed, found.missing) == (4, 1, 0)
     assert counts[0] == (2, 5)
     assert counts[-1] == (5, 5)

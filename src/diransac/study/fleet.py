@@ -215,9 +215,9 @@ def _asked(logs: Sequence[str | Path], pattern: str | None) -> list[tuple[str, i
     found = []
     for k, name in enumerate(names):
         match = search.search(name)
-        if match is None:
-            raise SettingsError(f'vehicle pattern {pattern!r} does not match log "{name}"')
-        groups = match.groupdict()
+        groups = match.groupdict() if match else {"vehicle": ""}
+        if groups["vehicle"] == "":
+            raise SettingsError(f'vehicle pattern {pattern!r} finds no vehicle in log "{name}"')
         found.append((name, k, groups["vehicle"], groups.get("time")))
     return found
 
