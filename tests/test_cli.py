@@ -143,7 +143,9 @@ def test_validate_needs_no_model_file_and_scores_every_signal(folder: Path):
     scores = json.loads(done.stdout)
     assert set(scores["rmse"]) == {"x", "x_dot", "x_ddot"}
     assert max(scores["rmse"].values()) < 0.02
-    assert "RMSE" in run("validate", "model.json", "held_out.csv", "--horizon", 0.5).stdout
+    at = run("validate", "model.json", "held_out.csv", "--horizon", 0.5, "--report", "page.html")
+    assert "RMSE" in at.stdout
+    assert "0.5 s, the judged horizon" in Path("page.html").read_text()
 
 
 @pytest.mark.parametrize("content", [None, b"", b"{}", b"\x00\xff", b'{"format": 1}'])

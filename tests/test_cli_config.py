@@ -7,6 +7,8 @@ import pytest
 
 import diransac as dr
 from command_line import FEW, MODEL, run, working_folder
+from diransac.cli import screen
+from diransac.cli.workers import running
 
 QUICKEST = ["--method", "ols"]
 
@@ -53,6 +55,14 @@ def test_a_wrong_configuration_is_one_sentence(text: str, says: str):
     assert says in done.stderr
 
 
+def test_a_configuration_may_have_options_of_groups_that_the_command_is_none_of():
+    Path("c.toml").write_text('trials = 2\n[study.run]\nstore = "s.db"\n[fleet.export]\noutput = "rows.csv"\n')
+    assert run("identify", "swim.csv", *MODEL, *QUICKEST, "--config", "c.toml").exit_code == 0
+    Path("c.toml").write_text("[study.run]\ntirals = 2\n")
+    wrong = run("identify", "swim.csv", *MODEL, *QUICKEST, "--config", "c.toml")
+    assert 'study run has no option "tirals"; did you mean trials?' in wrong.stderr
+
+
 def test_a_log_from_stdin_and_a_result_on_stdout_are_those_of_files():
     run("identify", "swim.csv", *MODEL, *QUICKEST, "-o", "model.json")
     piped = run("identify", "-", *MODEL, *QUICKEST, "-o", "-", stdin=Path("swim.csv").read_bytes())
@@ -81,3 +91,16 @@ def test_quiet_prints_nothing_and_verbose_every_stage():
     assert (quiet.exit_code, quiet.stdout, quiet.stderr) == (0, "", "")
     assert verbose.stdout == plain.stdout
     assert len(verbose.stderr.splitlines()) > len(plain.stderr.splitlines())
+
+
+def test_quiet_shows_no_progress_of_rows(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")  # a bar, from the first row on
+    try:
+        for level, shown in ((-1, False), (0, True)):
+            screen.set_verbosity(level)
+            with running("3 logs", Path("fleet.db"), 1, None) as how:
+                how["progress"](1, 3)
+                how["progress"](3, 3)
+            assert bool(capsys.readouterr().err) is shown
+    finally:
+        screen.set_verbosity(0)

@@ -2,7 +2,10 @@
 
 import csv
 import json
+import os
+import sqlite3
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +15,7 @@ import diransac as dr
 from command_line import run
 from diransac.errors import SettingsError, StudyError
 from diransac.study import FleetRows, FleetStatus, fleet_status, identify_each, read_fleet, summarise_fleet
+from diransac.study.fleet import export_fleet
 
 N_VEHICLES, N_LOGS = 20, 10
 
@@ -101,8 +105,9 @@ def test_each_log_is_a_row_a_failed_one_with_its_reason_and_a_store_resumes(logs
         found = identify_each(MODEL, logs[::-1], "ols", progress=lambda *n: counts.append(n), **options)
         with pytest.raises(StudyError, match="has another arguments"):
             identify_each(MODEL, logs, "ols", seed=1, **options)
-        with pytest.raises(SettingsError, match="does not match"):
-            identify_each(MODEL, logs, "ols", **options | {"vehicle": "(?P<vehicle>z+)"})
+        for pattern in ("(?P<vehicle>z+)", "(?P<vehicle>z*)"):
+            with pytest.raises(SettingsError, match="finds no vehicle in log"):
+                identify_each(MODEL, logs, "ols", **options | {"vehicle": pattern})
     assert (found.done, found.failed, found.missing) == (4, 1, 0)
     assert counts[0] == (2, 5)
     assert counts[-1] == (5, 5)
@@ -113,6 +118,83 @@ def test_each_log_is_a_row_a_failed_one_with_its_reason_and_a_store_resumes(logs
     alone = dr.identify(MODEL, dr.read_log(logs[3]), "ols")
     assert rows.values["mass"][3] == alone.parameters["mass"]
     assert rows.standard_errors["mass"][3] == alone.standard_errors["mass"]
+
+
+def identified(store: Path, logs: list[Path], method: str = "ols", model: dr.Model = MODEL, **arguments) -> FleetStatus:
+    with ThreadPoolExecutor(1) as threads:
+        return identify_each(model, logs, method, store=store, executor=threads, **arguments)
+
+
+def test_a_log_whose_file_has_changed_is_identified_again_and_one_that_was_only_copied_is_not(logs, tmp_path):
+    store, counts = tmp_path / "fleet.db", list[tuple[int, int]]()
+    identified(store, logs[:3])
+    heavier = dr.read_log(logs[0])
+    dr.Log.from_arrays(heavier.time, {**heavier.signals, "force": 2.0 * heavier["force"]}).write(logs[0])
+    copied = logs[1].read_bytes()
+    logs[1].unlink()
+    logs[1].write_bytes(copied)
+    os.utime(logs[1], (1.0, 1.0))
+    logs[2].unlink()
+    status = identified(store, logs[:3], progress=lambda *n: counts.append(n))
+    assert counts == [(2, 3), (3, 3)]  # a file that is not here is not looked at
+    assert status.done == 3
+    assert read_fleet(store).values["mass"] == pytest.approx([4.0, 2.0, 3.0], abs=0.02)
+
+
+def test_logs_that_a_store_lacks_follow_those_it_has_and_all_of_them_together_set_the_order_anew(logs, tmp_path):
+    store, everything = tmp_path / "fleet.db", logs[:4]
+    for some in (everything[1:2], everything[:1], everything[2:4], everything[:2]):
+        identified(store, some)
+    assert read_fleet(store).logs == tuple(str(everything[k]) for k in (1, 0, 2, 3))
+    identified(store, everything)
+    assert read_fleet(store).logs == tuple(map(str, everything))
+
+
+def test_parameters_that_differ_in_case_alone_have_columns_of_their_own(logs, tmp_path):
+    model = dr.Model(
+        "sledge",
+        coordinates={"s": "m"},
+        inputs={"force": "N"},
+        parameters={"M": dr.Parameter("kg", positive=True), "m": dr.Parameter("N s/m")},
+        equations=lambda q, v, a, u, p: [p.M * a.s + p.m * v.s - u.force],
+    )
+    store = tmp_path / "fleet.db"
+    identified(store, logs[:1], model=model)
+    rows, alone = read_fleet(store), dr.identify(model, dr.read_log(logs[0]), "ols")
+    assert {name: x[0] for name, x in rows.values.items()} == dict(alone.parameters)
+    export_fleet(store, tmp_path / "fleet.csv")
+    with (tmp_path / "fleet.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert (float(row["parameter_M"]), float(row["parameter_m"])) == tuple(alone.parameters.values())
+
+
+def test_a_store_resumes_with_other_threads_and_a_method_by_name_or_as_an_object_but_with_nothing_else(logs, tmp_path):
+    store = tmp_path / "fleet.db"
+    identified(store, logs[:1], "i-diransac", settings=dr.Settings(max_iterations=20, threads=1), seed=3)
+    same = dr.IDiransac(dr.Settings(max_iterations=20, threads=2, batch_size=64))
+    assert identified(store, logs[:2], same, seed=3).done == 2
+    with pytest.raises(StudyError, match="has another method"):
+        identified(store, logs[:2], "i-diransac", seed=3)
+    with pytest.raises(StudyError, match="has another preparation"):
+        identified(store, logs[:2], same, seed=3, configuration={"preparation": {}})
+    with pytest.raises(TypeError, match="seeed"):
+        identified(store, logs[:2], same, seeed=3)
+    prepared = tmp_path / "prepared.db"
+    identified(prepared, logs[:1], configuration={"preparation": {}})
+    with pytest.raises(StudyError, match="has another preparation"):
+        identified(prepared, logs[:1])
+
+
+def test_a_store_of_an_earlier_format_is_refused_and_stays_as_it_is(logs, tmp_path):
+    store = tmp_path / "fleet.db"
+    identified(store, logs[:1])
+    with closing(sqlite3.connect(store)) as connection:
+        connection.execute("PRAGMA user_version = 1")
+    before = store.read_bytes()
+    for use in (lambda: identified(store, logs[:1]), lambda: read_fleet(store)):
+        with pytest.raises(StudyError, match="has format 1, this version reads 2; begin another"):
+            use()
+    assert store.read_bytes() == before
 
 
 @pytest.mark.usefixtures("trials_in_this_process")
@@ -134,7 +216,9 @@ def test_the_command_line_identifies_each_log_and_shows_plots_and_writes_the_fle
     assert run("fleet", "export", store, "-o", tmp_path / "fleet.csv").exit_code == 0
     with (tmp_path / "fleet.csv").open() as file:
         assert [row["status"] for row in csv.DictReader(file)] == ["done"] * 4 + ["failed"]
-    assert "give another" in run("study", "status", store).stderr or run("study", "status", store).exit_code == 1
+    refused = run("study", "status", store)
+    assert (refused.exit_code, "is no store of a study" in refused.stderr) == (1, True)
+    assert run(*words[:2], "-", *words[3:], "--store", store).exit_code == 2
     assert run("identify", logs[0], "--model", "servo-axis", "--store", store).exit_code == 2
     assert run(*words).exit_code == 2
     assert fleet_status(store).failed == 1

@@ -323,3 +323,76 @@ def test_trivial_predictions_are_scored_beside_the_model():
     scores = dr.validate(scaled(), log, 0.5, input_hold="linear").judged
     assert scores.constant_velocity["q"] < 1e-6
     assert scores.hold_last["q"] == pytest.approx(np.sqrt(np.mean((2.0 * 0.01 * np.arange(1, 51)) ** 2)), rel=1e-3)
+
+
+@pytest.mark.parametrize("horizon", [3.0, 6.0])
+def test_a_horizon_at_which_prediction_means_nothing_gives_neither_a_good_nor_a_bad_verdict(horizon):
+    found = dr.validate(scaled(), balanced(2, 0.05, noise=2e-3), horizon)  # off by 0 at 3 s, by 5600000 at 6 s
+    assert found.judged.of_starts["q"] > 10.0
+    assert found.verdict == "usable with care"
+    assert "tells little of the model" in found.findings[0]
+
+
+def test_an_error_beyond_what_the_start_can_do_is_bad_at_any_horizon():
+    found = dr.validate(scaled(J=1.4, k=0.6), balanced(2, 0.05, noise=2e-3), 3.0)
+    assert found.judged.sensitivity["q"] > 5.0
+    assert found.verdict == "do not rely on this"
+
+
+SENSED = dr.Model(
+    "sledge with accelerometer",
+    {"x": "m"},
+    {"u": "N"},
+    {"m": dr.Parameter("kg", positive=True), "d": dr.Parameter("N s/m"), "scale": dr.Parameter("1")},
+    lambda q, v, a, u, p: [p.m * a.x + p.d * v.x - u.u],
+    sensors={"acc": dr.Sensor("m/s^2", lambda q, v, a, u, p: p.scale * a.x)},
+)
+
+
+def sledge_log(n=1000, seed=0):
+    """Exact motion of a sledge of 2 kg and 1 N s/m whose force holds between samples, with noise and accelerations."""
+    rng, dt = np.random.default_rng(seed), 0.01
+    t = dt * np.arange(n)
+    u, x, v, decay = 4.0 * np.sin(1.7 * t) + 3.0 * np.sin(5.3 * t), np.zeros(n), np.zeros(n), np.exp(-0.5 * dt)
+    for k in range(n - 1):
+        v[k + 1] = u[k] + (v[k] - u[k]) * decay
+        x[k + 1] = x[k] + u[k] * dt + (v[k] - u[k]) * (1.0 - decay) / 0.5
+    noisy = {"x": x + 2e-3 * rng.normal(size=n), "acc": 0.5 * (u - v) + 0.01 * rng.normal(size=n)}
+    return dr.Log.from_arrays(t, {**noisy, "u": u}, source=f"{n} rows")
+
+
+def test_a_wrong_parameter_of_a_sensor_alone_is_not_usable():
+    right, wrong = (
+        dr.validate(dr.Plant(SENSED, {"m": 2.0, "d": 1.0, "scale": scale}), sledge_log()) for scale in (1.0, 1.4)
+    )
+    assert right.verdict == "usable", right.findings
+    assert wrong.verdict == "usable with care"
+    assert wrong.judged.relative_error["acc"] == pytest.approx(0.4, abs=0.1)
+    assert any("reading of acc is off by" in text for text in wrong.findings)
+
+
+def test_a_log_that_is_too_short_for_its_noise_to_be_known_convicts_no_model():
+    plant = dr.Plant(SENSED, {"m": 2.0, "d": 1.0, "scale": 1.0})
+    log = sledge_log(10)
+    hit = dr.Log.from_arrays(log.time, {"x": log["x"], "x_dot": log["x"] + 3.0, "u": log["u"]}, source="10 rows")
+    found = dr.validate(plant, hit)
+    assert max(found.judged.relative_error.values()) > 0.5
+    assert found.verdict == "usable with care"
+    assert "10 rows" in found.findings[0]
+    assert dr.validate(plant, hit, start="measured").verdict == "do not rely on this"
+
+
+def test_a_signal_that_ends_while_the_filter_settles_has_no_innovations():
+    log = sledge_log()
+    speed = np.gradient(log["x"], log.time)
+    speed[80:] = np.nan  # of 1000 rows, the first 99 do not count
+    beside = dr.Log.from_arrays(log.time, {**log.signals, "x_dot": speed})
+    (found,) = dr.validate(dr.Plant(SENSED, {"m": 2.0, "d": 1.0, "scale": 1.0}), beside).innovations
+    assert set(found.normalized) == {"x", "acc"}
+    assert set(found.standard_deviation) == set(found.coloured) | {"x", "acc"}
+
+
+def test_a_log_in_which_nothing_moves_says_so():
+    still = dr.Log.from_arrays(0.01 * np.arange(500), {n: np.zeros(500) for n in ("x", "x_dot", "u")})
+    found = dr.validate(dr.Plant(SENSED, {"m": 2.0, "d": 1.0, "scale": 1.0}), still)
+    assert found.findings[0].startswith("No state moves")

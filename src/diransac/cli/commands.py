@@ -190,7 +190,7 @@ def _validate(
         if report:
             from diransac.report import write_report
 
-            write_report(result, logs, page, command=screen.command())
+            write_report(result, logs, page, horizon=horizon, command=screen.command())
         screen.show(found, as_json)
     screen.end(found.verdict, strict)
 

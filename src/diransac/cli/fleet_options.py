@@ -11,7 +11,7 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.options import Preparation
-from diransac.cli.outputs import PAGE, check_ending, checked, staged
+from diransac.cli.outputs import PAGE, STDOUT, check_ending, checked, staged
 from diransac.cli.workers import Cluster, Jobs, running
 from diransac.identification.method import Method
 from diransac.model import Model
@@ -64,6 +64,8 @@ class FleetOptions:
         from diransac.study.fleet_findings import summarise_fleet
 
         assert self.store is not None
+        if STDOUT in files:
+            raise typer.BadParameter("--each reads files, not standard input; give their names")
         checked([report], [*files, self.store])
         check_ending(report, PAGE)
         prepared = {name: value for name, value in asdict(preparation).items() if value is not None}

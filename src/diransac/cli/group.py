@@ -56,9 +56,9 @@ class Group(TyperGroup):
             _convert_plainly(command, ctx)
         return command
 
-    def _all_commands(self, words: Sequence[str]) -> dict[str, Any]:
-        """Commands by name, with the groups that are imported on first use where one of these is given."""
-        for name in set(_LATER) & set(words):
+    def _all_commands(self) -> dict[str, Any]:
+        """Commands by name, with the groups that are imported on first use."""
+        for name in _LATER:
             self.get_command(typer.Context(self), name)
         return {name: command for name, command in self.commands.items() if not getattr(command, "hidden", False)}
 
@@ -79,7 +79,7 @@ class Group(TyperGroup):
         try:
             words, file = _without_config(words)
             if file is not None:
-                extra["default_map"] = config_defaults(file, self._all_commands(words))
+                extra["default_map"] = config_defaults(file, self._all_commands())
             code = super().main(words, *positional, **extra)
         except UsageError as error:
             where = error.ctx.command_path if error.ctx else "diransac"

@@ -16,7 +16,18 @@ import typer
 
 from diransac.identification.method import Callback, Progress
 
-__all__ = ["Lines", "bar", "command", "end", "say", "set_command", "set_verbosity", "show", "stdout_taken"]
+__all__ = [
+    "Lines",
+    "bar",
+    "command",
+    "end",
+    "is_quiet",
+    "say",
+    "set_command",
+    "set_verbosity",
+    "show",
+    "stdout_taken",
+]
 
 _STATE = {"verbosity": 0, "taken": 0}
 """Of the command that this process runs: -1 quiet, 1 verbose; number of outputs that are written to stdout."""
@@ -63,7 +74,7 @@ def say(text: str) -> None:
     ----------
     text : str
     """
-    if _STATE["verbosity"] >= 0:
+    if not is_quiet():
         typer.echo(text, err=bool(_STATE["taken"]))
 
 
@@ -92,6 +103,11 @@ def set_verbosity(level: int) -> None:
         -1: results that are asked for as JSON, and errors; 0: results and progress; 1: a line for every stage.
     """
     _STATE["verbosity"] = level
+
+
+def is_quiet() -> bool:
+    """True if there is no progress and no text."""
+    return _STATE["verbosity"] < 0
 
 
 @contextmanager
@@ -142,7 +158,7 @@ def bar(label: str) -> Iterator[Callback]:
     callable
         Takes a `Progress`.
     """
-    if _STATE["verbosity"] < 0:
+    if is_quiet():
         yield lambda _: None
         return
     if _STATE["verbosity"] > 0:

@@ -90,7 +90,7 @@ def _new(
             new.write(template())
     except FileExistsError as error:
         raise SettingsError(f'"{file}" is there already; give another name') from error
-    typer.echo(f"{file}: edit it, then run diransac study run {file} --store {file.with_suffix('.db')}")
+    screen.say(f"{file}: edit it, then run diransac study run {file} --store {file.with_suffix('.db')}")
 
 
 @study.command("status")

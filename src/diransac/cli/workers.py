@@ -81,7 +81,13 @@ def _kept(store: Path) -> Iterator[Progress]:
 
 @contextmanager
 def _bar(label: str) -> Iterator[Progress]:
-    """Progress callback: a bar with rate and time left if stderr is a terminal, else a line every ten seconds."""
+    """Progress callback: a bar with rate and time left if stderr is a terminal, else a line every ten seconds.
+
+    Nothing if quiet.
+    """
+    if screen.is_quiet():
+        yield lambda _done, _asked: None
+        return
     if sys.stderr is None or not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
         yield _lines(label)
         return

@@ -365,7 +365,8 @@ def _logs(result: Result) -> Iterator[Finding]:
             advice = "leave this log out, or give what differs a value per log"
             yield Finding("bad", f"{one.remark}. One set of parameters does not describe all logs: {advice}.")
     yield from _excluded(result.logs)
-    text = f"Evaluated on {_these(result.logs)}, used for identification; held-out data are a stricter test."
+    which = "the logs" if len(result.logs) > 1 else "the log"
+    text = f"Evaluated on {which} of the identification; held-out data are a stricter test."
     yield Finding("note", text)
 
 

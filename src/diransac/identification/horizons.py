@@ -62,11 +62,13 @@ class HorizonScores:
     constant_velocity : mapping of str to float
         RMSE, without outliers, of the prediction that every coordinate goes on at the velocity of the start.
     relative_error : mapping of str to float
-        Of each state that moves: RMSE in excess of the noise and of the effect of uncertain starts, over the excess of
-        the better of these two predictions.  0: perfect; 1: no better than a trivial prediction.
+        Of each state and sensor that moves: RMSE in excess of the noise and of the effect of uncertain starts, over the
+        excess of the better of these two predictions.  0: perfect; 1: no better than a trivial prediction.
     sensitivity : mapping of str to float
-        Of each state that moves: RMS effect on the prediction of 1 % changes of the parameters, of random signs, and of
-        uncertain starts, over the same excess.
+        Of each state and sensor that moves: RMS effect on the prediction of 1 % changes of the parameters, of random
+        signs, and of uncertain starts, over the same excess.
+    of_starts : mapping of str to float
+        The part of uncertain starts in it, an error up to which cannot be seen.
     """
 
     horizon: float
@@ -82,6 +84,7 @@ class HorizonScores:
     constant_velocity: Mapping[str, float]
     relative_error: Mapping[str, float]
     sensitivity: Mapping[str, float]
+    of_starts: Mapping[str, float]
 
     @property
     def name(self) -> str:
@@ -335,17 +338,19 @@ def pooled_scores(signals: Sequence[str], horizon: float, logs: Sequence[OpenLoo
         total = total.plus(part)
     spread = sum((_spread(x.measured) for x in parts), np.zeros(len(signals)))
     regular = sum((_spread(np.where(x.outliers, np.nan, x.measured)) for x in parts), np.zeros(len(signals)))
-    state = np.array([n in logs[0].segment.model.state for n in signals])
+    model = logs[0].segment.model
+    judged = np.array([n in model.state or n in model.sensors for n in signals])
     with np.errstate(divide="ignore", invalid="ignore"):
         count = total.robust_count
         ratio, robust_ratio = total.squared / spread, total.robust_squared / regular
         held, uniform, noise = total.held / count, total.uniform / count, total.of_noise / count
         trivial = np.fmin(held, uniform)
-        moves = state & (trivial > _MOVES**2 * noise) & (trivial > 0.0)
+        moves = judged & (trivial > _MOVES**2 * noise) & (trivial > 0.0)
         excess = trivial - noise
         known = (total.of_noise + total.of_starts) / count
         error = np.sqrt(np.maximum(total.robust_squared / count - known, 0.0) / excess)
         effect = np.sqrt((total.of_starts + total.of_parameters) / count / excess)
+        of_starts = np.sqrt(total.of_starts / count / excess)
     columns = (
         np.sqrt(total.squared / np.maximum(total.count, 1)),
         100.0 * (1.0 - np.sqrt(ratio)),
@@ -363,7 +368,7 @@ def pooled_scores(signals: Sequence[str], horizon: float, logs: Sequence[OpenLoo
             for n, x, yes in zip(signals, values, moves, strict=True)
             if yes
         }
-        for values in (error, effect)
+        for values in (error, effect, of_starts)
     ]
     return HorizonScores(horizon, total.windows, total.diverged, *by_name, *of_moving)
 

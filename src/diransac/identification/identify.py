@@ -27,7 +27,7 @@ from diransac.model import Model
 from diransac.simulation import HOLDS
 from diransac.time_limit import check_time, time_limited
 
-__all__ = ["METHODS", "checked_hold", "identify"]
+__all__ = ["METHODS", "checked_hold", "identify", "method_object"]
 
 
 def identify(
@@ -119,7 +119,7 @@ def identify(
     ----------
     Dimmig et al. 2023, Algorithm 1.
     """
-    chosen = _method(method, settings, estimator)
+    chosen = method_object(method, settings, estimator)
     given = distinct_logs(logs)
     _check_arguments(model, seed)
     hold = checked_hold(input_hold)
@@ -143,8 +143,20 @@ def identify(
         return task.with_sensitivity(result, derived, progress)
 
 
-def _method(method: object, settings: object, estimator: object) -> Method:
-    """The method object, with the settings that are given beside its name."""
+def method_object(method: object, settings: object, estimator: object) -> Method:
+    """The method object itself, or that of a name, with the settings and the estimator that are given beside it.
+
+    Parameters
+    ----------
+    method : str or Method
+    settings : Settings or None
+    estimator : str, Estimator or None
+
+    Raises
+    ------
+    SettingsError
+        There is no such method or estimator, or the method has no use for what is given beside it.
+    """
     if settings is not None and not isinstance(settings, Settings):
         raise SettingsError(f"settings is {settings!r}; give a dr.Settings, such as dr.Settings(sample_size=75)")
     if not isinstance(method, str):

@@ -142,7 +142,8 @@ def innovations(one: OpenLoop) -> Innovations | None:
     segment, n = one.segment, rows.stop - rows.start
     states, spread = one.filled_states()[rows], np.maximum(np.nanstd(segment.measured, axis=0), 1e-300)
     measured = np.where(one.outliers, np.nan, segment.measured)[rows]
-    seen = [i for i, x in enumerate(measured.T) if np.isfinite(x).sum() >= _FEWEST]
+    counted = measured[int(_SETTLED * (n - 1)) : -1]
+    seen = [i for i, x in enumerate(counted.T) if np.isfinite(x).sum() > _N_LAGS]
     if n < _FEWEST or not seen:
         return None
     columns = [segment.model.signals.index(segment.signals[i]) for i in seen]

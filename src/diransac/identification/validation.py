@@ -29,6 +29,8 @@ _GOOD, _FAR = 0.1, 0.5
 """Relative errors of predictions up to which a model is good, and needs care."""
 _TELLING = 0.1
 """Sensitivity of predictions to 1 % of the parameters and to the start, up to which a horizon tells models apart."""
+_BEYOND, _SEEN = 3.0, 0.2
+"""Least error of a bad prediction, over its sensitivity; effect of uncertain starts up to which an error is seen."""
 _VISIBLE = 0.01
 
 
@@ -56,6 +58,10 @@ class Validation:
         One-step innovations of each log that can be smoothed.
     outlier_fraction : mapping of str to float, optional
         Part of each signal's samples that robust scores leave out.
+    sensors : tuple of str, optional
+        Those signals that are sensors.
+    unsmoothed : tuple of str, optional
+        Names of the logs that are too short to be smoothed: their windows start at recorded samples, with their noise.
     """
 
     source: str
@@ -66,6 +72,8 @@ class Validation:
     force_error_percent: Mapping[str, float] = field(default_factory=dict)
     innovations: tuple[Innovations, ...] = ()
     outlier_fraction: Mapping[str, float] = field(default_factory=dict)
+    sensors: tuple[str, ...] = ()
+    unsmoothed: tuple[str, ...] = ()
 
     @property
     def judged(self) -> HorizonScores:
@@ -141,25 +149,49 @@ class Validation:
 
 
 def _prediction(found: Validation) -> Iterator[Finding]:
-    """The prediction of the worst state over the judged horizon."""
+    """The predictions of the worst state and of the worst sensor over the judged horizon."""
     scores = found.judged
-    errors = scores.relative_error
+    states = {n: x for n, x in scores.relative_error.items() if n not in found.sensors}
+    worst, effect = max(states.values(), default=0.0), max(scores.sensitivity.values(), default=0.0)
+    unseen = worst <= _GOOD and max(scores.of_starts.values(), default=0.0) > _SEEN
+    over = "the whole log" if np.isinf(scores.horizon) else scores.name
     if scores.diverged:
         yield Finding("bad", f"The simulation diverges ({scores.name}): check signs, units and terms of the model.")
-    elif not errors:
+    elif not scores.relative_error:
         yield Finding("care", "No state moves ten times as far as its noise: this log tells little of the model.")
+    elif found.unsmoothed:
+        where = f"a log, or its stretches between gaps, are too short ({listed(found.unsmoothed)})"
+        yield Finding("care", f"Noise and starts are unknown where {where}: give longer ones.")
+    elif unseen or _FAR < worst <= _BEYOND * effect:
+        advice = "a shorter horizon, less noise or more motion tells more"
+        yield Finding("care", f"Prediction over {over} tells little of the model: {_cause(effect)}; {advice}.")
     else:
-        name = max(errors, key=lambda n: errors[n])
-        x = errors[name]
-        level: Level = "good" if x <= _GOOD else "care" if x <= _FAR else "bad"
-        over = "the whole log" if np.isinf(scores.horizon) else scores.name
-        if not x:
-            yield Finding(level, f"Over {over} every state is predicted within its noise.")
-            return
-        text = f"Over {over} the prediction of {name} is off by {percent(x)} of its motion, in excess of the noise"
-        others = "; the other states are closer" if len(errors) > 1 else ""
-        advice = ": check the parameters and the terms of the model" if level == "bad" else ""
-        yield Finding(level, f"{text}{others}{advice}.")
+        yield from _worst_state(states, over)
+        yield from _worst_sensor({n: x for n, x in scores.relative_error.items() if n in found.sensors}, over)
+
+
+def _worst_state(errors: Mapping[str, float], over: str) -> Iterator[Finding]:
+    """The largest relative error of a state; none without one."""
+    name = max(errors, key=lambda n: errors[n], default="")
+    if not name:
+        return
+    x = errors[name]
+    if not x:
+        yield Finding("good", f"Over {over} every state is predicted within its noise.")
+        return
+    level: Level = "good" if x <= _GOOD else "care" if x <= _FAR else "bad"
+    text = f"Over {over} the prediction of {name} is off by {percent(x)} of its motion, in excess of the noise"
+    others = "; the other states are closer" if len(errors) > 1 else ""
+    advice = ": check the parameters and the terms of the model" if level == "bad" else ""
+    yield Finding(level, f"{text}{others}{advice}.")
+
+
+def _worst_sensor(errors: Mapping[str, float], over: str) -> Iterator[Finding]:
+    """The largest relative error of a sensor, where it is large; the motion may be right."""
+    name = max(errors, key=lambda n: errors[n], default="")
+    if name and errors[name] > _GOOD:
+        text = f"Over {over} the predicted reading of {name} is off by {percent(errors[name])} of its motion"
+        yield Finding("care", f"{text}, in excess of the noise: check the parameters of this sensor.")
 
 
 def _remarks(found: Validation) -> Iterator[Finding]:
@@ -168,8 +200,7 @@ def _remarks(found: Validation) -> Iterator[Finding]:
     most = max((x for one in longer for x in one.sensitivity.values()), default=0.0)
     if longer and most > _TELLING:
         names = listed([one.name for one in longer])
-        cause = f"1 % of the parameters, or errors of the start within the noise, change it by up to {number(most, 2)}"
-        yield Finding("note", f"Prediction over {names} is not judged: {cause} times the motion.")
+        yield Finding("note", f"Prediction over {names} is not judged: {_cause(most)}.")
     left_out = {n: x for n, x in found.outlier_fraction.items() if x > _VISIBLE}
     if left_out:
         name = max(left_out, key=lambda n: left_out[n])
@@ -182,6 +213,12 @@ def _remarks(found: Validation) -> Iterator[Finding]:
             names = listed([f"{n} ({number(x, 2)})" for n, x in one.coloured.items()])
             where = f" of {one.source}" if len(found.innovations) > 1 else ""
             yield Finding("note", f"One-step innovations{where} are not white, with autocorrelations of {names}.")
+
+
+def _cause(effect: float) -> str:
+    """The sensitivity of a prediction as a reason not to judge by it."""
+    size = number(effect, 2)
+    return f"1 % of the parameters, or errors of the start within the noise, change it by up to {size} times the motion"
 
 
 def _short(x: float, decimals: int) -> str:
@@ -276,6 +313,8 @@ def validate(
         force_errors(dataset, own, resolution),
         tuple(x for x in map(innovations, predictions) if x is not None),
         _outlier_fraction(dataset, predictions),
+        tuple(known.model.sensors),
+        tuple(x.segment.log.source for x in predictions if start == "smoothed" and x.smoothed is None),
     )
 
 

@@ -24,6 +24,7 @@ def write_report(
     logs: Log | Sequence[Log],
     path: str | Path,
     *,
+    horizon: float | None = None,
     command: str = "",
 ) -> None:
     """Write one HTML page about one or several results, evaluated on one or several logs.
@@ -33,6 +34,7 @@ def write_report(
     results : one result, several, or several by label
     logs : the logs that were given to `identify`, or others: the page is then a held-out validation
     path : file of the page, written whole or not at all
+    horizon : of the open-loop scores and of the verdict on held-out logs, s, as in `validate`
     command : shell command that writes the page, to be shown on it
 
     Raises
@@ -46,7 +48,7 @@ def write_report(
     results and logs give the same page.
     """
     named, several = labelled(results), _as_list(logs)
-    entries = simulate_all(named, several)
+    entries = simulate_all(named, several, horizon)
     write_page(path, "report.html", ["page.css"], "page.js", command=command, **_content(entries, several))
 
 

@@ -168,8 +168,8 @@ class Entry:
 # ---------------------------------------------------------------------- simulations
 
 
-def simulate_all(results: Mapping[str, Result], logs: Sequence[Log]) -> list[Entry]:
-    """Every result simulated over every log.
+def simulate_all(results: Mapping[str, Result], logs: Sequence[Log], horizon: float | None = None) -> list[Entry]:
+    """Every result simulated over every log, and validated at a horizon, s; None: at those that suit the log.
 
     A diagnosis is a property of the log and the machine: the first one of a log restarts the simulations of every
     result over that log.
@@ -180,7 +180,9 @@ def simulate_all(results: Mapping[str, Result], logs: Sequence[Log]) -> list[Ent
     diagnoses = [_diagnosis_of(results, log) for log in logs]
     return [
         Entry(
-            label, result, tuple(simulate_on(label, result, *one) for one in zip(logs, diagnoses, names, strict=True))
+            label,
+            result,
+            tuple(simulate_on(label, result, *one, horizon) for one in zip(logs, diagnoses, names, strict=True)),
         )
         for label, result in results.items()
     ]
@@ -193,7 +195,12 @@ def _diagnosis_of(results: Mapping[str, Result], log: Log) -> Diagnosis | None:
 
 
 def simulate_on(
-    label: str, result: Result, log: Log, diagnosis: Diagnosis | None = None, log_name: str | None = None
+    label: str,
+    result: Result,
+    log: Log,
+    diagnosis: Diagnosis | None = None,
+    log_name: str | None = None,
+    horizon: float | None = None,
 ) -> Run:
     """A result simulated over a log, which is preprocessed as the result's own was.
 
@@ -205,6 +212,7 @@ def simulate_on(
     diagnosis : of this log; with it, the simulation restarts periodically from the smoothed state, so that the effect
         of unmodelled forces does not accumulate
     log_name : name of the log on the page; its source by default
+    horizon : of `validate`, s
 
     Raises
     ------
@@ -213,12 +221,14 @@ def simulate_on(
     """
     view = log_view(result, log)
     try:
-        return _simulate(result, view, log, diagnosis, label=label, log_name=log_name or log.source)
+        return _simulate(result, view, log, diagnosis, horizon, label=label, log_name=log_name or log.source)
     except (LogError, SettingsError) as error:
         raise ResultError(f'no report: model "{result.model.name}" cannot be simulated on this log: {error}') from error
 
 
-def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | None, **names: Any) -> Run:
+def _simulate(
+    result: Result, view: LogView, given: Log, diagnosis: Diagnosis | None, horizon: float | None, **names: Any
+) -> Run:
     """The run of a result over a log."""
     log = _prepared(result, view, given)
     dataset = _dataset(result, log, given)
@@ -227,7 +237,7 @@ def _simulate(result: Result, view: LogView, given: Log, diagnosis: Diagnosis | 
     simulation = Simulation(dataset, scoring.judged, result.estimate.resolution, stretches, threads=1)
     observations, parameters = dataset.segments[0], result.model.parameter_vector(view.parameters)
     first_row = observations.first_row_in(given)
-    validation = _validation(result, log)
+    validation = _validation(result, log, horizon)
     held_out = OpenLoop(dataset, 0, view.parameters, result.estimate.resolution) if view.held_out else None
     begin = None if held_out is None else _estimated_starts(held_out, len(observations))
     whole = simulated_rows(simulation, 0, parameters, observations, begin)
@@ -311,9 +321,9 @@ def _dataset(result: Result, log: Log, given: Log) -> Dataset:
         return Dataset.of(result.model, log, pointwise=False, given=[given])
 
 
-def _validation(result: Result, log: Log) -> Validation | str:
+def _validation(result: Result, log: Log, horizon: float | None) -> Validation | str:
     """Open-loop scores, or the reason why there are none."""
     try:
-        return validate(result, log)
+        return validate(result, log, horizon)
     except (LogError, SettingsError) as error:
         return str(error)

@@ -10,7 +10,8 @@ import sqlite3
 import time
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -20,18 +21,23 @@ from typing import Any, Self
 from diransac.errors import StudyError
 
 __all__ = [
+    "AGAIN",
     "Database",
     "check_plain",
     "connected_to",
     "copied",
     "damage",
     "is_empty",
+    "kept_apart",
     "quoted",
     "reported",
     "roll_back",
     "transaction",
     "word",
 ]
+
+AGAIN = "~"
+"""Mark of a column whose name another one has in other case."""
 
 _LOCK_TIMEOUT = 120.0
 """s to wait while another process writes."""
@@ -73,12 +79,12 @@ class Database:
 # Values --------------------------------------------------------------------------------------------------------------
 @contextmanager
 def damage(path: Path) -> Iterator[None]:
-    """Context in which values of a store are used.  Raises StudyError: one is none that a study writes."""
+    """Context in which values of a store are used.  Raises StudyError: one is none that diransac writes."""
     try:
         yield
     except _DAMAGE as error:
         reason = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise StudyError(f'store "{path}" is damaged: {reason:.200}; run its study into a new one') from error
+        raise StudyError(f'store "{path}" is damaged: {reason:.200}; begin a new one') from error
 
 
 def word(value: object) -> str:
@@ -110,7 +116,7 @@ def reported(path: Path) -> Iterator[None]:
     try:
         yield
     except (sqlite3.Error, UnicodeError) as error:
-        raise StudyError(f'store "{path}": {error}; give a file that diransac study made, or a new one') from error
+        raise StudyError(f'store "{path}": {error}; give a store of diransac, or a new file') from error
 
 
 @contextmanager
@@ -129,7 +135,7 @@ def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
 def roll_back(path: Path) -> None:
     """Undo what a killed process has left half written, which needs the right to write.
 
-    Raises StudyError: the journal names a further file, which a study's never does and SQLite would delete.
+    Raises StudyError: the journal names a further file, which diransac's never does and SQLite would delete.
     """
     journal = path.with_name(f"{path.name}-journal")
     if not journal.is_file():
@@ -142,7 +148,7 @@ def roll_back(path: Path) -> None:
             if error.sqlite_errorname != "SQLITE_READONLY_ROLLBACK":
                 return  # said when the store is read
     if journal.read_bytes().endswith(_ANOTHER_JOURNAL):
-        raise StudyError(f'store "{path}" has a journal that no study writes; give the store without it')
+        raise StudyError(f'store "{path}" has a journal that diransac does not write; give the store without it')
     with closing(connected_to(path, "rw")) as connection, reported(path):
         connection.execute("SELECT count(*) FROM sqlite_master")
 
@@ -153,12 +159,12 @@ def check_plain(connection: sqlite3.Connection, path: Path, needed: AbstractSet[
     for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
         is_plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE ")
         if not is_plain and (kind != "index" or sql is not None):
-            raise StudyError(f'store "{path}" has {kind} "{name!s:.40}", which no study makes; give another store')
+            raise StudyError(f'store "{path}" has {kind} "{name!s:.40}", which diransac never makes; give another')
         if is_plain:
             tables.add(name)
     if not tables >= needed:
         missing = ", ".join(sorted(needed - tables))
-        raise StudyError(f'store "{path}" is damaged: it has no {missing}; run its study into a new one')
+        raise StudyError(f'store "{path}" is damaged: it has no {missing}; begin a new one')
 
 
 def copied(connection: sqlite3.Connection) -> sqlite3.Connection:
@@ -172,6 +178,15 @@ def copied(connection: sqlite3.Connection) -> sqlite3.Connection:
 def is_empty(connection: sqlite3.Connection) -> bool:
     """True for a file without tables: it is new, or the process that made it was killed at once."""
     return not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+
+
+def kept_apart(names: Iterable[str]) -> list[str]:
+    """Column names that SQLite, which ignores case, keeps apart: without the marks at their ends, the names."""
+    before, found = Counter[str](), list[str]()
+    for name in names:
+        found.append(name + AGAIN * before[name.lower()])
+        before[name.lower()] += 1
+    return found
 
 
 def quoted(name: str) -> str:

@@ -2,7 +2,7 @@
 
 | table | contents |
 |---|---|
-| ``logs`` | one row per log that was identified, or failed |
+| ``logs`` | one row per log that was identified, or failed, with the file's size, time and hash |
 | ``asked`` | logs that were asked for, with vehicle and order |
 | ``configuration`` | the values that determine rows, as JSON; only the same values may add rows |
 """
@@ -19,8 +19,10 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from hashlib import sha256
+from inspect import signature
 from pathlib import Path
 from typing import Any, Self
 
@@ -32,18 +34,21 @@ from diransac.blas import single_threaded
 from diransac.data.log import Log
 from diransac.data.readers import read_log
 from diransac.errors import DiransacError, SettingsError, StudyError
-from diransac.identification.identify import METHODS, identify
+from diransac.identification.identify import identify, method_object
 from diransac.identification.method import Method
 from diransac.identification.methods import DEFAULT
 from diransac.identification.result import Result
+from diransac.identification.settings import EXECUTION, Settings
 from diransac.model import Model
 from diransac.plain_data import json_data
 from diransac.study.database import (
+    AGAIN,
     Database,
     check_plain,
     connected_to,
     damage,
     is_empty,
+    kept_apart,
     quoted,
     reported,
     roll_back,
@@ -59,10 +64,13 @@ __all__ = ["FleetRows", "FleetStatus", "export_fleet", "fleet_status", "identify
 _APPLICATION = 0x64697266
 """SQLite's application id: "dirf"."""
 
-_FORMAT = 1
+_FORMAT = 2
 _TABLES = {"logs", "asked", "configuration"}
 _UNKNOWN = "unknown"
 """Vehicle of a log that names none."""
+
+_INTERNAL = ("own_vehicle", "file_stamp", "file_hash")
+"""Columns that are not exported."""
 
 _MANY = 6
 """Differences that an error message lists."""
@@ -128,29 +136,37 @@ def identify_each(
     Notes
     -----
     The row of a log depends on its file and the configuration alone.  A log that cannot be read or identified is a row
-    with the reason.  Rows are committed as batches end; the same call after an interruption runs the others.  To run
-    logs that failed again, delete their rows or begin another store.
+    with the reason.  Rows are committed as batches end; the same call after an interruption runs the others, and those
+    whose files have changed since.  Logs that a store lacks follow those it has, whose order only a call that names all
+    of them changes.  To run logs that failed again, delete their rows or begin another store.
     """
     if batch_size < 1:
         raise SettingsError(f"batch_size is {batch_size}; give at least 1")
-    if isinstance(method, str) and method not in METHODS:
-        raise SettingsError(f"there is no method {method!r}; there are {', '.join(METHODS)}")
+    chosen = method_object(method, arguments.pop("settings", None), arguments.pop("estimator", None))
+    signature(identify).bind(model, None, chosen, **arguments)  # a name that it lacks fails here, not once per log
     asked = _asked(logs, vehicle)
-    work = pickle.dumps((model, method, read, arguments))
+    work = pickle.dumps((model, chosen, read, arguments))
     wanted = {
         "model": model.fingerprint,
-        "method": method if isinstance(method, str) else [method.name, repr(method)],
+        "method": [chosen.name, _without_execution(chosen)],
         "arguments": repr(sorted(arguments.items())),
         **(configuration or {}),
     }
     workers = workers_of(executor, jobs, tasks)
     with FleetStore(store, model, wanted) as kept, time_limited(time_limit):
         kept.ask_for(asked)
+        kept.forget_changed(name for name, *_ in asked)
         finished = kept.finished()
         missing = [name for name, *_ in asked if name not in finished]
         batches = [_Batch(work, tuple(missing[k : k + batch_size])) for k in range(0, len(missing), batch_size)]
         distribute(batches, kept, workers, asked=len(asked), progress=progress)
     return fleet_status(store)
+
+
+def _without_execution(method: Method) -> str:
+    """The method in words, without the settings on which no answer depends."""
+    defaults = {name: getattr(Settings(), name) for name in EXECUTION}
+    return repr(replace(method, criteria=replace(method.criteria, **defaults)))  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)
@@ -184,7 +200,7 @@ def _asked(logs: Sequence[str | Path], pattern: str | None) -> list[tuple[str, i
 
     Raises SettingsError: the pattern is wrong, or a file is named twice.
     """
-    names = [str(path) for path in logs]
+    names = [str(Path(path)) for path in logs]
     twice = [name for name, other in zip(sorted(names), sorted(names)[1:], strict=False) if name == other]
     if twice or not names:
         raise SettingsError(f'log "{twice[0]}" is named twice' if twice else "no log is named; give files")
@@ -199,9 +215,9 @@ def _asked(logs: Sequence[str | Path], pattern: str | None) -> list[tuple[str, i
     found = []
     for k, name in enumerate(names):
         match = search.search(name)
-        if match is None:
-            raise SettingsError(f'vehicle pattern {pattern!r} does not match log "{name}"')
-        groups = match.groupdict()
+        groups = match.groupdict() if match else {"vehicle": ""}
+        if groups["vehicle"] == "":
+            raise SettingsError(f'vehicle pattern {pattern!r} finds no vehicle in log "{name}"')
         found.append((name, k, groups["vehicle"], groups.get("time")))
     return found
 
@@ -226,9 +242,9 @@ def identify_logs(work: bytes, logs: Sequence[str]) -> list[dict[str, Any]]:
 
 
 @lru_cache(maxsize=4)
-def _unpickled(work: bytes) -> tuple[Model, str | Method, Callable[[Path], Log], Mapping[str, Any]]:
+def _unpickled(work: bytes) -> tuple[Model, Method, Callable[[Path], Log], Mapping[str, Any]]:
     try:
-        found: tuple[Model, str | Method, Callable[[Path], Log], Mapping[str, Any]] = pickle.loads(work)
+        found: tuple[Model, Method, Callable[[Path], Log], Mapping[str, Any]] = pickle.loads(work)
         return found
     except Exception as error:
         raise StudyError(f"a worker on {platform.node()} cannot load the work: {error}") from error
@@ -237,12 +253,12 @@ def _unpickled(work: bytes) -> tuple[Model, str | Method, Callable[[Path], Log],
 def _row(
     name: str,
     model: Model,
-    method: str | Method,
+    method: Method,
     read: Callable[[Path], Log],
     arguments: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The row of one log."""
-    begin, row = time.perf_counter(), dict[str, Any](log=name, status="done", error=None)
+    begin, row = time.perf_counter(), dict[str, Any](log=name, status="done", error=None, **_content(Path(name)))
     try:
         log = read(Path(name))
         row |= {"own_vehicle": _identity(log), "duration": float(log.time[-1] - log.time[0])}
@@ -251,6 +267,35 @@ def _row(
         known = isinstance(error, DiransacError | OSError)
         row |= {"status": "failed", "error": str(error) if known else f"{type(error).__name__}: {error}"}
     return {**row, "versions": versions(), "seconds": time.perf_counter() - begin, "host": platform.node()}
+
+
+def _content(path: Path) -> dict[str, str | None]:
+    """Marks of a file, or of a folder with all of its files: of sizes and times, and of contents; None without it."""
+    try:
+        return {"file_stamp": _stamp(path), "file_hash": _hash(path)}
+    except OSError:
+        return {"file_stamp": None, "file_hash": None}
+
+
+def _stamp(path: Path) -> str:
+    """Sizes and times of the files of a log.  Raises OSError: it cannot be read."""
+    about = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in _files(path)]
+    return sha256(repr(about).encode()).hexdigest()
+
+
+def _hash(path: Path) -> str:
+    """Contents of the files of a log.  Raises OSError: it cannot be read."""
+    found = sha256()
+    for file in _files(path):
+        found.update(repr((file.name, file.stat().st_size)).encode())
+        with file.open("rb") as data:
+            while block := data.read(2**20):
+                found.update(block)
+    return found.hexdigest()
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(x for x in path.rglob("*") if x.is_file()) if path.is_dir() else [path]
 
 
 def _identity(log: Log) -> str | None:
@@ -286,14 +331,14 @@ class FleetStore(Database):
     """
 
     def __init__(self, path: str | Path, model: Model, wanted: Mapping[str, Any]) -> None:
-        self.path = Path(path)
+        self.path, values = Path(path), json_data(json.dumps(wanted))
         self._connection = connected_to(self.path, "rwc")
         try:
             with transaction(self._connection, self.path):
                 if is_empty(self._connection):
                     _create(self._connection, model, wanted)
                 _check(self._connection, self.path)
-            self._compare(json_data(json.dumps(wanted)))
+            self._compare(values)
         except BaseException:
             self._connection.close()
             raise
@@ -323,9 +368,25 @@ class FleetStore(Database):
             return {word(key): json_data(value) for key, value in rows}
 
     def ask_for(self, logs: Iterable[tuple[str, int, str | None, str | None]]) -> None:
-        """Add logs, or give those that are known another place, vehicle and time."""
+        """Add logs after those that are known, or give all known ones another order; each has a vehicle and time."""
+        rows = sorted(logs, key=lambda row: row[1])
         with transaction(self._connection, self.path):
-            self._connection.executemany("INSERT OR REPLACE INTO asked VALUES (?, ?, ?, ?)", logs)
+            known = dict(self._connection.execute("SELECT log, place FROM asked").fetchall())
+            if known.keys() <= {name for name, *_ in rows}:
+                places = {name: k for k, (name, *_) in enumerate(rows)}
+            else:
+                new = [name for name, *_ in rows if name not in known]
+                places = known | {name: k for k, name in enumerate(new, max(known.values()) + 1)}
+            placed = [(name, places[name], vehicle, moment) for name, _, vehicle, moment in rows]
+            self._connection.executemany("INSERT OR REPLACE INTO asked VALUES (?, ?, ?, ?)", placed)
+
+    def forget_changed(self, logs: Iterable[str]) -> None:
+        """Delete the rows of logs whose files differ from those that were read; files that are not here stay."""
+        rows = self.select("SELECT log, file_stamp, file_hash FROM logs")
+        kept = {name: (stamp, content) for name, stamp, content in rows}
+        changed = [(name,) for name in logs if name in kept and _differs(Path(name), *kept[name])]
+        with transaction(self._connection, self.path):
+            self._connection.executemany("DELETE FROM logs WHERE log = ?", changed)
 
     def finished(self) -> set[str]:
         """Names of the logs whose rows are present."""
@@ -339,32 +400,48 @@ class FleetStore(Database):
     def add(self, rows: Sequence[Mapping[str, Any]]) -> int:
         """Number of new rows, written in one transaction; rows that are present stay as they are."""
         before = self._connection.total_changes
+        columns = {column.rstrip(AGAIN): column for _, column, *_ in self.select("PRAGMA table_info(logs)")}
         with transaction(self._connection, self.path):
             for row in rows:
-                names, marks = ", ".join(map(quoted, row)), ", ".join("?" * len(row))
+                names, marks = ", ".join(quoted(columns[name]) for name in row), ", ".join("?" * len(row))
                 self._connection.execute(f"INSERT OR IGNORE INTO logs ({names}) VALUES ({marks})", [*row.values()])
         return self._connection.total_changes - before
 
     def _compare(self, wanted: Mapping[str, Any]) -> None:
         """Raises StudyError: the store has another configuration."""
-        kept = self.configuration
-        differing = [key for key, value in wanted.items() if kept.get(key) != value]
+        kept = {key: value for key, value in self.configuration.items() if key not in _ABOUT}
+        differing = [key for key in {**wanted, **kept} if kept.get(key) != wanted.get(key)]
         if differing:
             raise StudyError(
                 f'store "{self.path}" has another {", ".join(differing[:_MANY])}: give the same, or another store'
             )
 
 
+def _differs(path: Path, stamp: str | None, content: str | None) -> bool:
+    """True if a file is here and is not the one with these marks."""
+    try:
+        return path.exists() and _stamp(path) != stamp and _hash(path) != content
+    except OSError:
+        return False
+
+
+def _columns(parameters: Iterable[str]) -> dict[str, str]:
+    """Columns of the parameters and of their standard errors, by name."""
+    names = [f"{kind}_{name}" for name in parameters for kind in ("parameter", _ERROR)]
+    return dict(zip(names, kept_apart(names), strict=True))
+
+
 def _create(connection: sqlite3.Connection, model: Model, wanted: Mapping[str, Any]) -> None:
     """Make the tables of a new store."""
-    of_parameters = [f"{quoted(f'{kind}_{n}')} REAL" for n in model.parameters for kind in ("parameter", _ERROR)]
+    of_parameters = [f"{quoted(column)} REAL" for column in _columns(model.parameters).values()]
     about = {**wanted, "model_name": model.name, "units": {name: x.unit for name, x in model.parameters.items()}}
     for statement in (
         f"PRAGMA application_id = {_APPLICATION}",
         f"PRAGMA user_version = {_FORMAT}",
         "CREATE TABLE logs (log TEXT PRIMARY KEY, own_vehicle TEXT, status TEXT NOT NULL, error TEXT, verdict TEXT, "
         f"findings TEXT, duration REAL, {', '.join(of_parameters)}, fit_error REAL, inlier_fraction REAL, "
-        "stop_reason TEXT, versions TEXT NOT NULL, seconds REAL NOT NULL, host TEXT NOT NULL)",
+        "stop_reason TEXT, file_stamp TEXT, file_hash TEXT, "
+        "versions TEXT NOT NULL, seconds REAL NOT NULL, host TEXT NOT NULL)",
         "CREATE TABLE asked (log TEXT PRIMARY KEY, place INTEGER NOT NULL, vehicle TEXT, time TEXT)",
         "CREATE TABLE configuration (key TEXT PRIMARY KEY, value TEXT NOT NULL)",
     ):
@@ -373,7 +450,8 @@ def _create(connection: sqlite3.Connection, model: Model, wanted: Mapping[str, A
     connection.executemany("INSERT INTO configuration VALUES (?, ?)", values)
 
 
-_ERROR = "standard_error"
+_ERROR, _ABOUT = "standard_error", ("model_name", "units")
+"""Beginning of a column; keys of the configuration on which no row depends."""
 
 
 def _check(connection: sqlite3.Connection, path: Path) -> None:
@@ -474,7 +552,8 @@ def read_fleet(store: str | Path) -> FleetRows:
         with damage(kept.path):
             units = {word(name): word(unit) for name, unit in about["units"].items()}
             model = word(about["model_name"])
-        columns = [quoted(f"{kind}_{name}") for kind in ("parameter", _ERROR) for name in units]
+        of_parameters = _columns(units)
+        columns = [quoted(of_parameters[f"{kind}_{name}"]) for kind in ("parameter", _ERROR) for name in units]
         rows = kept.select(
             "SELECT log, coalesce(vehicle, own_vehicle, ?), time, place, verdict, "
             f"{', '.join(columns)} FROM logs JOIN asked USING (log) WHERE status = 'done'",
@@ -515,7 +594,7 @@ def export_fleet(store: str | Path, path: str | Path) -> None:
         There is no such store.
     """
     with FleetStore.existing(store) as kept:
-        names = [name for _, name, *_ in kept.select("PRAGMA table_info(logs)") if name != "own_vehicle"]
+        names = [name for _, name, *_ in kept.select("PRAGMA table_info(logs)") if name not in _INTERNAL]
         columns = ", ".join(map(quoted, names[1:]))
         rows = kept.select(
             f"SELECT log, coalesce(vehicle, own_vehicle), time, {columns} FROM asked LEFT JOIN logs USING (log) "
@@ -525,7 +604,7 @@ def export_fleet(store: str | Path, path: str | Path) -> None:
     def write(temporary: Path) -> None:
         with temporary.open("w", newline="", encoding="utf-8") as file:
             table = csv.writer(file)
-            table.writerow(["log", "vehicle", "time", *names[1:]])
+            table.writerow(["log", "vehicle", "time", *(name.rstrip(AGAIN) for name in names[1:])])
             table.writerows(rows)
 
     write_with(path, write)

@@ -19,8 +19,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Self
@@ -29,12 +28,14 @@ from diransac.errors import StudyError
 from diransac.plain_data import json_data
 from diransac.study.assessment import PlantFacts
 from diransac.study.database import (
+    AGAIN,
     Database,
     check_plain,
     connected_to,
     copied,
     damage,
     is_empty,
+    kept_apart,
     quoted,
     reported,
     roll_back,
@@ -68,9 +69,6 @@ _RENAMED_VALUES = {
     ("noise.first_row", "hit"): "corrupted",
 }
 """Keys and values of format 1, and what they are in format 2."""
-
-_AGAIN = "~"
-"""Suffix of a column whose name differs from another in case only, which SQLite takes for the same."""
 
 _PLANTS = "plants"
 """Key of the properties of plants, among names."""
@@ -155,7 +153,7 @@ class Store(Database):
     def columns(self) -> dict[str, tuple[str, str]]:
         """Name in a row -> column and its SQL type."""
         found = self.select("PRAGMA table_info(trials)")
-        return {column.rstrip(_AGAIN): (column, kind) for _, column, kind, *_ in found}
+        return {column.rstrip(AGAIN): (column, kind) for _, column, kind, *_ in found}
 
     @property
     def about(self) -> dict[str, Any]:
@@ -267,7 +265,7 @@ def _upgrade(connection: sqlite3.Connection, path: Path) -> None:
 def _create(connection: sqlite3.Connection, study: Study) -> None:
     """Make the tables of a new store."""
     kinds = _columns(study)
-    columns = ", ".join(f"{quoted(name)} {kind}" for name, kind in zip(_apart(kinds), kinds.values(), strict=True))
+    columns = ", ".join(f"{quoted(name)} {kind}" for name, kind in zip(kept_apart(kinds), kinds.values(), strict=True))
     for statement in (
         f"PRAGMA application_id = {_APPLICATION}",
         f"PRAGMA user_version = {_FORMAT}",
@@ -303,11 +301,3 @@ def _columns(study: Study) -> dict[str, str]:
         "seconds": "TEXT NOT NULL",
         "host": "TEXT NOT NULL",
     }
-
-
-def _apart(names: Iterable[str]) -> Iterator[str]:
-    """Column names that SQLite, which ignores case, keeps apart."""
-    before = Counter[str]()
-    for name in names:
-        yield name + _AGAIN * before[name.lower()]
-        before[name.lower()] += 1
