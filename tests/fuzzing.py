@@ -422,9 +422,7 @@ def _statements(tables: dict[str, list[str]], rng: Random) -> list[str]:
         [f'DROP TABLE "{table}"'],
         [f'ALTER TABLE "{table}" RENAME TO "{rng.choice(("x", table.upper() + "2"))}"'],
         [f'ALTER TABLE "{table}" RENAME COLUMN "{column}" TO "{rng.choice(("x", "best_x", column + "~", ""))}"'],
-        [
-            f'ALTER TABLE "{table}" ADD COLUMN "{rng.choice(("x", "parameter_x", "low_mass", "square"))}" {rng.choice(("", "REAL"))}'
-        ],
+        [f'ALTER TABLE "{table}" ADD COLUMN "{rng.choice(("x", "parameter_x", "low_mass", "square"))}" REAL'],
         [f'ALTER TABLE "{table}" ADD COLUMN g AS (randomblob(100000000))'],
         [f'ALTER TABLE "{table}" DROP COLUMN "{column}"'],
         [f'ALTER TABLE "{table}" RENAME TO old', f'CREATE VIEW "{table}" AS SELECT * FROM old'],
@@ -443,7 +441,7 @@ def _statements(tables: dict[str, list[str]], rng: Random) -> list[str]:
         [schema, f"UPDATE sqlite_master SET sql = {cell} WHERE name = '{table}'"],
         [schema, f"UPDATE sqlite_master SET rootpage = {rng.choice((0, 1, 2, 99))} WHERE name = '{table}'"],
         [schema, f"UPDATE sqlite_master SET type = '{rng.choice(('view', 'x'))}' WHERE name = '{table}'"],
-        [schema, f"INSERT INTO sqlite_master VALUES ('table', 'x', 'x', 0, 'CREATE VIRTUAL TABLE x USING csv')"],
+        [schema, "INSERT INTO sqlite_master VALUES ('table', 'x', 'x', 0, 'CREATE VIRTUAL TABLE x USING csv')"],
     ]
     return rng.choice(choices[:3] * 6 + choices)
 
@@ -458,7 +456,10 @@ def _change_texts(connection: sqlite3.Connection, tables: dict[str, list[str]], 
                     f'UPDATE "{table}" SET "{column}" = ? WHERE rowid = ?', (changed_bytes(value, rng), number)
                 )
             elif isinstance(value, str) and rng.random() < 0.5:
-                changed = as_json(changed_data(json.loads(value), rng)) if value[:1] in '{["' and value else value + "x"
+                try:
+                    changed = as_json(changed_data(json.loads(value), rng))
+                except (ValueError, RecursionError):
+                    changed = changed_text(value, rng)
                 text = changed.encode("utf-8", "replace").decode()
                 connection.execute(f'UPDATE OR IGNORE "{table}" SET "{column}" = ? WHERE rowid = ?', (text, number))
 
