@@ -160,7 +160,7 @@ METADATA = {
         '{"version": 1, "filter": {"bandwidth": 1e-300, "derivation_bandwidth": 1, "derived": {}}}',
         "too long for its rate",
     ),
-    "deep": ("[" * 100_000, "RecursionError"),
+    "deep": ("[" * 100_000, "nested too deeply"),
     "unnamed": ('{"version": 1, "unusable": {"": "is text"}}', "cannot name a signal"),
 }
 

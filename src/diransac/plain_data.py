@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +21,9 @@ LARGEST_TABLE = 2**20
 
 _DEEPEST_KEY = 64
 """Dots in a key of TOML."""
+
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+"""One half of a character in JSON's escapes; only pairs of them are text."""
 
 
 def read_text(path: str | Path, largest: int = LARGEST) -> str:
@@ -54,10 +58,21 @@ def json_data(text: str | bytes) -> Any:
     Raises
     ------
     ValueError
-        It is no JSON, nested too deeply, or has a number of thousands of digits.
+        It is no JSON, nested too deeply, or has a number of thousands of digits or half a character.
     """
     with _bounded():
-        return json.loads(text, parse_constant=_refused)
+        found = json.loads(text, parse_constant=_refused)
+        if _SURROGATE.search(text if isinstance(text, str) else text.decode("latin-1")):
+            _check_encodable(found)
+        return found
+
+
+def _check_encodable(value: object) -> None:
+    """Raises ValueError: a text cannot be written in UTF-8."""
+    try:
+        json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        raise ValueError("a text has half a character") from error
 
 
 def _refused(word: str) -> NoReturn:

@@ -18,10 +18,10 @@ from pathlib import Path
 
 from diransac.errors import DiransacError, ModelError
 
-__all__ = ["blaming", "definitions", "file_and_name", "leave_stdout", "running"]
+__all__ = ["blaming", "definitions", "file_and_name", "leave_stdout", "running", "silenced"]
 
 _ALONE = threading.RLock()
-"""Held while users' code runs, which may run more of it: threads share stdout, stderr and the module path."""
+"""Held without output, and while users' code runs, which may run more of it: threads share stdout and stderr."""
 
 _FILE = re.compile(r"([^\0\n]+\.py)(?::(\w+))?")
 _STDOUT, _STDERR = 1, 2
@@ -58,7 +58,7 @@ def definitions(file: Path, what: str) -> Mapping[str, object]:
 @contextlib.contextmanager
 def running(file: Path, what: str) -> Iterator[None]:
     """Context for a file's own code, one thread at a time: neighbours importable, no output, errors name the file."""
-    with _ALONE, blaming(file, what), _importable(file.resolve().parent), _silenced():
+    with silenced(), blaming(file, what), _importable(file.resolve().parent):
         yield
 
 
@@ -104,11 +104,18 @@ def _in_one_line(said: object) -> str:
 
 
 @contextlib.contextmanager
-def _silenced() -> Iterator[None]:
+def silenced() -> Iterator[None]:
     """Context without output of the process, in whatever language it is written; ``--debug`` sends it to stderr.
 
-    It acts on all threads, and two of them must not enter it at a time: the later would restore the earlier's state.
+    It acts on all threads. One at a time enters it: the later of two would restore the earlier's state.
     """
+    with _ALONE, _without_output():
+        yield
+
+
+@contextlib.contextmanager
+def _without_output() -> Iterator[None]:
+    """Context of `silenced`."""
     _flush()
     kept = {channel: os.dup(channel) for channel in (_STDOUT, _STDERR) if _is_open(channel)}
     sink = os.dup(_STDERR) if "--debug" in sys.argv and _STDERR in kept else os.open(os.devnull, os.O_WRONLY)

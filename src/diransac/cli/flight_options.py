@@ -17,7 +17,7 @@ from diransac.errors import ModelError
 from diransac.flight.noise import Noise
 from diransac.model import Model
 from diransac.model.library import TABLE_I, extended_rotorcraft, planar_rotorcraft
-from diransac.model.plant import Plant
+from diransac.model.plant import Plant, check_possible
 
 __all__ = [
     "SHAPES",
@@ -218,9 +218,7 @@ def _true_parameters(model: Model, given: Mapping[str, float]) -> dict[str, floa
     if missing:
         wanted = " ".join(f"--parameter {name}=VALUE" for name in missing)
         raise ModelError(f'the true parameters of "{model.name}" are not known; give {wanted}')
-    for name, bounds in model.parameters.items():
-        if not bounds.admits(values[name]):
-            raise ModelError(f'"{model.name}" cannot have {name} = {values[name]:g}, which is outside its bounds')
+    check_possible(model, values)
     return values
 
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "as_column",
+    "as_doubles",
     "as_numbers",
     "check_clock",
     "check_even",
@@ -42,10 +43,16 @@ _CLOCKS = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("millisec
 # ---------------------------------------------------------------------- columns
 
 
+def as_doubles(values: npt.NDArray[Any]) -> FloatArray:
+    """Copy of an array of numbers as float64, without warning of the signalling NaNs that damaged bytes may hold."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return values.astype(np.float64)
+
+
 def as_numbers(values: npt.NDArray[Any]) -> FloatArray | str:
     """Copy of an array as float64, or the reason why it has none: ``is not numeric: row 3 holds 'takeoff'``."""
     if values.dtype.kind in "biuf":
-        return values.astype(np.float64)
+        return as_doubles(values)
     if values.dtype.kind != "O":
         return f"is not numeric: row 0 holds {values.ravel()[0]!s:.60}" if values.size else "is empty"
     numbers = np.full(values.shape, np.nan)

@@ -76,8 +76,10 @@ def decode_metadata(text: str | bytes, source: str, remedy: str) -> Metadata:
 
     Raises LogError: they are damaged, or of a later version; the message ends with the remedy.
     """
+    from diransac.plain_data import json_data
+
     try:
-        facts = json.loads(text)
+        facts = json_data(text)
         version = facts.get("version")
         if version == _VERSION:
             return _metadata(facts)

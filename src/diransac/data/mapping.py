@@ -28,7 +28,6 @@ components, or of the four of a quaternion whose ``order`` in the file is given.
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,6 +36,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import LogError
+from diransac.plain_data import LARGEST_TABLE, read_text, toml_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -55,7 +55,6 @@ _ORDERS = ("wxyz", "xyzw")
 _KEYS = {"name", "topic", "field", "unit", "scale", "sign", "offset", "frame", "order", "optional", "where"}
 _STEPS = {"resample", "repair", "from", "until", "despike", "shift", "differentiate", "bandwidth"}
 _TOP = {"description", "time", "signals", "events", *_STEPS}
-_LARGEST_FILE = 1_000_000
 _ANY = "{joint}"
 _FOLDER = Path(__file__).parent / "mappings"
 
@@ -345,24 +344,22 @@ def load_mapping(mapping: str | Path) -> LogMapping:
         source = f'mapping "{path}"'
         text = _text(path, source)
     try:
-        content = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        content = toml_table(text)
+    except ValueError as error:
         raise LogError(f"{source}: it is not TOML ({' '.join(str(error).split()):.120})") from error
     return _parse(content, source)
 
 
 def _text(path: Path, source: str) -> str:
     try:
-        if path.is_file() and path.stat().st_size > _LARGEST_FILE:
-            raise LogError(f"{source}: it is larger than 1 MB; is it a mapping?")
-        return path.read_text(encoding="utf-8")
+        return read_text(path, LARGEST_TABLE)
     except FileNotFoundError as error:
         built_in = ", ".join(BUILT_IN)
         raise LogError(f"{source}: there is no such file; built in are {built_in}") from error
-    except UnicodeDecodeError as error:
-        raise LogError(f"{source}: it is not UTF-8 text") from error
-    except (OSError, ValueError) as error:
-        raise LogError(f"{source}: it cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    except OSError as error:
+        raise LogError(f"{source}: it cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise LogError(f"{source}: {error}") from error
 
 
 def _parse(content: Mapping[str, Any], source: str) -> LogMapping:

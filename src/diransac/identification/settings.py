@@ -13,9 +13,20 @@ import numpy as np
 from diransac.errors import SettingsError
 from diransac.simulation import INTEGRATORS
 
-__all__ = ["EXECUTION", "JUDGING", "SIMULATION", "Settings", "check_used", "nearest_names"]
+__all__ = [
+    "EXECUTION",
+    "JUDGING",
+    "MOST_SUBSTEPS",
+    "SIMULATION",
+    "Settings",
+    "check_substeps",
+    "check_used",
+    "nearest_names",
+]
 
 # Similarity of names, 0 to 1, from which on one is taken for a misspelling of the other.
+MOST_SUBSTEPS = 10_000
+"""Integration steps per sample, at most: more are a slip of the pen, and take hours."""
 _NEAR = 0.75
 
 REFITS = ("inliers", "none")
@@ -100,6 +111,7 @@ class Settings:
         for name in ("min_inlier_signals", "threads"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _positive_integer(name, getattr(self, name)))
+        check_substeps(self.substeps)
         if self.stop_inlier_fraction is not None:
             fraction = _fraction("stop_inlier_fraction", self.stop_inlier_fraction)
             object.__setattr__(self, "stop_inlier_fraction", fraction)
@@ -217,6 +229,12 @@ def _positive_integer(name: str, value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise SettingsError(f"{name} is {value!r}; give a whole number of at least 1")
     return int(value)
+
+
+def check_substeps(substeps: int) -> None:
+    """Raise SettingsError: there are more integration steps per sample than any machine needs."""
+    if substeps > MOST_SUBSTEPS:
+        raise SettingsError(f"substeps is {substeps!s:.20}; give up to {MOST_SUBSTEPS} integration steps per sample")
 
 
 def _fraction(name: str, value: object) -> float:

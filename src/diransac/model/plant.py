@@ -22,13 +22,17 @@ from diransac.model import derivation, expressions
 from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 
-__all__ = ["Disturbance", "DisturbedModel", "ModelWithParameters", "Plant", "as_plant"]
+__all__ = ["Disturbance", "DisturbedModel", "ModelWithParameters", "Plant", "as_plant", "check_possible"]
 
 Effect = Callable[[Symbols, Symbols, Symbols, Symbols, Symbols], Mapping[str, Any]]
 """``effect(q, v, u, p, d)`` gives expressions by name."""
 
 _STEPS_PER_PERIOD = 8
 """Integration steps per period of the fastest disturbance; docs/flying.md has the convergence."""
+
+
+_HIGHEST_FREQUENCY = 1e5
+"""Hz, of effects that simulations may resolve: 8000 integration steps per sample at 100 Hz."""
 
 
 class ModelWithParameters(Protocol):
@@ -143,8 +147,11 @@ class Disturbance:
                 raise ModelError(f"{self._label}: {name} is {value!r}; give a finite number")
             if is_range and value[0] > value[1]:
                 raise ModelError(f"{self._label}: {name} is {value!r}; give the low end of a range first")
-        if self.highest_frequency < 0:
-            raise ModelError(f"{self._label}: highest_frequency is {self.highest_frequency}; give Hz, 0 or more")
+        if not 0.0 <= self.highest_frequency <= _HIGHEST_FREQUENCY:
+            raise ModelError(
+                f"{self._label}: highest_frequency is {self.highest_frequency:g}; give Hz, from 0 to "
+                f"{_HIGHEST_FREQUENCY:g}, which integration steps can resolve"
+            )
 
     def _expressions(
         self, what: str, effect: Effect | None, names: Sequence[str], arguments: Sequence[Symbols]
@@ -384,6 +391,13 @@ class Plant:
         """Integration steps per sample of dt (s) that resolve every disturbance."""
         fastest = max((one.highest_frequency for one in self.disturbances), default=0.0)
         return max(1, int(np.ceil(_STEPS_PER_PERIOD * fastest * dt)))
+
+
+def check_possible(model: Model, parameters: Mapping[str, float]) -> None:
+    """Raise ModelError: a machine cannot have these parameters, one of which is outside its bounds."""
+    for name, bounds in model.parameters.items():
+        if not bounds.admits(parameters[name]):
+            raise ModelError(f'"{model.name}" cannot have {name} = {parameters[name]:g}, which is outside its bounds')
 
 
 def as_plant(plant: ModelWithParameters) -> Plant:

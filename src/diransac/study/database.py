@@ -48,6 +48,10 @@ _READ_TIMEOUT = 120.0
 _ANOTHER_JOURNAL = bytes.fromhex("d9d505f920a163d7")
 """Last bytes of a journal of several databases, which names a file that is deleted when it is rolled back."""
 
+_HEADER = b"SQLite format 3\0"
+_MODES = slice(18, 20)
+"""Bytes of a file's header that are 1 with a rollback journal, and 2 with a write-ahead log."""
+
 _LARGEST_VALUE = 64 * 2**20
 """Bytes of the largest value in a store."""
 
@@ -96,7 +100,14 @@ def word(value: object) -> str:
 
 # SQLite --------------------------------------------------------------------------------------------------------------
 def connected_to(path: Path, mode: str) -> sqlite3.Connection:
-    """A connection without implicit transactions.  Raises StudyError: the file cannot be opened."""
+    """A connection without implicit transactions.
+
+    Raises StudyError: the file cannot be opened, or has a write-ahead log, which makes two further files when read.
+    """
+    if _has_write_ahead_log(path):
+        raise StudyError(
+            f'store "{path}" has a write-ahead log, which no study makes; PRAGMA journal_mode = DELETE takes it out'
+        )
     try:
         uri = f"{path.absolute().as_uri()}?mode={mode}"
         connection = sqlite3.connect(uri, timeout=_LOCK_TIMEOUT, isolation_level=None, uri=True)
@@ -108,6 +119,16 @@ def connected_to(path: Path, mode: str) -> sqlite3.Connection:
         raise StudyError(
             f'store "{path}" cannot be opened: {error}; does its folder exist, may you write there?'
         ) from error
+
+
+def _has_write_ahead_log(path: Path) -> bool:
+    """True for a database in this mode; False also for a file that is missing or cannot be read."""
+    try:
+        with path.open("rb") as file:
+            header = file.read(_MODES.stop)
+    except OSError:
+        return False
+    return header.startswith(_HEADER) and 2 in header[_MODES]
 
 
 @contextmanager

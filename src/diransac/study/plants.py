@@ -24,7 +24,7 @@ from diransac.errors import DiransacError, ModelError, SettingsError
 from diransac.model import Model, Parameter
 from diransac.model.derivation import Symbols
 from diransac.model.library import TABLE_I, builtin, extended_rotorcraft
-from diransac.model.plant import Disturbance, Plant
+from diransac.model.plant import Disturbance, Plant, check_possible
 from diransac.study.tables import RANDOM, FunctionTable, Text, check_signature, function_arguments
 from diransac.user_files import blaming, definitions, file_and_name, running
 
@@ -179,7 +179,8 @@ class PlantChoice(FunctionTable):
     Raises
     ------
     SettingsError
-        An unknown kind or key, a value that makes no plant, a file that is missing or has changed.
+        An unknown kind or key, a value that makes no plant, a parameter outside its bounds, a file that is missing or
+        has changed.
     """
 
     PLACE: ClassVar[str] = "plant"
@@ -218,8 +219,8 @@ class PlantChoice(FunctionTable):
 
     @model_validator(mode="after")
     def _makes_a_plant(self) -> Self:
-        with _settings_errors():
-            self.plant  # noqa: B018  refuses arguments that make none
+        with _settings_errors():  # also of arguments that make no plant
+            check_possible(self.plant.model, self.plant.parameters)
         return self
 
     @property

@@ -34,7 +34,7 @@ from diransac.identification.methods import (
     estimator_named,
     factory,
 )
-from diransac.identification.settings import Settings
+from diransac.identification.settings import MOST_SUBSTEPS, Settings
 from diransac.model import Model
 from diransac.model.plant import ModelWithParameters
 from diransac.study.axis import AnyAxis
@@ -112,7 +112,9 @@ class FlightChoice(FunctionTable):
     PLACE: ClassVar[str] = "data"
 
     trajectory: Annotated[Text, OneOf(TRAJECTORIES)]
-    substeps: Count | None = Field(None, description="a whole number of at least 1")
+    substeps: Count | None = Field(
+        None, le=MOST_SUBSTEPS, description=f"a whole number of at least 1 and at most {MOST_SUBSTEPS}"
+    )
     arguments: dict[str, Any] = Field({})
 
     @field_validator("arguments")

@@ -253,7 +253,8 @@ def _upgrade(connection: sqlite3.Connection, path: Path) -> None:
             new = "pseudo_true_" + column.removeprefix("best_")
             connection.execute(f"ALTER TABLE trials RENAME COLUMN {quoted(column)} TO {quoted(new)}")
     for part, key, text in connection.execute("SELECT part, key, value FROM configuration").fetchall():
-        value = json.loads(text)
+        with damage(path):
+            value = json_data(text)
         renamed = _RENAMED_VALUES.get((key, value), value) if isinstance(value, str) else value
         connection.execute(
             "UPDATE configuration SET key = ?, value = ? WHERE part = ? AND key = ?",

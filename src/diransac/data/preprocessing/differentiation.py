@@ -275,6 +275,8 @@ def choose_bandwidth(motions: list[tuple[FloatArray, int]], dt: float) -> Bandwi
 
 
 def _of_one_motion(values: FloatArray, order: int, dt: float) -> Bandwidth | None:
+    if len(values) <= order:
+        return None
     f, A = _acceleration_spectrum(values, order, dt)
     if not len(f) or not A.all():
         return None

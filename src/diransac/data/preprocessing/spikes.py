@@ -91,9 +91,9 @@ def hampel(
         raise SettingsError(
             f"window = {window}, threshold = {threshold}: give an odd window from 3, a threshold above 0"
         )
-    median = _running_median(values, window)
-    deviation = (scale or window_deviation)(values, median, window)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
+        median = _running_median(values, window)
+        deviation = (scale or window_deviation)(values, median, window)
         return np.asarray(np.abs(values - median) > threshold * deviation), median
 
 

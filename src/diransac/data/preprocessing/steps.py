@@ -37,6 +37,8 @@ Column = TypeVar("Column")
 
 _BRIDGED_INTERVALS = 3.5
 _MOST_ROWS = 10_000_000
+# New rows per old one, of more than so many, that only a damaged time takes.
+_MOST_NEW, _MANY_ROWS = 1000, 100_000
 _ROUNDING = 1e-6
 _FOLDING = 0.9
 
@@ -215,6 +217,13 @@ def resampling_grid(time: FloatArray, rate: float | str, source: str) -> tuple[F
     """Uniform time (n,) over that of a clock, and its rate in Hz.  Raises LogError, SettingsError: as `resample`."""
     hertz = _rate(rate, float(np.median(np.diff(time))))
     n = _new_rows(float(time[-1] - time[0]), hertz, source)
+    if n > max(_MANY_ROWS, _MOST_NEW * len(time)):
+        steps = np.diff(time)
+        row = int(np.argmax(steps))
+        raise LogError(
+            f"{source}: resampling at {hertz:.6g} Hz would make {n:,} rows of {len(time)}: {steps[row]:.4g} s pass "
+            f"after t = {time[row]:.6g} s (row {row}); split the log there, or correct its time"
+        )
     return time[0] + np.arange(n) / hertz, hertz
 
 

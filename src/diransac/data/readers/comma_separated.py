@@ -15,7 +15,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.files import COMMENT
 from diransac.data.readers.repair import Repairs
-from diransac.data.readers.table import Table, check_unique, with_metadata
+from diransac.data.readers.table import LARGEST, Table, check_unique, with_metadata
 from diransac.data.units import split_unit
 from diransac.errors import LogError
 
@@ -28,6 +28,7 @@ __all__ = ["joined", "read_csv", "read_csv_gz"]
 
 _SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
 _FEW_LINES = 20_000
+_CHUNK = 1 << 22
 _COMMENTS = ("#", "%", "//")
 _ISO = re.compile(
     r"(?P<date>(?:19|20|21)\d\d-\d\d-\d\d)[T ](?P<clock>\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)(?P<zone>Z|[+-]\d\d:?\d\d)?"
@@ -38,9 +39,22 @@ _MISSING = ("", "na", "n/a", "nan", "null", "none")
 def read_csv_gz(data: bytes, source: str, names: Sequence[str] | None = None, repairs: Repairs | None = None) -> Table:
     """Table of gzip data.  Raises LogError: as `read_csv`; the data are not gzip, or are cut off."""
     try:
-        return read_csv(gzip.decompress(data), source, names, repairs)
+        text = _unpacked(data, source)
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise LogError(f"{source}: the gzip data are damaged or cut off ({error})") from error
+    return read_csv(text, source, names, repairs)
+
+
+def _unpacked(data: bytes, source: str) -> bytes:
+    """Text of gzip data.  Raises LogError: it is too large."""
+    parts, size = list[bytes](), 0
+    with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+        while part := file.read(_CHUNK):
+            parts.append(part)
+            size += len(part)
+            if size > LARGEST:
+                raise LogError(f"{source}: its text is larger than 2 GiB; split it")
+    return b"".join(parts)
 
 
 def read_csv(data: bytes, source: str, names: Sequence[str] | None = None, repairs: Repairs | None = None) -> Table:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from diransac.data.checks import as_doubles
 from diransac.data.readers.recording import Samples, Stamps
 from diransac.errors import LogError
 
@@ -113,7 +114,7 @@ class CrazyflieRecording:
                     raise LogError(f'{self.source}: event "{name}" has no "{label}"; it has {", ".join(known)}')
             records = self._records[name]
             time = (records["t"].astype(np.float64) - self._start) * self._tick
-            samples[name] = Samples(time, {label: records[label].astype(np.float64) for label in fields})
+            samples[name] = Samples(time, {label: as_doubles(records[label]) for label in fields})
         return samples
 
 

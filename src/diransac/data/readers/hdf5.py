@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from diransac.data.readers.table import Table, table_of_arrays
+from diransac.data.readers.table import LARGEST, Table, table_of_arrays
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["MAGIC", "read_hdf5"]
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
-_LARGEST, _MOST = 1 << 31, 10_000
+_MOST = 10_000
 _DAMAGED = (OSError, ValueError, TypeError, KeyError, RuntimeError, MemoryError, OverflowError, AttributeError)
 
 
@@ -45,7 +45,7 @@ def read_hdf5(data: bytes, source: str, *, transposed: bool = False) -> Table:
         with h5py.File(io.BytesIO(data), "r") as file:
             for name, dataset in _datasets(file, ""):
                 total += dataset.size * dataset.dtype.itemsize
-                if total > _LARGEST or len(arrays) >= _MOST:
+                if total > LARGEST or len(arrays) >= _MOST:
                     raise LogError(f"{source}: its arrays are larger than 2 GiB together, or too many")
                 values = np.asarray(dataset[()])
                 arrays[name] = values.T if transposed else values

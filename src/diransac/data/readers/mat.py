@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.data.readers import hdf5
-from diransac.data.readers.table import Table, check_unique, table_of_arrays
+from diransac.data.readers.table import LARGEST, Table, check_unique, table_of_arrays
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["read_mat"]
 
-_HEADER, _LARGEST, _DEEPEST, _MOST = 128, 1 << 31, 8, 10_000
+_HEADER, _DEEPEST, _MOST = 128, 8, 10_000
 _MATRIX, _COMPRESSED = 14, 15
 _CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _STRUCTURE, _COMPLEX = 2, 0x0800
@@ -105,7 +105,7 @@ def _level_5(data: bytes) -> Iterator[tuple[str, npt.NDArray[Any]]]:
     """Arrays of a file of version 5, those of structures by dotted names."""
     order = "<" if data[126:128] == b"IM" else ">"
     elements = _Elements(memoryview(data)[_HEADER:], order)
-    budget = _LARGEST
+    budget = LARGEST
     while elements:
         kind, content = elements.take()
         if kind == _COMPRESSED:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from diransac.data.files import MEMBER
-from diransac.data.readers.table import Table, check_unique, table_of_arrays, with_metadata
+from diransac.data.readers.table import LARGEST, Table, check_unique, table_of_arrays, with_metadata
 from diransac.errors import LogError
 
 __all__ = ["read_npz"]
@@ -28,6 +28,8 @@ def read_npz(data: bytes, source: str) -> Table:
     except (zipfile.BadZipFile, NotImplementedError) as error:
         raise LogError(f"{source}: it is not an NPZ file, or is cut off ({error})") from error
     check_unique(archive.namelist(), source)
+    if sum(entry.file_size for entry in archive.infolist()) > LARGEST:
+        raise LogError(f"{source}: its arrays are larger than 2 GiB together; split it")
     arrays: dict[str, Any] = {}
     metadata = None
     for entry in archive.namelist():

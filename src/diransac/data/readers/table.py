@@ -18,7 +18,10 @@ from diransac.errors import LogError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["Table", "check_unique", "table_of_arrays", "with_metadata"]
+__all__ = ["LARGEST", "Table", "check_unique", "table_of_arrays", "with_metadata"]
+
+LARGEST = 1 << 31
+"""Bytes that a compressed file may unpack to, 2 GiB."""
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from diransac.data.checks import as_doubles
 from diransac.data.readers.recording import Samples, Stamps, seconds_since
 from diransac.errors import LogError
 
@@ -292,7 +293,7 @@ class UlogRecording:
         if clock != "timestamp" and not times.all():  # some publishers leave it zero
             times = self._column(topic, "timestamp", topic.places)
         since = np.minimum(times, np.uint64(_LATEST_STAMP)).astype(np.int64) - min(self._start, _LATEST_STAMP)
-        columns = {label: self._column(topic, label, topic.places).astype(np.float64) for label in fields}
+        columns = {label: as_doubles(self._column(topic, label, topic.places)) for label in fields}
         return Samples(seconds_since(0, since * _NANOSECONDS), columns)
 
     def _column(self, topic: _Topic, label: str, places: array[int]) -> npt.NDArray[Any]:

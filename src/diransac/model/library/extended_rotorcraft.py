@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from math import pi
 from types import MappingProxyType
@@ -14,7 +14,7 @@ from diransac.errors import ModelError
 from diransac.model.derivation import Symbols
 from diransac.model.library.planar_rotorcraft import planar_rotorcraft
 from diransac.model.model import Model
-from diransac.model.plant import Disturbance, Plant
+from diransac.model.plant import Disturbance, Plant, check_possible
 
 __all__ = ["BLADE_FLAPPING", "TABLE_I", "extended_rotorcraft"]
 
@@ -30,6 +30,18 @@ With ideal twist and C_T of Table I: inflow ``lambda = sqrt(2 C_T / pi) / pi = 0
 
 _LARGEST_MU = 0.5
 """Advance ratio above which flapping is constant: the rotor almost stands still."""
+
+_POSITIVE = 1e-6, 1e6
+_RANGES = {
+    "thrust_coefficient": _POSITIVE,
+    "power_coefficient": (0.0, 1e6),
+    "diameter": _POSITIVE,
+    "arm_length": _POSITIVE,
+    "rotor_height": (-1e6, 1e6),
+    "air_density": _POSITIVE,
+    "gravity": (0.0, 1e6),
+}
+"""Values in SI units that a machine can have, by far."""
 
 _EFFECTS = ("rotational", "gravitational")
 PerRotor = float | tuple[float, float]
@@ -100,7 +112,8 @@ def extended_rotorcraft(
     Raises
     ------
     ModelError
-        An unknown convention, phase, effect or parameter, or a number that is not finite.
+        An unknown convention, phase, effect or parameter, a parameter outside its bounds, a number that is not finite,
+        or one that no rotor has.
 
     References
     ----------
@@ -113,6 +126,10 @@ def extended_rotorcraft(
     _check_choice("phase", phase, ("integrated", "instantaneous"))
     for effect in mass_effects:
         _check_choice("mass_effects", effect, _EFFECTS)
+    numbers = (thrust_coefficient, power_coefficient, diameter, arm_length, rotor_height, air_density, gravity)
+    for (name, (low, high)), value in zip(_RANGES.items(), numbers, strict=True):
+        if isinstance(value, Sequence) or not low <= value <= high:
+            raise ModelError(f"extended rotorcraft: {name} is {value}; give one number from {low:g} to {high:g}")
     model = planar_rotorcraft(arm_length, gravity)
     rotors = _Rotors(
         convention,
@@ -128,6 +145,7 @@ def extended_rotorcraft(
     mass = {effect: mass_imbalance if effect in mass_effects else 0.0 for effect in _EFFECTS}
     constants = _per_rotor(aerodynamic=aerodynamic_imbalance, **mass)
     known = Plant(model, parameters)
+    check_possible(model, known.parameters)
     disturbances = [rotors.imbalance(model, constants, rotor_phase, known.parameters["mass"])]
     if any(_per_rotor(flapping=blade_flapping).values()):
         disturbances.append(rotors.flapping(model, _per_rotor(flapping=blade_flapping)))

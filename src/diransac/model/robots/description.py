@@ -203,6 +203,14 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
         The file cannot be read; or it has a free joint whose base is neither, a ball joint, a closed loop, a tendon
         that exerts forces, or a surrounding fluid.
     """
+    try:
+        return _description(path, base)
+    except UnicodeDecodeError as error:  # a name in another encoding, or none
+        raise _unreadable(path, error) from error
+
+
+def _description(path: str | Path, base: str | None) -> Description:
+    """As `read_description`.  Raises UnicodeDecodeError: a name is not UTF-8."""
     spec = parsed(path)
     floating = [x for x in spec.joints if x.type == mujoco_module().mjtJoint.mjJNT_FREE] if base else []
     names = [joint.parent.name for joint in floating]

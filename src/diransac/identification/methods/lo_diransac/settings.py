@@ -11,7 +11,7 @@ import numpy as np
 
 from diransac.errors import SettingsError
 from diransac.identification.candidate_terms import TermLibrary
-from diransac.identification.settings import JUDGING, Settings, check_used
+from diransac.identification.settings import JUDGING, Settings, check_substeps, check_used
 
 if TYPE_CHECKING:
     from diransac.model import Model
@@ -75,6 +75,7 @@ class LoDiransacSettings:
                 object.__setattr__(self, f.name, _checked_names(f.name, value))
             elif f.name not in (*_OBJECTS, *_SWITCHES):
                 object.__setattr__(self, f.name, _checked(f.name, value, f.default))
+        check_substeps(self.substeps)
         if self.candidate_terms is not None and not callable(self.candidate_terms):
             raise SettingsError(
                 f"candidate_terms is {self.candidate_terms!r}; give a function of (q, v, u) that returns expressions "
