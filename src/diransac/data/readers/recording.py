@@ -16,7 +16,7 @@ from diransac.errors import LogError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-__all__ = ["Aligned", "Recording", "Samples", "Stamps", "align", "find_field", "seconds_since"]
+__all__ = ["Aligned", "Recording", "Samples", "Stamps", "align", "find_field", "seconds_since", "shortened"]
 
 Stamps = str
 """``"header"``: time at which a message says it was sampled; ``"message"``: time at which it was recorded."""
@@ -91,6 +91,42 @@ def find_field(path: str, fields: Mapping[str, Iterable[str]], source: str) -> t
     if len(fields) == 1:
         return next(iter(fields)), path
     raise LogError(f'{source}: "{path}" names no topic; found {_some(fields)}. Name it as topic.field')
+
+
+def shortened(fields: Iterable[str]) -> list[str]:
+    """Names of fields for a listing: ``covariance[0..8]`` and ``velocity.{x, y, z}`` in one, those of a header left out.
+
+    Notes
+    -----
+    Fields that stand side by side are put together; the order is kept.
+    """
+    found: list[tuple[str, str, list[str]]] = []
+    for name in fields:
+        if name.startswith("header."):
+            continue
+        whole, kind, part = _last_part(name)
+        if found and found[-1][:2] == (whole, kind) and kind:
+            found[-1][2].append(part)
+        else:
+            found.append((whole, kind, [part]))
+    return [_together(*one) for one in found]
+
+
+def _last_part(name: str) -> tuple[str, str, str]:
+    """Name without its last index or member, ``[`` or ``.``, and that; the name itself where it has neither."""
+    if name.endswith("]"):
+        whole, _, index = name[:-1].rpartition("[")
+        return whole, "[", index
+    whole, point, member = name.rpartition(".")
+    return (whole, point, member) if point else (name, "", "")
+
+
+def _together(whole: str, kind: str, parts: list[str]) -> str:
+    if not kind:
+        return whole
+    if kind == "[":
+        return f"{whole}[{parts[0]}..{parts[-1]}]" if len(parts) > 1 else f"{whole}[{parts[0]}]"
+    return f"{whole}.{{{', '.join(parts)}}}" if len(parts) > 1 else f"{whole}.{parts[0]}"
 
 
 def _some(names: Iterable[str], most: int = 40) -> str:

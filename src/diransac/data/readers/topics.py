@@ -10,7 +10,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.mapping import LogMapping, MappedSignals, held
-from diransac.data.readers.recording import Recording, Samples, align, find_field
+from diransac.data.readers.recording import Recording, Samples, align, find_field, shortened
 from diransac.data.readers.table import Table
 from diransac.errors import LogError
 from diransac.text_table import aligned
@@ -240,7 +240,8 @@ class TopicTable:
         rows = [["topic", "messages", "Hz", "from s", "to s", "gaps", "longest s", "fields"]]
         for name, x in self.topics.items():
             gaps = [str(x.n_gaps or "-"), f"{x.longest_gap:.3g}" if x.n_gaps else "-"]
-            shown = ", ".join(x.fields[:_FIELDS_SHOWN]) + (", ..." if len(x.fields) > _FIELDS_SHOWN else "")
+            listed = shortened(x.fields)
+            shown = ", ".join(listed[:_FIELDS_SHOWN]) + (", ..." if len(listed) > _FIELDS_SHOWN else "")
             rate = f"{x.rate:.4g}" if np.isfinite(x.rate) else "-"
             rows.append([name, str(x.n_messages), rate, f"{x.start:.6g}", f"{x.end:.6g}", *gaps, shown])
         machine = self.metadata.get("information", {})
