@@ -2,8 +2,8 @@
 
 ``gimbal_monday.mcap`` and ``gimbal_friday.mcap`` are the logs of ``docs/tutorial.md``.  The camera's centre of mass is off
 its axis, and its inertia about the pan axis depends on the tilt.  Encoders and drives have messages of their own, in
-degrees and milliamperes, with clocks of their own; of the encoders' samples 2 % are glitches, and 0.6 s are lost.  For the
-first seconds the drives are off, and somebody turns the camera by hand.  In both, the cable to the camera pulls the pan
+degrees and milliamperes, with clocks of their own; of the encoders' samples 2 % are glitches, and 0.6 s are lost.  At
+times the drives are off, and somebody turns the camera by hand.  In both, the cable to the camera pulls the pan
 axis back, and gusts turn it; no equation of the tutorial's first model has either.
 """
 
@@ -30,7 +30,7 @@ TRUTH = {
 }
 CABLE = 0.02  # N m/rad
 STEP = 0.0005
-LIMIT = 2.5  # A
+LIMIT = 2.0  # A
 DRIVES_HZ, ENCODERS_HZ, IMU_HZ = 200, 100, 100
 START = 1_790_000_000_000_000_000  # ns
 OFF, TRACKING = 0, 3
@@ -69,8 +69,13 @@ def target(t: float, shift: float) -> tuple[float, float]:
     return pan, tilt
 
 
-def simulated(seconds: float, off: float, seed: int) -> Motion:
-    """Gimbal under the control of its drives, which are off at first: until then somebody turns the camera by hand."""
+def is_off(t: float, off: list[tuple[float, float]]) -> bool:
+    """True within one of the stretches, s, in which the drives are off."""
+    return any(start <= t < stop for start, stop in off)
+
+
+def simulated(seconds: float, off: list[tuple[float, float]], seed: int) -> Motion:
+    """Gimbal under the control of its drives; while they are off somebody turns the camera by hand."""
     p, n = TRUTH, round(seconds / STEP)
     rng, knots = np.random.default_rng(seed), np.arange(0.0, seconds + 0.7, 0.7)
     gusts = np.interp(np.arange(n) * STEP, knots, rng.normal(0.0, 0.003, len(knots)))
@@ -78,11 +83,16 @@ def simulated(seconds: float, off: float, seed: int) -> Motion:
     pan, tilt, pan_rate, tilt_rate = 0.2, -0.3, 0.0, 0.0
     for k in range(n):
         t = k * STEP
-        wanted = target(t, 0.9 * seed) if t >= off else (0.2 + 0.4 * sin(1.5 * t), -0.3 + 0.3 * sin(2.0 * t))
+        tracking = not is_off(t, off)
+        wanted = target(t, 0.9 * seed) if tracking else (0.2 + 0.4 * sin(1.5 * t), -0.3 + 0.3 * sin(2.0 * t))
         if k % round(1.0 / (DRIVES_HZ * STEP)) == 0:
-            pull = (7.0 * (wanted[0] - pan) - 0.45 * pan_rate, 6.0 * (wanted[1] - tilt) - 0.35 * tilt_rate)
-            currents[k:] = np.clip(pull, -LIMIT, LIMIT) if t >= off else 0.0
-        hand = (0.0, 0.0) if t >= off else (0.5 * (wanted[0] - pan), 0.5 * (wanted[1] - tilt) + 0.04)
+            pull = (7.0 * (wanted[0] - pan) - 0.6 * pan_rate, 5.0 * (wanted[1] - tilt) - 0.4 * tilt_rate)
+            currents[k:] = currents[k] + 0.35 * (np.clip(pull, -LIMIT, LIMIT) - currents[k]) if tracking else 0.0
+        hand = (
+            (0.0, 0.0)
+            if tracking
+            else (0.5 * (wanted[0] - pan) - 0.02 * pan_rate, 0.5 * (wanted[1] - tilt) - 0.02 * tilt_rate + 0.04)
+        )
         angles[k], rates[k] = (pan, tilt), (pan_rate, tilt_rate)
         inertia = p["base_inertia"] + p["camera_inertia"] * cos(tilt) ** 2
         turn = p["camera_inertia"] * sin(2.0 * tilt) * pan_rate
@@ -95,7 +105,7 @@ def simulated(seconds: float, off: float, seed: int) -> Motion:
     return Motion(np.arange(n) * STEP, angles, rates, currents)
 
 
-def record(motion: Motion, off: float, seed: int, path: Path) -> None:
+def record(motion: Motion, off: list[tuple[float, float]], seed: int, path: Path) -> None:
     """Write what the gimbal's computer would record of a motion."""
     rng = np.random.default_rng([seed, 1])
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -126,7 +136,7 @@ def record(motion: Motion, off: float, seed: int, path: Path) -> None:
     for k in rows(DRIVES_HZ, 0.0):
         t = motion.time[k]
         milliamperes = np.round(1000.0 * motion.currents[k] + rng.normal(0.0, 4.0, 2)).astype(np.int16)
-        mode = TRACKING if t >= off else OFF
+        mode = OFF if is_off(t, off) else TRACKING
         volts = 24.6 - 0.01 * t - 0.2 * np.abs(motion.currents[k]).sum()
         add("/ptu/drives", "ptu_msgs/msg/Drives", t, rng.uniform(0.0005, 0.002), milliamperes, mode, volts)
     for k in rows(IMU_HZ, 0.0035):
@@ -158,7 +168,7 @@ def definition(kind: str) -> str:
 
 def main() -> None:
     """Write both recordings into the working directory."""
-    for day, seconds, off, seed in (("monday", 12.0, 1.5, 1), ("friday", 9.0, 1.5, 2)):
+    for day, seconds, off, seed in (("monday", 12.5, [(0.0, 1.5), (4.0, 4.8)], 1), ("friday", 9.0, [(0.0, 1.5)], 2)):
         path = Path(f"gimbal_{day}.mcap")
         record(simulated(seconds, off, seed), off, seed, path)
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 __all__ = ["Coverage", "suggest_mapping"]
 
 _LEAST, _LISTED, _MOST_LISTED = 0.5, 3, 60
-_STATES = frozenset({"mode", "state", "status", "armed", "airborne", "landed", "flying", "enabled", "contact", "battery"})
+_STATES = frozenset(
+    {"mode", "state", "status", "armed", "airborne", "landed", "flying", "enabled", "contact", "battery"}
+)
 """Words of fields that may say when a stretch of a log counts."""
 _WORD = re.compile(r"[a-z]+|\d+")
 _ALIKE = {
@@ -177,9 +179,7 @@ def suggest_mapping(
             missing[name] = tuple(f"{topic}.{label}" if topic else label for _, (topic, label) in near)
     ordered = {name: entries[name] for name in needed if name in entries}
     used = {(entry.topic, label) for entry in ordered.values() for label in entry.fields}
-    unused = {
-        topic: tuple(label for label in labels if (topic, label) not in used) for topic, labels in fields.items()
-    }
+    unused = {topic: tuple(label for label in labels if (topic, label) not in used) for topic, labels in fields.items()}
     return Coverage(model.name, source, ordered, derivable, missing, model.units, built_in, _clock(fields), unused)
 
 

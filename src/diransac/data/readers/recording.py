@@ -36,11 +36,14 @@ class Samples:
         Samples of each field that was asked for; NaN where a message lacks it.
     unusable : mapping of str to str
         Fields that hold no numbers, and why.
+    texts : mapping of str to (n,) array of str
+        Samples of those that hold texts; empty where a message lacks it.
     """
 
     time: FloatArray
     columns: Mapping[str, FloatArray]
     unusable: Mapping[str, str] = field(default_factory=dict)
+    texts: Mapping[str, npt.NDArray[np.object_]] = field(default_factory=dict)
 
     @property
     def interval(self) -> float:
@@ -61,6 +64,8 @@ class Recording(Protocol):
     """Facts beside the samples, that JSON can hold: the machine, its parameters, messages in words."""
     elements: dict[str, tuple[str, ...]]
     """Names of the elements of arrays, such as joints, of the topics that have some."""
+    texts: dict[str, tuple[str, ...]]
+    """Names of the fields that hold texts, such as a mode, of the topics that have some."""
 
     @property
     def fields(self) -> Mapping[str, tuple[str, ...]]:
