@@ -1,10 +1,10 @@
 """Two recordings of a simulated pan-tilt gimbal, as ROS 2 writes them: ``python examples/gimbal_log.py``.
 
-``gimbal_monday.mcap`` and ``gimbal_friday.mcap`` are the logs of ``docs/tutorial.md``.  The camera's centre of mass is off
-its axis, and its inertia about the pan axis depends on the tilt.  Encoders and drives have messages of their own, in
-degrees and milliamperes, with clocks of their own; of the encoders' samples 2 % are glitches, and 0.6 s are lost.  At
-times the drives are off, and somebody turns the camera by hand.  In both, the cable to the camera pulls the pan
-axis back, and gusts turn it; no equation of the tutorial's first model has either.
+``gimbal_monday.mcap`` and ``gimbal_friday.mcap`` are the logs of ``docs/tutorial.md``.  The camera's centre of mass is
+off its axis, and its inertia about the pan axis depends on the tilt.  Encoders and drives have messages of their own,
+in degrees and milliamperes, with clocks of their own; of the encoders' samples 2 % are glitches, and 0.6 s are lost.
+At times the drives are off, and somebody turns the camera by hand.  The cable to the camera pulls the pan axis back,
+and gusts turn it.
 """
 
 from __future__ import annotations

@@ -119,8 +119,8 @@ class Coverage:
                 if _STATES & set(_WORD.findall(label.lower())):
                     place = f"# topic = {json.dumps(topic)}\n" if topic else ""
                     return [
-                        "# Stretches that count, by a field of the log: with while, the rows of the others are left out.\n"
-                        f'# while = ["running"] # above the first [[signals]]\n# [[events]]\n# name = "running"\n{place}'
+                        "# Stretches that count, by a field of the log; with while, all others are left out.\n"
+                        f'# while = ["running"] # above [[signals]]\n# [[events]]\n# name = "running"\n{place}'
                         f"# where = {{ field = {json.dumps(label)}, equals = 1 }}\n"
                     ]
         return []

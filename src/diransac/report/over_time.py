@@ -74,7 +74,7 @@ def figures_of(log: Log, runs: Sequence[Run], n_logs: int) -> LogFigures:
         legend=tuple(_legend(runs, marking, log, timeline)),
         signals=tuple(_signal(name, runs, marking, log, timeline) for name in names),
         unmodelled_about=_unmodelled_about(diagnosed[0][2]) if diagnosed else "",
-        unmodelled=tuple(figure for i, run, found in diagnosed for figure in _unmodelled(run, found, i, timeline)),
+        unmodelled=tuple(figure for i, run, found in diagnosed for figure in _unmodelled(run, found, i, log, timeline)),
         inliers=_inliers(runs, timeline),
     )
 
@@ -292,13 +292,22 @@ def _unmodelled_about(found: Diagnosis) -> str:
     return f"{what}: zero where the model explains the motion. Each step is the mean over {window}."
 
 
-def _unmodelled(run: Run, found: Diagnosis, i: int, timeline: Timeline) -> list[Figure]:
+def _unmodelled(run: Run, found: Diagnosis, i: int, log: Log, timeline: Timeline) -> list[Figure]:
     """A figure of each unmodelled force, or of each acceleration if the model has no balance of forces."""
     series = found.unmodelled_forces or found.unmodelled_accelerations
-    return [_unmodelled_figure(run, name, values, found, i, timeline) for name, values in series.items()]
+    left_out = _left_out(run, log, timeline)
+    return [_unmodelled_figure(run, name, values, found, i, timeline, left_out) for name, values in series.items()]
 
 
-def _unmodelled_figure(run: Run, name: str, values: FloatArray, found: Diagnosis, i: int, timeline: Timeline) -> Figure:
+def _unmodelled_figure(
+    run: Run,
+    name: str,
+    values: FloatArray,
+    found: Diagnosis,
+    i: int,
+    timeline: Timeline,
+    left_out: BoolArray,
+) -> Figure:
     model = run.result.model
     unit = _FORCES.get(model.units[name], "") if found.unmodelled_forces else model.units[name]
     coordinate = model.rate_names[list(model.accelerations).index(name)]
@@ -311,7 +320,7 @@ def _unmodelled_figure(run: Run, name: str, values: FloatArray, found: Diagnosis
     scale = padded(min(-least, float(values.min())), max(least, float(values.max())))
     trace = Trace(what, f"m{i}", "line", *_steps(found, values, timeline))
     label = f"Unmodelled {what}{f' in {unit}' if unit else ''}"
-    plot = time_plot([trace], scale, timeline, label, levels=(0.0,))
+    plot = time_plot([trace], scale, timeline, label, levels=(0.0,), left_out=left_out)
     return Figure(
         what, unit, (f"RMS {number(rms, 2)} {unit}".strip() + f", {relative}",), (Panel(plot),), time_axis(timeline)
     )

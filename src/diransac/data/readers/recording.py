@@ -99,7 +99,7 @@ def find_field(path: str, fields: Mapping[str, Iterable[str]], source: str) -> t
 
 
 def shortened(fields: Iterable[str]) -> list[str]:
-    """Names of fields for a listing: ``covariance[0..8]`` and ``velocity.{x, y, z}`` in one, those of a header left out.
+    """Names of fields for a listing: ``covariance[0..8]`` and ``rate.{x, y, z}`` in one, those of a header left out.
 
     Notes
     -----
