@@ -31,7 +31,7 @@ TRUTH = {
 CABLE = 0.02  # N m/rad
 STEP = 0.0005
 LIMIT = 2.0  # A
-DRIVES_HZ, ENCODERS_HZ, IMU_HZ = 200, 100, 100
+DRIVES_HZ, ENCODERS_HZ, IMU_HZ = 100, 50, 100
 START = 1_790_000_000_000_000_000  # ns
 OFF, TRACKING = 0, 3
 
@@ -127,7 +127,7 @@ def record(motion: Motion, off: list[tuple[float, float]], seed: int, path: Path
         found.append((stamp + round(1e9 * delay), topic, kind, bytes(data)))
 
     lost = 0.55 * motion.time[-1]
-    for k in rows(ENCODERS_HZ, 0.0015):
+    for k in rows(ENCODERS_HZ, 0.0025):
         t = motion.time[k]
         if not lost < t < lost + 0.6:
             degrees = np.round((np.degrees(motion.angles[k]) + rng.normal(0.0, 0.02, 2)) / 0.022) * 0.022
@@ -168,7 +168,7 @@ def definition(kind: str) -> str:
 
 def main() -> None:
     """Write both recordings into the working directory."""
-    for day, seconds, off, seed in (("monday", 12.5, [(0.0, 1.5), (4.0, 4.8)], 1), ("friday", 9.0, [(0.0, 1.5)], 2)):
+    for day, seconds, off, seed in (("monday", 16.0, [(0.0, 1.5), (4.0, 4.8)], 1), ("friday", 12.0, [(0.0, 1.5)], 2)):
         path = Path(f"gimbal_{day}.mcap")
         record(simulated(seconds, off, seed), off, seed, path)
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")

@@ -222,13 +222,10 @@ def _not_held(log: Log) -> list[tuple[float, float, str]]:
 def _left_out_text(log: Log, run: Run, timeline: Timeline) -> list[str]:
     """A sentence about the stretches that are left out, with their reasons; none where nothing is."""
     found = _not_held(log)
-    reached = np.zeros(timeline.n_rows, bool)
-    for start, stop, _ in found:
-        reached |= (log.time >= start - log.dt) & (log.time <= stop + log.dt)
-    gaps = _left_out(run, log, timeline) & ~reached
-    found += [
-        (float(log.time[x.start]), float(log.time[x.stop - 1]), "samples are missing") for x in segment.runs(gaps)
-    ]
+    for gap in segment.runs(_left_out(run, log, timeline)):
+        start, stop = float(log.time[gap.start]), float(log.time[gap.stop - 1])
+        if not any(a <= stop and start <= b for a, b, _ in found):
+            found.append((start, stop, "samples are missing"))
     if not found:
         return []
     listed = [f"{number(a, 4)} to {number(b, 4)} s ({why})" for a, b, why in sorted(found)[:_STRETCHES]]
