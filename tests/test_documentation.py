@@ -28,7 +28,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED = REPOSITORY.parent / "shared"
 PAGES = [page for page in (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))) if page.is_file()]
 NOT_RUN = {"cd", "git", "make", "pip"}
-NEEDS = {"robots.md": "mujoco", "logs.md": "mcap"}
+NEEDS = {"robots.md": "mujoco", "logs.md": "mcap", "tutorial.md": "mcap"}
 """Package without which a page is not run."""
 LANGUAGES = {"", "python", "console", "text", "toml", "json", "yaml", "csv", "mermaid"}
 

@@ -106,7 +106,10 @@ WRONG = {
         "give its order",
     ),
     "where": (f"{ENTRY}where = 3", "where must be a table"),
-    "where without limit": (f'{ENTRY}where = {{ field = "b" }}', "where needs a field, and above or below"),
+    "where without limit": (
+        f'{ENTRY}where = {{ field = "b" }}',
+        "where needs a field, and above, below or both, or equals",
+    ),
     "time": (f'time = "noon"\n{ENTRY}', 'time is \'noon\'; write "header", "message"'),
     "time without column": (f"time = {{ scale = 2 }}\n{ENTRY}", "time needs a column"),
     "shift": (f"shift = 3\n{ENTRY}", "shift must be a table"),
@@ -139,7 +142,7 @@ def test_a_placeholder_stands_for_the_joints_of_a_topic_and_is_refused_without_o
 class TwoTopics:
     """A recording whose fields are constant."""
 
-    source, fields, elements, metadata, notes = "log", {"a": ("y", "f"), "b": ("x", "z")}, {}, {}, ()
+    source, fields, elements, texts, metadata, notes = "log", {"a": ("y", "f"), "b": ("x", "z")}, {}, {}, {}, ()
 
     def read(self, wanted, stamps):
         """Samples, the same by either clock."""

@@ -19,14 +19,17 @@ components, or of the four of a quaternion whose ``order`` in the file is given.
 
 ::
 
+    while = ["airborne"]              # above the signals: rows where it does not hold are left out
+
     [[events]]
     name = "airborne"                 # a signal that is 1 where the conditions held last, else 0
     topic = "vehicle_land_detected"
-    where = { field = "landed", below = 0.5 }
+    where = { field = "landed", below = 0.5 } # above, below, or equals: a number or a text
 """
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,6 +46,8 @@ if TYPE_CHECKING:
 
 __all__ = ["BUILT_IN", "Condition", "Event", "LogMapping", "MappedSignals", "held", "load_mapping"]
 
+TextArray = np.ndarray[Any, np.dtype[np.object_]]
+
 _HALF = math.sqrt(0.5)
 _AXES: dict[str, FloatArray] = {
     **dict.fromkeys(("ned-to-enu", "enu-to-ned"), np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])),
@@ -53,7 +58,7 @@ _ATTITUDES = ("ned-frd-to-enu-flu", "enu-flu-to-ned-frd")
 _ORDERS = ("wxyz", "xyzw")
 
 _KEYS = {"name", "topic", "field", "unit", "scale", "sign", "offset", "frame", "order", "optional", "where"}
-_STEPS = {"resample", "repair", "from", "until", "despike", "shift", "differentiate", "bandwidth"}
+_STEPS = {"resample", "repair", "from", "until", "while", "despike", "shift", "differentiate", "bandwidth"}
 _TOP = {"description", "time", "signals", "events", *_STEPS}
 _ANY = "{joint}"
 _FOLDER = Path(__file__).parent / "mappings"
@@ -64,15 +69,26 @@ BUILT_IN = ("px4-multirotor", "crazyflie", "ros-joint-states", "ros-odometry-imu
 
 @dataclass(frozen=True)
 class Condition:
-    """Samples count where a field of the same topic is above, below, or both; others are missing."""
+    """Samples count where a field of the same topic is above, below, both, or equal; others are missing."""
 
     field: str
     above: float = -math.inf
     below: float = math.inf
+    equals: float | str | None = None
 
-    def holds(self, values: FloatArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Flags (n,); False for NaN."""
+    def holds(self, values: FloatArray | TextArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Flags (n,); False for NaN, and for texts where numbers are compared, or the reverse."""
+        if (values.dtype == np.object_) != isinstance(self.equals, str):
+            return np.zeros(len(values), np.bool_)
+        if self.equals is not None:
+            return np.asarray(values == self.equals, np.bool_)
         return np.asarray((values > self.above) & (values < self.below))
+
+    def __str__(self) -> str:
+        if self.equals is not None:
+            return json.dumps(self.equals) if isinstance(self.equals, str) else f"{self.equals:g}"
+        limits = [f"above {self.above:g}"] if self.above > -math.inf else []
+        return " and ".join([*limits, *([f"below {self.below:g}"] if self.below < math.inf else [])])
 
 
 @dataclass(frozen=True)
@@ -113,7 +129,7 @@ class MappedSignals:
         """Fields that must be read."""
         return tuple(dict.fromkeys((*self.fields, *(x.field for x in self.where))))
 
-    def apply(self, columns: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    def apply(self, columns: Mapping[str, Any]) -> dict[str, FloatArray]:
         """Signals (n,) of the columns of the topic."""
         rows = [columns[name] for name in self.fields]
         if self.factors or self.offsets:
@@ -128,13 +144,11 @@ class MappedSignals:
             rows = [np.where(valid, x, np.nan) for x in rows]
         return dict(zip(self.names, rows, strict=True))
 
-    def invalid(self, columns: Mapping[str, FloatArray]) -> str:
+    def invalid(self, columns: Mapping[str, Any]) -> str:
         """Reason why no sample of the topic counts; empty where one does."""
         for x in self.where:
             if not x.holds(columns[x.field]).any():
-                limits = [f"above {x.above:g}"] if x.above > -math.inf else []
-                limits += [f"below {x.below:g}"] if x.below < math.inf else []
-                return f"has no valid sample: {x.field} is never {' and '.join(limits)}"
+                return f"has no valid sample: {x.field} is never {x}"
         return ""
 
     def known_units(self) -> dict[str, str]:
@@ -164,7 +178,7 @@ class Event:
         """Fields that must be read."""
         return tuple(dict.fromkeys(x.field for x in self.where))
 
-    def flags(self, columns: Mapping[str, FloatArray]) -> FloatArray:
+    def flags(self, columns: Mapping[str, Any]) -> FloatArray:
         """1 for each sample (n,) of the topic at which it holds, else 0."""
         holds = np.logical_and.reduce([x.holds(columns[x.field]) for x in self.where])
         return np.asarray(holds, np.float64)
@@ -211,7 +225,7 @@ class LogMapping:
     time_column : str, optional
         Column of the time of a table, times ``time_scale`` in seconds.
     preparation : mapping
-        ``resample``, ``repair``, ``from``, ``until``, ``despike``, ``shift``, which `read_log` does, and
+        ``resample``, ``repair``, ``from``, ``until``, ``while``, ``despike``, ``shift``, which `read_log` does, and
         ``differentiate``, ``bandwidth``, which the command line does.
     """
 
@@ -415,6 +429,8 @@ def _check_preparation(steps: Mapping[str, Any], source: str) -> None:
         _number(delay, f"shift of {name}", source)
     if "despike" in steps and steps["despike"] != "all":
         _strings(steps["despike"], "despike", source)
+    if "while" in steps:
+        _strings(steps["while"], "while", source)
     if "repair" in steps and not isinstance(steps["repair"], bool):
         _strings(steps["repair"], "repair", source)
 
@@ -495,12 +511,17 @@ def _conditions(tables: Any, source: str) -> tuple[Condition, ...]:
         raise LogError(f'{source}: where must be a table: where = {{ field = "xy_valid", above = 0.5 }}')
     conditions = []
     for table in tables:
-        _check_keys(table, {"field", "above", "below"}, f"{source}: where")
-        name = _string(table, "field", f"{source}: where")
-        if name is None or not {"above", "below"} & set(table):
-            raise LogError(f"{source}: where needs a field, and above or below")
+        _check_keys(table, {"field", "above", "below", "equals"}, f"{source}: where")
+        name, given = _string(table, "field", f"{source}: where"), {"above", "below", "equals"} & set(table)
+        if name is None or not given or ("equals" in given and len(given) > 1):
+            raise LogError(f"{source}: where needs a field, and above, below or both, or equals")
         limits = {key: _number(table[key], key, f"{source}: where") for key in ("above", "below") if key in table}
-        conditions.append(Condition(name, **limits))
+        equals = table.get("equals")
+        if isinstance(equals, bool):
+            equals = float(equals)
+        if equals is not None and not (isinstance(equals, str) and equals):
+            equals = _number(equals, "equals", f"{source}: where")
+        conditions.append(Condition(name, **limits, equals=equals))
     return tuple(conditions)
 
 

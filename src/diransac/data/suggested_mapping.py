@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from diransac.data.mapping import BUILT_IN, LogMapping, MappedSignals, load_mapping
+from diransac.data.readers.recording import shortened
 from diransac.data.units import conversion
 from diransac.errors import LogError
 
@@ -19,6 +20,10 @@ if TYPE_CHECKING:
 __all__ = ["Coverage", "suggest_mapping"]
 
 _LEAST, _LISTED, _MOST_LISTED = 0.5, 3, 60
+_STATES = frozenset(
+    {"mode", "state", "status", "armed", "airborne", "landed", "flying", "enabled", "contact", "battery"}
+)
+"""Words of fields that may say when a stretch of a log counts."""
 _WORD = re.compile(r"[a-z]+|\d+")
 _ALIKE = {
     **dict.fromkeys(("pos", "position", "q", "angle", "pose"), "position"),
@@ -54,8 +59,8 @@ class Coverage:
         Built-in mapping that serves most of the signals.
     clock : str
         Line of the mapping file about the time.
-    unused : tuple of str
-        Fields that serve no signal, as ``topic.field``.
+    unused : mapping of str to tuple of str
+        Topic -> its fields that serve no signal.
     """
 
     model: str
@@ -66,7 +71,7 @@ class Coverage:
     units: Mapping[str, str]
     built_in: str | None = None
     clock: str = ""
-    unused: tuple[str, ...] = ()
+    unused: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON."""
@@ -90,20 +95,44 @@ class Coverage:
         start += "# Check topics, units, signs and frames: value = sign * scale * field + offset.\n"
         start += self.clock
         start += '# resample = "median" # or a rate in Hz; without it the rows are those of the fastest topic\n'
+        derived = ", ".join(self.derivable)
+        start += f"differentiate = true # derives {derived}\n" if derived else ""
         parts = [start]
         parts += [_toml(entry, self.units) for entry in dict.fromkeys(self.entries.values())]
-        parts += [f"# {name}: derived from {source} with --differentiate\n" for name, source in self.derivable.items()]
         for name, near in self.missing.items():
             listed = f"; the nearest names are {', '.join(near)}" if near else ""
             unit = self.units.get(name, "?")
             parts.append(
                 f"# No field was found for {name} [{unit}]{listed}.\n"
-                f"# [[signals]]\n# name = {json.dumps(name)}\n# topic = \n# field = \n# unit = {json.dumps(unit)}\n"
+                f'# [[signals]]\n# name = {json.dumps(name)}\n# topic = ""\n# field = ""\n# unit = {json.dumps(unit)}\n'
             )
-        if self.missing and self.unused:
-            more = f" and {len(self.unused) - _MOST_LISTED} more" if len(self.unused) > _MOST_LISTED else ""
-            parts.append(f"# Other fields: {', '.join(self.unused[:_MOST_LISTED])}{more}\n")
-        return "\n".join(parts)
+        parts += self._event()
+        if self.missing:
+            rest = {topic: shortened(labels) for topic, labels in self.unused.items()}
+            parts.append("".join(f"# Other fields{_of(t)}: {_some(labels)}\n" for t, labels in rest.items() if labels))
+        return "\n".join(part for part in parts if part)
+
+    def _event(self) -> list[str]:
+        """A commented event of the first field whose name is that of a state; none where there is no such field."""
+        for topic, labels in self.unused.items():
+            for label in labels:
+                if _STATES & set(_WORD.findall(label.lower())):
+                    place = f"# topic = {json.dumps(topic)}\n" if topic else ""
+                    return [
+                        "# Stretches that count, by a field of the log; with while, all others are left out.\n"
+                        f'# while = ["running"] # above [[signals]]\n# [[events]]\n# name = "running"\n{place}'
+                        f"# where = {{ field = {json.dumps(label)}, equals = 1 }}\n"
+                    ]
+        return []
+
+
+def _of(topic: str) -> str:
+    return f" of {topic}" if topic else ""
+
+
+def _some(labels: Sequence[str]) -> str:
+    more = f" and {len(labels) - _MOST_LISTED} more" if len(labels) > _MOST_LISTED else ""
+    return ", ".join(labels[:_MOST_LISTED]) + more
 
 
 def suggest_mapping(
@@ -143,19 +172,14 @@ def suggest_mapping(
         if name in entries:
             continue
         parent = next((chain[chain.index(name) - 1] for chain in model.chains if name in chain[1:]), None)
-        if parent is not None and (parent in entries or parent in derivable):
+        if parent is not None and (parent in entries or parent in derivable or parent in missing):
             derivable[name] = parent
         elif name not in model.accelerations:
             near = [x for x in _nearest(name, fields) if x[0] > 0.0][:_LISTED]
             missing[name] = tuple(f"{topic}.{label}" if topic else label for _, (topic, label) in near)
     ordered = {name: entries[name] for name in needed if name in entries}
     used = {(entry.topic, label) for entry in ordered.values() for label in entry.fields}
-    unused = tuple(
-        f"{topic}.{label}" if topic else label
-        for topic, labels in fields.items()
-        for label in labels
-        if (topic, label) not in used
-    )
+    unused = {topic: tuple(label for label in labels if (topic, label) not in used) for topic, labels in fields.items()}
     return Coverage(model.name, source, ordered, derivable, missing, model.units, built_in, _clock(fields), unused)
 
 

@@ -20,7 +20,7 @@ from diransac.identification.identifiability import Ambiguity, in_words, of_log,
 from diransac.identification.refusal import check_motion
 from diransac.identification.settings import Settings
 from diransac.identification.uncertainty import jackknife_covariance
-from diransac.text_table import aligned
+from diransac.text_table import aligned, percent
 
 if TYPE_CHECKING:
     from diransac.data.log import Log
@@ -134,6 +134,8 @@ class Inspection:
         Findings on reading, a sentence each.
     fitness : Fitness, optional
         Suitability for a model; None where no model was given.
+    events : mapping of str to float
+        Part of the rows in which each event of the mapping holds.
     """
 
     source: str
@@ -143,6 +145,7 @@ class Inspection:
     signals: Mapping[str, SignalFacts]
     notes: tuple[str, ...]
     fitness: Fitness | None = None
+    events: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     @property
     def duration(self) -> float:
@@ -162,7 +165,8 @@ class Inspection:
         head = f"{self.source}: {self.n_rows} rows at {1.0 / self.dt:.6g} Hz, {self.start:.6g} to {end:.6g} s"
         rows = [["signal", "unit", "minimum", "maximum", "std", "Hz", "NaN", "spikes", "frozen s"]]
         rows += [[name, *_cells(facts)] for name, facts in self.signals.items()]
-        return "\n".join([head, *aligned(rows), *(f"  {note}" for note in self.notes), *self._fitness_lines()])
+        held = [f"  event {n}: holds in {percent(x)} of the rows" for n, x in self.events.items()]
+        return "\n".join([head, *aligned(rows), *held, *(f"  {note}" for note in self.notes), *self._fitness_lines()])
 
     def _fitness_lines(self) -> list[str]:
         found = self.fitness
@@ -171,7 +175,7 @@ class Inspection:
         lines = ["", f"for {found.model}:"]
         rest = [name for name in found.missing if name not in found.derivable]
         lines += [f"  missing: {', '.join(rest)}; name columns with --map, or see diransac map"] if rest else []
-        lines += [f"  missing, --differentiate supplies: {', '.join(found.derivable)}"] if found.derivable else []
+        lines += [f"  derived with --differentiate: {', '.join(found.derivable)}"] if found.derivable else []
         lines += [f"  {found.reason}"] if found.reason else []
         if found.excitation:
             rows = [("parameter", "least squares", "unit", "error", "determined")]
@@ -195,11 +199,18 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
     Inspection
     """
     continuous = preprocessing.unwrap(log) if model is None else preprocessing.continuous(log, model)
-    signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names}
+    events = {name: float(np.mean(log[name] == 1.0)) for name in _events(log)}
+    signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names if name not in events}
     fitness = None if model is None else _fitness(log, model)
     if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
         fitness = dataclasses.replace(fitness, caveat=_caveat(signals, model))
-    return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, log.notes, fitness)
+    return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, log.notes, fitness, events)
+
+
+def _events(log: Log) -> list[str]:
+    """Signals of the log that are events of its mapping."""
+    named = [name for step in log.history if step.get("step") == "map" for name in step.get("events", ())]
+    return [name for name in named if name in log]
 
 
 # ---------------------------------------------------------------------- signals

@@ -3,7 +3,8 @@
 The motion of a log is smoothed first without the equations of motion, as lo-diransac begins.  It gives the noise of
 each signal, its outliers, and a first state of each window.  The state is then the one whose simulation over the
 samples about the start agrees best with them: robust nonlinear least squares, with Geman and McClure's weights, by
-Gauss-Newton steps.  Of a model that explains a log without noise, it is exact.
+Gauss-Newton steps, which are shortened where they do not descend.  Of a model that explains a log without noise, it is
+exact.
 
 References
 ----------
@@ -33,7 +34,8 @@ _OUTLIER = 6.0
 """Distance of an outlier from the smoothed motion, in standard deviations of the noise."""
 _SMALLEST_NOISE = 1e-3
 """Noise below which a distance from the smoothed motion is an error of that, over the spread of the signal."""
-_STEPS, _CONVERGED = 12, 1e-12
+_STEPS, _CONVERGED, _SHORTEST_STEP = 20, 1e-12, 0.05
+"""Gauss-Newton steps, relative decrease of the loss below which it has converged, and the shortest part of a step."""
 _DIFFERENCE = 1e-6
 """Step of finite differences, over the spread of a state."""
 _SOFT = 3.0
@@ -179,7 +181,7 @@ class _Fit:
 
     def solved(self, states: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """States ``(K, n_x)``, their covariances ``(K, n_x, n_x)``, and the residuals' scale ``(n_s,)``."""
-        errors = self._errors(states[:, None])[:, 0]
+        errors, part = self._errors(states[:, None])[:, 0], np.ones(len(states))
         for step in range(_STEPS + 1):
             scale = np.maximum(least, self._scale(errors))
             jacobian = self._jacobian(states, errors)
@@ -192,13 +194,14 @@ class _Fit:
             scaled = G / d[:, :, None] / d[:, None, :] + _DAMPING * np.eye(G.shape[1])
             if step == _STEPS:
                 break
-            moved = states - np.linalg.solve(scaled, (g / d)[:, :, None])[:, :, 0] / d
+            moved = states - part[:, None] * np.linalg.solve(scaled, (g / d)[:, :, None])[:, :, 0] / d
             tried = self._errors(moved[:, None])[:, 0]
             old, new = self._loss(errors, scale), self._loss(tried, scale)
             better = new < old * (1.0 - _CONVERGED)
             states = np.where(better[:, None], moved, states)
             errors = np.where(better[:, None, None], tried, errors)
-            if not better.any():
+            part = np.where(better, np.minimum(2.0 * part, 1.0), 0.3 * part)  # friction bends the loss within a step
+            if part.max() < _SHORTEST_STEP:
                 break
         inverse = np.linalg.pinv(scaled, rcond=1e-10, hermitian=True)
         return states, inverse / d[:, :, None] / d[:, None, :], scale

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data import segment
 from diransac.data.log import Log
 from diransac.identification.estimate import Diagnosis
 from diransac.identification.prediction import bulk_range
@@ -24,6 +25,7 @@ _BEYOND_REFERENCE = 2.0
 _VISIBLE = 0.01
 _MOST = 0.5
 _NOISE = 3.0
+_STRETCHES = 6
 _FORCES = {"m/s^2": "N", "rad/s^2": "N m"}
 
 
@@ -68,11 +70,11 @@ def figures_of(log: Log, runs: Sequence[Run], n_logs: int) -> LogFigures:
     return LogFigures(
         name=runs[0].log_name,
         size=f"{number(log.dt * (len(log) - 1))} s at {number(1.0 / log.dt)} Hz, {plural(len(log), 'row')}",
-        method=_method(runs),
-        legend=tuple(_legend(runs, marking)),
-        signals=tuple(_signal(name, runs, marking, timeline) for name in names),
+        method=" ".join([_method(runs), *_left_out_text(log, marking, timeline)]),
+        legend=tuple(_legend(runs, marking, log, timeline)),
+        signals=tuple(_signal(name, runs, marking, log, timeline) for name in names),
         unmodelled_about=_unmodelled_about(diagnosed[0][2]) if diagnosed else "",
-        unmodelled=tuple(figure for i, run, found in diagnosed for figure in _unmodelled(run, found, i, timeline)),
+        unmodelled=tuple(figure for i, run, found in diagnosed for figure in _unmodelled(run, found, i, log, timeline)),
         inliers=_inliers(runs, timeline),
     )
 
@@ -98,7 +100,7 @@ def _method(runs: Sequence[Run]) -> str:
     return f"{text} The faint line is one simulation of the whole log{agreeing}."
 
 
-def _legend(runs: Sequence[Run], marking: Run) -> list[tuple[str, str]]:
+def _legend(runs: Sequence[Run], marking: Run, log: Log, timeline: Timeline) -> list[tuple[str, str]]:
     keys = [("measured", "measured")]
     if marking.screened:
         of = f" of {marking.label}" if len(runs) > 1 else ""
@@ -110,7 +112,7 @@ def _legend(runs: Sequence[Run], marking: Run) -> list[tuple[str, str]]:
     keys += [(f"m{i}", f"simulated, {run.label}") for i, run in enumerate(runs)]
     if _shows_both(runs):
         keys.append(("long", "whole-log simulation"))
-    return [*keys, ("band", "left out")] if any(run.observations.gaps.any() for run in runs) else keys
+    return [*keys, ("band", "left out")] if any(_left_out(run, log, timeline).any() for run in runs) else keys
 
 
 def _shows_both(runs: Sequence[Run]) -> bool:
@@ -118,7 +120,7 @@ def _shows_both(runs: Sequence[Run]) -> bool:
     return len(runs) == 1 and bool(np.isfinite(runs[0].restart_period))
 
 
-def _signal(name: str, runs: Sequence[Run], marking: Run, timeline: Timeline) -> Figure:
+def _signal(name: str, runs: Sequence[Run], marking: Run, log: Log, timeline: Timeline) -> Figure:
     """Figure of one signal and its residuals."""
     having = [(i, run) for i, run in enumerate(runs) if name in run.observations.signals]
     shown = marking if name in marking.observations.signals else having[0][1]
@@ -131,7 +133,7 @@ def _signal(name: str, runs: Sequence[Run], marking: Run, timeline: Timeline) ->
     facts = [_median_error(name, run, unit, label=f"{run.label} " * (len(runs) > 1)) for _, run in having]
     beyond = _beyond(shown.observations.column(name), scale)
     about = f"{name} in {unit}, measured and simulated over {number(timeline.dt * (timeline.n_rows - 1))} s"
-    left_out = _left_out(shown, timeline)
+    left_out = _left_out(shown, log, timeline)
     plot = time_plot(traces, scale, timeline, about, full=beyond and beyond[:2], left_out=left_out)
     return Figure(
         title=name,
@@ -195,11 +197,40 @@ def _beyond_text(beyond: tuple[float, float, int] | None) -> str:
     return f"{plural(n_beyond, 'sample')} outside of this range, from {number(low)} to {number(high)}"
 
 
-def _left_out(run: Run, timeline: Timeline) -> BoolArray:
-    """Rows of the log ``(n_rows,)`` in gaps, which no simulation covers."""
+# ---------------------------------------------------------------------- stretches that are left out
+
+
+def _left_out(run: Run, log: Log, timeline: Timeline) -> BoolArray:
+    """Rows of the log ``(n_rows,)`` in gaps, which no simulation covers, and where an event does not hold."""
     rows = np.zeros(timeline.n_rows, bool)
     rows[run.rows] = run.observations.gaps
+    for start, stop, _ in _not_held(log):
+        rows |= (log.time >= start) & (log.time <= stop)
     return rows
+
+
+def _not_held(log: Log) -> list[tuple[float, float, str]]:
+    """Start and end, s, of the stretches in which an event does not hold, and the reason."""
+    return [
+        (start, stop, f"not {' and '.join(step['events'])}")
+        for step in log.history
+        if step.get("step") == "keep_while"
+        for start, stop in step["left_out"]
+    ]
+
+
+def _left_out_text(log: Log, run: Run, timeline: Timeline) -> list[str]:
+    """A sentence about the stretches that are left out, with their reasons; none where nothing is."""
+    found = _not_held(log)
+    for gap in segment.runs(_left_out(run, log, timeline)):
+        start, stop = float(log.time[gap.start]), float(log.time[gap.stop - 1])
+        if not any(a <= stop and start <= b for a, b, _ in found):
+            found.append((start, stop, "samples are missing"))
+    if not found:
+        return []
+    listed = [f"{number(a, 4)} to {number(b, 4)} s ({why})" for a, b, why in sorted(found)[:_STRETCHES]]
+    more = f" and {len(found) - _STRETCHES} more" if len(found) > _STRETCHES else ""
+    return [f"Left out: {', '.join(listed)}{more}."]
 
 
 # ---------------------------------------------------------------------- residuals
@@ -259,13 +290,22 @@ def _unmodelled_about(found: Diagnosis) -> str:
     return f"{text} Dashed: what the suggested terms explain of it." if found.suggested_terms else text
 
 
-def _unmodelled(run: Run, found: Diagnosis, i: int, timeline: Timeline) -> list[Figure]:
+def _unmodelled(run: Run, found: Diagnosis, i: int, log: Log, timeline: Timeline) -> list[Figure]:
     """A figure of each unmodelled force, or of each acceleration if the model has no balance of forces."""
     series = found.unmodelled_forces or found.unmodelled_accelerations
-    return [_unmodelled_figure(run, name, values, found, i, timeline) for name, values in series.items()]
+    left_out = _left_out(run, log, timeline)
+    return [_unmodelled_figure(run, name, values, found, i, timeline, left_out) for name, values in series.items()]
 
 
-def _unmodelled_figure(run: Run, name: str, values: FloatArray, found: Diagnosis, i: int, timeline: Timeline) -> Figure:
+def _unmodelled_figure(
+    run: Run,
+    name: str,
+    values: FloatArray,
+    found: Diagnosis,
+    i: int,
+    timeline: Timeline,
+    left_out: BoolArray,
+) -> Figure:
     model = run.result.model
     unit = _FORCES.get(model.units[name], "") if found.unmodelled_forces else model.units[name]
     coordinate = model.rate_names[list(model.accelerations).index(name)]
@@ -281,7 +321,7 @@ def _unmodelled_figure(run: Run, name: str, values: FloatArray, found: Diagnosis
         explained = _steps(found, found.suggested_terms[name], timeline)
         traces.append(Trace("suggested terms", "suggested", "line", *explained))
     label = f"Unmodelled {what}{f' in {unit}' if unit else ''}"
-    plot = time_plot(traces, scale, timeline, label, levels=(0.0,))
+    plot = time_plot(traces, scale, timeline, label, levels=(0.0,), left_out=left_out)
     return Figure(
         what, unit, (f"RMS {number(rms, 2)} {unit}".strip() + f", {relative}",), (Panel(plot),), time_axis(timeline)
     )

@@ -176,6 +176,9 @@ def _prepared(log: Log, mapping: LogMapping) -> Log:
     start, stop = mapping.option("from"), mapping.option("until")
     if start is not None or stop is not None:
         log = log.between(-math.inf if start is None else start, math.inf if stop is None else stop)
+    events = mapping.option("while")
+    if events is not None:
+        log = preprocessing.keep_while(log, [events] if isinstance(events, str) else events)
     despiked = mapping.option("despike")
     if despiked is not None:
         names = [despiked] if isinstance(despiked, str) else despiked

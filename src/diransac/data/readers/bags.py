@@ -12,6 +12,7 @@ import dataclasses
 import json
 import re
 import struct
+import sys
 from array import array
 from dataclasses import dataclass, field
 from functools import partial
@@ -33,6 +34,7 @@ _LARGEST_CHUNK, _MAGIC_SIZE = 1 << 29, 8
 _MOST_FIELDS, _MOST_ELEMENTS = 2000, 64
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\]]*)\]")
 _OTHER_CLOCK, _LATEST = 3600 * 10**9, 1 << 62
+_NUMBERS = (bool, int, float, np.number, np.bool_)
 
 
 class Raw(NamedTuple):
@@ -59,13 +61,16 @@ class BagRecording:
         self.metadata: dict[str, Any] = {}
         self._file = file
         self.elements: dict[str, tuple[str, ...]] = {}
+        self.texts: dict[str, tuple[str, ...]] = {}
         self._fields: dict[str, tuple[str, ...]] = {}
         self._origin: int | None = None
         for raw in file.messages(None):
             self._origin = raw.time if self._origin is None else min(raw.time, self._origin)
             if raw.topic not in self._fields:
                 message = _decoded(raw, source)
-                self._fields[raw.topic] = _field_names(message)
+                self._fields[raw.topic] = _field_names(message, _NUMBERS)
+                if texts := _field_names(message, (str,)):
+                    self.texts[raw.topic] = texts
                 names = _member(message, "name")
                 if isinstance(names, (list, np.ndarray)):
                     self.elements[raw.topic] = tuple(str(name) for name in names[:_MOST_ELEMENTS])
@@ -120,12 +125,13 @@ class BagRecording:
 
     def _samples(self, topic: str, found: _Columns, origin: int) -> Samples:
         for label, values in found.values.items():
-            if label in found.missing and np.isnan(np.frombuffer(values)).all():
+            if label in found.missing and label not in found.texts and np.isnan(np.frombuffer(values)).all():
                 known = ", ".join(self._fields[topic])
                 raise LogError(f'{self.source}: topic "{topic}" has no field "{label}"; it has {known}')
         times = np.frombuffer(found.stamps if found.is_stamped else found.times, dtype=np.int64)
         columns = {label: np.frombuffer(x, dtype=np.float64) for label, x in found.values.items()}
-        return Samples(seconds_since(origin, times), columns, dict.fromkeys(found.texts, "is not numeric"))
+        texts = {label: np.array(x, dtype=np.object_) for label, x in found.texts.items()}
+        return Samples(seconds_since(origin, times), columns, dict.fromkeys(texts, "is not numeric"), texts)
 
 
 @dataclass
@@ -137,7 +143,7 @@ class _Columns:
     times: array[int] = field(default_factory=lambda: array("q"))
     stamps: array[int] = field(default_factory=lambda: array("q"))
     missing: set[str] = field(default_factory=set)
-    texts: set[str] = field(default_factory=set)
+    texts: dict[str, list[str]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, fields: Sequence[str]) -> _Columns:
@@ -160,12 +166,14 @@ class _Columns:
             number = np.nan
             if value is None:
                 self.missing.add(label)
-            elif isinstance(value, (bool, int, float, np.number, np.bool_)):
+            elif isinstance(value, _NUMBERS):
                 number = float(value)
             else:
                 self.missing.add(label)
-                self.texts.add(label)
+                self.texts.setdefault(label, [""] * len(self.values[label]))
             self.values[label].append(number)
+            if label in self.texts:
+                self.texts[label].append(sys.intern(value) if isinstance(value, str) else "")
 
 
 def _decoded(raw: Raw, source: str) -> Any:
@@ -223,26 +231,26 @@ def _stamp(message: Any) -> int:
     return nanoseconds if abs(nanoseconds) < 1 << 62 else 0
 
 
-def _field_names(message: Any) -> tuple[str, ...]:
-    """Dotted names of the numbers in a message, in its order; long arrays are cut."""
+def _field_names(message: Any, kinds: tuple[type, ...]) -> tuple[str, ...]:
+    """Dotted names of the values of some types in a message, in its order; long arrays are cut."""
     names: list[str] = []
-    _collect(message, "", names, 0)
+    _collect(message, "", names, kinds, 0)
     return tuple(names[:_MOST_FIELDS])
 
 
-def _collect(value: Any, prefix: str, names: list[str], depth: int) -> None:
+def _collect(value: Any, prefix: str, names: list[str], kinds: tuple[type, ...], depth: int) -> None:
     if len(names) >= _MOST_FIELDS or depth > 12:
         return
-    if isinstance(value, (bool, int, float, np.number, np.bool_)):
+    if isinstance(value, kinds):
         names.append(prefix)
     elif isinstance(value, (list, np.ndarray)):
         for k, element in enumerate(value[:_MOST_ELEMENTS]):
-            _collect(element, f"{prefix}[{k}]", names, depth + 1)
-    else:
+            _collect(element, f"{prefix}[{k}]", names, kinds, depth + 1)
+    elif not isinstance(value, (str, bytes)):
         members = value if isinstance(value, dict) else getattr(value, "__dict__", {})
         for name, member in members.items():
-            if not name.startswith("_") and not isinstance(member, (str, bytes)):
-                _collect(member, f"{prefix}.{name}" if prefix else name, names, depth + 1)
+            if not name.startswith("_"):
+                _collect(member, f"{prefix}.{name}" if prefix else name, names, kinds, depth + 1)
 
 
 # ---------------------------------------------------------------------- MCAP

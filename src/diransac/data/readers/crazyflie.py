@@ -39,6 +39,7 @@ class CrazyflieRecording:
         self.source = source
         self.metadata: dict[str, Any] = {}
         self.elements: dict[str, tuple[str, ...]] = {}
+        self.texts: dict[str, tuple[str, ...]] = {}
         self._notes: list[str] = []
         try:
             version, number = struct.unpack_from("<HH", data, 1)

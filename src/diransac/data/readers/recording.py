@@ -16,7 +16,7 @@ from diransac.errors import LogError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-__all__ = ["Aligned", "Recording", "Samples", "Stamps", "align", "find_field", "seconds_since"]
+__all__ = ["Aligned", "Recording", "Samples", "Stamps", "align", "find_field", "seconds_since", "shortened"]
 
 Stamps = str
 """``"header"``: time at which a message says it was sampled; ``"message"``: time at which it was recorded."""
@@ -36,11 +36,14 @@ class Samples:
         Samples of each field that was asked for; NaN where a message lacks it.
     unusable : mapping of str to str
         Fields that hold no numbers, and why.
+    texts : mapping of str to (n,) array of str
+        Samples of those that hold texts; empty where a message lacks it.
     """
 
     time: FloatArray
     columns: Mapping[str, FloatArray]
     unusable: Mapping[str, str] = field(default_factory=dict)
+    texts: Mapping[str, npt.NDArray[np.object_]] = field(default_factory=dict)
 
     @property
     def interval(self) -> float:
@@ -61,6 +64,8 @@ class Recording(Protocol):
     """Facts beside the samples, that JSON can hold: the machine, its parameters, messages in words."""
     elements: dict[str, tuple[str, ...]]
     """Names of the elements of arrays, such as joints, of the topics that have some."""
+    texts: dict[str, tuple[str, ...]]
+    """Names of the fields that hold texts, such as a mode, of the topics that have some."""
 
     @property
     def fields(self) -> Mapping[str, tuple[str, ...]]:
@@ -91,6 +96,42 @@ def find_field(path: str, fields: Mapping[str, Iterable[str]], source: str) -> t
     if len(fields) == 1:
         return next(iter(fields)), path
     raise LogError(f'{source}: "{path}" names no topic; found {_some(fields)}. Name it as topic.field')
+
+
+def shortened(fields: Iterable[str]) -> list[str]:
+    """Names of fields for a listing: ``covariance[0..8]`` and ``rate.{x, y, z}`` in one, those of a header left out.
+
+    Notes
+    -----
+    Fields that stand side by side are put together; the order is kept.
+    """
+    found: list[tuple[str, str, list[str]]] = []
+    for name in fields:
+        if name.startswith("header."):
+            continue
+        whole, kind, part = _last_part(name)
+        if found and found[-1][:2] == (whole, kind) and kind:
+            found[-1][2].append(part)
+        else:
+            found.append((whole, kind, [part]))
+    return [_together(*one) for one in found]
+
+
+def _last_part(name: str) -> tuple[str, str, str]:
+    """Name without its last index or member, ``[`` or ``.``, and that; the name itself where it has neither."""
+    if name.endswith("]"):
+        whole, _, index = name[:-1].rpartition("[")
+        return whole, "[", index
+    whole, point, member = name.rpartition(".")
+    return (whole, point, member) if point else (name, "", "")
+
+
+def _together(whole: str, kind: str, parts: list[str]) -> str:
+    if not kind:
+        return whole
+    if kind == "[":
+        return f"{whole}[{parts[0]}..{parts[-1]}]" if len(parts) > 1 else f"{whole}[{parts[0]}]"
+    return f"{whole}.{{{', '.join(parts)}}}" if len(parts) > 1 else f"{whole}.{parts[0]}"
 
 
 def _some(names: Iterable[str], most: int = 40) -> str:

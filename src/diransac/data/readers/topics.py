@@ -10,7 +10,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.mapping import LogMapping, MappedSignals, held
-from diransac.data.readers.recording import Recording, Samples, align, find_field
+from diransac.data.readers.recording import Recording, Samples, align, find_field, shortened
 from diransac.data.readers.table import Table
 from diransac.errors import LogError
 from diransac.text_table import aligned
@@ -86,7 +86,7 @@ def table_of_topics(
     Raises LogError: neither is given; a topic or field is missing; ``rename`` has a part of a vector; as `align`.
     """
     source, fields = recording.source, recording.fields
-    entries, notes = ([], []) if mapping is None else mapping.chosen(fields, recording.elements, source)
+    entries, notes = ([], []) if mapping is None else mapping.chosen(_with_texts(recording), recording.elements, source)
     entries = [x for x in entries if not set(x.names) <= set(rename)]
     for name, path in rename.items():
         if name == "t":
@@ -133,12 +133,16 @@ _KEPT = ("sys_name", "ver_hw", "ver_sw", "ver_sw_branch", "sys_uuid")
 def _flags(recording: Recording, mapping: LogMapping, rows: FloatArray) -> dict[str, FloatArray]:
     """Flags (N,) of the events of a mapping at the rows of a log, without those whose topic has no message."""
     found = {}
-    for event in mapping.events_in(recording.fields):
+    for event in mapping.events_in(_with_texts(recording)):
         with suppress(LogError):
             samples = recording.read({event.topic: event.needs}, mapping.time)[event.topic]
-            if not samples.unusable:
-                found[event.name] = held(samples.time, event.flags(samples.columns), rows)
+            found[event.name] = held(samples.time, event.flags({**samples.columns, **samples.texts}), rows)
     return found
+
+
+def _with_texts(recording: Recording) -> dict[str, tuple[str, ...]]:
+    """Fields of each topic, those that hold texts included."""
+    return {topic: (*fields, *recording.texts.get(topic, ())) for topic, fields in recording.fields.items()}
 
 
 def _signals_of(
@@ -149,12 +153,13 @@ def _signals_of(
     unusable: dict[str, str] = {}
     for entry in entries:
         if entry.topic == topic:
-            for label in entry.needs:
+            for label in entry.fields:
                 if label in samples.unusable:
                     raise LogError(f'{source}: field "{label}" of topic "{topic}" {samples.unusable[label]}')
-            why = entry.invalid(samples.columns)
+            columns = {**samples.columns, **samples.texts}
+            why = entry.invalid(columns)
             unusable |= dict.fromkeys(entry.names, why) if why else {}
-            signals |= {} if why else entry.apply(samples.columns)
+            signals |= {} if why else entry.apply(columns)
     return repairs.ordered(Samples(samples.time, signals, unusable), topic)
 
 
@@ -194,6 +199,8 @@ class TopicFacts:
     n_gaps, longest_gap : int, float
         Intervals of more than three and a half median ones, and the longest interval, s.
     fields : tuple of str
+    texts : tuple of str
+        Fields that hold texts.
     """
 
     n_messages: int
@@ -203,6 +210,7 @@ class TopicFacts:
     n_gaps: int
     longest_gap: float
     fields: tuple[str, ...]
+    texts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -240,7 +248,8 @@ class TopicTable:
         rows = [["topic", "messages", "Hz", "from s", "to s", "gaps", "longest s", "fields"]]
         for name, x in self.topics.items():
             gaps = [str(x.n_gaps or "-"), f"{x.longest_gap:.3g}" if x.n_gaps else "-"]
-            shown = ", ".join(x.fields[:_FIELDS_SHOWN]) + (", ..." if len(x.fields) > _FIELDS_SHOWN else "")
+            listed = [*shortened(x.fields), *(f"{name} (text)" for name in shortened(x.texts))]
+            shown = ", ".join(listed[:_FIELDS_SHOWN]) + (", ..." if len(listed) > _FIELDS_SHOWN else "")
             rate = f"{x.rate:.4g}" if np.isfinite(x.rate) else "-"
             rows.append([name, str(x.n_messages), rate, f"{x.start:.6g}", f"{x.end:.6g}", *gaps, shown])
         machine = self.metadata.get("information", {})
@@ -257,7 +266,9 @@ def list_topics(recording: Recording) -> TopicTable:
     """Topics of a recording, with their rates and gaps."""
     fields = recording.fields
     read = recording.read(dict.fromkeys(fields, ()), "message")
-    topics = {name: _facts(read[name].time, fields[name]) for name in fields}
+    topics = {
+        name: replace(_facts(read[name].time, fields[name]), texts=recording.texts.get(name, ())) for name in fields
+    }
     return TopicTable(recording.source, topics, recording.notes, recording.metadata, recording.elements)
 
 

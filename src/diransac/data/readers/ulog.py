@@ -73,6 +73,7 @@ class UlogRecording:
         self.source = source
         self.metadata: dict[str, Any] = {"information": {}, "parameters": {}, "messages": [], "dropouts": []}
         self.elements: dict[str, tuple[str, ...]] = {}
+        self.texts: dict[str, tuple[str, ...]] = {}
         self._notes: list[str] = []
         self._formats: dict[str, str] = {}
         self._subscriptions: dict[int, _Topic] = {}
