@@ -396,9 +396,7 @@ class _Step:
         discrepancies = _left(basis, _rows(means.discrepancies, scale))
         beside = _slopes(_rows(columns, scale), np.hstack([-force, whole]))[:m]
         inertia = means.inertia + means.inertia_slopes @ beside[:, 0]
-        return cls(
-            means, scale, _left(basis, force)[:, 0], terms, discrepancies, inertia, beside[:, 1:], independent
-        )
+        return cls(means, scale, _left(basis, force)[:, 0], terms, discrepancies, inertia, beside[:, 1:], independent)
 
     def _by_equation(self, rows: FloatArray) -> FloatArray:
         """Rows (n e, ...) as (n, e, ...)."""
