@@ -127,7 +127,8 @@ def test_events_of_a_table_are_listed_apart_by_inspect_until_they_leave_out_rows
     event = '[[events]]\nname = "airborne"\nwhere = { field = "landed", equals = false }\n'
     log = dr.read_log(path, mapping=written(tmp_path, f'[[signals]]\nname = "x"\nfield = "a"\n{event}'))
     found = inspect(log)
-    assert list(found.signals) == ["x"] and found.events == {"airborne": pytest.approx(on.mean())}
+    assert list(found.signals) == ["x"]
+    assert found.events == {"airborne": pytest.approx(on.mean())}
     assert "event airborne: holds in 50 % of the rows" in str(found)
     kept = dr.read_log(
         path, mapping=written(tmp_path, f'while = "airborne"\n[[signals]]\nname = "x"\nfield = "a"\n{event}')
@@ -205,7 +206,8 @@ def test_a_suggestion_lists_what_is_missing_with_the_nearest_names(tmp_path):
 def test_a_suggestion_is_completed_by_filling_in_and_uncommenting(tmp_path):
     path = csv(tmp_path, t=T, enc=Q, drive_counts=TAU, mode=T > 1.0)
     found = suggest_mapping(*read_fields(path), dr.models.servo_axis(), "log")
-    assert set(found.missing) == {"position", "force"} and set(found.derivable) == {"position_dot", "position_ddot"}
+    assert set(found.missing) == {"position", "force"}
+    assert set(found.derivable) == {"position_dot", "position_ddot"}
     text = found.toml()
     for name, field in (("position", "enc"), ("force", "drive_counts")):
         block = f'# [[signals]]\n# name = "{name}"\n# topic = ""\n# field = ""\n'
