@@ -349,7 +349,7 @@ def test_windows_on_an_axis_that_rests_begin_where_it_rests():
     noisy = dr.Log.from_arrays(t, {"x": x + rng.normal(0.0, 1e-3, len(t)), "force": force})
     dataset = Dataset.of(model, [noisy], pointwise=False)
     loop = OpenLoop(dataset, 0, truth, Resolution(substeps=20), "smoothed")
-    rows, far = np.arange(60, 740, 20), [*loop.filled_states(), 0.0, 2.0]
+    rows, far = np.arange(60, 740, 20), loop.filled_states() + np.array([0.0, 2.0])
     found = window_starts(
         loop.simulation, loop.parameters, far, loop.smoothed, loop.segment.measured, loop.stretches[0], rows
     )
