@@ -17,6 +17,7 @@ from diransac.data.readers.repair import REPAIRS, Repairs
 from diransac.data.readers.topics import table_of_topics
 from diransac.data.suggested_mapping import suggest_mapping
 from diransac.errors import LogError, SettingsError
+from diransac.identification.inspection import inspect
 
 T = np.arange(300) / 100.0
 RNG = np.random.default_rng(8)
@@ -120,6 +121,22 @@ WRONG = {
 }
 
 
+def test_events_of_a_table_are_listed_apart_by_inspect_until_they_leave_out_rows(tmp_path):
+    on = (T > 1.0) & (T < 2.5)
+    path = csv(tmp_path, t=T, a=Q, landed=~on)
+    event = '[[events]]\nname = "airborne"\nwhere = { field = "landed", equals = false }\n'
+    log = dr.read_log(path, mapping=written(tmp_path, f'[[signals]]\nname = "x"\nfield = "a"\n{event}'))
+    found = inspect(log)
+    assert list(found.signals) == ["x"]
+    assert found.events == {"airborne": pytest.approx(on.mean())}
+    assert "event airborne: holds in 50 % of the rows" in str(found)
+    kept = dr.read_log(
+        path, mapping=written(tmp_path, f'while = "airborne"\n[[signals]]\nname = "x"\nfield = "a"\n{event}')
+    )
+    np.testing.assert_array_equal(kept["x"], Q[on])
+    assert kept.history[-1]["events"] == ["airborne"]
+
+
 @pytest.mark.parametrize("case", WRONG)
 def test_a_wrong_mapping_is_refused_with_one_sentence(tmp_path, case):
     text, said = WRONG[case]
@@ -184,6 +201,23 @@ def test_a_suggestion_lists_what_is_missing_with_the_nearest_names(tmp_path):
     assert found.missing == {"force": ("force_gauge_raw_counts",)}
     assert found.derivable == {"position_dot": "position", "position_ddot": "position_dot"}
     assert '# name = "force"' in found.toml()
+
+
+def test_a_suggestion_is_completed_by_filling_in_and_uncommenting(tmp_path):
+    path = csv(tmp_path, t=T, enc=Q, drive_counts=TAU, mode=T > 1.0)
+    found = suggest_mapping(*read_fields(path), dr.models.servo_axis(), "log")
+    assert set(found.missing) == {"position", "force"}
+    assert set(found.derivable) == {"position_dot", "position_ddot"}
+    text = found.toml()
+    for name, field in (("position", "enc"), ("force", "drive_counts")):
+        block = f'# [[signals]]\n# name = "{name}"\n# topic = ""\n# field = ""\n'
+        assert block in text
+        text = text.replace(block, f'[[signals]]\nname = "{name}"\nfield = "{field}"\n')
+    event = text[text.index("# [[events]]") : text.index("# Other fields")]
+    text = text.replace(event, event.replace("# ", "")).replace("# while", "while").replace(" # above [[signals]]", "")
+    moved = next(line for line in text.splitlines() if line.startswith("while"))
+    log = dr.read_log(path, mapping=written(tmp_path, f"{moved}\n" + text.replace(moved, "")))
+    np.testing.assert_array_equal(log["position"], Q[T > 1.0])
 
 
 # ---------------------------------------------------------------------- repairs

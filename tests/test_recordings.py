@@ -1,5 +1,6 @@
 """Recordings of several topics, written here as their own tools write them: the same arrays as from CSV, to the bit."""
 
+import json
 import random
 from pathlib import Path
 
@@ -10,8 +11,9 @@ import pytest
 import diransac as dr
 from diransac.data.readers import read_topics
 from diransac.data.readers.crazyflie import CrazyflieRecording
+from diransac.data.readers.recording import shortened
 from diransac.errors import LogError
-from recordings import EFFORT, T, Ulog, V, X, flight, write_bag, write_mcap
+from recordings import EFFORT, T, Ulog, V, X, flight, nanoseconds, write_bag, write_mcap
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -82,6 +84,38 @@ def test_rows_on_the_ground_are_left_out_by_the_logs_own_topic(tmp_path):
     assert kept.history[-1]["left_out"][1] == pytest.approx([T[20], T[29]])
     with pytest.raises(LogError, match="armed"):
         dr.keep_while(log, ["armed"])
+
+
+EVENTS = """
+while = ["auto"]
+
+[[signals]]
+name = "{signal}"
+topic = "{topic}"
+field = "{field}"
+
+[[events]]
+name = "auto"
+topic = "{state}"
+where = [{{ field = "mode", equals = {mode} }}, {{ field = "volts", above = 11.5 }}]
+"""
+
+
+def test_a_mode_and_a_charged_battery_of_a_ulog_are_an_event_and_the_mapping_leaves_out_the_rest(tmp_path):
+    data, enu, _ = flight()
+    file = Ulog()
+    file.data = data
+    file.format("state", "uint64_t timestamp;float volts;uint8_t mode;uint8_t[3] _padding0;")
+    file.subscribe(9, "state")
+    for k, volts, mode in ((0, 12.0, 2), (10, 12.0, 3), (90, 12.0, 4), (100, 12.0, 3), (150, 11.0, 3)):
+        file.record(9, "fB", T[k] - 1e-4, volts, mode)
+    (tmp_path / "flight.ulg").write_bytes(file.data)
+    place = {"signal": "wx", "topic": "vehicle_angular_velocity", "field": "xyz[0]", "state": "state", "mode": 3}
+    (tmp_path / "map.toml").write_text(EVENTS.format(**place))
+    log = dr.read_log(tmp_path / "flight.ulg", mapping=tmp_path / "map.toml")
+    kept = np.isin(np.arange(10, 150), [*range(10, 90), *range(100, 150)])
+    np.testing.assert_array_equal(log["wx"], np.where(kept, enu["wx"][10:150], np.nan))
+    assert any("not auto" in note and "0.9 to 0.99 s" in note for note in log.notes)
 
 
 def test_a_slow_topic_has_its_samples_where_they_are_valid_and_nothing_between(ulog):
@@ -181,6 +215,49 @@ def test_a_ulog_is_read_on_behind_a_damage(ulog, tmp_path):
 
 
 # ---------------------------------------------------------------------- MCAP and bags
+
+
+def write_state_mcap(path):
+    """A position at 100 Hz, and at times a mode in words with the voltage of the battery."""
+    writer_of = pytest.importorskip("mcap.writer", reason="NOT CHECKED: mcap is missing")
+    with path.open("wb") as file:
+        writer = writer_of.Writer(file)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        encoder, state = (writer.register_channel(x, "json", schema) for x in ("/encoder", "/state"))
+        told = {0: ("MANUAL", 12.0), 10: ("AUTO", 12.0), 90: ("MANUAL", 12.0), 100: ("AUTO", 12.0), 150: ("AUTO", 11.0)}
+        for k in range(len(T)):
+            writer.add_message(encoder, nanoseconds(k), json.dumps({"x": X[k]}).encode(), nanoseconds(k))
+            if k in told:
+                text = json.dumps({"mode": told[k][0], "volts": told[k][1]}).encode()
+                writer.add_message(state, nanoseconds(k) - 1000, text, nanoseconds(k) - 1000)
+        writer.finish()
+    return path
+
+
+def test_a_mode_in_words_and_a_charged_battery_of_an_mcap_are_an_event(tmp_path):
+    path = write_state_mcap(tmp_path / "a.mcap")
+    place = {"signal": "x", "topic": "/encoder", "field": "x", "state": "/state", "mode": '"AUTO"'}
+    (tmp_path / "map.toml").write_text(EVENTS.format(**place))
+    log = dr.read_log(path, mapping=tmp_path / "map.toml")
+    kept = np.isin(np.arange(10, 150), [*range(10, 90), *range(100, 150)])
+    np.testing.assert_array_equal(log["x"], np.where(kept, X[10:150], np.nan))
+    assert "mode (text)" in str(read_topics(path))
+    (tmp_path / "map.toml").write_text(EVENTS.format(**place | {"mode": 3}))  # a number is no text
+    with pytest.raises(LogError, match="no stretch of it is auto"):
+        dr.read_log(path, mapping=tmp_path / "map.toml")
+
+
+def test_a_text_is_no_signal(tmp_path):
+    path = write_state_mcap(tmp_path / "a.mcap")
+    (tmp_path / "map.toml").write_text('[[signals]]\nname = "m"\ntopic = "/state"\nfield = "mode"\n')
+    with pytest.raises(LogError, match='field "mode" of topic "/state" is not numeric'):
+        dr.read_log(path, mapping=tmp_path / "map.toml")
+
+
+def test_a_listing_puts_arrays_and_vectors_together_and_leaves_out_headers():
+    fields = ["header.stamp.sec", "q.x", "q.y", "c[0]", "c[1]", "c[2]", "c[0].a", "mode"]
+    assert shortened(fields) == ["q.{x, y}", "c[0..2]", "c[0].a", "mode"]
 
 
 @pytest.mark.parametrize("version", [1, "SQLITE3", "MCAP"])

@@ -275,6 +275,20 @@ def test_rows_with_missing_samples_are_counted(model, log, tmp_path):
     assert Page(written(found, holed, tmp_path)).all("path", "bar uncounted")
 
 
+def test_stretches_that_are_left_out_are_bands_with_their_reasons(model, log, tmp_path):
+    n = len(log)
+    rows = np.arange(n)
+    held = with_signals(log, diving=np.where((rows < 20) | ((rows > n // 2) & (rows < n // 2 + 40)), 0.0, 1.0))
+    kept = dr.keep_while(held, ["diving"])
+    text = written(dr.identify(model, kept, "ols"), kept, tmp_path)
+    (ends, middle) = kept.history[-1]["left_out"]
+    assert middle[0] == pytest.approx(held.time[n // 2 + 1])
+    assert f"Left out: {ends[0]:.4g} to {ends[1]:.4g} s (not diving), {middle[0]:.4g} to {middle[1]:.4g} s" in text
+    assert 'class="band"' in text
+    assert "left out" in text
+    assert "Left out" not in written(dr.identify(model, log, "ols"), log, tmp_path)
+
+
 def test_a_log_of_positions_is_differentiated_as_the_results_was(model, log):
     bare = dr.Log.from_arrays(log.time, {"x": log["x"], "thrust": log["thrust"]}, source="bare")
     found = dr.identify(model, bare, "ols", differentiate=True)

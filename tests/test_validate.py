@@ -2,6 +2,7 @@
 
 import json
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -10,7 +11,9 @@ from diransac.data.dataset import Dataset
 from diransac.data.input_timing import InputTiming
 from diransac.errors import LogError, SettingsError
 from diransac.identification.estimate import Resolution
+from diransac.identification.horizons import OpenLoop
 from diransac.identification.inverse_dynamics import force_errors
+from diransac.identification.window_starts import window_starts
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight, rollout
 
@@ -396,3 +399,32 @@ def test_a_log_in_which_nothing_moves_says_so():
     still = dr.Log.from_arrays(0.01 * np.arange(500), {n: np.zeros(500) for n in ("x", "x_dot", "u")})
     found = dr.validate(dr.Plant(SENSED, {"m": 2.0, "d": 1.0, "scale": 1.0}), still)
     assert found.findings[0].startswith("No state moves")
+
+
+def test_windows_on_an_axis_that_rests_begin_where_it_rests():
+    """Friction bends the loss of an initial state within one Gauss-Newton step, which must then be shortened."""
+    model = dr.Model(
+        name="slider",
+        coordinates={"x": "m"},
+        inputs={"force": "N"},
+        parameters={"mass": dr.Parameter("kg"), "dry": dr.Parameter("N")},
+        equations=lambda q, v, a, u, p: [p.mass * a.x + p.dry * ca.tanh(v.x / 0.01) - u.force],
+    )
+    truth = {"mass": 1.0, "dry": 2.0}
+    rng, t = np.random.default_rng(4), np.arange(0.0, 8.0, 0.01)
+    force = 3.0 * np.where(np.sin(2.4 * t) > 0.6, 1.0, np.where(np.sin(2.4 * t) < -0.6, -1.0, 0.0))
+    x, v = np.zeros((2, len(t)))
+    for k in range(len(t) - 1):
+        x[k + 1], v[k + 1] = x[k], v[k]
+        for _ in range(50):
+            v[k + 1] += 2e-4 * (force[k] - truth["dry"] * np.tanh(v[k + 1] / 0.01)) / truth["mass"]
+            x[k + 1] += 2e-4 * v[k + 1]
+    noisy = dr.Log.from_arrays(t, {"x": x + rng.normal(0.0, 1e-3, len(t)), "force": force})
+    dataset = Dataset.of(model, [noisy], pointwise=False)
+    loop = OpenLoop(dataset, 0, truth, Resolution(substeps=20), "smoothed")
+    rows, far = np.arange(60, 740, 20), loop.filled_states() + np.array([0.0, 2.0])
+    found = window_starts(
+        loop.simulation, loop.parameters, far, loop.smoothed, loop.segment.measured, loop.stretches[0], rows
+    )
+    np.testing.assert_allclose(found.states[:, 0], x[rows], atol=0.02)
+    np.testing.assert_allclose(found.states[:, 1], v[rows], atol=0.02)

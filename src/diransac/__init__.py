@@ -25,7 +25,16 @@ from diransac.model.parts import independent_parts
 if TYPE_CHECKING:
     from diransac.data.filters import FilterSpecification
     from diransac.data.log import Log
-    from diransac.data.preprocessing import despike, differentiate, keep_while, rename, resample, scale, shift
+    from diransac.data.preprocessing import (
+        despike,
+        differentiate,
+        keep_while,
+        leave_out,
+        rename,
+        resample,
+        scale,
+        shift,
+    )
     from diransac.data.readers import read_log, read_topics
     from diransac.flight.closed_loop import fly, fly_batch, tracking_error
     from diransac.flight.corruption import CorruptedLog, corrupt
@@ -113,6 +122,7 @@ __all__ = [
     "identify",
     "independent_parts",
     "keep_while",
+    "leave_out",
     "models",
     "multisine",
     "plan",
@@ -140,7 +150,16 @@ __all__ = [
 _FOUND_IN = {
     "data.filters": ("FilterSpecification",),
     "data.log": ("Log",),
-    "data.preprocessing": ("despike", "differentiate", "keep_while", "rename", "resample", "scale", "shift"),
+    "data.preprocessing": (
+        "despike",
+        "differentiate",
+        "keep_while",
+        "leave_out",
+        "rename",
+        "resample",
+        "scale",
+        "shift",
+    ),
     "data.readers": ("read_log", "read_topics"),
     "flight.closed_loop": ("fly", "fly_batch", "tracking_error"),
     "flight.corruption": ("CorruptedLog", "corrupt"),

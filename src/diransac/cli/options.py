@@ -74,6 +74,18 @@ def _rate(text: str | None) -> str | float | None:
         raise typer.BadParameter(f"--resample: {text!r} is no rate; give a number in Hz, or median") from error
 
 
+def _stretches(text: str) -> list[tuple[float, float]]:
+    """Pairs of seconds of ``4.8:5.9,7:8``.  Raises typer.BadParameter: it is anything else."""
+    found = []
+    for part in text.split(","):
+        try:
+            start, stop = (float(x) for x in part.split(":"))
+        except ValueError as error:
+            raise typer.BadParameter(f"--leave-out: {part!r} is no stretch; give START:END in seconds") from error
+        found.append((start, stop))
+    return found
+
+
 def known_methods(text: str) -> list[str]:
     """Names of methods from ``"a, b"``.  Raises typer.BadParameter: a name is unknown, or there is none."""
     wanted = [known_method(name) for name in names(text)]
@@ -261,6 +273,10 @@ class Preparation:
         str | None,
         _option("--while", metavar="EVENT,...", help="Leave out rows where an event does not hold: airborne."),
     ] = None
+    left_out: Annotated[
+        str | None,
+        _option("--leave-out", metavar="S:S,...", help="Leave out stretches of time, from start to end: 4.8:5.9."),
+    ] = None
     despike: Annotated[
         str | None, _option("--despike", metavar="all|NAME,...", help="Signals to take spikes out of.")
     ] = None
@@ -292,6 +308,8 @@ class Preparation:
             log = log.between(-inf if self.start is None else self.start, inf if self.stop is None else self.stop)
         if self.events is not None:
             log = preprocessing.keep_while(log, names(self.events))
+        if self.left_out is not None:
+            log = preprocessing.leave_out(log, _stretches(self.left_out))
         if self.despike is not None:
             log = preprocessing.despike(log, None if self.despike == "all" else names(self.despike))
         return preprocessing.shift(log, delays) if delays else log

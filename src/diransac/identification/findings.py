@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from diransac.identification.departures import departures
 from diransac.identification.estimate import TIME_LIMIT, Finding, Level
 from diransac.text_table import number, percent, plural, share
 
@@ -25,6 +26,8 @@ _MOST, _HALF, _FEW = 0.7, 0.5, 0.01
 _BREAKDOWN = 2.0 / 3.0
 """Fraction of outliers beyond which the estimate of lo-diransac is arbitrary."""
 _UNCERTAIN = 0.5
+_LISTED = 3
+"""Stretches that a sentence names."""
 _CONTRADICTION = 3.0
 """Distance of an estimate from the mean of its prior, in standard deviations of that, which needs care."""
 _IMPOSSIBLE = 4.0
@@ -262,6 +265,7 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
             yield Finding(
                 "bad", f"{text}: check its sign and unit and the terms of the model, or leave the signal out."
             )
+    yield from _departures(result.logs, found)
     yield from _unexplained(result.logs)
     for suggestion in result.suggestions:
         yield Finding("care", f"The model seems to lack a term. {suggestion.text}.")
@@ -272,6 +276,24 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
         included = f"the estimate includes this {what}, as do its evaluation and validation"
         yield Finding("care", f"{late}{how}: {included}; other simulations of the model must include it, too.")
     yield from _unidentifiable(result, found)
+
+
+def _departures(logs: Sequence[LogSummary], found: Diagnosis) -> Iterator[Finding]:
+    """Stretches in which the model does not hold."""
+    for i, one in enumerate(logs):
+        known = {} if one.prediction is None else one.prediction.unexplained
+        stretches = departures(found, i, known)
+        if stretches:
+            listed = ", ".join(f"{number(x.start, 3)} to {number(x.stop, 3)} s" for x in stretches[:_LISTED])
+            more = f" and {len(stretches) - _LISTED} more" if len(stretches) > _LISTED else ""
+            option = ",".join(f"{x.start:.4g}:{x.stop:.4g}" for x in stretches)
+            ratio = number(max(x.ratio for x in stretches), 2)
+            yield Finding(
+                "care",
+                f"The model does not hold from {listed}{more}{_worst_of(one, logs)}: forces that it lacks are up to "
+                f"{ratio} times as large there as elsewhere, as on the ground, in the hand, at a stop or at a limit of "
+                f"the inputs. Leave it out, unless a term explains it: --leave-out={option}.",
+            )
 
 
 def _unexplained(logs: Sequence[LogSummary]) -> Iterator[Finding]:

@@ -210,11 +210,12 @@ def _left_out(run: Run, log: Log, timeline: Timeline) -> BoolArray:
 
 
 def _not_held(log: Log) -> list[tuple[float, float, str]]:
-    """Start and end, s, of the stretches in which an event does not hold, and the reason."""
+    """Start and end, s, and the reason, of the stretches that the preparation of the log has left out."""
+    why = {"keep_while": "not {}", "leave_out": "as asked"}
     return [
-        (start, stop, f"not {' and '.join(step['events'])}")
+        (start, stop, why[step["step"]].format(" and ".join(step.get("events", ()))))
         for step in log.history
-        if step.get("step") == "keep_while"
+        if step.get("step") in why
         for start, stop in step["left_out"]
     ]
 

@@ -12,7 +12,7 @@ from diransac.data.preprocessing.continuity import (
 )
 from diransac.data.preprocessing.differentiation import acting_inputs, differentiate, filter_rows
 from diransac.data.preprocessing.spikes import despike, hampel, running_deviation
-from diransac.data.preprocessing.steps import keep_while, rename, resample, scale, shift
+from diransac.data.preprocessing.steps import keep_while, leave_out, rename, resample, scale, shift
 
 __all__ = [
     "acting_inputs",
@@ -23,6 +23,7 @@ __all__ = [
     "filter_rows",
     "hampel",
     "keep_while",
+    "leave_out",
     "rename",
     "resample",
     "running_deviation",

@@ -23,6 +23,7 @@ __all__ = [
     "describe_resampling",
     "interpolate_at",
     "keep_while",
+    "leave_out",
     "origins_of",
     "rename",
     "rename_columns",
@@ -141,19 +142,54 @@ def keep_while(log: Log, events: Sequence[str]) -> Log:
     LogError
         The log has no such signal, or they hold together in fewer than 2 rows.
     """
-    kept = np.logical_and.reduce([log[name] == 1.0 for name in events])
-    rows, together = np.flatnonzero(kept), " and ".join(events)
-    if len(rows) < 2:
+    kept, together = np.logical_and.reduce([log[name] == 1.0 for name in events]), " and ".join(events)
+    if kept.sum() < 2:
         raise LogError(f"{log.source}: no stretch of it is {together}; leave that out, or look at the event's topic")
+    return _kept(log, kept, {"step": "keep_while", "events": list(events)}, f"not {together}", events)
+
+
+def leave_out(log: Log, stretches: Sequence[tuple[float, float]]) -> Log:
+    """Log without some stretches, such as those in which it is in the hand.
+
+    Parameters
+    ----------
+    log : Log
+    stretches : sequence of (float, float)
+        First and last time of each, s.  At the ends of the log they are cut; of those between, every sample is missing.
+
+    Returns
+    -------
+    Log
+
+    Raises
+    ------
+    LogError
+        Fewer than 2 rows are left.
+    SettingsError
+        A stretch does not end after its start.
+    """
+    kept = np.ones(len(log), bool)
+    for start, stop in stretches:
+        if not start < stop:
+            raise SettingsError(f"the stretch {start:g}:{stop:g} is to be left out; give START:END, s")
+        kept &= (log.time < start) | (log.time > stop)
+    if kept.sum() < 2:
+        raise LogError(f"{log.source}: of {len(log)} rows, all but {kept.sum()} are to be left out")
+    return _kept(log, kept, {"step": "leave_out"}, "as asked", ())
+
+
+def _kept(log: Log, kept: npt.NDArray[np.bool_], step: dict[str, Any], why: str, events: Sequence[str]) -> Log:
+    """Log of the rows ``kept`` (N,): the ends are cut, and between them samples of signals but events are missing."""
+    rows = np.flatnonzero(kept)
     part, inside = log[int(rows[0]) : int(rows[-1]) + 1], kept[rows[0] : rows[-1] + 1]
     signals = {n: x if n in events else np.where(inside, x, np.nan) for n, x in part.signals.items()}
     edges = np.flatnonzero(np.diff(np.r_[True, kept, True].astype(int)))
     stretches = [[float(log.time[a]), float(log.time[b - 1])] for a, b in edges.reshape(-1, 2)]
-    step = {"step": "keep_while", "events": list(events), "left_out": stretches}
+    step |= {"left_out": stretches}
     if not stretches:
         return log.with_step(step)
     said = ", ".join(f"{a:.4g} to {b:.4g} s" for a, b in stretches[:5]) + ", ..." * (len(stretches) > 5)
-    note = f"{int((~kept).sum())} of {len(kept)} rows are left out, not {together}: {said}"
+    note = f"{int((~kept).sum())} of {len(kept)} rows are left out, {why}: {said}"
     return part.with_step(step, notes=[note], signals=signals)
 
 
