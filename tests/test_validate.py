@@ -428,3 +428,18 @@ def test_windows_on_an_axis_that_rests_begin_where_it_rests():
     )
     np.testing.assert_allclose(found.states[:, 0], x[rows], atol=0.02)
     np.testing.assert_allclose(found.states[:, 1], v[rows], atol=0.02)
+
+
+@pytest.mark.parametrize(("noise", "verdict"), [(0.02, "usable"), (0.7, "usable with care")])
+def test_noise_of_a_signal_with_few_samples_is_not_that_of_a_motion_that_follows_them(noise, verdict):
+    """Positions once a second: noise of 0.7 m made outliers of 55 %, and the true model not to be relied on."""
+    plant = dr.Plant(builtin("underwater-vehicle"), dict(zip(VEHICLE.truth, (120.0, 20.0, 35.0, 3.0), strict=True)))
+    t = 0.01 * np.arange(6000)
+    inputs = {"thrust": 40.0 * np.sin(0.4 * t) + 25.0 * np.sin(1.3 * t)}
+    start = {"x": 0.0, "x_dot": 0.0}
+    exact = dr.simulate(plant, dr.Log.from_arrays(t, inputs), initial_state=start, substeps=2)["x"]
+    x = np.full(len(t), np.nan)
+    x[::100] = (exact + noise * np.random.default_rng(1).normal(size=len(t)))[::100]
+    found = dr.validate(plant, dr.Log.from_arrays(t, {**inputs, "x": x}))
+    assert found.verdict == verdict
+    assert found.outlier_fraction["x"] < 0.1

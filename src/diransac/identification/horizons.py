@@ -30,6 +30,8 @@ _CHANGE, _N_PROBES = 0.01, 4
 """Relative change of the parameters whose effect on a prediction is its sensitivity; number of its random signs."""
 _NOISE_WINDOWS = 40
 """Short simulations from which the noise of a log is taken."""
+_FITTED = 2.0
+"""Numbers that a short simulation fits to the samples of a signal."""
 _MOVES = 10.0
 """Error of trivial predictions, in standard deviations of the noise, from which on a signal moves."""
 
@@ -180,13 +182,16 @@ class OpenLoop:
     def _noise(self) -> FloatArray:
         """Noise ``(n_s,)``: the lesser of the samples' deviations from the smoothed motion, and from short simulations.
 
-        The one holds errors of the smoothed motion besides noise, the other those of the model.
+        The one holds errors of the smoothed motion besides noise, the other those of the model, less what the fit of
+        their starts takes of few samples.
         """
         assert self.smoothed is not None
         stretch = max(self.stretches, key=lambda x: x.stop - x.start)
         every = max(1, (stretch.stop - stretch.start) // _NOISE_WINDOWS)
         rows = np.arange(stretch.start, stretch.stop, every)
-        return np.minimum(self.smoothed.noise, self._estimated(stretch, rows).residual)
+        samples = self.smoothed.samples
+        freedom = np.where(samples > 2 * _FITTED, 1.0 - _FITTED / np.maximum(samples, 2 * _FITTED), np.nan)
+        return np.fmin(self.smoothed.noise, self._estimated(stretch, rows).residual / np.sqrt(freedom))
 
     def _estimated(self, stretch: slice, rows: IntArray) -> WindowStarts:
         """Estimated initial states of windows from some rows of a stretch."""

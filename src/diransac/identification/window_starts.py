@@ -8,7 +8,8 @@ exact.
 
 References
 ----------
-Geman, McClure 1987; Ljung 1999, "System identification", section 16.4 (initial states of a validation).
+Gasser, Sroka, Jennen-Steinmetz 1986 (noise by pseudo-residuals); Geman, McClure 1987; Ljung 1999, "System
+identification", section 16.4 (initial states of a validation).
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["SmoothedLog", "WindowStarts", "smoothed_log", "window_starts"]
 
+_DENSE, _NORMAL = 20.0, 1.4826
+"""Samples from which on smoothing leaves their noise; standard deviation over the median of absolute deviations."""
 _OUTLIER = 6.0
 """Distance of an outlier from the smoothed motion, in standard deviations of the noise."""
 _SMALLEST_NOISE = 1e-3
@@ -53,17 +56,21 @@ class SmoothedLog:
     signals : (N, n_signals) array
         All signals of the model; NaN where a state is unmeasured.
     noise : (n_s,) array
-        Robust standard deviation of each signal of the dataset about the motion, its unit.
+        Robust standard deviation of each signal of the dataset about the motion, its unit.  A motion that is smoothed
+        over few samples follows their noise: then about the line between neighbours, which adds its curvature.
     outliers : (N, n_s) bool array
         Samples of the dataset's signals that are far from the motion.
     half_width : int
         Samples to either side over which the motion is smoothed.
+    samples : (n_s,) array
+        Mean number of each signal's samples among these.
     """
 
     signals: FloatArray
     noise: FloatArray
     outliers: BoolArray
     half_width: int
+    samples: FloatArray
 
 
 def smoothed_log(dataset: Dataset) -> SmoothedLog | None:
@@ -84,10 +91,28 @@ def smoothed_log(dataset: Dataset) -> SmoothedLog | None:
     columns = [model.signals.index(n) for n in one.signals]
     distances = one.measured - signals[:, columns]
     known: BoolArray = np.isfinite(distances)
-    noise = np.nan_to_num(lower_scale(np.where(known, distances, 0.0), known))
+    samples = known.mean(axis=0) * min(2 * intervals.length + 1, len(one))
+    of_motion = lower_scale(np.where(known, distances, 0.0), known)
+    noise = np.where(samples < _DENSE, _of_pseudo_residuals(one.measured), np.nan_to_num(of_motion))
     least = _SMALLEST_NOISE * motion.spread[columns]
     outliers = known & (np.abs(np.where(known, distances, 0.0)) > _OUTLIER * np.maximum(noise, least))
-    return SmoothedLog(signals, noise, outliers, intervals.length)
+    return SmoothedLog(signals, noise, outliers, intervals.length, samples)
+
+
+def _of_pseudo_residuals(samples: FloatArray) -> FloatArray:
+    """Robust noise ``(n_s,)`` of samples about the line between their neighbours; of two, their own deviation."""
+    found = []
+    for y in samples.T:
+        rows = np.flatnonzero(np.isfinite(y))
+        if len(rows) < 3:
+            found.append(float(np.std(y[rows])) if len(rows) else 0.0)
+            continue
+        later = (rows[1:-1] - rows[:-2]) / (rows[2:] - rows[:-2])
+        known = y[rows]
+        residuals = known[1:-1] - (1.0 - later) * known[:-2] - later * known[2:]
+        scaled = residuals / np.sqrt(1.0 + np.square(later) + np.square(1.0 - later))
+        found.append(_NORMAL * float(np.median(np.abs(scaled))))
+    return np.array(found)
 
 
 @dataclass(frozen=True)

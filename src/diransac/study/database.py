@@ -10,13 +10,14 @@ import sqlite3
 import time
 import zipfile
 import zlib
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import closing, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from diransac.errors import StudyError
 
@@ -60,11 +61,35 @@ _DAMAGE = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, 
 """Errors of values that a store of diransac never holds."""
 
 
-class Database:
+class Database(ABC):
     """An open file; a context that closes it."""
+
+    MAKER: ClassVar[str]
+    """Command that makes such a file."""
 
     path: Path
     _connection: sqlite3.Connection
+
+    @classmethod
+    def existing(cls, path: str | Path) -> Self:
+        """An existing store, for reading alone.  Raises StudyError: there is none, or it is none of this kind."""
+        store = cls.__new__(cls)
+        store.path = Path(path)
+        if not store.path.is_file():
+            raise StudyError(f'store "{path}" does not exist; make one with {cls.MAKER} --store {path}')
+        roll_back(store.path)
+        store._connection = connected_to(store.path, "ro")
+        try:
+            with reported(store.path):
+                store.check()
+        except BaseException:
+            store._connection.close()
+            raise
+        return store
+
+    @abstractmethod
+    def check(self) -> None:
+        """Raises StudyError: the file is no store that this version reads."""
 
     def __enter__(self) -> Self:
         return self

@@ -308,5 +308,5 @@ def connected(address: str) -> Iterator[tuple[Executor, int]]:
             yield client.get_executor(), 2 * max(32, sum(client.nthreads().values()))
         except ClosedClientError as error:
             raise StudyError(
-                f"the scheduler at {address} was lost; finished rows are kept: start another, then run the study again"
+                f"the scheduler at {address} was lost; finished rows are kept: start another, then run again"
             ) from error

@@ -24,7 +24,7 @@ from functools import lru_cache
 from hashlib import sha256
 from inspect import signature
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -50,8 +50,6 @@ from diransac.study.database import (
     is_empty,
     kept_apart,
     quoted,
-    reported,
-    roll_back,
     transaction,
     word,
 )
@@ -330,6 +328,8 @@ class FleetStore(Database):
         The file is no store of a fleet, or has another configuration.
     """
 
+    MAKER = "diransac identify --each"
+
     def __init__(self, path: str | Path, model: Model, wanted: Mapping[str, Any]) -> None:
         self.path, values = Path(path), json_data(json.dumps(wanted))
         self._connection = connected_to(self.path, "rwc")
@@ -337,28 +337,21 @@ class FleetStore(Database):
             with transaction(self._connection, self.path):
                 if is_empty(self._connection):
                     _create(self._connection, model, wanted)
-                _check(self._connection, self.path)
+                self.check()
             self._compare(values)
         except BaseException:
             self._connection.close()
             raise
 
-    @classmethod
-    def existing(cls, path: str | Path) -> Self:
-        """An existing store, for reading alone.  Raises StudyError: there is none."""
-        store = cls.__new__(cls)
-        store.path = Path(path)
-        if not store.path.is_file():
-            raise StudyError(f'store "{path}" does not exist; make one with diransac identify --each --store {path}')
-        roll_back(store.path)
-        store._connection = connected_to(store.path, "ro")
-        try:
-            with reported(store.path):
-                _check(store._connection, store.path)
-        except BaseException:
-            store._connection.close()
-            raise
-        return store
+    def check(self) -> None:
+        """Raises StudyError: the file is no store of a fleet that this version reads."""
+        application = self._connection.execute("PRAGMA application_id").fetchone()[0]
+        if application != _APPLICATION:
+            raise StudyError(f'"{self.path}" is no store of a fleet; give one of {self.MAKER}, or a new one')
+        number = self._connection.execute("PRAGMA user_version").fetchone()[0]
+        if number != _FORMAT:
+            raise StudyError(f'store "{self.path}" has format {number}, this version reads {_FORMAT}; begin another')
+        check_plain(self._connection, self.path, _TABLES)
 
     @property
     def configuration(self) -> dict[str, Any]:
@@ -452,17 +445,6 @@ def _create(connection: sqlite3.Connection, model: Model, wanted: Mapping[str, A
 
 _ERROR, _ABOUT = "standard_error", ("model_name", "units")
 """Beginning of a column; keys of the configuration on which no row depends."""
-
-
-def _check(connection: sqlite3.Connection, path: Path) -> None:
-    """Raises StudyError: the file is no store of a fleet that this version reads."""
-    application = connection.execute("PRAGMA application_id").fetchone()[0]
-    if application != _APPLICATION:
-        raise StudyError(f'"{path}" is no store of a fleet; give one of diransac identify --each, or a new one')
-    number = connection.execute("PRAGMA user_version").fetchone()[0]
-    if number != _FORMAT:
-        raise StudyError(f'store "{path}" has format {number}, this version reads {_FORMAT}; begin another')
-    check_plain(connection, path, _TABLES)
 
 
 # Reading -------------------------------------------------------------------------------------------------------------

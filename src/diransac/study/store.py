@@ -22,7 +22,7 @@ import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from diransac.errors import StudyError
 from diransac.plain_data import json_data
@@ -37,8 +37,6 @@ from diransac.study.database import (
     is_empty,
     kept_apart,
     quoted,
-    reported,
-    roll_back,
     transaction,
     word,
 )
@@ -91,6 +89,8 @@ class Store(Database):
         The file is no store, or has another configuration; the message lists the keys that differ.
     """
 
+    MAKER = "diransac study run NAME"
+
     def __init__(self, path: str | Path, study: Study) -> None:
         self.path = Path(path)
         self._connection = connected_to(self.path, "rwc")
@@ -107,26 +107,13 @@ class Store(Database):
             self._connection.close()
             raise
 
-    @classmethod
-    def existing(cls, path: str | Path) -> Self:
-        """An existing store, for reading alone.  Raises StudyError: there is none."""
-        store = cls.__new__(cls)
-        store.path = Path(path)
-        if not store.path.is_file():
-            raise StudyError(f'store "{path}" does not exist; make one with diransac study run NAME --store {path}')
-        roll_back(store.path)
-        store._connection = connected_to(store.path, "ro")
-        try:
-            with reported(store.path):
-                number = _format(store._connection, store.path)
-                check_plain(store._connection, store.path, _TABLES)
-                if number != _FORMAT:
-                    store._connection = copied(store._connection)
-                    _upgrade(store._connection, store.path)
-        except BaseException:
-            store._connection.close()
-            raise
-        return store
+    def check(self) -> None:
+        """Raises StudyError: the file is no store that this version reads; one of an earlier format is upgraded."""
+        number = _format(self._connection, self.path)
+        check_plain(self._connection, self.path, _TABLES)
+        if number != _FORMAT:
+            self._connection = copied(self._connection)
+            _upgrade(self._connection, self.path)
 
     def finished(self, level: str, trials: Sequence[int]) -> set[tuple[str, int, str]]:
         """Level, trial and method of the rows of these trials that are present."""
