@@ -1,5 +1,6 @@
 """What the fuzzer has found, each as a test of its own."""
 
+import json
 import os
 import sqlite3
 import struct
@@ -18,6 +19,7 @@ from diransac.plain_data import json_data
 from diransac.study import load, status
 from diransac.study.store import Store
 from fuzzing import listing
+from rebuilt import built, log
 from studies import OWN, OWN_PLANT, TINY, tiny
 
 T = 0.05 * np.arange(40)
@@ -120,6 +122,32 @@ def test_a_damaged_store_of_the_first_format_is_refused(tmp_path):
         connection.commit()
     with pytest.raises(dr.StudyError, match="is damaged: JSONDecodeError"):
         status(path)
+
+
+@pytest.mark.parametrize(
+    ("covariance", "hold", "says"),
+    [
+        ([[1.0, 2.0], [2.0, 1.0]], "zero-order", "covariance: it is that of no distribution"),
+        ([[-1.0, 0.0], [0.0, 1.0]], "zero-order", "covariance: it is that of no distribution"),
+        ([[1.0, 0.5], [0.1, 1.0]], "zero-order", "covariance: it is that of no distribution"),
+        ([[1.0, 0.5], [0.5, 1.0]], "zero-/rder", "hold zero-/rder"),
+    ],
+)
+def test_a_covariance_or_a_hold_that_there_is_none_of_is_refused_on_loading(covariance, hold, says):
+    data = dr.identify(built(), log(), "ols").to_dict()
+    assert data["resolution"]["hold"] == "zero-order"
+    whole = np.diag([1.0, 1.0, 1.0])
+    whole[:2, :2] = covariance
+    changed = {**data, "covariance": whole.tolist(), "resolution": {**data["resolution"], "hold": hold}}
+    with pytest.raises(dr.ResultError, match=says):
+        dr.Result.from_dict(changed)
+
+
+def test_enormous_forces_of_a_diagnosis_are_shown():
+    result = dr.identify(built(), log())
+    data = json.loads(json.dumps(result.to_dict()))
+    data["diagnosis"]["unmodelled_accelerations"] = {"s_ddot": [1e200] * len(log())}
+    assert "inf" in str(dr.Result.from_dict(data))
 
 
 # Robots, plants and settings ------------------------------------------------------------------------------------------
