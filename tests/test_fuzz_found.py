@@ -74,6 +74,18 @@ def test_a_damaged_time_is_not_filled_with_millions_of_rows(tmp_path):
         dr.read_log(tmp_path / "a.npz", resample="median")
 
 
+@pytest.mark.parametrize("step", [1e-310, 5e-324, 1e-15])
+def test_a_time_that_stands_still_is_refused(tmp_path, step):
+    np.savez(tmp_path / "a.npz", t=step * np.arange(40), x=T)
+    with pytest.raises(dr.LogError, match="s apart, which no clock resolves; pass --scale"):
+        dr.read_log(tmp_path / "a.npz")
+
+
+def test_a_time_in_another_unit_is_scaled_before_it_is_checked(tmp_path):
+    np.savez(tmp_path / "a.npz", t=1e-15 * np.arange(40), x=T)
+    assert len(dr.read_log(tmp_path / "a.npz", scale={"t": 1e13})) == 40
+
+
 def test_spikes_of_enormous_signals_are_no_overflow():
     hampel(np.where(np.arange(40) % 3, 1.5e308, -1.5e308))
 
