@@ -34,9 +34,9 @@ _ROUNDING = 1e-6
 # Samples of a signal from which its rate is taken.
 _FEWEST_SAMPLES = 5
 
-# Seconds from row to row: the least that are accepted, likely ones, and the most that are accepted.  Clocks that explain
-# longer ones: their tick in seconds, and the number of ticks from row to row above which it is this clock rather than
-# the next.
+# Seconds from row to row: the least that are accepted, likely ones, and the most that are accepted.  Clocks that
+# explain longer ones: their tick in seconds, and the number of ticks from row to row above which it is this clock
+# rather than the next.
 _LEAST, _SHORTEST, _LONGEST, _ABSURD = 1e-12, 1e-7, 1.0, 1e3
 _CLOCKS = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("milliseconds", 1e-3, _LONGEST))
 
