@@ -6,7 +6,7 @@ BIN := .venv/bin
 PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
 ENVIRONMENT := .venv/.installed
 
-.PHONY: demo test quick lint bench docs coverage lock clean
+.PHONY: demo test quick fuzz lint bench docs coverage lock clean
 
 demo: $(ENVIRONMENT)  ## fly, identify, fly what was identified; writes out/demo/report.html and flight.png
 	$(BIN)/python examples/demo.py
@@ -16,6 +16,11 @@ test: lint docs  ## everything that must hold
 
 quick: $(ENVIRONMENT)  ## tests without the slow ones
 	$(BIN)/pytest -q $(PARALLEL) -m "not slow"
+
+# Others every time; FUZZ_EXAMPLES files of each kind.
+FUZZ_EXAMPLES ?= 200
+fuzz: $(ENVIRONMENT)  ## damaged files of every kind
+	FUZZ_EXAMPLES=$(FUZZ_EXAMPLES) $(BIN)/pytest -q -s tests/test_fuzz.py
 
 lint: $(ENVIRONMENT)
 	$(BIN)/ruff check .

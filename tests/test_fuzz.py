@@ -188,9 +188,9 @@ def result(changed, _: Path) -> Kind:
 
 def study_store(folder: Path) -> Kind:
     commands = (
-        command("study status a.db", share=10),
-        command("study export a.db --to csv -o out.csv", "out.csv", share=5),
-        command("study export a.db --to parquet -o out.parquet", "out.parquet", share=5),
+        command("study status a.db", share=20),
+        command("study export a.db --to csv -o out.csv", "out.csv", share=10),
+        command("study export a.db --to parquet -o out.parquet", "out.parquet", share=10),
         command("study plot a.db -o out.svg", "out.svg"),
         command("study plot a.db --paths --level 40 -o out.svg", "out.svg"),
         command("study report a.db -o out.html", "out.html"),
@@ -200,9 +200,9 @@ def study_store(folder: Path) -> Kind:
 
 def fleet_store(folder: Path) -> Kind:
     commands = (
-        command("fleet status a.db", share=8),
-        command("fleet show a.db", share=8),
-        command("fleet export a.db -o out.csv", "out.csv", share=5),
+        command("fleet status a.db", share=10),
+        command("fleet show a.db", share=10),
+        command("fleet export a.db -o out.csv", "out.csv", share=10),
         command("fleet plot a.db -o out.svg", "out.svg"),
         command("fleet report a.db -o out.html", "out.html"),
     )
@@ -236,28 +236,28 @@ def ros2(part: str, folder: Path) -> Kind:
 
 SEARCH = "--model underwater-vehicle --method i-diransac --time-limit 1"
 KINDS = {
-    "results": (60, lambda folder: result(changed_result, folder)),
-    "equations": (30, lambda folder: result(changed_graph, folder)),
-    "stores": (40, study_store),
-    "fleets": (20, fleet_store),
-    "studies": (40, study_file),
-    "csv": (20, lambda _: log("log.csv", table(), changed_table)),
-    "csv with metadata": (10, lambda folder: log("log.csv", columns(".csv", folder), changed_table)),
+    "results": (40, lambda folder: result(changed_result, folder)),
+    "equations": (20, lambda folder: result(changed_graph, folder)),
+    "stores": (30, study_store),
+    "fleets": (15, fleet_store),
+    "studies": (30, study_file),
+    "csv": (15, lambda _: log("log.csv", table(), changed_table)),
+    "csv with metadata": (8, lambda folder: log("log.csv", columns(".csv", folder), changed_table)),
     "csv.gz": (8, lambda folder: log("log.csv.gz", columns(".csv.gz", folder))),
-    "parquet": (10, lambda folder: log("log.parquet", columns(".parquet", folder))),
-    "npz": (10, lambda folder: log("log.npz", columns(".npz", folder))),
-    "mat": (10, lambda _: log("log.mat", mat())),
-    "hdf5": (10, lambda folder: log("log.h5", hdf5(folder))),
-    "ulog": (10, lambda _: log("log.ulg", flight()[0][:20_000], options="--mapping px4-multirotor")),
-    "mcap": (10, lambda folder: log("log.mcap", recording("log.mcap", folder), options="--mapping ros-joint-states")),
+    "parquet": (8, lambda folder: log("log.parquet", columns(".parquet", folder))),
+    "npz": (8, lambda folder: log("log.npz", columns(".npz", folder))),
+    "mat": (8, lambda _: log("log.mat", mat())),
+    "hdf5": (8, lambda folder: log("log.h5", hdf5(folder))),
+    "ulog": (8, lambda _: log("log.ulg", flight()[0][:20_000], options="--mapping px4-multirotor")),
+    "mcap": (8, lambda folder: log("log.mcap", recording("log.mcap", folder), options="--mapping ros-joint-states")),
     "ros 1 bag": (8, lambda folder: log("log.bag", recording("log.bag", folder), options="--mapping ros-joint-states")),
     "ros 2 bag": (8, lambda folder: ros2("db3", folder)),
     "ros 2 metadata": (8, lambda folder: ros2("yaml", folder)),
-    "crazyflie": (10, lambda _: log("log", crazyflie(), options="--map x=fixed.x,thrust=fixed.u")),
-    "mapping": (10, lambda _: options("m.toml", MAPPING, f"identify swim.csv {MODEL} --mapping m.toml")),
-    "settings": (10, lambda _: options("s.toml", SETTINGS, f"identify swim.csv {SEARCH} --settings s.toml")),
-    "configuration": (10, lambda _: options("c.toml", CONFIG, "identify --config c.toml")),
-    "robot": (10, robot),
+    "crazyflie": (8, lambda _: log("log", crazyflie(), options="--map x=fixed.x,thrust=fixed.u")),
+    "mapping": (8, lambda _: options("m.toml", MAPPING, f"identify swim.csv {MODEL} --mapping m.toml")),
+    "settings": (8, lambda _: options("s.toml", SETTINGS, f"identify swim.csv {SEARCH} --settings s.toml")),
+    "configuration": (8, lambda _: options("c.toml", CONFIG, "identify --config c.toml")),
+    "robot": (8, robot),
 }
 """Examples of each kind in the suite, and what makes the kind."""
 
@@ -302,6 +302,7 @@ def no_code(monkeypatch):
     monkeypatch.setattr("diransac.cli.study.run_study", kept)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 def test_every_command_keeps_the_rule_over_a_damaged_file(name, tmp_path_factory, counts):
     few, make = KINDS[name]

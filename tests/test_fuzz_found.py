@@ -1,5 +1,6 @@
 """What the fuzzer has found, each as a test of its own."""
 
+import json
 import os
 import sqlite3
 import struct
@@ -18,6 +19,7 @@ from diransac.plain_data import json_data
 from diransac.study import load, status
 from diransac.study.store import Store
 from fuzzing import listing
+from rebuilt import built, log
 from studies import OWN, OWN_PLANT, TINY, tiny
 
 T = 0.05 * np.arange(40)
@@ -72,6 +74,18 @@ def test_a_damaged_time_is_not_filled_with_millions_of_rows(tmp_path):
         dr.read_log(tmp_path / "a.npz", resample="median")
 
 
+@pytest.mark.parametrize("step", [1e-310, 5e-324, 1e-15])
+def test_a_time_that_stands_still_is_refused(tmp_path, step):
+    np.savez(tmp_path / "a.npz", t=step * np.arange(40), x=T)
+    with pytest.raises(dr.LogError, match="s apart, which no clock resolves; pass --scale"):
+        dr.read_log(tmp_path / "a.npz")
+
+
+def test_a_time_in_another_unit_is_scaled_before_it_is_checked(tmp_path):
+    np.savez(tmp_path / "a.npz", t=1e-15 * np.arange(40), x=T)
+    assert len(dr.read_log(tmp_path / "a.npz", scale={"t": 1e13})) == 40
+
+
 def test_spikes_of_enormous_signals_are_no_overflow():
     hampel(np.where(np.arange(40) % 3, 1.5e308, -1.5e308))
 
@@ -120,6 +134,32 @@ def test_a_damaged_store_of_the_first_format_is_refused(tmp_path):
         connection.commit()
     with pytest.raises(dr.StudyError, match="is damaged: JSONDecodeError"):
         status(path)
+
+
+@pytest.mark.parametrize(
+    ("covariance", "hold", "says"),
+    [
+        ([[1.0, 2.0], [2.0, 1.0]], "zero-order", "covariance: it is that of no distribution"),
+        ([[-1.0, 0.0], [0.0, 1.0]], "zero-order", "covariance: it is that of no distribution"),
+        ([[1.0, 0.5], [0.1, 1.0]], "zero-order", "covariance: it is that of no distribution"),
+        ([[1.0, 0.5], [0.5, 1.0]], "zero-/rder", "hold zero-/rder"),
+    ],
+)
+def test_a_covariance_or_a_hold_that_there_is_none_of_is_refused_on_loading(covariance, hold, says):
+    data = dr.identify(built(), log(), "ols").to_dict()
+    assert data["resolution"]["hold"] == "zero-order"
+    whole = np.diag([1.0, 1.0, 1.0])
+    whole[:2, :2] = covariance
+    changed = {**data, "covariance": whole.tolist(), "resolution": {**data["resolution"], "hold": hold}}
+    with pytest.raises(dr.ResultError, match=says):
+        dr.Result.from_dict(changed)
+
+
+def test_enormous_forces_of_a_diagnosis_are_shown():
+    result = dr.identify(built(), log())
+    data = json.loads(json.dumps(result.to_dict()))
+    data["diagnosis"]["unmodelled_accelerations"] = {"s_ddot": [1e200] * len(log())}
+    assert "inf" in str(dr.Result.from_dict(data))
 
 
 # Robots, plants and settings ------------------------------------------------------------------------------------------

@@ -34,9 +34,10 @@ _ROUNDING = 1e-6
 # Samples of a signal from which its rate is taken.
 _FEWEST_SAMPLES = 5
 
-# Likely seconds from row to row, and the most that are accepted.  Clocks that explain longer ones: their tick in
-# seconds, and the number of ticks from row to row above which it is this clock rather than the next.
-_SHORTEST, _LONGEST, _ABSURD = 1e-7, 1.0, 1e3
+# Seconds from row to row: the least that are accepted, likely ones, and the most that are accepted.  Clocks that
+# explain longer ones: their tick in seconds, and the number of ticks from row to row above which it is this clock
+# rather than the next.
+_LEAST, _SHORTEST, _LONGEST, _ABSURD = 1e-12, 1e-7, 1.0, 1e3
 _CLOCKS = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("milliseconds", 1e-3, _LONGEST))
 
 
@@ -135,7 +136,7 @@ def _where(word: str, flags: Mapping[str, npt.NDArray[np.bool_]], time: FloatArr
 
 
 def check_time_order(time: FloatArray, source: str) -> None:
-    """Raise LogError if time ``(N,)`` has fewer than 2 rows, is not finite, repeats or runs backwards."""
+    """Raise LogError if time ``(N,)`` has fewer than 2 rows, is not finite, repeats, runs backwards or stands still."""
     if len(time) < 2:
         raise LogError(f"{source}: a log has at least 2 rows; found {len(time)}")
     if not np.isfinite(time).all():
@@ -143,6 +144,11 @@ def check_time_order(time: FloatArray, source: str) -> None:
         raise LogError(f"{source}: time is {time[row]} at row {row}; give every row a time in seconds")
     steps = np.diff(time)
     if steps.min() > 0.0:
+        if time[-1] - time[0] < _LEAST * len(steps):
+            raise LogError(
+                f"{source}: rows are {float(np.median(steps)):.4g} s apart, which no clock resolves; "
+                "pass --scale t=FACTOR if the time is not in seconds"
+            )
         return
     row, n = int(np.argmax(steps <= 0.0)), int((steps <= 0.0).sum())
     more = f" (and {n - 1} more like it)" if n > 1 else ""

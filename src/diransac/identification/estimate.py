@@ -285,7 +285,8 @@ class Diagnosis:
             measured, latent = name in self.noise_std, self.unmodelled_accelerations.get(name)
             noise = f"{self.noise_std[name]:.2g}" if measured else ""
             fraction = f"{100.0 * self.outlier_fraction[name]:.1f} %" if measured else ""
-            unexplained = "" if latent is None else f"{np.sqrt(np.mean(np.square(latent))):.2g}"
+            with np.errstate(over="ignore"):
+                unexplained = "" if latent is None else f"{np.sqrt(np.mean(np.square(latent))):.2g}"
             rows.append([name, noise, fraction, unexplained, units[name]])
         return rows
 

@@ -24,6 +24,7 @@ from diransac.identification.suggestions import Suggestion
 from diransac.identification.uncertainty import student_quantile, students_draws
 from diransac.model import Model
 from diransac.plain_data import json_data, read_text
+from diransac.simulation import HOLDS
 from diransac.text_table import aligned, telling_digits
 
 if TYPE_CHECKING:
@@ -33,11 +34,27 @@ __all__ = ["MARKS", "Result"]
 
 _FORMAT = 7
 _BY_LOG = ("parameters", "covariance")
+_ROUNDING = 1e-3
+"""Errors of correlations, by far: those of collinear parameters come from matrices that are nearly singular."""
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
 _N_EXPORTED = 1000
 """Draws of the parameters in a YAML file."""
 MARKS = {"bad": "!", "care": "·"}
 """Marks of the findings that are printed."""
+
+
+def _is_covariance(covariance: FloatArray) -> bool:
+    """True if variances are not negative, and the correlations of those that are finite are symmetric and definite."""
+    variances = np.diag(covariance)
+    if (variances < 0.0).any():
+        return False
+    known = np.isfinite(variances) & (variances > 0.0)
+    deviations = np.sqrt(variances[known])
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        correlation = covariance[np.ix_(known, known)] / deviations[:, None] / deviations
+    if not np.isfinite(correlation).all() or np.abs(correlation - correlation.T).max(initial=0.0) > _ROUNDING:
+        return False
+    return bool(np.linalg.eigvalsh(correlation).min(initial=0.0) >= -_ROUNDING)
 
 
 def _write(path: str | Path, text: str) -> None:
@@ -518,6 +535,10 @@ class Result:
         masks = [] if estimate.diagnosis is None else estimate.diagnosis.outliers.values()
         if any(len(mask) != n_rows for mask in (evaluation.inliers, *masks)):
             raise ValueError(f"a mask of other than {n_rows} rows")
+        if not _is_covariance(estimate.covariance):
+            raise ValueError("covariance: it is that of no distribution")
+        if estimate.resolution.hold not in HOLDS:
+            raise ValueError(f"hold {estimate.resolution.hold}")
         if not 1 <= estimate.degrees_of_freedom <= 2**53:
             raise ValueError(f"{estimate.degrees_of_freedom} degrees of freedom")
         for log in plain.logs:

@@ -166,7 +166,7 @@ def students_draws(
     rng, kept, n_drawn = np.random.default_rng(seed), np.zeros((len(mean), 0)), 0
     while kept.shape[1] < n:
         try:
-            normal = rng.multivariate_normal(np.zeros(len(mean)), covariance, _N_DRAWS, method="eigh").T
+            normal = rng.multivariate_normal(np.zeros(len(mean)), covariance, _N_DRAWS, "ignore", method="eigh").T
         except np.linalg.LinAlgError as error:
             raise ResultError(
                 "the covariance has no eigenvalues in floating point; identify from other data"

@@ -205,6 +205,10 @@ def _optimise(module: LLVM, machine: LLVM) -> None:
             passes.run(function, builder)
 
 
+_MOST_DIGITS = 6
+"""Of a number of threads."""
+
+
 def default_threads() -> int:
     """Default number of threads: `DIRANSAC_THREADS`, else one in a worker process, else all available cores.
 
@@ -217,8 +221,8 @@ def default_threads() -> int:
     """
     asked = os.environ.get("DIRANSAC_THREADS", "")
     if asked:
-        if not asked.isdecimal() or int(asked) < 1:
-            raise SettingsError(f"DIRANSAC_THREADS is {asked!r}; give a positive whole number, or unset it.")
+        if not asked.isdecimal() or len(asked) > _MOST_DIGITS or int(asked) < 1:
+            raise SettingsError(f"DIRANSAC_THREADS is {asked!r:.40}; give a positive whole number, or unset it.")
         return int(asked)
     from multiprocessing import parent_process
 
