@@ -239,7 +239,7 @@ def changed_data(data: Any, rng: Random) -> Any:
                     (-node[key], node[key] * 1e6, node[key] + 1, node[key] / 3, 0, 10**30, str(node[key]))
                 )
             case _:
-                node[key] = rng.choice(_ODD)
+                node[key] = copy.deepcopy(rng.choice(_ODD))
     return changed[""]
 
 

@@ -17,10 +17,11 @@ from diransac.data.preprocessing.spikes import hampel
 from diransac.data.readers import comma_separated, npz, parquet
 from diransac.plain_data import json_data
 from diransac.study import load, status
+from diransac.study.reading import read
 from diransac.study.store import Store
 from fuzzing import listing
 from rebuilt import built, log
-from studies import OWN, OWN_PLANT, TINY, tiny
+from studies import OWN, OWN_PLANT, TINY, row, tiny
 
 T = 0.05 * np.arange(40)
 
@@ -122,6 +123,26 @@ def test_a_store_with_a_write_ahead_log_is_refused_and_nothing_is_left_beside_it
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")
     assert "tiny" in str(status(path))
+
+
+@pytest.mark.parametrize("statement", ["DELETE FROM configuration WHERE part = 'study'", "DELETE FROM trials"])
+def test_a_store_without_a_study_or_without_rows_is_no_internal_error(tmp_path, statement):
+    with Store(tmp_path / "a.db", load(TINY)):
+        pass
+    with closing(sqlite3.connect(tmp_path / "a.db")) as connection:
+        connection.execute(statement)
+        connection.commit()
+    assert run("study", "export", tmp_path / "a.db", "--to", "parquet", "-o", tmp_path / "a.parquet").exit_code == 0
+    assert pl.read_parquet(tmp_path / "a.parquet").is_empty()
+    done = run("study", "plot", tmp_path / "a.db", "-o", tmp_path / "a.svg")
+    assert (done.exit_code, "damaged: KeyError" in done.stderr) == (1, "part" in statement), done.stderr
+
+
+def test_times_without_stages_are_refused(tmp_path):
+    with Store(tmp_path / "a.db", load(TINY)) as kept:
+        kept.add([row(seconds={})])
+    with pytest.raises(dr.StudyError, match=r"is damaged: ValueError: seconds are \{\}"):
+        read(tmp_path / "a.db")
 
 
 def test_a_damaged_store_of_the_first_format_is_refused(tmp_path):
