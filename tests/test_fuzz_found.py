@@ -179,8 +179,17 @@ def test_a_covariance_or_a_hold_that_there_is_none_of_is_refused_on_loading(cova
 def test_enormous_forces_of_a_diagnosis_are_shown():
     result = dr.identify(built(), log())
     data = json.loads(json.dumps(result.to_dict()))
-    data["diagnosis"]["unmodelled_accelerations"] = {"s_ddot": [1e200] * len(log())}
+    data["diagnosis"]["unmodelled_accelerations"] = {"s_ddot": [1e200] * len(data["diagnosis"]["window_log"])}
     assert "inf" in str(dr.Result.from_dict(data))
+
+
+@pytest.mark.parametrize("name", ["unmodelled_time", "smoothed_time", "smoothed_states", "unmodelled_accelerations"])
+def test_figures_of_other_than_the_windows_are_refused_on_loading(name):
+    data = json.loads(json.dumps(dr.identify(built(), log()).to_dict()))
+    found = data["diagnosis"][name]
+    (found if isinstance(found, list) else next(iter(found.values()))).pop()
+    with pytest.raises(dr.ResultError, match=r"figures of other than \d+ windows"):
+        dr.Result.from_dict(data)
 
 
 # Robots, plants and settings ------------------------------------------------------------------------------------------

@@ -535,6 +535,8 @@ class Result:
         masks = [] if estimate.diagnosis is None else estimate.diagnosis.outliers.values()
         if any(len(mask) != n_rows for mask in (evaluation.inliers, *masks)):
             raise ValueError(f"a mask of other than {n_rows} rows")
+        if estimate.diagnosis is not None:
+            estimate.diagnosis.check_windows()
         if not _is_covariance(estimate.covariance):
             raise ValueError("covariance: it is that of no distribution")
         if estimate.resolution.hold not in HOLDS:
