@@ -176,6 +176,14 @@ def test_a_covariance_or_a_hold_that_there_is_none_of_is_refused_on_loading(cova
         dr.Result.from_dict(changed)
 
 
+@pytest.mark.parametrize("name", ["own_delays", "own_lags", "gain_drifts"])
+def test_timing_of_other_than_the_inputs_is_refused_on_loading(name):
+    data = json.loads(json.dumps(dr.identify(built(), log(), "ols").to_dict()))
+    data["resolution"]["timing"][name] = [0.1, 0.2]
+    with pytest.raises(dr.ResultError, match="timing of other than 1 inputs"):
+        dr.Result.from_dict(data)
+
+
 def test_enormous_forces_of_a_diagnosis_are_shown():
     result = dr.identify(built(), log())
     data = json.loads(json.dumps(result.to_dict()))
