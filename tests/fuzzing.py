@@ -239,7 +239,7 @@ def changed_data(data: Any, rng: Random) -> Any:
                     (-node[key], node[key] * 1e6, node[key] + 1, node[key] / 3, 0, 10**30, str(node[key]))
                 )
             case _:
-                node[key] = rng.choice(_ODD)
+                node[key] = copy.deepcopy(rng.choice(_ODD))
     return changed[""]
 
 
@@ -324,7 +324,7 @@ def changed_graph(data: bytes, rng: Random) -> bytes:
             k = rng.randrange(1, len(lines))
             number, _, word, *operands = lines[k].split(" ")
             if rng.random() < 0.7:
-                word = rng.choice(_WORDS[len(operands)])
+                word = rng.choice(_WORDS.get(len(operands), (word,)))
             if rng.random() < 0.5:
                 operands = [str(rng.choice((0, 1, rng.randrange(k), rng.randrange(k)))) for _ in operands]
             lines[k] = " ".join((number, "=", word, *operands, *("0",) * rng.choice((0, 0, 0, 0, 1))))

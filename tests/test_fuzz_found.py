@@ -17,10 +17,11 @@ from diransac.data.preprocessing.spikes import hampel
 from diransac.data.readers import comma_separated, npz, parquet
 from diransac.plain_data import json_data
 from diransac.study import load, status
+from diransac.study.reading import read
 from diransac.study.store import Store
 from fuzzing import listing
 from rebuilt import built, log
-from studies import OWN, OWN_PLANT, TINY, tiny
+from studies import OWN, OWN_PLANT, TINY, row, tiny
 
 T = 0.05 * np.arange(40)
 
@@ -124,6 +125,26 @@ def test_a_store_with_a_write_ahead_log_is_refused_and_nothing_is_left_beside_it
     assert "tiny" in str(status(path))
 
 
+@pytest.mark.parametrize("statement", ["DELETE FROM configuration WHERE part = 'study'", "DELETE FROM trials"])
+def test_a_store_without_a_study_or_without_rows_is_no_internal_error(tmp_path, statement):
+    with Store(tmp_path / "a.db", load(TINY)):
+        pass
+    with closing(sqlite3.connect(tmp_path / "a.db")) as connection:
+        connection.execute(statement)
+        connection.commit()
+    assert run("study", "export", tmp_path / "a.db", "--to", "parquet", "-o", tmp_path / "a.parquet").exit_code == 0
+    assert pl.read_parquet(tmp_path / "a.parquet").is_empty()
+    done = run("study", "plot", tmp_path / "a.db", "-o", tmp_path / "a.svg")
+    assert (done.exit_code, "damaged: KeyError" in done.stderr) == (1, "part" in statement), done.stderr
+
+
+def test_times_without_stages_are_refused(tmp_path):
+    with Store(tmp_path / "a.db", load(TINY)) as kept:
+        kept.add([row(seconds={})])
+    with pytest.raises(dr.StudyError, match=r"is damaged: ValueError: seconds are \{\}"):
+        read(tmp_path / "a.db")
+
+
 def test_a_damaged_store_of_the_first_format_is_refused(tmp_path):
     path = tmp_path / "a.db"
     with Store(path, load(TINY)):
@@ -155,11 +176,28 @@ def test_a_covariance_or_a_hold_that_there_is_none_of_is_refused_on_loading(cova
         dr.Result.from_dict(changed)
 
 
+@pytest.mark.parametrize("name", ["own_delays", "own_lags", "gain_drifts"])
+def test_timing_of_other_than_the_inputs_is_refused_on_loading(name):
+    data = json.loads(json.dumps(dr.identify(built(), log(), "ols").to_dict()))
+    data["resolution"]["timing"][name] = [0.1, 0.2]
+    with pytest.raises(dr.ResultError, match="timing of other than 1 inputs"):
+        dr.Result.from_dict(data)
+
+
 def test_enormous_forces_of_a_diagnosis_are_shown():
     result = dr.identify(built(), log())
     data = json.loads(json.dumps(result.to_dict()))
-    data["diagnosis"]["unmodelled_accelerations"] = {"s_ddot": [1e200] * len(log())}
+    data["diagnosis"]["unmodelled_accelerations"] = {"s_ddot": [1e200] * len(data["diagnosis"]["window_log"])}
     assert "inf" in str(dr.Result.from_dict(data))
+
+
+@pytest.mark.parametrize("name", ["unmodelled_time", "smoothed_time", "smoothed_states", "unmodelled_accelerations"])
+def test_figures_of_other_than_the_windows_are_refused_on_loading(name):
+    data = json.loads(json.dumps(dr.identify(built(), log()).to_dict()))
+    found = data["diagnosis"][name]
+    (found if isinstance(found, list) else next(iter(found.values()))).pop()
+    with pytest.raises(dr.ResultError, match=r"figures of other than \d+ windows"):
+        dr.Result.from_dict(data)
 
 
 # Robots, plants and settings ------------------------------------------------------------------------------------------

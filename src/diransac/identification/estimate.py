@@ -239,6 +239,13 @@ class Diagnosis:
         for array in series:
             array.setflags(write=False)
 
+    def check_windows(self) -> None:
+        """Raise ValueError: the figures of windows are not as many as these."""
+        named = (self.unmodelled_accelerations, self.unmodelled_forces, self.smoothed_states)
+        figures = (self.unmodelled_time, self.smoothed_time, *(x for values in named for x in values.values()))
+        if any(len(x) != len(self.window_log) for x in figures):
+            raise ValueError(f"figures of other than {len(self.window_log)} windows")
+
     def windows_of(self, log: int) -> IntArray:
         """Indices of the windows of one log."""
         return np.flatnonzero(self.window_log == log)

@@ -535,10 +535,15 @@ class Result:
         masks = [] if estimate.diagnosis is None else estimate.diagnosis.outliers.values()
         if any(len(mask) != n_rows for mask in (evaluation.inliers, *masks)):
             raise ValueError(f"a mask of other than {n_rows} rows")
+        if estimate.diagnosis is not None:
+            estimate.diagnosis.check_windows()
         if not _is_covariance(estimate.covariance):
             raise ValueError("covariance: it is that of no distribution")
         if estimate.resolution.hold not in HOLDS:
             raise ValueError(f"hold {estimate.resolution.hold}")
+        timing = estimate.resolution.timing
+        if any(len(x) not in (0, model.n_u) for x in (timing.own_delays, timing.own_lags, timing.gain_drifts)):
+            raise ValueError(f"timing of other than {model.n_u} inputs")
         if not 1 <= estimate.degrees_of_freedom <= 2**53:
             raise ValueError(f"{estimate.degrees_of_freedom} degrees of freedom")
         for log in plain.logs:

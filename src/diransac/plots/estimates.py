@@ -13,6 +13,7 @@ from diransac.errors import SettingsError
 from diransac.plots.figure import INK, MUTED, PAPER, WIDTH, check_ending, draw_heading, header_height, write
 from diransac.plots.rows import LogAxis, MarkRow, as_marks, draw_rows, name_rows, names_width, row_height
 from diransac.plots.study import axis_label, level_labels, method_looks, n_trials, title_of
+from diransac.study.database import damage
 from diransac.study.specification import TRUE
 from diransac.study.store import Store
 from diransac.study.summary import ParameterErrors, Summary, summarise
@@ -79,8 +80,8 @@ def plot_estimates(store: str | Path, path: str | Path | None = None, *, title: 
 
 
 def evaluates_parameters(store: str | Path) -> bool:
-    """True if a store's study evaluates parameters.  Raises StudyError: there is no such store."""
-    with Store.existing(store) as kept:
+    """True if a store's study evaluates parameters.  Raises StudyError: there is no such store, or it is damaged."""
+    with Store.existing(store) as kept, damage(Path(store)):
         return bool(kept.configuration["study"].get("evaluation.parameters"))
 
 

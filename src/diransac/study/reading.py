@@ -87,7 +87,7 @@ def _checked(columns: Mapping[str, Sequence[Any]], schema: Mapping[str, type]) -
     times = [json_data(text) for text in columns["seconds"]]
     stages = list(times[0]) if times else []
     for time in times:
-        if list(time) != stages or not all(type(value) in (int, float) for value in time.values()):
+        if not stages or list(time) != stages or not all(type(value) in (int, float) for value in time.values()):
             raise ValueError(f"seconds are {time!r:.40}")
     return [json.dumps(dict(zip(stages, map(float, time.values()), strict=True))) for time in times]
 
@@ -162,7 +162,10 @@ def export(store: str | Path, path: str | Path, kind: str) -> None:
     frame = read(store)
     memory = io.BytesIO()  # Polars' own errors of a full disk are no OSError
     if kind == "parquet":
-        frame.write_parquet(memory)
+        rows = (
+            frame if len(frame) else frame.drop("seconds")
+        )  # without rows it has no stages, which Parquet cannot hold
+        rows.write_parquet(memory)
     elif kind == "csv":
         frame.with_columns(pl.col("seconds").struct.json_encode()).write_csv(memory)
     else:
