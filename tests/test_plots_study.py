@@ -103,6 +103,14 @@ def test_equal_errors_have_no_deviation_at_all(store: Path):
     assert summarise(store).flights["square"].deviation("z")[0, METHODS.index("ols")] == 0.0
 
 
+def test_an_infinite_error_that_a_damaged_store_holds_is_an_infinite_deviation(tmp_path: Path):
+    with Store(tmp_path / "b.db", load(tiny(trials=2))) as kept:
+        kept.add([row("0", trial, "ols", **errors(x)) for trial, x in enumerate((0.1, np.inf))])
+    flights = summarise(tmp_path / "b.db").flights["square"]
+    assert np.isinf(flights.deviation("x")[0, METHODS.index("ols")])
+    plot_study(tmp_path / "b.db", tmp_path / "b.svg")
+
+
 def test_where_most_trials_failed_there_is_no_finite_median_and_where_all_did_no_mean(tmp_path: Path):
     with Store(tmp_path / "b.db", load(tiny(trials=3))) as kept:
         failed = [row("0", trial, "ols", status="failed", error="no") for trial in range(3)]

@@ -39,6 +39,9 @@ __all__ = [
     "Resolution",
 ]
 
+_LARGEST = 1e150
+"""Bound of figures of windows; their squares are finite."""
+
 TIME_LIMIT = "time limit reached"
 """Stop reason of a search that a limit on its time ended."""
 
@@ -240,11 +243,13 @@ class Diagnosis:
             array.setflags(write=False)
 
     def check_windows(self) -> None:
-        """Raise ValueError: the figures of windows are not as many as these."""
-        named = (self.unmodelled_accelerations, self.unmodelled_forces, self.smoothed_states)
+        """Raise ValueError: the figures of windows are not as many as these, or squares of them overflow."""
+        named = (self.unmodelled_accelerations, self.unmodelled_forces, self.suggested_terms, self.smoothed_states)
         figures = (self.unmodelled_time, self.smoothed_time, *(x for values in named for x in values.values()))
         if any(len(x) != len(self.window_log) for x in figures):
             raise ValueError(f"figures of other than {len(self.window_log)} windows")
+        if not all((np.abs(x) < _LARGEST).all() for x in figures):
+            raise ValueError("figures of windows that no machine has")
 
     def windows_of(self, log: int) -> IntArray:
         """Indices of the windows of one log."""
@@ -292,8 +297,7 @@ class Diagnosis:
             measured, latent = name in self.noise_std, self.unmodelled_accelerations.get(name)
             noise = f"{self.noise_std[name]:.2g}" if measured else ""
             fraction = f"{100.0 * self.outlier_fraction[name]:.1f} %" if measured else ""
-            with np.errstate(over="ignore"):
-                unexplained = "" if latent is None else f"{np.sqrt(np.mean(np.square(latent))):.2g}"
+            unexplained = "" if latent is None else f"{np.sqrt(np.mean(np.square(latent))):.2g}"
             rows.append([name, noise, fraction, unexplained, units[name]])
         return rows
 

@@ -333,4 +333,6 @@ def _upper_median(values: FloatArray) -> np.floating:
 
 def _sample_deviation(values: FloatArray) -> np.floating:
     """Standard deviation with n - 1; exactly 0 for equal values, in spite of rounding of the mean."""
+    if not np.isfinite(values).all():
+        return np.float64(np.inf)
     return np.float64(np.std(values - values[0], ddof=1))
