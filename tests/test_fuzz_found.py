@@ -184,6 +184,14 @@ def test_timing_of_other_than_the_inputs_is_refused_on_loading(name):
         dr.Result.from_dict(data)
 
 
+@pytest.mark.parametrize(("name", "value"), [("delay", 1e308), ("lag", "nan"), ("own_delays", [1e308])])
+def test_timing_that_overflows_is_refused_on_loading(name, value):
+    data = json.loads(json.dumps(dr.identify(built(), log()).to_dict()))
+    data["resolution"]["timing"][name] = value
+    with pytest.raises(dr.ResultError, match="timing: it is that of no machine"):
+        dr.Result.from_dict(data)
+
+
 @pytest.mark.parametrize("name", ["unmodelled_time", "smoothed_time", "smoothed_states", "unmodelled_accelerations"])
 def test_figures_of_other_than_the_windows_are_refused_on_loading(name):
     data = json.loads(json.dumps(dr.identify(built(), log()).to_dict()))

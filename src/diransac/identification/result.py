@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["MARKS", "Result"]
 
 _FORMAT = 7
+_LATEST = 1e9
+"""Bound of delays and lags, s, and of the drift of gains."""
 _BY_LOG = ("parameters", "covariance")
 _ROUNDING = 1e-3
 """Errors of correlations, by far: those of collinear parameters come from matrices that are nearly singular."""
@@ -542,8 +545,11 @@ class Result:
         if estimate.resolution.hold not in HOLDS:
             raise ValueError(f"hold {estimate.resolution.hold}")
         timing = estimate.resolution.timing
-        if any(len(x) not in (0, model.n_u) for x in (timing.own_delays, timing.own_lags, timing.gain_drifts)):
+        of_inputs = (timing.own_delays, timing.own_lags, timing.gain_drifts)
+        if any(len(x) not in (0, model.n_u) for x in of_inputs):
             raise ValueError(f"timing of other than {model.n_u} inputs")
+        if not all(abs(x) < _LATEST for x in chain((timing.delay, timing.lag), *of_inputs)):
+            raise ValueError("timing: it is that of no machine")
         if not 1 <= estimate.degrees_of_freedom <= 2**53:
             raise ValueError(f"{estimate.degrees_of_freedom} degrees of freedom")
         for log in plain.logs:
