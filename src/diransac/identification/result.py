@@ -17,7 +17,7 @@ from diransac.atomic import write_text
 from diransac.data.dataset import ParameterLayout
 from diransac.data.log import Log
 from diransac.errors import DiransacError, ResultError, SettingsError
-from diransac.identification.estimate import Diagnosis, Estimate, Evaluation, Finding, LogSummary
+from diransac.identification.estimate import Diagnosis, Estimate, Evaluation, Finding, LogSummary, Resolution
 from diransac.identification.findings import Verdict, findings_of, verdict_of
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
@@ -37,13 +37,25 @@ _FORMAT = 7
 _LATEST = 1e9
 """Bound of delays and lags, s, and of the drift of gains."""
 _BY_LOG = ("parameters", "covariance")
+"""Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
 _ROUNDING = 1e-3
 """Errors of correlations, by far: those of collinear parameters come from matrices that are nearly singular."""
-"""Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
 _N_EXPORTED = 1000
 """Draws of the parameters in a YAML file."""
 MARKS = {"bad": "!", "care": "·"}
 """Marks of the findings that are printed."""
+
+
+def _check_resolution(resolution: Resolution, n_u: int) -> None:
+    """Raise ValueError: the inputs of a simulation have no such hold or timing."""
+    timing = resolution.timing
+    of_inputs = (timing.own_delays, timing.own_lags, timing.gain_drifts)
+    if resolution.hold not in HOLDS:
+        raise ValueError(f"hold {resolution.hold}")
+    if any(len(x) not in (0, n_u) for x in of_inputs):
+        raise ValueError(f"timing of other than {n_u} inputs")
+    if not all(abs(x) < _LATEST for x in chain((timing.delay, timing.lag), *of_inputs)):
+        raise ValueError("timing: it is that of no machine")
 
 
 def _is_covariance(covariance: FloatArray) -> bool:
@@ -542,14 +554,7 @@ class Result:
             estimate.diagnosis.check_windows()
         if not _is_covariance(estimate.covariance):
             raise ValueError("covariance: it is that of no distribution")
-        if estimate.resolution.hold not in HOLDS:
-            raise ValueError(f"hold {estimate.resolution.hold}")
-        timing = estimate.resolution.timing
-        of_inputs = (timing.own_delays, timing.own_lags, timing.gain_drifts)
-        if any(len(x) not in (0, model.n_u) for x in of_inputs):
-            raise ValueError(f"timing of other than {model.n_u} inputs")
-        if not all(abs(x) < _LATEST for x in chain((timing.delay, timing.lag), *of_inputs)):
-            raise ValueError("timing: it is that of no machine")
+        _check_resolution(estimate.resolution, model.n_u)
         if not 1 <= estimate.degrees_of_freedom <= 2**53:
             raise ValueError(f"{estimate.degrees_of_freedom} degrees of freedom")
         for log in plain.logs:
