@@ -155,10 +155,11 @@ def measure(name: str) -> None:
 
 
 def measured(name: str, folder: str) -> dict[str, float]:
-    """What `measure` prints in a process of its own."""
+    """What `measure` prints in a process of its own, which finds the modules compiled if one ran before."""
     single = {"DIRANSAC_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "DIRANSAC_CACHE": folder}
+    inherited = {k: x for k, x in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     command = [sys.executable, __file__, "--measure", name]
-    printed = subprocess.run(command, env=os.environ | single, check=True, capture_output=True, text=True).stdout
+    printed = subprocess.run(command, env=inherited | single, check=True, capture_output=True, text=True).stdout
     found: dict[str, float] = json.loads(printed)
     return found
 
