@@ -6,7 +6,7 @@ BIN := .venv/bin
 PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
 ENVIRONMENT := .venv/.installed
 
-.PHONY: demo test quick fuzz lint bench docs coverage lock clean
+.PHONY: demo test quick fuzz lint bench docs docs-figures coverage lock clean
 
 demo: $(ENVIRONMENT)  ## fly, identify, fly what was identified; writes out/demo/report.html and flight.png
 	$(BIN)/python examples/demo.py
@@ -33,6 +33,9 @@ bench: $(ENVIRONMENT)  ## measured figures; each benchmark prints its table
 
 docs: $(ENVIRONMENT)  ## the pages; --quiet would let warnings pass
 	$(BIN)/mkdocs build --strict --site-dir out/site
+
+docs-figures: $(ENVIRONMENT)  ## every command behind a number of the pages that has no output yet; many hours
+	$(BIN)/python benchmarks/documented.py --run
 
 coverage: $(ENVIRONMENT)
 	$(BIN)/pytest -q --cov --cov-report=term

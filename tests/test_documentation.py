@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import documented
 import pytest
 from typer.testing import CliRunner
 
@@ -134,3 +135,23 @@ def test_blocks_are_found_with_their_lines_and_without_their_indent():
 def test_a_command_that_cannot_run_is_refused(tmp_path: Path):
     with pytest.raises(AssertionError, match="text block"):
         run_command(["curl", "example.org"], tmp_path)
+
+
+def test_documented_benchmarks_exist_and_have_their_options():
+    found = [shlex.split(command) for command in documented.documented(["benchmarks/"])]
+    assert len(found) > 15
+    for _, file, *options in found:
+        words = set(re.findall(r'"-{0,2}([\w-]+)"', (REPOSITORY / file).read_text()))
+        unknown = [x for x in options if x.startswith("-") and x.lstrip("-") not in words]
+        assert not unknown, f"{file}: {unknown}"
+
+
+def test_commands_behind_figures_are_those_in_code_and_in_text_blocks():
+    page = "Run `python benchmarks/a.py --seeds\n0:5`, not `python benchmarks/a.py N`.\n"
+    page += (
+        "```text\n$ diransac study run fig2 \\\n    --store b.db\nrows\n```\n```console\n$ diransac study run c\n```\n"
+    )
+    assert list(documented.commands(page)) == [
+        "python benchmarks/a.py --seeds 0:5",
+        "diransac study run fig2 --store b.db",
+    ]
