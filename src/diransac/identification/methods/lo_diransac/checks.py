@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import varianc
 from diransac.identification.methods.lo_diransac.projection import (
     batch_sums,
     effect_of_intervals,
+    inflated_prior,
     least_squares_gains,
     means_of_intervals,
     means_of_windows,
@@ -46,9 +48,10 @@ __all__ = ["Change", "Parts", "compared_parts", "findings_of_fit"]
 _CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
 # Delay of an input that is worth a sentence, samples.
 _SMALL_DELAY = 0.1
-# Parts of the logs that are predicted by the rest; mean square of what the model leaves of them, over that of the fit,
-# from which on it is no chance; standard errors of a parameter that differs then.
-_HELD_OUT, _WORSE, _LIKELY = 5, 1.25, 2.0
+# Parts of the logs that are predicted by the rest; mean square of what the model leaves of them, over what it is for
+# parameters that do not change, from which on it is no chance; standard errors by which the parameter that changed most
+# differs then, and probability that any of the others differs as much by chance.
+_HELD_OUT, _WORSE, _LIKELY, _UNLIKELY = 5, 1.25, 2.0, 0.05
 # Parts whose parameters an exact model must have in common; normal deviation of a difference that is no chance, of a
 # probability of 1e-4; part of a parameter that is negligible; information about a direction of the parameters, over the
 # largest, that is rounding.
@@ -122,7 +125,7 @@ class Parts:
         Parameters that clearly differ between the halves; none where the model is exact.
     held_out : float, optional
         Mean square of what the model leaves of fifths of the logs whose parameters are those of the rest, over that of
-        the fit.
+        the fit, and over what this is on average for parameters that do not change.
     deviation : Deviation, optional
         Of the part that deviates most from an exact model, if parts differ by more than noise explains.
     """
@@ -210,57 +213,88 @@ def _of_parts(names: Sequence[str], parts: Parts) -> Iterator[Finding]:
         yield Finding("care", f"{text}: {effect}. Intervals are too narrow, or the model lacks an effect.")
 
 
-def compared_parts(found: Explanation, result: ProjectedEstimate) -> Parts:
+def compared_parts(found: Explanation, result: ProjectedEstimate, prior_inflation: float) -> Parts:
     """Parameters of parts of the logs, compared with each other.
 
     Parameters
     ----------
     found : Explanation
     result : ProjectedEstimate
+    prior_inflation : float
+        Factor of the prior on model error under which parameters must differ, too.
 
     Returns
     -------
     Parts
     """
-    intervals = found.intervals
+    intervals, fit = found.intervals, found.refinement.fit
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
     share = place / np.bincount(intervals.log_of)[intervals.log_of]
-    compared = _deviating if found.exact else _changing
-    return compared(intervals, found.refinement.fit, result, share)
+    if found.exact:
+        return _deviating(intervals, fit, result, share)
+    return _changing(intervals, fit, result, share, prior_inflation)
 
 
-def _changing(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
+def _changing(
+    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray, prior_inflation: float
+) -> Parts:
     """Halves and held-out fifths of the logs, where the model is not exact."""
     share = share[result.windows]
     first = share < 0.5
     if min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
         return Parts()
+    equations = _equations(intervals, fit, result)
+    held_out = _held_out(*equations, (_HELD_OUT * share).astype(int))
+    moved, apart = _of_halves(*equations, first)
+    apart[np.isinf(np.diag(result.covariance))] = 0.0
+    changed = np.abs(apart) > _clear(apart, held_out)
+    if changed.any():
+        # Noise that the prior takes for unmodelled forces, or the reverse, is no change of the machine.
+        wide = inflated_prior(intervals, fit, prior_inflation)
+        _, apart_again = _of_halves(*_equations(intervals, wide, result), first)
+        changed &= apart_again * np.sign(apart) > _LIKELY
+    halves = result.parameters + moved
+    both = [Change(int(k), *halves[:, k].tolist()) for k in np.flatnonzero(changed)]
+    return Parts([x for x in both if x.apart > _DIFFERENT], held_out)
+
+
+def _clear(apart: FloatArray, held_out: float) -> FloatArray:
+    """Standard errors ``(n,)`` beyond which a difference of parameters, so many standard errors, is no chance."""
+    if held_out <= _WORSE:
+        return np.full(len(apart), _CLEAR)
+    of_any = NormalDist().inv_cdf(1.0 - 0.5 * _UNLIKELY / len(apart))
+    return np.where(np.abs(apart) == np.abs(apart).max(), _LIKELY, min(of_any, _CLEAR))
+
+
+def _equations(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate) -> tuple[FloatArray, FloatArray]:
+    """Regressors (W, n_v, n) and residuals (W, n_v) of the fitted motion, in the mean over each window."""
     _, rows, regressors, _ = residuals_of_motion(intervals, fit, result.parameters)
     W = means_of_intervals(intervals, regressors * intervals.counted[:, None, None])
     residuals = means_of_intervals(intervals, rows * intervals.counted[:, None])
-    W, residuals = (means_of_windows(x, result.windows) for x in (W, residuals))
-    held_out = _held_out(W, residuals, (_HELD_OUT * share).astype(int))
+    return means_of_windows(W, result.windows), means_of_windows(residuals, result.windows)
+
+
+def _of_halves(W: FloatArray, residuals: FloatArray, first: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Changes (2, n) of the parameters in the first and the second half; their difference (n,), in standard errors."""
     moved, variances = zip(*(_change(W[half], residuals[half]) for half in (first, ~first)), strict=True)
-    halves, errors = result.parameters[None] + np.array(moved), np.sqrt(sum(variances))
-    both = [Change(k, *x) for k, x in enumerate(halves.T.tolist())]
-    determined, clear = np.isfinite(np.diag(result.covariance)), _LIKELY if held_out > _WORSE else _CLEAR
-    changes = [
-        x
-        for x, s, ok in zip(both, errors, determined, strict=True)
-        if ok and abs(x.first - x.second) > clear * s and x.apart > _DIFFERENT
-    ]
-    return Parts(changes, held_out)
+    return np.array(moved), (moved[1] - moved[0]) / np.sqrt(np.maximum(np.sum(variances, axis=0), _TINY))
 
 
 def _held_out(W: FloatArray, residuals: FloatArray, part: IntArray) -> float:
-    """Mean square of the residuals of each part with the parameters of the others, over that with those of all."""
+    """Mean square of the residuals of each part with the parameters of the others, over that with those of all.
+
+    Of n parameters that do not change, fitted to N residuals, that of all is ``1 - n/N`` times that of the noise, and
+    that of a part ``1 + n/N'``, with N' residuals of the others.  The ratio of these two is 1 here.
+    """
     scale = _scales(residuals)
     fitted = residuals + W @ _change(W, residuals)[0]
     left = np.zeros_like(residuals)
     for k in np.unique(part):
         held = part == k
         left[held] = residuals[held] + W[held] @ _change(W[~held], residuals[~held])[0]
-    return float(np.square(left / scale).sum() / max(np.square(fitted / scale).sum(), _TINY))
+    n = _n_estimated(W) / residuals.size
+    usual = (1.0 + n * _HELD_OUT / (_HELD_OUT - 1.0)) / max(1.0 - n, _TINY)
+    return float(np.square(left / scale).sum() / max(np.square(fitted / scale).sum() * usual, _TINY))
 
 
 def _deviating(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
@@ -300,12 +334,20 @@ def _is_no_chance(distance: float, freedom: int) -> bool:
 
 
 def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Change ``(n,)`` of parameters by least squares of some rows, and its variance by batches of them."""
+    """Change ``(n,)`` of parameters by least squares of some rows, and its variance by batches of them.
+
+    What is left of N residuals is too small by what n parameters have taken of them, ``1 - n/N`` on average.
+    """
     gains = least_squares_gains(W, 1.0 / _scales(residuals))
     change = -np.einsum("pwi,wi->p", gains, residuals)
     left = residuals + W @ change
     sums = batch_sums(np.einsum("pwi,wi->wp", gains, left))
-    return change, np.square(sums).sum(axis=0)
+    return change, np.square(sums).sum(axis=0) / max(1.0 - _n_estimated(W) / residuals.size, _TINY)
+
+
+def _n_estimated(W: FloatArray) -> int:
+    """Number of parameters that have a part in the regressors."""
+    return int(W.any(axis=(0, 1)).sum())
 
 
 def _scales(residuals: FloatArray) -> FloatArray:

@@ -251,7 +251,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         result = instrumented.result
     if best.impossible or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
-    parts, lacks = compared_parts(likeliest, result), None
+    parts, lacks = compared_parts(likeliest, result, settings.prior_inflation), None
     if settings.suggestions and not likeliest.exact:
         lacks = missing_terms(intervals, refined.fit, result, settings.candidate_terms)
     ambiguity = _ambiguity(parts.changes, lacks, instrumented)
@@ -331,10 +331,7 @@ def _searched(
     hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
     intervals, hypotheses, n_spikes = find_spikes(settings, intervals, motion, hypotheses, seed, dataset)
     if n_spikes:
-        notes += (
-            f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; the running median "
-            "replaces them",
-        )
+        notes += (f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; they are interpolated",)
     unit = discrepancy_units(intervals, motion, hypotheses[0])
     search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None, to_beat=to_beat)

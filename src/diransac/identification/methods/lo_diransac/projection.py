@@ -69,6 +69,7 @@ __all__ = [
     "fitted_parameters",
     "inertia_slopes",
     "inertial_forces",
+    "inflated_prior",
     "instrumented_contrast",
     "least_squares_gains",
     "mean_regressors",
@@ -186,7 +187,7 @@ def estimate_parameters(
         Within the inclusive bounds; parameters on them have an infinite variance.
     """
     wide = _with_wide_priors(intervals, fit)
-    found, inflated = _solution(intervals, wide, instruments), _inflated_prior(intervals, wide, prior_inflation)
+    found, inflated = _solution(intervals, wide, instruments), inflated_prior(intervals, wide, prior_inflation)
     change = projected_parameters(intervals, inflated, instruments) - found.parameters
     found = replace(found, covariance=found.covariance + np.outer(change, change))
     return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
@@ -337,8 +338,19 @@ def _combined_with_priors(intervals: ShootingIntervals, fit: Fit, found: Project
     return replace(found, parameters=p, covariance=covariance, unexplained=left)
 
 
-def _inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fit:
-    """The fit after one step with ``tau`` larger by a factor."""
+def inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fit:
+    """The fit after one step with a prior on model error, `Fit.tau`, that is larger by a factor.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    factor : float
+
+    Returns
+    -------
+    Fit
+    """
     inflated, n_x = replace(fit, tau=factor * fit.tau), fit.x.shape[1]
     at = linearize(intervals, inflated, weights_of(intervals, fit))
     step = at.system.solve(at.right_z, at.right_s)

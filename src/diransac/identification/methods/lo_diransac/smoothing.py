@@ -58,8 +58,8 @@ _UNINFORMED = 1e-9
 _FEWEST, _ENOUGH_SAMPLES = 5, 25
 # Residuals that a scale is taken from; more would only cost time.
 _ENOUGH = 4000
-# Samples of the running median beside which inputs have spikes: those of two samples at most.
-_SPIKE_WINDOW, _MAD_TO_STD = 5, 1.4826
+# Samples of the running medians beside which inputs have spikes: those of two samples at most.  Passes over them.
+_SPIKE_WINDOW, _SPIKE_PASSES, _MAD_TO_STD = 5, 20, 1.4826
 # Numbers of the windows of chains that are fitted together at most; more would only take memory.
 _NUMBERS_TOGETHER = 100_000
 
@@ -174,7 +174,7 @@ def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[
 
 
 def without_spikes(inputs: FloatArray, threshold: float) -> tuple[FloatArray, int]:
-    """Inputs whose spikes of one or two samples, large beside their noise, are replaced by the running median.
+    """Inputs whose spikes of one or two samples, large beside their noise, are interpolated.
 
     Spikes of a measured torque that are smaller than its range escape `screened_inputs`.  Those of a controller look
     alike, so that simulations must tell which inputs acted.
@@ -183,8 +183,8 @@ def without_spikes(inputs: FloatArray, threshold: float) -> tuple[FloatArray, in
     ----------
     inputs : (N, n_u) array
     threshold : float
-        Standard deviations of the noise, by second differences, from the running median beyond which an input is
-        replaced.  An input without noise, which is held or steps, is kept.
+        Standard deviations of the noise, by second differences, beyond which an input is replaced.  An input without
+        noise, which is held or steps, is kept.
 
     Returns
     -------
@@ -194,14 +194,32 @@ def without_spikes(inputs: FloatArray, threshold: float) -> tuple[FloatArray, in
     """
     if len(inputs) < _SPIKE_WINDOW or not inputs.shape[1]:
         return inputs, 0
-    spikes, median = preprocessing.hampel(inputs, _SPIKE_WINDOW, threshold, _noise_deviation)
-    return np.where(spikes, median, inputs), int(spikes.any(axis=1).sum())
+    columns = [_without_spikes_of_one(u, threshold * _noise_deviation(u)) for u in inputs.T]
+    cleaned = np.column_stack(columns)
+    return cleaned, int((cleaned != inputs).any(axis=1).sum())
 
 
-def _noise_deviation(values: FloatArray, _median: FloatArray, _window: int) -> FloatArray:
-    """Standard deviation ``(n_u,)`` of white noise by second differences; infinite where most of these are zero."""
-    usual = np.median(np.abs(np.diff(values, 2, axis=0)), axis=0)
-    return np.where(usual > 0.0, _MAD_TO_STD / np.sqrt(6.0) * usual, np.inf)
+def _without_spikes_of_one(u: FloatArray, limit: float) -> FloatArray:
+    """One input ``(N,)``, interpolated where it is further than a limit from others beside it.
+
+    Where spikes are frequent, most samples of a window may be spikes: those found are left out before the next medians,
+    and samples that agree with what is interpolated in the end were none.
+    """
+    rows = np.arange(len(u))
+    kept = rows
+    for _ in range(_SPIKE_PASSES):
+        spikes, _ = preprocessing.hampel(u[kept], _SPIKE_WINDOW, 1.0, lambda *_: np.asarray(limit))
+        if not spikes.any() or len(kept) - spikes.sum() < _SPIKE_WINDOW:
+            break
+        kept = kept[~spikes]
+    good = np.abs(u - np.interp(rows, kept, u[kept])) <= limit
+    return np.where(good, u, np.interp(rows, rows[good], u[good]))
+
+
+def _noise_deviation(u: FloatArray) -> float:
+    """Standard deviation of white noise by second differences; infinite where most of these are zero."""
+    usual = float(np.median(np.abs(np.diff(u, 2))))
+    return _MAD_TO_STD / np.sqrt(6.0) * usual if usual > 0.0 else np.inf
 
 
 # ---------------------------------------------------------------------- smoothing
