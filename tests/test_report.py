@@ -356,10 +356,19 @@ def test_findings_over_several_logs_are_on_the_worst_one_and_on_all_rows(model, 
 def test_findings_on_a_held_out_log_join_those_of_the_result(result, log, other, tmp_path):
     page = Page(written(result, [log, other], tmp_path))
     assert all(str(finding) in page.text for finding in result.findings)
-    assert "Held out: outliers are left out of robust scores:" in page.text
-    assert "Held out: over the whole log the prediction of x_dot is off by" in page.text
-    assert "Not used for identification (held-out validation): another dive." in page.text
+    held_out, own = page.text.partition("Held out, another dive")[2].split(f"Identification from {log.source}", 1)
+    assert "Outliers are left out of robust scores:" in held_out
+    assert "Over the whole log the prediction of x_dot is off by" in held_out
+    assert all(str(finding) in own for finding in result.findings)
     assert "Held out" not in Page(written(result, log, tmp_path)).text
+
+
+def test_parts_of_one_log_are_told_apart_by_their_times(model, tmp_path):
+    log = dive(model, 900)
+    result = dr.identify(model, log.between(3.0, 10.0), method="ols")
+    page = Page(written(result, log.between(10.0, 17.0), tmp_path))
+    assert f"evaluated on {log.source} from 10 to 17 s, not used for identification" in page.text
+    assert f"Identification from {log.source} from 3 to 10 s" in page.text
 
 
 def test_a_model_that_fails_on_a_held_out_log_is_not_to_be_relied_on(model, result, tmp_path):

@@ -183,7 +183,7 @@ def test_an_unstable_machine_is_judged_by_restarted_simulations_of_held_out_logs
     assert result.logs[0].prediction.restart_period < 0.2 * (len(log) - 1) * DT
     dr.write_report(result, inverted(seed=4)[1], tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
-    assert "Held out: prediction over" in page  # and it is not judged where noise of the start has grown 500 times
+    assert "Prediction over" in page  # and it is not judged where noise of the start has grown 500 times
     assert "</span> usable</h3>" in page
     falling = changed(result, parameters={"stiffness": -25.0, "gain": 5.0})
     dr.write_report(falling, inverted(seed=4)[1], tmp_path / "page.html")

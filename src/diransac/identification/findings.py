@@ -228,7 +228,9 @@ def _inliers(logs: Sequence[LogSummary], fraction: float, *, restarted: bool) ->
     text = f"{percent(fraction)} of {plural(n_rows, 'row')} agree with"
     if restarted:
         yield Finding(
-            "note", f"{text} an open-loop simulation of the whole log, in which unmodelled forces accumulate."
+            "note",
+            f"{text} an open-loop simulation of the whole log, in which effects of unmodelled forces and errors of its "
+            "start add up, and grow where the machine is unstable.",
         )
         return
     if fraction < _HALF:
@@ -271,10 +273,12 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
         yield Finding("care", f"The model seems to lack a term. {suggestion.text}.")
     if found.input_delay_significant:
         sense, lag = "later" if found.input_delay > 0.0 else "earlier", result.estimate.resolution.timing.lag
-        late = f"Inputs act {number(1e3 * abs(found.input_delay), 3)} ms {sense} than recorded"
-        how, what = (", after a first-order lag of the actuators", "lag") if lag else ("", "delay")
+        time = number(1e3 * abs(found.input_delay), 3)
+        late, what = f"Inputs act {time} ms {sense} than recorded", "delay"
+        if lag:
+            late, what = f"Inputs act after a first-order lag of the actuators of {time} ms (time constant)", "lag"
         included = f"the estimate includes this {what}, as do its evaluation and validation"
-        yield Finding("care", f"{late}{how}: {included}; other simulations of the model must include it, too.")
+        yield Finding("care", f"{late}: {included}; other simulations of the model must include it, too.")
     yield from _unidentifiable(result, found)
 
 

@@ -25,7 +25,7 @@ __all__ = ["Validation", "validate"]
 _NICE = (1.0, 2.0, 5.0)
 _PARTS, _FEWEST_STEPS = (200.0, 50.0, 10.0), 5
 """Horizons are these parts of a log; samples of one at least."""
-_GOOD, _FAR = 0.1, 0.5
+_GOOD, _FAR = 0.1, 0.25
 """Relative errors of predictions up to which a model is good, and needs care."""
 _TELLING = 0.1
 """Sensitivity of predictions to 1 % of the parameters and to the start, up to which a horizon tells models apart."""

@@ -89,6 +89,8 @@ def _method(runs: Sequence[Run]) -> str:
         return "Each simulation starts at the first row and depends on the inputs alone."
     state = restarted[0].restart_state
     which = "" if len(restarted) == len(runs) else f" by {', '.join(run.label for run in restarted)}"
+    if not any(run.restarts_within for run in restarted):
+        return f"Each simulation{which} starts at the first {state} state and depends on the inputs alone."
     period = number(restarted[0].restart_period)
     text = (
         f"Each simulation{which} depends on the inputs alone and restarts every {period} s from the {state} "
@@ -117,7 +119,7 @@ def _legend(runs: Sequence[Run], marking: Run, log: Log, timeline: Timeline) -> 
 
 def _shows_both(runs: Sequence[Run]) -> bool:
     """True if the whole-log simulation is drawn too, which is readable for a single result only."""
-    return len(runs) == 1 and bool(np.isfinite(runs[0].restart_period))
+    return len(runs) == 1 and runs[0].restarts_within
 
 
 def _signal(name: str, runs: Sequence[Run], marking: Run, log: Log, timeline: Timeline) -> Figure:

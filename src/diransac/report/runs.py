@@ -142,6 +142,11 @@ class Run(SimulatedLog):
         return "smoothed" if self.screened else "measured"
 
     @property
+    def restarts_within(self) -> bool:
+        """True if the simulation restarts before the end of the log."""
+        return bool(self.restart_period < (len(self.observations) - 1) * self.observations.log.dt)
+
+    @property
     def rows(self) -> IntArray:
         """Rows of the log (N,)."""
         return np.arange(self.first_row, self.first_row + len(self.observations))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +48,7 @@ def lead(entries: Sequence[Entry], logs: Sequence[Log]) -> str:
     methods = f"by {labels[0]}" if len(labels) == 1 else f"in {len(labels)} ways ({', '.join(labels)})"
     text = f"Identified {methods} from {_sources(entries)}"
     runs = [run for entry in entries for run in entry.runs]
-    held_out = dict.fromkeys(run.log_name for run in runs if run.held_out)
+    held_out = dict.fromkeys(_name(run) for run in runs if run.held_out)
     if held_out and all(run.held_out for run in runs):
         text = f"Held-out validation. {text}; evaluated on {', '.join(held_out)}, not used for identification"
     elif held_out:
@@ -57,8 +57,15 @@ def lead(entries: Sequence[Entry], logs: Sequence[Log]) -> str:
 
 
 def _sources(entries: Sequence[Entry]) -> str:
-    """Names of the logs of every result."""
-    groups = dict.fromkeys(tuple(s.source for s in summaries(entry.result)) for entry in entries)
+    """Names of the logs of every result, with their times where a log of the page has the same name."""
+    held_out = {run.log_name for entry in entries for run in entry.runs if run.held_out}
+    groups = dict.fromkeys(
+        tuple(
+            _with_time(x.source, x.start, x.start + (x.n_rows - 1) * x.dt) if x.source in held_out else x.source
+            for x in summaries(entry.result)
+        )
+        for entry in entries
+    )
     return " and ".join(
         sources[0] if len(sources) == 1 else f"{len(sources)} logs ({', '.join(sources)})" for sources in groups
     )
@@ -72,34 +79,39 @@ def _size(logs: Sequence[Log]) -> str:
 
 @dataclass(frozen=True)
 class Card:
-    """The verdict on one result and the findings behind it."""
+    """The verdict on one result and the findings behind it, by the log that they are about."""
 
     label: str
     level: Level
     verdict: Verdict
-    findings: tuple[Finding, ...]
+    groups: tuple[tuple[str, tuple[Finding, ...]], ...]
 
 
 def card(entry: Entry) -> Card:
-    """The verdict on one result: its own findings, and those on held-out logs of the page."""
+    """The verdict on one result: its own findings, and before them those on held-out logs of the page."""
     held_out = [run for run in entry.runs if run.held_out]
-    found = entry.result.findings
-    if held_out:
-        found = by_seriousness((*found, *_findings_on_held_out(held_out)))
-    verdict = verdict_of(found)
-    return Card(entry.label, _LEVELS[verdict], verdict, found)
+    groups = [(f"Held out, {_name(run)}", _findings_on(run)) for run in held_out]
+    groups.append((f"Identification from {_sources([entry])}" if held_out else "", entry.result.findings))
+    verdict = verdict_of(finding for _, found in groups for finding in found)
+    return Card(entry.label, _LEVELS[verdict], verdict, tuple(groups))
 
 
-def _findings_on_held_out(runs: Sequence[Run]) -> Iterator[Finding]:
-    """Findings of the validation of each held-out log."""
-    for run in runs:
-        where = f" ({run.log_name})" if len(runs) > 1 else ""
-        if isinstance(run.validation, str):
-            yield Finding("care", f"Held out{where}: not scored: {run.validation}")
-        else:
-            found = run.validation.findings
-            yield from (Finding(x.level, f"Held out{where}: {x[:1].lower()}{x[1:]}") for x in found)
-    yield Finding("note", f"Not used for identification (held-out validation): {', '.join(x.log_name for x in runs)}.")
+def _findings_on(run: Run) -> tuple[Finding, ...]:
+    """Findings of the validation of a held-out log."""
+    if isinstance(run.validation, str):
+        return (Finding("care", f"Not scored: {run.validation}"),)
+    return by_seriousness(run.validation.findings)
+
+
+def _name(run: Run) -> str:
+    """Name of a log, with its time where the result was identified from a log of the same name."""
+    time = run.observations.log.time
+    same = run.log_name in (one.source for one in summaries(run.result))
+    return _with_time(run.log_name, float(time[0]), float(time[-1])) if run.held_out and same else run.log_name
+
+
+def _with_time(name: str, begin: float, end: float) -> str:
+    return f"{name} from {number(begin)} to {number(end)} s"
 
 
 def differences(entries: Sequence[Entry]) -> str:
@@ -348,8 +360,9 @@ def _delay(entry: Entry) -> str:
     if not found.input_delay_significant:
         return ""
     delay, error = number(1e3 * found.input_delay, 3), number(1e3 * found.input_delay_error, 2)
-    kind = "lag" if entry.result.estimate.resolution.timing.lag else "delay"
-    return f"Input {kind}: {delay} ± {error} ms (standard error). The estimate and the simulations shown include it."
+    lag = entry.result.estimate.resolution.timing.lag
+    what = "First-order lag of the inputs, time constant" if lag else "Input delay"
+    return f"{what}: {delay} ± {error} ms (standard error). The estimate and the simulations shown include it."
 
 
 def short_term_scores(runs: Sequence[Run]) -> Table | None:
@@ -396,30 +409,31 @@ def scores(run: Run) -> ScoreTable:
 
 
 def _horizon_table(label: str, at: HorizonScores, validation: Validation) -> Table:
-    """Scores of one horizon, beside those of trivial predictions."""
-    rows = []
-    for name in at.rmse:
-        errors = (at.rmse, at.robust_rmse, at.hold_last, at.constant_velocity)
-        fits = (number(x[name], 3) for x in (at.fit_percent, at.robust_fit_percent))
-        ratios = (_r_squared(x[name]) for x in (at.r_squared, at.robust_r_squared))
-        off = percent(at.relative_error[name]) if name in at.relative_error else "–"
-        rows.append((name, validation.units[name], *(number(x[name]) for x in errors), off, *fits, *ratios))
+    """Scores of one horizon, beside those of trivial predictions; robust ones where samples are left out of them."""
+    robust = any(x > 0.0 for x in validation.outlier_fraction.values())
+    columns: list[tuple[str, Mapping[str, float], Callable[[float], str]]] = [
+        ("RMSE", at.rmse, number),
+        *([("robust RMSE", at.robust_rmse, number)] if robust else []),
+        ("hold last", at.hold_last, number),
+        ("const. vel.", at.constant_velocity, number),
+        ("relative error", at.relative_error, percent),
+        ("fit %", at.fit_percent, _three_digits),
+        *([("robust fit %", at.robust_fit_percent, _three_digits)] if robust else []),
+        ("R²", at.r_squared, _r_squared),
+        *([("robust R²", at.robust_r_squared, _r_squared)] if robust else []),
+    ]
+    rows = [
+        (name, validation.units[name], *(text(x[name]) if name in x else "–" for _, x, text in columns))
+        for name in at.rmse
+    ]
     judged = ", the judged horizon" if at is validation.judged else ""
     lost = f", {at.diverged} diverged" if at.diverged else ""
-    header = (
-        "Signal",
-        "Unit",
-        "RMSE",
-        "robust",
-        "hold last",
-        "const. vel.",
-        "off by",
-        "fit %",
-        "robust",
-        "R²",
-        "robust",
-    )
+    header = ("Signal", "Unit", *(title for title, _, _ in columns))
     return Table(header, rows, f"{label}: {at.name}{judged} ({plural(at.windows, 'window')}{lost})")
+
+
+def _three_digits(x: float) -> str:
+    return number(x, 3)
 
 
 def _innovation_table(label: str, one: Innovations, validation: Validation) -> Table:

@@ -617,6 +617,8 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
     sigma, fraction = (np.where(seen, x, np.nan) for x in (fit.noise.sigma, fit.noise.pi))
     inlying = fit.noise.inlying(fit.residuals, intervals.known)
     outliers = intervals.known & (inlying < _OUTLIER)
+    counted = outliers.sum(axis=0) / np.maximum(intervals.known.sum(axis=0), 1)
+    fraction = np.where(fit.noise.has_outliers, fraction, np.where(seen, counted, np.nan))
     shown = intervals.is_logged[intervals.starts]
     window_log = intervals.log_of[shown]
     begins = np.array([one.log.time[one.offset] for one in dataset.segments])[window_log]

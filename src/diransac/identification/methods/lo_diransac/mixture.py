@@ -52,6 +52,11 @@ class Mixture:
     floor: FloatArray
     quaternions: Sequence[tuple[int, int, int, int]] = ()
 
+    @property
+    def has_outliers(self) -> BoolArray:
+        """Signals ``(n_s,)`` whose fraction of outliers is more than the least that is assumed."""
+        return np.asarray(self.pi > _FRACTION[0])
+
     def inlying(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Probability ``(N, n_s)`` that each sample is not an outlier; 0 where it is missing (the E step)."""
         core, uniform = self._core(residuals), self.pi / (2.0 * self.span)

@@ -20,12 +20,14 @@ MacKay 1992 (evidence updates); Chung et al. 2013 (scales that are kept off zero
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.identification.methods.lo_diransac.lost_intervals import with_lost_intervals_restarted
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
@@ -295,6 +297,16 @@ def refine(
     TimeLimitError
         The time limit was reached.
     """
+    found = _refined(settings, intervals, fit, prior, settled=settled, to_beat=to_beat)
+    return _likelier(
+        intervals, found, lambda again: _refined(settings, intervals, again, prior, settled=True, to_beat=found.cost)
+    )
+
+
+def _refined(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, *, settled: bool, to_beat: float
+) -> Refinement:
+    """As `refine`, from one start."""
     damping, robust, converged, steps = 0.0, settings.robust_model_error and not settled, False, 0
     race = _Race(to_beat)
     while steps < settings.max_steps and (robust or not converged) and not race.is_lost(intervals, fit, steps):
@@ -333,6 +345,20 @@ def refine_exact(
     TimeLimitError
         The time limit was reached.
     """
+    found = _refined_exactly(settings, intervals, fit, prior, to_beat)
+    return _likelier(intervals, found, lambda again: _refined_exactly(settings, intervals, again, prior, found.cost))
+
+
+def _likelier(intervals: ShootingIntervals, found: Refinement, refined: Callable[[Fit], Refinement]) -> Refinement:
+    """The likelier of a refinement and of another one, in which the intervals that it has lost start anew."""
+    again = with_lost_intervals_restarted(intervals, found.fit) if found.converged else None
+    return found if again is None else min(found, refined(again), key=lambda x: x.cost)
+
+
+def _refined_exactly(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, to_beat: float
+) -> Refinement:
+    """As `refine_exact`, from one start."""
     n_p, least = intervals.n_p, _EXACT * prior.tau
     shared, sizes = fit.shared.copy(), fit.prior.copy()
     shared[n_p:-1], sizes[n_p:-1] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:-1]
