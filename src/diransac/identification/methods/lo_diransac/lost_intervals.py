@@ -68,7 +68,7 @@ def with_lost_intervals_restarted(intervals: ShootingIntervals, fit: Fit) -> Fit
 
 
 def _in_doubt(intervals: ShootingIntervals, fit: Fit) -> IntArray:
-    """Intervals that follow none, whose states no others lead to, and those with unusually many outliers of a signal."""
+    """Intervals that follow none, to which no state leads, and those with unusually many outliers of a signal."""
     outlying = intervals.known & (fit.noise.inlying(fit.residuals, intervals.known) < 0.5)
     n_outliers, n = (z.reshape(len(intervals), intervals.length, -1).sum(axis=1) for z in (outlying, intervals.known))
     share = n_outliers.sum(axis=0) / np.maximum(n.sum(axis=0), 1)
