@@ -71,7 +71,7 @@ def test_a_lag_of_the_actuators_is_estimated_and_named():
     assert found.worst < 0.2
     lags = [x for x in found.findings if "after a first-order lag of the actuators" in x]
     assert len(lags) == 1
-    assert float(lags[0].split(" of ")[-1].split()[0]) == pytest.approx(50.0, abs=5.0)
+    assert float(lags[0].split("actuators of ")[1].split()[0]) == pytest.approx(50.0, abs=5.0)
 
 
 def test_late_sensors_are_named():

@@ -25,7 +25,7 @@ MAX_LINES = 3
 UsageError: type[Any] = typer.BadParameter.__mro__[1]
 
 
-_PLAIN, _CHECKED = (str, Path, int, float), ("parser", "click_type", "min", "max")
+_PLAIN, _CHECKED = (str, Path, int, float), ("click_type", "min", "max")
 """Kinds of arguments that are converted by a call, and what makes Typer check or convert an argument otherwise."""
 
 _LATER = {"fleet": "diransac.cli.fleet", "study": "diransac.cli.study"}
@@ -138,9 +138,10 @@ class _Conversion:
             return () if several else None
         kind, about = param.type_descriptor.annotation, param.type_descriptor.parameter_info
         kind = next(iter(get_args(kind)), None) if several else kind
-        if kind in _PLAIN and not any(getattr(about, name, None) is not None for name in _CHECKED):
+        convert = getattr(about, "parser", None) or (kind if kind in _PLAIN else None)
+        if convert and not any(getattr(about, name, None) is not None for name in _CHECKED):
             with suppress(ValueError):
-                return [kind(x) for x in value] if several else kind(value)
+                return [convert(x) for x in value] if several else convert(value)
         return self.make().coerce(value, param=param, ctx=ctx)
 
 

@@ -44,7 +44,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Change", "Parts", "compared_parts", "findings_of_fit"]
 
-# A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious.
+# A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious,
+# if held-out parts of the logs are predicted worse for it.
 _CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
 # Delay of an input that is worth a sentence, samples.
 _SMALL_DELAY = 0.1
@@ -198,7 +199,8 @@ def _of_parts(names: Sequence[str], parts: Parts) -> Iterator[Finding]:
         first, second = number(change.first, 3), number(change.second, 3)
         text = f"{names[change.index]} changes during the log, from {first} in its first half to {second} in its second"
         advice = "a payload, a drifting gain or another regime; identify stretches of the log one by one"
-        yield Finding("bad" if change.apart > _SERIOUS else "care", f"{text}: {advice}.")
+        is_serious = change.apart > _SERIOUS and parts.held_out > _WORSE
+        yield Finding("bad" if is_serious else "care", f"{text}: {advice}.")
     if parts.held_out > _WORSE:
         more = percent(np.sqrt(parts.held_out) - 1.0)
         text = f"Fifths of the log that are held out have {more} more unmodelled force (RMS) than in the fit of all"
