@@ -56,6 +56,10 @@ def test_an_arm_in_the_hand_is_found_and_right_once_that_is_left_out(tmp_path):
     found = [tuple(map(float, part.split(":"))) for part in option.split(",")]
     assert len(found) == len(HELD)
     np.testing.assert_allclose(found, HELD, atol=0.35)
+    page = tmp_path / "arm.html"
+    dr.write_report(first, log, page)
+    assert 'class="swatch departed"></span>the model does not hold' in page.read_text()
+    assert page.read_text().count('class="band departed" d="M') >= 2
     log.write(tmp_path / "arm.csv")
     rest = dr.leave_out(log, found)
     second = dr.identify(MODEL, rest, differentiate=True)

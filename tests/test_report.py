@@ -284,7 +284,7 @@ def test_stretches_that_are_left_out_are_bands_with_their_reasons(model, log, tm
     (ends, middle) = kept.history[-1]["left_out"]
     assert middle[0] == pytest.approx(held.time[n // 2 + 1])
     assert f"Left out: {ends[0]:.4g} to {ends[1]:.4g} s (not diving), {middle[0]:.4g} to {middle[1]:.4g} s" in text
-    assert 'class="band"' in text
+    assert 'class="band left-out"' in text
     assert "left out" in text
     assert "Left out" not in written(dr.identify(model, log, "ols"), log, tmp_path)
 

@@ -7,7 +7,7 @@ dots additionally keep every n-th sample, so that their density is preserved.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -233,7 +233,7 @@ def time_plot(
     levels: Sequence[float] = (),
     full: tuple[float, float] | None = None,
     still: bool = False,
-    left_out: BoolArray | None = None,
+    bands: Mapping[str, BoolArray] | None = None,
 ) -> Plot:
     """Plot of several traces over time.
 
@@ -245,13 +245,16 @@ def time_plot(
     levels : values marked by a horizontal line
     full : range of all measured samples, where it exceeds the scale
     still : True if the axis is no time
-    left_out : (n_rows,)   rows that are shaded
+    bands : CSS classes -> (n_rows,)   rows that are shaded
     """
     marks = ticks(scale.low, scale.high)
     heights = [int(y) for y in scale.height([x for x, _ in marks])]
     width = max(1, timeline.n_rows - 1)
-    shaded = [] if left_out is None else [f"M{x.start} 0v{_HEIGHT}h{x.stop - x.start}V0z" for x in runs(left_out)]
-    paths = [("band", "", "".join(shaded))] if shaded else []
+    paths = [
+        (f"band {look}", "", "".join(f"M{x.start} 0v{_HEIGHT}h{x.stop - x.start}V0z" for x in runs(rows)))
+        for look, rows in (bands or {}).items()
+        if rows.any()
+    ]
     paths.append(("grid", "", "".join(f"M0 {y}h{width}" for y in heights)))
     if levels:
         paths.append(("level", "", "".join(f"M0 {y}h{width}" for y in scale.height(levels))))

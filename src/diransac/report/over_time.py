@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,7 +114,8 @@ def _legend(runs: Sequence[Run], marking: Run, log: Log, timeline: Timeline) -> 
     keys += [(f"m{i}", f"simulated, {run.label}") for i, run in enumerate(runs)]
     if _shows_both(runs):
         keys.append(("long", "whole-log simulation"))
-    return [*keys, ("band", "left out")] if any(_left_out(run, log, timeline).any() for run in runs) else keys
+    shown = [_bands(run, log, timeline) for run in runs]
+    return [*keys, *((look, text) for look, text in _BANDS.items() if any(x[look].any() for x in shown))]
 
 
 def _shows_both(runs: Sequence[Run]) -> bool:
@@ -135,8 +136,8 @@ def _signal(name: str, runs: Sequence[Run], marking: Run, log: Log, timeline: Ti
     facts = [_median_error(name, run, unit, label=f"{run.label} " * (len(runs) > 1)) for _, run in having]
     beyond = _beyond(shown.observations.column(name), scale)
     about = f"{name} in {unit}, measured and simulated over {number(timeline.dt * (timeline.n_rows - 1))} s"
-    left_out = _left_out(shown, log, timeline)
-    plot = time_plot(traces, scale, timeline, about, full=beyond and beyond[:2], left_out=left_out)
+    bands = _bands(shown, log, timeline)
+    plot = time_plot(traces, scale, timeline, about, full=beyond and beyond[:2], bands=bands)
     return Figure(
         title=name,
         unit=unit,
@@ -199,7 +200,19 @@ def _beyond_text(beyond: tuple[float, float, int] | None) -> str:
     return f"{plural(n_beyond, 'sample')} outside of this range, from {number(low)} to {number(high)}"
 
 
-# ---------------------------------------------------------------------- stretches that are left out
+# ---------------------------------------------------------------------- stretches that are left out, or not described
+
+
+_BANDS = {"left-out": "left out", "departed": "the model does not hold"}
+"""CSS class of each kind of band -> what it shows."""
+
+
+def _bands(run: Run, log: Log, timeline: Timeline) -> dict[str, BoolArray]:
+    """Rows of the log ``(n_rows,)`` that each kind of band shades."""
+    departed = np.zeros(timeline.n_rows, bool)
+    for stretch in run.view.departures:
+        departed |= (log.time >= stretch.start) & (log.time <= stretch.stop)
+    return {"left-out": _left_out(run, log, timeline), "departed": departed}
 
 
 def _left_out(run: Run, log: Log, timeline: Timeline) -> BoolArray:
@@ -296,8 +309,8 @@ def _unmodelled_about(found: Diagnosis) -> str:
 def _unmodelled(run: Run, found: Diagnosis, i: int, log: Log, timeline: Timeline) -> list[Figure]:
     """A figure of each unmodelled force, or of each acceleration if the model has no balance of forces."""
     series = found.unmodelled_forces or found.unmodelled_accelerations
-    left_out = _left_out(run, log, timeline)
-    return [_unmodelled_figure(run, name, values, found, i, timeline, left_out) for name, values in series.items()]
+    bands = _bands(run, log, timeline)
+    return [_unmodelled_figure(run, name, values, found, i, timeline, bands) for name, values in series.items()]
 
 
 def _unmodelled_figure(
@@ -307,7 +320,7 @@ def _unmodelled_figure(
     found: Diagnosis,
     i: int,
     timeline: Timeline,
-    left_out: BoolArray,
+    bands: Mapping[str, BoolArray],
 ) -> Figure:
     model = run.result.model
     unit = _FORCES.get(model.units[name], "") if found.unmodelled_forces else model.units[name]
@@ -324,7 +337,7 @@ def _unmodelled_figure(
         explained = _steps(found, found.suggested_terms[name], timeline)
         traces.append(Trace("suggested terms", "suggested", "line", *explained))
     label = f"Unmodelled {what}{f' in {unit}' if unit else ''}"
-    plot = time_plot(traces, scale, timeline, label, levels=(0.0,), left_out=left_out)
+    plot = time_plot(traces, scale, timeline, label, levels=(0.0,), bands=bands)
     return Figure(
         what, unit, (f"RMS {number(rms, 2)} {unit}".strip() + f", {relative}",), (Panel(plot),), time_axis(timeline)
     )

@@ -14,6 +14,7 @@ from diransac.data.dataset import Dataset
 from diransac.data.log import Log
 from diransac.data.segment import Segment
 from diransac.errors import LogError, ResultError, SettingsError
+from diransac.identification.departures import Departure, departures
 from diransac.identification.estimate import Diagnosis, LogSummary
 from diransac.identification.evaluation import Scoring, Simulation, as_estimated, choose_scoring, judged_signals
 from diransac.identification.horizons import OpenLoop
@@ -57,6 +58,7 @@ class LogView:
     inliers : (N,)   over the rows of the log; None for a held-out log
     preparation : preprocessing steps of the log, in order; of a held-out log, those to repeat
     diagnosis : restricted to the rows and windows of this log; None if there is none, and for a held-out log
+    departures : stretches of this log in which the model does not hold
     fit_error : of this log; NaN for a held-out log
     remark : disagreement with the other logs, empty if there is none
     """
@@ -67,6 +69,7 @@ class LogView:
     inliers: BoolArray | None
     preparation: Sequence[Mapping[str, Any]]
     diagnosis: Diagnosis | None
+    departures: Sequence[Departure]
     fit_error: float
     remark: str
 
@@ -89,14 +92,25 @@ def log_view(result: Result, log: Log) -> LogView:
     own = (i for i, summary in enumerate(result.logs) if summary.fingerprint == log.fingerprint)
     index = next(own, None)
     if index is None:
-        return LogView(None, result.parameters, (), None, result.logs[0].preparation, None, np.nan, "")
+        return LogView(None, result.parameters, (), None, result.logs[0].preparation, None, (), np.nan, "")
     summary, rows = result.logs[index], result.log_rows(index)
     parameters = result.parameters_in(log)
-    diagnosis = None if result.diagnosis is None else result.diagnosis.of_log(index, rows)
+    diagnosis, departing = None, list[Departure]()
+    if result.diagnosis is not None:
+        diagnosis = result.diagnosis.of_log(index, rows)
+        departing = departures(result.diagnosis, index, summary.prediction.unexplained if summary.prediction else {})
     inliers = result.inliers[rows]
     steps = summary.preparation
     return LogView(
-        index, parameters, tuple(result.per_log), inliers, steps, diagnosis, summary.fit_error, summary.remark
+        index,
+        parameters,
+        tuple(result.per_log),
+        inliers,
+        steps,
+        diagnosis,
+        departing,
+        summary.fit_error,
+        summary.remark,
     )
 
 
