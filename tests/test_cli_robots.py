@@ -132,6 +132,23 @@ def test_experiments_of_limbs_are_one_log_of_targets_within_the_limits_of_the_fi
         assert shown[leg]["parameters"][f"armature_{leg}_hip"]["ratio"] < 1.0
 
 
+def test_a_workspace_is_a_limit_on_the_place_of_a_body(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    leg = """<body name="foot" pos="0 0 -0.3"><joint name="knee" axis="0 1 0" range="-1 1"/>
+      <geom size="0.05" pos="0 0 -0.2"/><body name="toe" pos="0.1 0 -0.2"/></body>"""
+    legs = PAIR.replace("</body>", leg + "</body>", 1)
+    (tmp_path / "pair.xml").write_text(legs)
+    words = ["--frequency", "1", "--limit", "toe_x=-0.05:0.12,foot_x=0.15"]
+    done = run(*DESIGN, *words, "-o", "design.csv", "--json")
+    assert done.exit_code == 0, done.stderr
+    log, limbs = dr.read_log("design.csv"), json.loads(done.stdout)["limbs"]
+    hip, knee = log["FL_hip"], log["knee"]
+    toe = -0.3 * np.sin(hip) + 0.1 * np.cos(hip + knee) - 0.2 * np.sin(hip + knee)
+    assert -0.05 - 1e-6 <= toe.min() <= toe.max() <= 0.12 + 1e-6
+    assert np.abs(0.3 * np.sin(hip)).max() <= 0.15
+    assert [limb for limb, x in limbs.items() if "toe_x" in x["limits"]] == [next(iter(limbs))]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -9,6 +9,7 @@ import pytest
 import diransac as dr
 import robots
 from diransac.errors import ModelError
+from diransac.model.robots.mechanism import identifier as robots_identifier
 
 mujoco = pytest.importorskip("mujoco", reason="MODELS OF ROBOTS NOT CHECKED: mujoco is missing")
 
@@ -492,3 +493,55 @@ def test_least_squares_of_exact_motion_returns_the_robot(described, bodies):
     log = dr.Log.from_arrays(t, signals | {f"{n}_torque": tau[:, k] for k, n in enumerate(names)})
     result = dr.identify(model, log, "ols")
     assert dict(result.parameters) == pytest.approx({n: x.value for n, x in model.parameters.items()}, abs=1e-8)
+
+
+# ---------------------------------------------------------------------- positions of bodies
+
+
+@EVERY_ROBOT
+def test_points_of_bodies_are_where_mujoco_has_them(described, kind):
+    path = described(ROBOTS[kind](1))
+    model, data = compiled(path)
+    joints = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, k) for k in range(model.njnt)]
+    point = np.array([0.03, -0.2, 0.1])
+    for body, coordinates in dr.models.coordinates_of_bodies(path).items():
+        outputs = dr.models.body_position(path, body, point)
+        i = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)
+        if i < 0:  # a root link, which MuJoCo merges with the world
+            assert not coordinates
+            continue
+        for q in np.random.default_rng(2).normal(size=(3, model.nq)):
+            data.qpos[:] = q
+            mujoco.mj_kinematics(model, data)
+            named = {robots_identifier(name): x for name, x in zip(joints, q, strict=True)}
+            found = outputs(named, None, None, None, None)
+            expected = data.xpos[i] + data.xmat[i].reshape(3, 3) @ point
+            assert [float(x) for x in found.values()] == pytest.approx(expected, abs=EXACT)
+            assert set(coordinates) <= set(named)
+
+
+def test_a_body_behind_a_coupled_joint_is_moved_by_its_leader(described):
+    path = described(robots.panda_like())
+    assert dr.models.coordinates_of_bodies(path)["right"][-1] == "left_finger"
+    model, data = compiled(path)
+    i = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "right")
+    q = np.append(np.linspace(-0.5, 0.6, 7), [0.02, 0.021])  # right_finger = 0.001 + left_finger
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    named = dict(zip((*(f"joint{k}" for k in range(1, 8)), "left_finger"), q, strict=False))
+    found = dr.models.body_position(path, "right")(named, None, None, None, None)
+    assert [float(x) for x in found.values()] == pytest.approx(data.xpos[i], abs=EXACT)
+    assert list(found) == ["right_x", "right_y", "right_z"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"body": "foot"}, "body: there is no 'foot'"),
+        ({"body": "hand", "point": (0.0, 1.0)}, "point is"),
+        ({"body": "hand", "joints": "joint9"}, "joints: there is no 'joint9'"),
+    ],
+)
+def test_positions_of_no_body_are_refused(described, words, message):
+    with pytest.raises(ModelError, match=message):
+        dr.models.body_position(described(robots.panda_like()), **words)

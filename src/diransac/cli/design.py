@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 __all__ = ["DesignOptions", "DesignedModel", "Designs", "designed", "source_of"]
 
+_AXES = ("_x", "_y", "_z")
+"""Endings of the names of positions of bodies."""
+
 DesignedModel = Annotated[
     str,
     typer.Argument(
@@ -44,7 +47,8 @@ class DesignOptions:
         typer.Option(
             "--limit",
             metavar="NAME=LOW:HIGH|NAME=SIZE,...",
-            help="Range of a quantity, or its largest magnitude; {}_dot=5 for every joint. A robot's file has others.",
+            help="Range of a quantity, or its largest magnitude; {}_dot=5 for every joint; hand_z=0.1:0.8 for the "
+            "place of a body. A robot's file has others.",
         ),
     ] = None
     assignments: Annotated[
@@ -105,6 +109,28 @@ def _own(values: Mapping[str, Any], limbs: Mapping[str, Model], limb: str) -> di
     models = [model for other, model in limbs.items() if other != limb]
     others = {n for model in models for n in (*model.units, *map(FORCE.format, model.coordinates))}
     return {n: x for n, x in values.items() if n not in others}
+
+
+def _outputs(machine: UnsaturatedRobot, limb: Model, names: Sequence[str]) -> Callable[..., dict[str, Any]] | None:
+    """Forces of a limb's drives, and positions of its bodies that are among some names; None without a description."""
+    if machine.drives is None:
+        return None
+    from diransac.model.robots import drive_forces
+
+    wanted = {name[:-2] for name in names if name[-2:] in _AXES}
+    parts = [drive_forces(machine.drives, list(limb.coordinates))]
+    parts += [of for name, (moved, of) in machine.bodies.items() if name in wanted and moved <= set(limb.coordinates)]
+    return lambda *at: {name: x for part in parts for name, x in part(*at).items()}
+
+
+def _of_other_limbs(machine: UnsaturatedRobot, limb: Model) -> set[str]:
+    """Names of the positions of bodies that another limb moves."""
+    return {
+        name + axis
+        for name, (moved, _) in machine.bodies.items()
+        if not moved <= set(limb.coordinates)
+        for axis in _AXES
+    }
 
 
 @dataclass(frozen=True)
@@ -170,12 +196,11 @@ def designed(model: str, robot: RobotOptions, options: DesignOptions) -> Designs
     Raises as `diransac.design_experiment`; typer.BadParameter: an option cannot be read.
     """
     from diransac.flight.planning import design_experiment
-    from diransac.model.robots import drive_forces
 
     assumed, known = numbers("--parameter", options.assignments or ()), dict[str, float]()
     if _is_result(model):
         result = Result.load(model)
-        machine, known = UnsaturatedRobot({"": result.model}, {}, None), dict(result.parameters)
+        machine, known = UnsaturatedRobot({"": result.model}, {}), dict(result.parameters)
     else:
         machine = robot.load_unsaturated(model)
     limbs = machine.limbs
@@ -188,12 +213,13 @@ def designed(model: str, robot: RobotOptions, options: DesignOptions) -> Designs
     noise = _of_joints(numbers("--noise", options.noise or ()), limbs)
     found = {}
     for limb, own in limbs.items():
+        elsewhere = _of_other_limbs(machine, own) if len(limbs) > 1 else ()
         with screen.bar(f"design {limb}".rstrip()) as show:
             found[limb] = design_experiment(
                 options.plant(own, known | assumed),
-                limits=_own(limits, limbs, limb),
+                limits={n: x for n, x in _own(limits, limbs, limb).items() if n not in elsewhere},
                 noise=_own(noise, limbs, limb) or None,
-                outputs=None if machine.drives is None else drive_forces(machine.drives, list(own.coordinates)),
+                outputs=_outputs(machine, own, list(limits)),
                 progress=lambda stage, fraction, show=show: show(Progress(stage, fraction)),  # type: ignore[misc]
                 **options.numbers_of(),
             )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -42,11 +42,14 @@ class UnsaturatedRobot:
         Of joints and forces of drives, by the description and the drives.
     drives : Actuation, optional
         None: the machine has no description.
+    bodies : mapping of str to (set of str, callable)
+        By name without special characters: coordinates that move the body, and its position as `body_position` has it.
     """
 
     limbs: Mapping[str, Model]
     limits: Mapping[str, tuple[float, float]]
-    drives: Actuation | None
+    drives: Actuation | None = None
+    bodies: Mapping[str, tuple[frozenset[str], Callable[..., dict[str, Any]]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -101,17 +104,23 @@ class RobotOptions:
         Raises as `load`.
         """
         if not is_description(model):
-            return UnsaturatedRobot({"": self.load(model)}, {}, None)
-        from diransac.model.library import robot, robot_limits
+            return UnsaturatedRobot({"": self.load(model)}, {})
+        from diransac.model.library import body_position, coordinates_of_bodies, robot, robot_limits
         from diransac.model.robots import JointTorques
+        from diransac.model.robots.mechanism import identifier
 
         arguments = self._arguments()
         given = self._actuation() or JointTorques()
         drives = replace(given, limit=None)
         whole = robot(model, **arguments | {"actuation": drives})
-        limits = robot_limits(model, actuation=given, joints=arguments.get("joints"), base=self.base)
-        limbs = independent_parts(whole)
-        return UnsaturatedRobot(limbs if len(limbs) > 1 else {"": whole}, limits, drives)
+        chosen: dict[str, Any] = {"joints": arguments.get("joints"), "base": self.base}
+        bodies = {
+            identifier(name): (frozenset(moved), body_position(model, name, **chosen))
+            for name, moved in coordinates_of_bodies(model, **chosen).items()
+            if moved
+        }
+        limits, limbs = robot_limits(model, actuation=given, **chosen), independent_parts(whole)
+        return UnsaturatedRobot(limbs if len(limbs) > 1 else {"": whole}, limits, drives, bodies)
 
     def _arguments(self) -> dict[str, Any]:
         found: dict[str, Any] = {"actuation": self._actuation(), "base": self.base}

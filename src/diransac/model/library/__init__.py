@@ -21,14 +21,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from diransac.model.model import Model
-    from diransac.model.robots import drive_forces, robot, robot_limits
+    from diransac.model.robots import body_position, coordinates_of_bodies, drive_forces, robot, robot_limits
 
 __all__ = [
     "BLADE_FLAPPING",
     "BUILTIN",
     "TABLE_I",
+    "body_position",
     "builtin",
     "cart_pole",
+    "coordinates_of_bodies",
     "dc_motor",
     "differential_drive",
     "double_pendulum",
@@ -57,7 +59,7 @@ BUILTIN: dict[str, Callable[[], Model]] = {
     "quadrotor": quadrotor,
 }
 
-_OF_ROBOTS = ("drive_forces", "robot", "robot_limits")
+_OF_ROBOTS = ("body_position", "coordinates_of_bodies", "drive_forces", "robot", "robot_limits")
 
 
 def __getattr__(name: str) -> Any:

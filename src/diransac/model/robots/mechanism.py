@@ -234,11 +234,11 @@ class Mechanism:
     def _followed(self, coupling: Coupling, joint: Joint, found: Sequence[_Motion]) -> _Motion:
         """Motion of a joint that another determines."""
         c = coupling.coefficients
+        y = followed(self.description, coupling, [x.q for x in found])
         if coupling.leader is None:
-            return _Motion(joint.reference + c[0], 0.0, 0.0, 0.0, None)
+            return _Motion(y, 0.0, 0.0, 0.0, None)
         leader = found[coupling.leader]
         x = leader.q - self.description.joints[coupling.leader].reference
-        y = joint.reference + sum(b * x**k for k, b in enumerate(c))
         slope = sum(k * b * x ** (k - 1) for k, b in enumerate(c) if k > 0)
         curvature = sum(k * (k - 1) * b * x ** (k - 2) for k, b in enumerate(c) if k > 1)
         a = slope * leader.a + curvature * leader.v**2
@@ -284,6 +284,15 @@ def identifier(name: str) -> str:
 
 def _base_name(name: str, weights: Mapping[str, float]) -> str:
     return f"{name}_grouped" if len(weights) > 1 else name
+
+
+def followed(description: Description, coupling: Coupling, q: Sequence[Any]) -> Any:
+    """Position of a joint that another determines, from those of all."""
+    reference, c = description.joints[coupling.follower].reference, coupling.coefficients
+    if coupling.leader is None:
+        return reference + c[0]
+    x = q[coupling.leader] - description.joints[coupling.leader].reference
+    return reference + sum(b * x**k for k, b in enumerate(c))
 
 
 def ordered_couplings(label: str, description: Description) -> list[Coupling]:

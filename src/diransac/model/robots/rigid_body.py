@@ -117,6 +117,37 @@ def inverse_dynamics(
     return _joint_forces(description, q, [_inertial_force(body, J, motion) for body, J, motion in parts])
 
 
+def position_of(description: Description, body: int, point: Sequence[float], q: Sequence[Any]) -> ca.SX:
+    """Position of a point of a body.
+
+    Parameters
+    ----------
+    description : Description
+    body : int
+        Index of the body.
+    point : three floats
+        In the body's frame, m.
+    q : sequence of SX or float, one per joint
+        Positions, rad or m.
+
+    Returns
+    -------
+    (3,) SX
+        In the frame of the world, or of the base whose motion is measured, m.
+    """
+    r = ca.SX(ca.DM(list(point)))
+    while body >= 0:
+        own = description.bodies[body]
+        for k in reversed(own.joints):
+            R, origin = _displacement(description.joints[k], q[k])
+            r = R @ r + origin
+        if body == description.base:
+            break
+        r = ca.DM(own.rotation) @ r + ca.DM(own.position)
+        body = own.parent
+    return r
+
+
 def _joint_forces(description: Description, q: Sequence[Any], forces: list[_Force]) -> list[ca.SX]:
     """Forces of the joints, summed from the tips of the tree to its root."""
     of_joints = [ca.SX(0)] * len(description.joints)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +15,10 @@ from diransac.errors import ModelError
 from diransac.model.model import Model
 from diransac.model.robots.actuation import FORCE, Actuation, JointTorques
 from diransac.model.robots.description import Description, read_description
-from diransac.model.robots.mechanism import UNKNOWN, Mechanism, identifier, ordered_couplings
+from diransac.model.robots.mechanism import UNKNOWN, Mechanism, followed, identifier, ordered_couplings
+from diransac.model.robots.rigid_body import position_of
 
-__all__ = ["robot", "robot_limits"]
+__all__ = ["body_position", "coordinates_of_bodies", "robot", "robot_limits"]
 
 
 def robot(
@@ -93,7 +95,7 @@ def robot(
         raise ModelError(f'base is {base!r}; give "held" or "measured", or None')
     description = read_description(path, base)
     if gravity is not None:
-        description = replace(description, gravity=_vector(gravity))
+        description = replace(description, gravity=_vector(gravity, "gravity"))
     label = f'robot "{path}"'
     coordinates = _coordinates(label, description, joints)
     moved = set(coordinates.values())
@@ -148,6 +150,98 @@ def robot_limits(
         low, high = joint.force_limits
         found |= {name: joint.position_limits, FORCE.format(name): (max(low, -own), min(high, own))}
     return {name: pair for name, pair in found.items() if np.isfinite(pair).all()}
+
+
+def body_position(
+    path: str | Path,
+    body: str,
+    point: Sequence[float] = (0.0, 0.0, 0.0),
+    *,
+    joints: Collection[str] | Mapping[str, str] | str | None = None,
+    base: str | None = None,
+) -> Callable[..., dict[str, Any]]:
+    """Position of a point of a body, ``hand_x``, ``hand_y`` and ``hand_z``, as ``outputs`` of `design_experiment`.
+
+    Limits of these are a workspace: ``limits={"hand_z": (0.05, 0.8)}``.
+
+    Parameters
+    ----------
+    path : str or Path
+        MJCF or URDF.
+    body : str
+        Name of the body, or link.
+    point : sequence of three floats, optional
+        In the body's frame, m; its origin by default.
+    joints, base
+        As of `robot`.
+
+    Returns
+    -------
+    callable
+        ``(q, v, a, u, p)`` to the coordinates by name, m, in the frame of the world, or of a measured base.  The
+        coordinates of the model must include those that `coordinates_of_bodies` has for this body.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read, a name is unknown, or the point is no point.
+    """
+    description = read_description(path, base)
+    label = f'robot "{path}"'
+    chosen = _coordinates(label, description, joints)
+    names = [x.name for x in description.bodies]
+    i = names.index(_known_names("body", body, names)[0])
+    couplings, needed = ordered_couplings(label, description), coordinates_of_bodies(path, joints=joints, base=base)
+    at = _vector(point, "point")
+
+    def outputs(q: Any, _v: Any, _a: Any, _u: Any, _p: Any) -> dict[str, Any]:
+        found: list[Any] = [joint.reference for joint in description.joints]
+        for name in needed[body]:
+            found[chosen[name]] = q[name]
+        for coupling in couplings:
+            found[coupling.follower] = followed(description, coupling, found)
+        r = position_of(description, i, at.tolist(), found)
+        return {f"{identifier(body)}_{axis}": r[k] for k, axis in enumerate("xyz")}
+
+    return outputs
+
+
+def coordinates_of_bodies(
+    path: str | Path,
+    *,
+    joints: Collection[str] | Mapping[str, str] | str | None = None,
+    base: str | None = None,
+) -> dict[str, tuple[str, ...]]:
+    """Coordinates that move each body of a robot.
+
+    Parameters
+    ----------
+    path : str or Path
+        MJCF or URDF.
+    joints, base
+        As of `robot`.
+
+    Returns
+    -------
+    dict of str to tuple of str
+        By name of the body; none for a body that does not move.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read, or a name is unknown.
+    """
+    description = read_description(path, base)
+    label = f'robot "{path}"'
+    owner = {k: name for name, k in _coordinates(label, description, joints).items()}
+    for coupling in ordered_couplings(label, description):
+        if coupling.leader in owner:
+            owner[coupling.follower] = owner[coupling.leader]
+    found = list[tuple[str, ...]]()
+    for i, body in enumerate(description.bodies):
+        above = () if body.parent < 0 or i == description.base else found[body.parent]
+        found.append(tuple(dict.fromkeys((*above, *(owner[k] for k in body.joints if k in owner)))))
+    return {body.name: names for body, names in zip(description.bodies, found, strict=True)}
 
 
 # ---------------------------------------------------------------------- arguments
@@ -212,11 +306,11 @@ def _positive(what: str, value: float) -> float:
     return float(value)
 
 
-def _vector(gravity: Sequence[float]) -> FloatArray:
+def _vector(given: Sequence[float], what: str) -> FloatArray:
     try:
-        found = np.array(gravity, dtype=float)
+        found = np.array(given, dtype=float)
     except (TypeError, ValueError) as error:
-        raise ModelError(f"gravity is {gravity!r:.60}; give three numbers") from error
+        raise ModelError(f"{what} is {given!r:.60}; give three numbers") from error
     if found.shape != (3,) or not np.isfinite(found).all():
-        raise ModelError(f"gravity is {gravity!r:.60}; give three finite numbers")
+        raise ModelError(f"{what} is {given!r:.60}; give three finite numbers")
     return found
