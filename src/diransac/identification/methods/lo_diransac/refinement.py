@@ -20,7 +20,6 @@ MacKay 1992 (evidence updates); Chung et al. 2013 (scales that are kept off zero
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -297,16 +296,6 @@ def refine(
     TimeLimitError
         The time limit was reached.
     """
-    found = _refined(settings, intervals, fit, prior, settled=settled, to_beat=to_beat)
-    return _likelier(
-        intervals, found, lambda again: _refined(settings, intervals, again, prior, settled=True, to_beat=found.cost)
-    )
-
-
-def _refined(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, *, settled: bool, to_beat: float
-) -> Refinement:
-    """As `refine`, from one start."""
     damping, robust, converged, steps = 0.0, settings.robust_model_error and not settled, False, 0
     race = _Race(to_beat)
     while steps < settings.max_steps and (robust or not converged) and not race.is_lost(intervals, fit, steps):
@@ -346,13 +335,10 @@ def refine_exact(
         The time limit was reached.
     """
     found = _refined_exactly(settings, intervals, fit, prior, to_beat)
-    return _likelier(intervals, found, lambda again: _refined_exactly(settings, intervals, again, prior, found.cost))
-
-
-def _likelier(intervals: ShootingIntervals, found: Refinement, refined: Callable[[Fit], Refinement]) -> Refinement:
-    """The likelier of a refinement and of another one, in which the intervals that it has lost start anew."""
     again = with_lost_intervals_restarted(intervals, found.fit) if found.converged else None
-    return found if again is None else min(found, refined(again), key=lambda x: x.cost)
+    if again is None:
+        return found
+    return min(found, _refined_exactly(settings, intervals, again, prior, found.cost), key=lambda x: x.cost)
 
 
 def _refined_exactly(
