@@ -53,12 +53,14 @@ def with_lost_intervals_restarted(intervals: ShootingIntervals, fit: Fit) -> Fit
         None where no interval is lost, or no other state is likelier.
     """
     hidden = [intervals.model.state.index(name) for name in unmeasured_states(intervals)]
-    lost = _in_doubt(intervals, fit)
     if not hidden:
         return None
-    own, begin = fit.x[lost], fit.x[lost]
+    lost = _in_doubt(intervals, fit)
+    begin = fit.x[lost]
     begin[:, hidden] = fit.x[np.minimum(lost + 1, len(fit.x) - 1)][:, hidden]
-    own, found = (_estimated(intervals, fit, x, lost, at) for x, at in ((own, _SCALES[-1:]), (begin, _SCALES)))
+    own, found = (
+        _estimated(intervals, fit, x, lost, scales) for x, scales in ((fit.x[lost], _SCALES[-1:]), (begin, _SCALES))
+    )
     better = _losses(intervals, fit, found, lost) < _losses(intervals, fit, own, lost) - _LIKELIER
     if not better.any():
         return None
