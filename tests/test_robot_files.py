@@ -285,11 +285,14 @@ def test_a_result_with_impossible_bodies_says_so(described):
 
 
 def test_drake_reads_the_estimated_robot(described):
-    drake = pytest.importorskip("pydrake.all", reason="DRAKE DOES NOT READ ROBOTS: pip install drake")
+    drake = pytest.importorskip("pydrake.all", reason="DRAKE DOES NOT READ ROBOTS: pip install 'diransac[snopt]'")
     path = described(robots.urdf())
     model = models.robot(path, bodies="all")
     text, _ = calibrated(path, model.parameters, nominal(model), np.diag((0.01 * nominal(model)) ** 2 + 1e-12))
     plant = drake.MultibodyPlant(0.0)
-    drake.Parser(plant).AddModels(str(described(text, "found")))
+    (index,) = drake.Parser(plant).AddModels(str(described(text, "found")))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("link0"))
     plant.Finalize()
     assert plant.num_velocities() == 6
+    mass = sum(float(x.attrib["value"]) for x in ElementTree.fromstring(text).iter("mass"))
+    assert plant.CalcTotalMass(plant.CreateDefaultContext(), [index]) == pytest.approx(mass)

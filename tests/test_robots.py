@@ -115,6 +115,31 @@ def test_forces_are_those_of_pinocchio(described, kind, seed):
         assert required(model, q, v, a, p) == pytest.approx(expected, abs=EXACT * (1 + np.abs(expected).max()))
 
 
+@pytest.mark.parametrize("kind", ["panda-like", "quadruped", "six-axes", "tree"])
+def test_forces_are_those_of_drake(described, kind):
+    """With damping, which Drake counts among a machine's own forces; armatures are left out."""
+    drake = pytest.importorskip("pydrake.all", reason="DRAKE NOT COMPARED: pip install 'diransac[snopt]'")
+    path = described(ROBOTS[kind](0))
+    plant, model = drake.MultibodyPlant(0.0), dr.models.robot(path)
+    drake.Parser(plant).AddModels(str(path))
+    if path.suffix == ".urdf":
+        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("link0"))
+    plant.Finalize()
+    context, every = plant.CreateDefaultContext(), map(plant.get_joint, plant.GetJointIndices())
+    at = {joint.name().replace("-", "_"): joint for joint in every}
+    places = [at[name].velocity_start() for name in model.coordinates]
+    own = {n: x.value if n.startswith("damping") else 0.0 for n, x in model.parameters.items()}
+    for q, v, a in motions(model.n_q):
+        states, theirs = np.zeros((2, model.n_q)), np.zeros(model.n_q)
+        states[:, places], theirs[places] = (q, v), a
+        plant.SetPositionsAndVelocities(context, states.ravel())
+        forces = drake.MultibodyForces(plant)
+        plant.CalcForceElementsContribution(context, forces)
+        expected = plant.CalcInverseDynamics(context, theirs, forces)[places]
+        found = required(model, q, v, a, model.parameter_vector(own))
+        assert found == pytest.approx(expected, abs=EXACT * (1 + np.abs(expected).max()))
+
+
 def test_a_real_description_has_the_forces_of_mujoco(shared_data):
     path = shared_data / "unitree_go2" / "go2.xml"
     model, (reference, data) = dr.models.robot(path), compiled(path)
