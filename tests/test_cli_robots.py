@@ -149,6 +149,19 @@ def test_a_workspace_is_a_limit_on_the_place_of_a_body(tmp_path, monkeypatch):
     assert [limb for limb, x in limbs.items() if "toe_x" in x["limits"]] == [next(iter(limbs))]
 
 
+def test_a_body_that_several_limbs_move_has_no_workspace(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    axes = """<mujoco><worldbody><body name="bridge"><joint name="x" type="slide" axis="1 0 0" range="-1 1"/>
+      <geom size="0.1"/><body name="tool"><joint name="y" type="slide" axis="0 1 0" range="-1 1"/><geom size="0.1"/>
+      </body></body></worldbody></mujoco>"""
+    (tmp_path / "pair.xml").write_text(axes)
+    done = run(*DESIGN, "--limit", "tool_y=0.5", "-o", "design.csv")
+    assert done.exit_code == 2
+    assert "--limit: x, y move tool, which are designed apart; limit these instead of tool_y" in " ".join(
+        done.stderr.split()
+    )
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -102,35 +102,44 @@ def _of_joints(given: Mapping[str, Any], limbs: Mapping[str, Model]) -> dict[str
     return found | {name: value for name, value in given.items() if name not in patterns}
 
 
-def _own(values: Mapping[str, Any], limbs: Mapping[str, Model], limb: str) -> dict[str, Any]:
+def _own(values: Mapping[str, Any], limbs: Mapping[str, Model], limb: str, places: Mapping[str, str]) -> dict[str, Any]:
     """Values of a limb's quantities: those whose names do not belong to another limb."""
     from diransac.model.robots.actuation import FORCE
 
     models = [model for other, model in limbs.items() if other != limb]
     others = {n for model in models for n in (*model.units, *map(FORCE.format, model.coordinates))}
-    return {n: x for n, x in values.items() if n not in others}
+    return {n: x for n, x in values.items() if n not in others and places.get(n, limb) == limb}
 
 
-def _outputs(machine: UnsaturatedRobot, limb: Model, names: Sequence[str]) -> Callable[..., dict[str, Any]] | None:
-    """Forces of a limb's drives, and positions of its bodies that are among some names; None without a description."""
-    if machine.drives is None:
+def _places(machine: UnsaturatedRobot, limits: Iterable[str]) -> dict[str, str]:
+    """Limits on the positions of bodies, with the limb that moves the body.
+
+    Raises typer.BadParameter: several limbs move it.
+    """
+    found = {}
+    for limit in limits:
+        name, moved = machine.bodies.get(limit[:-2], ("", frozenset[str]()))
+        if not name or limit[-2:] not in _AXES:
+            continue
+        limbs = [limb for limb, own in machine.limbs.items() if moved <= set(own.coordinates)]
+        if not limbs:
+            movers = ", ".join(sorted(moved))
+            raise typer.BadParameter(
+                f"--limit: {movers} move {name}, which are designed apart; limit these instead of {limit}"
+            )
+        found[limit] = limbs[0]
+    return found
+
+
+def _outputs(machine: UnsaturatedRobot, limb: Model, places: Iterable[str]) -> Callable[..., dict[str, Any]] | None:
+    """Forces of a limb's drives, and positions of its bodies that are limited; None without a description."""
+    if machine.drives is None or machine.position is None:
         return None
     from diransac.model.robots import drive_forces
 
-    wanted = {name[:-2] for name in names if name[-2:] in _AXES}
-    parts = [drive_forces(machine.drives, list(limb.coordinates))]
-    parts += [of for name, (moved, of) in machine.bodies.items() if name in wanted and moved <= set(limb.coordinates)]
+    bodies = dict.fromkeys(machine.bodies[name[:-2]][0] for name in places)
+    parts = [drive_forces(machine.drives, list(limb.coordinates)), *map(machine.position, bodies)]
     return lambda *at: {name: x for part in parts for name, x in part(*at).items()}
-
-
-def _of_other_limbs(machine: UnsaturatedRobot, limb: Model) -> set[str]:
-    """Names of the positions of bodies that another limb moves."""
-    return {
-        name + axis
-        for name, (moved, _) in machine.bodies.items()
-        if not moved <= set(limb.coordinates)
-        for axis in _AXES
-    }
 
 
 @dataclass(frozen=True)
@@ -211,15 +220,14 @@ def designed(model: str, robot: RobotOptions, options: DesignOptions) -> Designs
     given = {name: _range(name, text) for name, text in pairs("--limit", options.limits or ()).items()}
     limits = {**machine.limits, **_of_joints(given, limbs)}
     noise = _of_joints(numbers("--noise", options.noise or ()), limbs)
-    found = {}
+    places, found = _places(machine, limits), {}
     for limb, own in limbs.items():
-        elsewhere = _of_other_limbs(machine, own) if len(limbs) > 1 else ()
         with screen.bar(f"design {limb}".rstrip()) as show:
             found[limb] = design_experiment(
                 options.plant(own, known | assumed),
-                limits={n: x for n, x in _own(limits, limbs, limb).items() if n not in elsewhere},
-                noise=_own(noise, limbs, limb) or None,
-                outputs=_outputs(machine, own, list(limits)),
+                limits=_own(limits, limbs, limb, places),
+                noise=_own(noise, limbs, limb, {}) or None,
+                outputs=_outputs(machine, own, [name for name, of in places.items() if of == limb]),
                 progress=lambda stage, fraction, show=show: show(Progress(stage, fraction)),  # type: ignore[misc]
                 **options.numbers_of(),
             )

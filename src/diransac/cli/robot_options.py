@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -42,14 +43,17 @@ class UnsaturatedRobot:
         Of joints and forces of drives, by the description and the drives.
     drives : Actuation, optional
         None: the machine has no description.
-    bodies : mapping of str to (set of str, callable)
-        By name without special characters: coordinates that move the body, and its position as `body_position` has it.
+    bodies : mapping of str to (str, set of str)
+        By name without special characters: name in the file, and coordinates that move the body; only if some do.
+    position : callable, optional
+        Position of a body by its name in the file, as `body_position` has it.
     """
 
     limbs: Mapping[str, Model]
     limits: Mapping[str, tuple[float, float]]
     drives: Actuation | None = None
-    bodies: Mapping[str, tuple[frozenset[str], Callable[..., dict[str, Any]]]] = field(default_factory=dict)
+    bodies: Mapping[str, tuple[str, frozenset[str]]] = field(default_factory=dict)
+    position: Callable[[str], Callable[..., dict[str, Any]]] | None = None
 
 
 @dataclass(frozen=True)
@@ -114,13 +118,11 @@ class RobotOptions:
         drives = replace(given, limit=None)
         whole = robot(model, **arguments | {"actuation": drives})
         chosen: dict[str, Any] = {"joints": arguments.get("joints"), "base": self.base}
-        bodies = {
-            identifier(name): (frozenset(moved), body_position(model, name, **chosen))
-            for name, moved in coordinates_of_bodies(model, **chosen).items()
-            if moved
-        }
+        moving = coordinates_of_bodies(model, **chosen).items()
+        bodies = {identifier(name): (name, frozenset(moved)) for name, moved in moving if moved}
+        position = partial(body_position, model, **chosen)
         limits, limbs = robot_limits(model, actuation=given, **chosen), independent_parts(whole)
-        return UnsaturatedRobot(limbs if len(limbs) > 1 else {"": whole}, limits, drives, bodies)
+        return UnsaturatedRobot(limbs if len(limbs) > 1 else {"": whole}, limits, drives, bodies, position)
 
     def _arguments(self) -> dict[str, Any]:
         found: dict[str, Any] = {"actuation": self._actuation(), "base": self.base}

@@ -191,12 +191,12 @@ def body_position(
     chosen = _coordinates(label, description, joints)
     names = [x.name for x in description.bodies]
     i = names.index(_known_names("body", body, names)[0])
-    couplings, needed = ordered_couplings(label, description), coordinates_of_bodies(path, joints=joints, base=base)
+    couplings, needed = ordered_couplings(label, description), _moving(label, description, chosen)[i]
     at = _vector(point, "point")
 
     def outputs(q: Any, _v: Any, _a: Any, _u: Any, _p: Any) -> dict[str, Any]:
         found: list[Any] = [joint.reference for joint in description.joints]
-        for name in needed[body]:
+        for name in needed:
             found[chosen[name]] = q[name]
         for coupling in couplings:
             found[coupling.follower] = followed(description, coupling, found)
@@ -233,7 +233,13 @@ def coordinates_of_bodies(
     """
     description = read_description(path, base)
     label = f'robot "{path}"'
-    owner = {k: name for name, k in _coordinates(label, description, joints).items()}
+    moving = _moving(label, description, _coordinates(label, description, joints))
+    return {body.name: names for body, names in zip(description.bodies, moving, strict=True)}
+
+
+def _moving(label: str, description: Description, chosen: Mapping[str, int]) -> list[tuple[str, ...]]:
+    """Coordinates that move each body."""
+    owner = {k: name for name, k in chosen.items()}
     for coupling in ordered_couplings(label, description):
         if coupling.leader in owner:
             owner[coupling.follower] = owner[coupling.leader]
@@ -241,7 +247,7 @@ def coordinates_of_bodies(
     for i, body in enumerate(description.bodies):
         above = () if body.parent < 0 or i == description.base else found[body.parent]
         found.append(tuple(dict.fromkeys((*above, *(owner[k] for k in body.joints if k in owner)))))
-    return {body.name: names for body, names in zip(description.bodies, found, strict=True)}
+    return found
 
 
 # ---------------------------------------------------------------------- arguments

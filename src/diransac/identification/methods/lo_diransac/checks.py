@@ -286,7 +286,7 @@ def _held_out(W: FloatArray, residuals: FloatArray, part: IntArray) -> float:
     """Mean square of the residuals of each part with the parameters of the others, over that with those of all.
 
     Of n parameters that do not change, fitted to N residuals, that of all is ``1 - n/N`` times that of the noise, and
-    that of a part ``1 + n/N'``, with N' residuals of the others.  The ratio of these two is 1 here.
+    that of a part ``1 + n/N'``, with N' residuals of the others.  The ratio of these two counts as 1.
     """
     scale = _scales(residuals)
     fitted = residuals + W @ _change(W, residuals)[0]
@@ -294,8 +294,8 @@ def _held_out(W: FloatArray, residuals: FloatArray, part: IntArray) -> float:
     for k in np.unique(part):
         held = part == k
         left[held] = residuals[held] + W[held] @ _change(W[~held], residuals[~held])[0]
-    n = _n_estimated(W) / residuals.size
-    usual = (1.0 + n * _HELD_OUT / (_HELD_OUT - 1.0)) / max(1.0 - n, _TINY)
+    taken = _n_estimated(W) / residuals.size
+    usual = (1.0 + taken * _HELD_OUT / (_HELD_OUT - 1.0)) / max(1.0 - taken, _TINY)
     return float(np.square(left / scale).sum() / max(np.square(fitted / scale).sum() * usual, _TINY))
 
 
