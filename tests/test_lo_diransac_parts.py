@@ -12,6 +12,7 @@ from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 from diransac.identification.methods.lo_diransac.augmented_model import augmented_model
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
 from diransac.identification.methods.lo_diransac.local_search import fewest_parts
+from diransac.identification.methods.lo_diransac.missing_terms import short_windows
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
@@ -21,6 +22,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
     with_residuals,
 )
 from diransac.identification.methods.lo_diransac.projection import (
+    batch_sums,
     estimate_parameters,
     means_of_intervals,
     projected_parameters,
@@ -405,6 +407,26 @@ def test_noise_that_unmodelled_accelerations_follow_does_not_attenuate_parameter
 def test_every_interval_counts_where_unmodelled_accelerations_are_small():
     intervals, fit = noisy_motion(1000, 1e-4)
     assert len(estimate_parameters(intervals, fit, 10.0).windows) == len(intervals)
+
+
+def test_terms_are_sought_in_windows_of_four_intervals_at_most():
+    """Windows never span two logs, whose first intervals are 0 and 20."""
+    assert short_windows(np.array([0, 16, 20, 36]), 38).tolist() == [0, 4, 8, 12, 16, 20, 24, 28, 32, 36]
+    assert short_windows(np.array([0, 2, 4, 5]), 7).tolist() == [0, 2, 4, 5]
+
+
+@pytest.mark.parametrize(("correlation", "least"), [(0.0, 0.92), (0.5, 0.91), (0.8, 0.89), (0.9, 0.85), (0.95, 0.8)])
+def test_intervals_of_a_mean_hold_it_though_neighbours_are_correlated(correlation, least):
+    """A first-order autoregression of 150 intervals; batches of sqrt(150) hold the mean in .66 of .95 at the last."""
+    rng, inside = np.random.default_rng(4), 0
+    for _ in range(500):
+        x = np.empty(150)
+        x[0], *steps = rng.standard_normal(150)
+        for k, step in enumerate(steps):
+            x[k + 1] = correlation * x[k] + np.sqrt(1.0 - correlation**2) * step
+        sums = batch_sums(((x - x.mean()) / len(x))[:, None])
+        inside += abs(x.mean()) < 1.96 * np.sqrt(np.square(sums).sum())
+    assert least < inside / 500 < 0.97
 
 
 # ---------------------------------------------------------------------- hypotheses

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.simulation.compiler import Map
 
-__all__ = ["MissingTerms", "clear_errors_of_inputs", "missing_terms"]
+__all__ = ["MissingTerms", "clear_errors_of_inputs", "missing_terms", "short_windows"]
 
 # Part of the force of an equation that an error of inputs must explain: a payload that is dropped is half a drift.
 _EXPLAINS = {"delay": 0.3, "lag": 0.3, "drift": 0.9}
@@ -52,6 +52,8 @@ _EXPLAINS = {"delay": 0.3, "lag": 0.3, "drift": 0.9}
 _INDEPENDENT, _NO_GAIN = 1e-2, 1.0
 # Part of the samples of an input that its size bounds.
 _MOSTLY = 0.99
+# Most intervals over which forces are averaged.
+_LONGEST = 4
 # Number of rows at which the inertia is compared.
 _SOME = 20
 _SMALLEST, _TINY = 1e-6, 1e-300
@@ -95,7 +97,8 @@ def missing_terms(
     -------
     MissingTerms
     """
-    rows = _Rows(intervals, result.windows, *residuals_of_motion(intervals, fit, result.parameters))
+    windows = short_windows(result.windows, len(intervals))
+    rows = _Rows(intervals, windows, *residuals_of_motion(intervals, fit, result.parameters))
     speeds = np.sqrt(np.square(rows.motion[1][intervals.counted]).mean(axis=0))
     inputs = rows.motion[3][intervals.counted]
     sizes = np.stack([np.sqrt(np.square(inputs).mean(axis=0)), np.quantile(np.abs(inputs), _MOSTLY, axis=0)], axis=1)
@@ -109,6 +112,29 @@ def missing_terms(
     accelerations = -np.einsum("wij,wj->wi", np.linalg.pinv(rows.M[intervals.starts]), forces)
     change = changes_beside(means, selected)[: intervals.n_p]
     return MissingTerms(suggestions_of(candidates, helpful), change, accelerations)
+
+
+def short_windows(windows: IntArray, n: int) -> IntArray:
+    """Windows over which forces are averaged in the search for terms.
+
+    Windows that attenuate no parameter may be longer than a reversal, and averages hide friction that changes its sign
+    in between.  Noise of the accelerations matters less to terms: they are functions of coordinates, velocities and
+    inputs.
+
+    Parameters
+    ----------
+    windows : (n_windows,) int array
+        First intervals of those of the parameters.
+    n : int
+        Number of intervals.
+
+    Returns
+    -------
+    (at least n_windows,) int array
+        First intervals of the same, or of parts of four intervals.
+    """
+    place = np.arange(n) - np.repeat(windows, np.diff(windows, append=n))
+    return np.flatnonzero(place % _LONGEST == 0)
 
 
 def clear_errors_of_inputs(intervals: ShootingIntervals, fit: Fit, kinds: Container[str]) -> list[RecordingError]:

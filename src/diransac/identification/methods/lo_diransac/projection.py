@@ -94,6 +94,8 @@ _EQUATIONS, _CLEAR, _NEGLIGIBLE, _KEPT = 8, 2.5, 0.05, 0.95
 _REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
 # Least variance of a regressor's covariance with its instruments: beyond it they are the regressor.
 _EXACT = 1e-9
+# Fewest batches of correlated intervals.
+_BATCHES = 4
 
 
 @dataclass(frozen=True)
@@ -652,20 +654,46 @@ def _instrumented_gains(W: FloatArray, Z: FloatArray, weights: FloatArray) -> Fl
 
 
 def batch_sums(values: FloatArray) -> FloatArray:
-    """Sums over about sqrt(W) neighbouring intervals each: their squares count what neighbours have in common.
+    """Sums over neighbouring intervals: their squares count what neighbours have in common.
 
-    They are increased by Student's t for their number, so that a normal interval has its level.
+    A batch has about sqrt(W) intervals, or as many as a first-order autoregression of a column asks for (Andrews 1991,
+    Bartlett's kernel), but a quarter of them at most: a slow current pushes one way for a third of a log.  Sums are
+    increased for their number: by what an estimate takes from them, and by Student's t, so that a normal interval has
+    its level.
 
     Parameters
     ----------
     values : (W, n) array
+        Contributions of the intervals to the error of an estimate.
 
     Returns
     -------
     (n_batches, n) array
     """
-    sums = np.add.reduceat(values, np.arange(0, len(values), round(np.sqrt(len(values)))), axis=0)
-    return np.asarray(sums * student_quantile(max(len(sums) - 1, 1), _UPPER) / _NORMAL_UPPER)
+    usual = round(np.sqrt(len(values)))
+    sums = _sums_of_batches(values, usual)
+    for j, length in enumerate(_correlated(values)):
+        if length > usual:
+            longer = np.square(_sums_of_batches(values[:, j], length)).sum()
+            sums[:, j] *= np.sqrt(max(longer / (np.square(sums[:, j]).sum() + _TINY), 1.0))
+    return sums
+
+
+def _sums_of_batches(values: FloatArray, length: int) -> FloatArray:
+    """Sums over ``length`` intervals each, increased for their number."""
+    sums = np.add.reduceat(values, np.arange(0, len(values), length), axis=0)
+    freedom = max(len(sums) - 1, 1)
+    more = np.sqrt(len(sums) / freedom) * student_quantile(freedom, _UPPER) / _NORMAL_UPPER
+    return np.asarray(sums * more)
+
+
+def _correlated(values: FloatArray) -> IntArray:
+    """Intervals ``(n,)`` that a batch of each column takes by its correlation with the next interval."""
+    power = np.square(values).sum(axis=0) + _TINY
+    rho = np.clip((values[1:] * values[:-1]).sum(axis=0) / power, 0.0, 1.0 - 1.0 / len(values))
+    alpha = np.square(2.0 * rho / ((1.0 - rho) * (1.0 + rho)))
+    wanted = np.ceil(1.1447 * np.cbrt(alpha * len(values)))
+    return np.asarray(np.minimum(wanted, len(values) // _BATCHES), int)
 
 
 def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:
