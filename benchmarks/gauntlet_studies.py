@@ -13,6 +13,8 @@ VEHICLES = {
     "servo-axis": "gauntlet-servo-axis",
     "double-pendulum": "gauntlet-double-pendulum",
     "pendulum": "gauntlet-pendulum",
+    "underwater-vehicle": "gauntlet-underwater-vehicle",
+    "rotorcraft-in-gusts": "gauntlet-gusts",
 }
 """A study each: the name of one that the package brings, or a TOML file."""
 

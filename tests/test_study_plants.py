@@ -103,7 +103,27 @@ def test_ripple_of_a_double_pendulum_is_a_torque_at_each_joint():
     assert acceleration(plant, state, torques, phase) == pytest.approx(alone(plant, state, torques + ripples))
 
 
-@pytest.mark.parametrize("kind", ["servo-axis", "double-pendulum", "pendulum"])
+def test_gusts_push_a_rotorcraft_by_five_sines_that_are_drawn_by_themselves():
+    given = {"kind": "rotorcraft-in-gusts", "gusts": 0.3, "moment_gusts": 0.004}
+    plant = PlantChoice.from_dict(given).plant
+    state, inputs, size = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [2.4, 0.1], np.array([0.3, 0.3, 0.004])
+    pushed = acceleration(plant, state, inputs, 0.7) - alone(plant, state, inputs)
+    assert pushed * [0.249, 0.249, 0.004] == pytest.approx(size * np.sqrt(2 / 5) * 5 * np.sin(0.7))
+    rates = np.array(plant.simulated.dynamics([*state, *[0.0] * 15], inputs, plant.constants)[0]).ravel()
+    assert rates[6:].reshape(3, 5) / (2 * np.pi) == pytest.approx(np.tile([0.11, 0.23, 0.54, 1.2, 2.6], (3, 1)))
+
+
+def test_drag_of_an_underwater_vehicle_is_that_of_its_motion_through_the_water():
+    plant = PlantChoice.from_dict({"kind": "underwater-vehicle", "waves": 1.3, "current": 0.05}).plant
+    current, waves = 0.05 * np.sqrt(2) * np.sin(1.1), 1.3 * np.sqrt(2 / 3) * 3 * np.sin(1.1)
+    through = 0.3 - current
+    by_hand = (9.0 + waves - 11.0 * through - 38.0 * abs(through) * through - 1.6) / 42.0
+    assert acceleration(plant, [0.0, 0.3], [9.0], 1.1) == pytest.approx(by_hand)
+
+
+@pytest.mark.parametrize(
+    "kind", ["servo-axis", "double-pendulum", "pendulum", "rotorcraft-in-gusts", "underwater-vehicle"]
+)
 def test_without_anything_given_a_plant_is_what_its_model_says_and_draws_its_phase(kind):
     choice = PlantChoice.from_dict({"kind": kind})
     plant, state = choice.plant, np.linspace(0.1, 0.4, 2 * choice.plant.model.n_q)

@@ -81,6 +81,7 @@ def test_every_trial_of_the_gauntlet_flies_another_flight_and_is_judged_by_its_p
 def test_runs_of_faults_strike_about_a_fifth_of_the_gauntlets_samples(name: str):
     study = load(name)
     log = dr.fly(plant := study.plant.plant, flown := study.data.planned(plant, 5), dr.tvlqr(plant, flown))
+    assert {"bursts", "frozen", "missing"} <= {level.text for level in study.axis.levels}
     for level in ("bursts", "frozen", "missing"):
         shares = [np.mean([*dr.corrupt(log, study.at(level).noise, seed).fault_mask.values()]) for seed in range(20)]
         assert np.mean(shares) == pytest.approx(0.2, abs=0.02)

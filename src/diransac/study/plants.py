@@ -1,7 +1,7 @@
 """`PlantChoice`: the plant of a study, by its kind and its arguments.
 
-Kinds are the paper's rotorcraft, three further machines whose drives exert periodic forces that their models leave out,
-and functions in files of users. Each drive starts at a phase that the seed of a flight draws.
+Kinds are the paper's rotorcraft, further machines with effects that their models leave out, and functions in files of
+users.
 """
 
 from __future__ import annotations
@@ -12,138 +12,21 @@ import hashlib
 import inspect
 import json
 from collections.abc import Callable, Iterator, Mapping
-from math import pi
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
-from casadi import cos, sin
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from diransac.errors import DiransacError, ModelError, SettingsError
-from diransac.model import Model, Parameter
-from diransac.model.derivation import Symbols
 from diransac.model.library import TABLE_I, builtin, extended_rotorcraft
-from diransac.model.plant import Disturbance, Plant, check_possible
+from diransac.model.plant import Plant, check_possible
+from diransac.study.machines import double_pendulum, pendulum, rotorcraft_in_gusts, servo_axis, underwater_vehicle
 from diransac.study.tables import RANDOM, FunctionTable, Text, check_signature, function_arguments
 from diransac.user_files import blaming, definitions, file_and_name, running
 
-__all__ = ["PlantChoice", "double_pendulum", "is_builtin", "pendulum", "servo_axis"]
-
-SERVO_AXIS: Mapping[str, float] = MappingProxyType(
-    {"mass": 95.0, "viscous_friction": 200.0, "dry_friction": 20.0, "offset": -12.0}
-)
-"""kg, N s/m, N, N: an axis of the size of EMPS."""
-
-DOUBLE_PENDULUM: Mapping[str, float] = MappingProxyType(
-    {
-        "inertia1": 0.09,
-        "moment1": 0.3,
-        "inertia2": 0.025,
-        "moment2": 0.12,
-        "rotor_inertia": 6e-5,
-        "viscous_friction1": 0.02,
-        "dry_friction1": 0.08,
-        "viscous_friction2": 0.02,
-        "dry_friction2": 0.05,
-    }
-)
-"""kg m^2, kg m, N m s/rad and N m: a desktop machine."""
-
-PENDULUM: Mapping[str, float] = MappingProxyType({"mass": 0.5, "length": 0.6, "friction": 0.05})
-"""kg, m, N m s/rad."""
-
-MAGNET_PITCH = 0.024
-"""m, period of the cogging force."""
-
-RIPPLES = 126
-"""Periods of a motor's torque per turn of its joint: 21 pole pairs behind a gear of 6."""
-
-_RIPPLE_FREQUENCY = 200.0
-"""Hz, at a joint velocity of 10 rad/s; the integration steps resolve it."""
+__all__ = ["PlantChoice", "is_builtin"]
 
 
-def servo_axis(cogging: float = 0.0, parameters: Mapping[str, float] = SERVO_AXIS) -> Plant:
-    """`models.servo_axis` with a cogging force of amplitude `cogging`, N, and a period of 24 mm."""
-    model = builtin("servo-axis")
-
-    def magnets(q: Symbols, _v: Symbols, _u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:
-        return {"position": d.cogging * cos(2 * pi * q.position / MAGNET_PITCH + d.phase)}
-
-    cogs = Disturbance(
-        model,
-        "magnets",
-        forces=magnets,
-        constants={"cogging": cogging},
-        highest_frequency=40.0,
-        **_random_phases("phase"),
-    )
-    return Plant(model, parameters, (cogs,))
-
-
-def double_pendulum(ripple: float = 0.0, parameters: Mapping[str, float] = DOUBLE_PENDULUM) -> Plant:
-    """`models.double_pendulum` with a torque ripple of amplitude `ripple`, N m, 126 periods per turn, at each joint."""
-    model = builtin("double-pendulum")
-
-    def motors(q: Symbols, _v: Symbols, _u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:
-        return {f"q{i}": d.ripple * cos(RIPPLES * q[f"q{i}"] + d[f"phase_{i}"]) for i in (1, 2)}
-
-    ripples = Disturbance(
-        model,
-        "motors",
-        forces=motors,
-        constants={"ripple": ripple},
-        highest_frequency=_RIPPLE_FREQUENCY,
-        **_random_phases("phase_1", "phase_2"),
-    )
-    return Plant(model, parameters, (ripples,))
-
-
-def pendulum(ripple: float = 0.0, parameters: Mapping[str, float] = PENDULUM) -> Plant:
-    """``a = -g/l sin(q) + (torque - c v) / (m l^2)``: a mass on a rod of unknown length, with a torque ripple, N m.
-
-    The length enters as 1/l and 1/l^2: the model is not affine in its parameters.
-    """
-
-    def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
-        torque = u.torque - p.friction * v.angle
-        return [a.angle + 9.81 / p.length * sin(q.angle) - torque / (p.mass * p.length**2)]
-
-    def motor(q: Symbols, _v: Symbols, _u: Symbols, p: Symbols, d: Symbols) -> dict[str, Any]:
-        return {"angle": d.ripple * cos(RIPPLES * q.angle + d.phase) / (p.mass * p.length**2)}
-
-    model = Model(
-        "pendulum",
-        coordinates={"angle": "rad"},
-        inputs={"torque": "N m"},
-        parameters={
-            "mass": Parameter("kg", positive=True),
-            "length": Parameter("m", positive=True),
-            "friction": Parameter("N m s/rad", lower=0.0),
-        },
-        equations=equations,
-    )
-    ripples = Disturbance(
-        model,
-        "motor",
-        accelerations=motor,
-        constants={"ripple": ripple},
-        highest_frequency=_RIPPLE_FREQUENCY,
-        **_random_phases("phase"),
-    )
-    return Plant(model, parameters, (ripples,))
-
-
-def _random_phases(*phases: str) -> dict[str, Any]:
-    """Constant states of a disturbance, uniform in a turn by the seed of a flight."""
-    return {
-        "states": dict.fromkeys(phases, "rad"),
-        "rates": lambda *_: dict.fromkeys(phases, 0.0),
-        "start": dict.fromkeys(phases, (0.0, 2 * pi)),
-    }
-
-
-# The choice -----------------------------------------------------------------------------------------------------------
 def _undisturbed(parameters: Mapping[str, float] = TABLE_I) -> Plant:
     """The planar rotorcraft without any disturbance."""
     return Plant(builtin("planar-rotorcraft"), parameters)
@@ -152,9 +35,11 @@ def _undisturbed(parameters: Mapping[str, float] = TABLE_I) -> Plant:
 _KINDS: dict[str, Callable[..., Plant]] = {
     "extended-rotorcraft": extended_rotorcraft,
     "planar-rotorcraft": _undisturbed,
+    "rotorcraft-in-gusts": rotorcraft_in_gusts,
     "servo-axis": servo_axis,
     "double-pendulum": double_pendulum,
     "pendulum": pendulum,
+    "underwater-vehicle": underwater_vehicle,
 }
 _DEFAULT_NAME = "plant"
 
@@ -170,8 +55,8 @@ class PlantChoice(FunctionTable):
     Parameters
     ----------
     kind : ``extended-rotorcraft`` (`models.extended_rotorcraft`); ``planar-rotorcraft``, with parameters only;
-        ``servo-axis``, ``double-pendulum``, ``pendulum``; or ``FILE.py:NAME``, a function of that name (default
-        ``plant``) in a file, which is run wherever trials run
+        ``rotorcraft-in-gusts``, ``servo-axis``, ``double-pendulum``, ``pendulum``, ``underwater-vehicle``; or
+        ``FILE.py:NAME``, a function of that name (default ``plant``) in a file, which is run wherever trials run
     file_digest : of the file, so that every worker and every resumed run uses the same one; "" for other kinds
     arguments : by name, as TOML has them: a list for a pair, ``random`` for a rotor phase that each flight draws;
         model parameters that are not given have the plant's defaults, such as Table I
