@@ -11,7 +11,7 @@ from diransac.data.dataset import ParameterLayout
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 from diransac.identification.methods.lo_diransac.augmented_model import augmented_model
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
-from diransac.identification.methods.lo_diransac.local_search import fewest_parts
+from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, fewest_parts
 from diransac.identification.methods.lo_diransac.missing_terms import short_windows
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
@@ -29,6 +29,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     residuals_of_motion,
     unexplained,
 )
+from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind, ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
     Samples,
@@ -252,6 +253,27 @@ def test_intervals_are_split_into_equal_parts_of_three_rows_at_least():
     for length in range(1, 80):
         possible = [k for k in range(2, length + 1) if length % k == 0 and length // k >= 3]
         assert fewest_parts(length) == min(possible, default=0)
+
+
+def test_an_exact_model_is_hopeless_until_unmodelled_accelerations_fall_by_as_much_as_it_was_behind():
+    intervals, signals = intervals_of()
+    fit = with_residuals(intervals, perturbed_fit(intervals, signals))
+    prior = Prior(fit.tau, fit.prior, 1.0, 1.0, 1.0)
+    now = Explanation(intervals, Refinement(fit, 0.0, 0.1, 9, True), prior, exact=False)
+    left = np.log(np.sqrt(np.square(unexplained(intervals, fit, projected_parameters(intervals, fit))).mean(axis=0)))
+    samples = float(intervals.known.sum())
+
+    def is_hopeless(behind: float, **changes: object) -> bool:
+        trial = ExactTrial(behind, now.cost, left, intervals.length)
+        return replace(now, trial=replace(trial, **changes)).exact_is_hopeless
+
+    assert not now.exact_is_hopeless
+    assert not is_hopeless(0.9 * samples)
+    assert is_hopeless(1.1 * samples)
+    assert not is_hopeless(1.1 * samples, length=intervals.length + 1)
+    assert not is_hopeless(5.9 * samples, unexplained=left + 5.0)
+    assert is_hopeless(6.1 * samples, unexplained=left + 5.0)
+    assert not is_hopeless(1.1 * samples, cost=now.cost + 0.2 * samples)
 
 
 def test_delay_moves_the_inputs_by_rows():

@@ -80,6 +80,28 @@ _CONTINUOUS = (-0.9, -0.1)
 
 
 @dataclass(frozen=True)
+class ExactTrial:
+    """A fit of the exact model that was less likely than an explanation with unmodelled accelerations.
+
+    Parameters
+    ----------
+    behind : float
+        Nats between them.
+    cost : float
+        Of that explanation.
+    unexplained : (n_v,) array
+        Log of the RMS acceleration that it left to unmodelled accelerations.
+    length : int
+        Samples of its intervals.
+    """
+
+    behind: float
+    cost: float
+    unexplained: FloatArray
+    length: int
+
+
+@dataclass(frozen=True)
 class Explanation:
     """A fit with its freedom.
 
@@ -94,6 +116,8 @@ class Explanation:
         Whether the fit is one of the model as it is.
     complete : bool, optional
         False if the time limit ended the search for a likelier one.
+    trial : ExactTrial, optional
+        The latest, of this explanation or of one that it came from.
     """
 
     intervals: ShootingIntervals
@@ -101,6 +125,7 @@ class Explanation:
     prior: Prior
     exact: bool
     complete: bool = True
+    trial: ExactTrial | None = None
 
     @property
     def cost(self) -> float:
@@ -109,6 +134,20 @@ class Explanation:
         late = abs(intervals.delay + self.refinement.fit.shared[-1]) > _SMALL_DELAY or bool(intervals.lag)
         n_scales = (0 if self.exact else 2 * intervals.model.n_v + 1) + late
         return self.refinement.cost + 0.5 * n_scales * float(np.log(intervals.is_logged.sum()))
+
+    @property
+    def exact_is_hopeless(self) -> bool:
+        """True if the exact model was so far behind that what has changed since cannot make it likelier.
+
+        What it leaves goes with the unmodelled accelerations: if these fall by a factor, so do its residuals, and
+        each sample gains the logarithm of it.  It may gain a nat more in every sample, and all that this one has.
+        With errors of inputs, unmodelled accelerations stand for what is left of these, and tell nothing.
+        """
+        trial, intervals = self.trial, self.intervals
+        if trial is None or trial.length != intervals.length or any(x.of_inputs for x in intervals.all_errors.kinds):
+            return False
+        fallen = max(0.0, float((trial.unexplained - _unexplained(self)).max()))
+        return bool(trial.behind > intervals.known.sum() * (1.0 + fallen) + max(trial.cost - self.cost, 0.0))
 
 
 @dataclass(frozen=True)
@@ -397,8 +436,26 @@ class LocalSearch:
 
         The prior is that of the exact model.
         """
+        exact = None if flexible.exact_is_hopeless else self._likeliest_exact(flexible, prior)
+        if exact is not None and exact.cost < flexible.cost:
+            return exact
+        while self.settings.model_error and (parts := fewest_parts(flexible.intervals.length)):
+            finer = self._split(flexible, parts)
+            if finer.cost > flexible.cost - _AS_LIKELY:
+                break
+            flexible = finer
+        if exact is None or not np.isfinite(exact.cost):
+            return flexible
+        cost, length = flexible.cost, flexible.intervals.length
+        return replace(flexible, trial=ExactTrial(exact.cost - cost, cost, _unexplained(flexible), length))
+
+    def _likeliest_exact(self, flexible: Explanation, prior: Prior) -> Explanation | None:
+        """The exact model from the parameters of a fit, or those of the best hypothesis; None if both are impossible.
+
+        Fits are given up that will hardly become as likely as the flexible one.
+        """
         intervals, fit = flexible.intervals, flexible.refinement.fit
-        projected = projected_parameters(intervals, fit)
+        projected, found = projected_parameters(intervals, fit), list[Explanation]()
         starts = np.array([projected, self.hypotheses[0]])
         starts = starts[: 1 + bool((np.abs(starts[1] - starts[0]) > _APART * np.abs(starts[0])).any())]
         for p in starts[intervals.layout.admits(starts)]:
@@ -406,15 +463,10 @@ class LocalSearch:
             is_left = any(x.of_inputs for x in intervals.all_errors.kinds)
             refined = refine_exact(self.settings, intervals, begin, prior, np.inf if is_left else flexible.cost)
             exact = Explanation(intervals, refined, prior, exact=True)
-            exact = self._with_refined_errors(exact) if is_left else exact
-            if exact.cost < flexible.cost:
-                return exact
-        while self.settings.model_error and (parts := fewest_parts(flexible.intervals.length)):
-            finer = self._split(flexible, parts)
-            if finer.cost > flexible.cost - _AS_LIKELY:
+            found.append(self._with_refined_errors(exact) if is_left else exact)
+            if found[-1].cost < flexible.cost:
                 break
-            flexible = finer
-        return flexible
+        return min(found, key=lambda x: x.cost, default=None)
 
     def _split(self, coarse: Explanation, parts: int) -> Explanation:
         """The fit with unmodelled accelerations that vary faster."""
@@ -426,7 +478,7 @@ class LocalSearch:
         begin = with_residuals(intervals, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
         to_beat = coarse.refinement.cost
         refined = refine(self.settings, intervals, begin, coarse.prior, settled=True, to_beat=to_beat)
-        return Explanation(intervals, refined, coarse.prior, exact=False)
+        return replace(coarse, intervals=intervals, refinement=refined)
 
     def _timings(self, now: Explanation, *, free_hold: bool) -> list[ShootingIntervals]:
         """Other timings of the inputs that the fit suggests: whole samples of delay, a lag, or another hold."""
@@ -469,7 +521,7 @@ class LocalSearch:
             refined = refine_exact(self.settings, intervals, begin, prior, now.cost)
             return Explanation(intervals, refined, prior, exact=True)
         refined = refine(self.settings, intervals, begin, prior, settled=True)
-        return self._simplest(Explanation(intervals, refined, prior, exact=False), prior)
+        return self._simplest(Explanation(intervals, refined, prior, exact=False, trial=now.trial), prior)
 
     def _with_likeliest_lag(self, intervals: ShootingIntervals) -> ShootingIntervals:
         """The lag, from half a sample to the latest delay, with which simulations by the best hypothesis agree best."""
