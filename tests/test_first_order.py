@@ -5,6 +5,7 @@ Logs are made by LSODA, SciPy's `odeint`, from equations that are written here o
 
 import pickle
 import runpy
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -14,9 +15,12 @@ import pytest
 from scipy.integrate import odeint
 
 import diransac as dr
+from diransac.data.dataset import ParameterLayout
 from diransac.data.preprocessing import differentiate
+from diransac.identification.driven_states import least_squares
 from diransac.identification.identifiability import structural
 from diransac.identification.inspection import inspect
+from diransac.identification.observers import Observers
 from diransac.model import Model, Parameter
 from diransac.simulation import RolloutBatch, rollouts
 from user_models import dc_motor, flexible_joint, lagged_thrust, oven, tank, tumbling
@@ -26,6 +30,7 @@ TANK = {"area": 0.2, "outlet": 6e-4}
 MOTOR = {"inertia": 2e-3, "friction": 1e-3, "constant": 0.05, "resistance": 0.8, "inductance": 0.02}
 THRUST = {"mass": 0.5, "gain": 8.0, "tau": 0.05, "drag": 0.2}
 JOINT = {"rotor": 0.02, "inertia": 0.05, "stiffness": 8.0, "damping": 0.02, "friction": 0.05}
+STIFF = {"rotor": 0.016, "inertia": 0.085, "stiffness": 75.0, "damping": 0.06, "friction": 0.2}
 
 
 # ---------------------------------------------------------------------- independent simulations
@@ -115,11 +120,20 @@ def thrust_signals():
 @cache
 def joint_signals():
     t = np.arange(1600) * 0.005
-    torque = 1.5 * excitation(t, 3, 5.0) + 0.5 * np.sign(excitation(t, 9, 2.0))
+    return motion_of_joint(JOINT, t, 1.5 * excitation(t, 3, 5.0) + 0.5 * np.sign(excitation(t, 9, 2.0)))
 
+
+@cache
+def stiff_joint_signals(seed):
+    """A joint with a resonance at 12 Hz that is hardly damped."""
+    t = np.arange(2000) * 0.005
+    return motion_of_joint(STIFF, t, 0.9 * excitation(t, seed, 9.0))
+
+
+def motion_of_joint(truth, t, torque):
     def rates(x, u):
-        spring = JOINT["stiffness"] * (x[0] - x[1]) + JOINT["damping"] * (x[2] - x[3])
-        return [x[2], x[3], (u - JOINT["friction"] * x[2] - spring) / JOINT["rotor"], spring / JOINT["inertia"]]
+        spring = truth["stiffness"] * (x[0] - x[1]) + truth["damping"] * (x[2] - x[3])
+        return [x[2], x[3], (u - truth["friction"] * x[2] - spring) / truth["rotor"], spring / truth["inertia"]]
 
     x, _ = solved(rates, [0.0, 0.0, 0.0, 0.0], t, torque)
     return t, dict(zip(("motor", "load", "motor_dot", "load_dot"), x.T, strict=True)), {"torque": torque}
@@ -286,6 +300,70 @@ def test_a_state_that_nothing_measures_is_estimated(make, truth, simulate, names
     assert_exact(exact, truth)
     assert exact.verdict == "usable"
     assert_right(dr.identify(make(), recorded(simulate(), names, 0.005, 0.1), differentiate=True), truth, largest)
+
+
+@pytest.mark.parametrize(("seed", "noise"), [(31, 0.005), (34, 0.01)])
+def test_a_resonance_that_smoothing_takes_for_noise_is_found(seed, noise):
+    """A search that begins with the smoothed motion ends at rotors that are three times as heavy."""
+    log = recorded(stiff_joint_signals(seed), ["motor"], noise)
+    found = dr.identify(flexible_joint(), log, differentiate=True)
+    assert found.verdict == "usable"
+    for name in ("rotor", "inertia", "stiffness"):
+        assert found.parameters[name] == pytest.approx(STIFF[name], rel=0.03)
+
+
+def observers_of_joint(bandwidth):
+    """Observers of the joint by its motor's angle, with parameters that are not quite right, and the true states."""
+    t, signals, inputs = joint_signals()
+    model, states = flexible_joint(), np.column_stack([joint_signals()[1][n] for n in flexible_joint().state])
+    layout = ParameterLayout(model.parameters)
+    sampled, weights = signals["motor"][:, None], np.full((len(t), 1), 1e4 / len(t))
+    given = (inputs["torque"][:, None], np.zeros((len(t), 0)), weights, states[:1], [slice(0, len(t))], t[1])
+    problem = Observers(model, layout, ("motor",), sampled, *given, bandwidth)
+    z = np.concatenate([[1.1 * x for x in JOINT.values()], states[0]])[None]
+    return problem, z, signals
+
+
+def test_observers_follow_samples_by_their_bandwidth_and_simulate_without():
+    apart = []
+    for bandwidth in (100.0, 10.0, 1.0):
+        problem, z, signals = observers_of_joint(bandwidth)
+        apart.append(np.abs(problem.trajectories(z[0])["motor"] - signals["motor"]).max())
+    assert apart[0] < 0.2 * apart[1] < 0.2 * apart[2]
+    problem, z, signals = observers_of_joint(1e-9)
+    exact = np.concatenate([list(JOINT.values()), z[0, 5:]])
+    found = problem.trajectories(exact)
+    assert set(found) == {"motor", "load", "motor_dot", "load_dot", "motor_ddot", "load_ddot"}
+    for name in ("motor", "load", "load_dot"):
+        np.testing.assert_allclose(found[name], signals[name], atol=1e-4 * np.abs(signals[name]).max())
+
+
+def test_gradients_of_observers_are_those_of_their_cost():
+    problem, z, _ = observers_of_joint(8.0)
+    gradient = problem.linearized(z)[1][0]
+    for j in range(z.shape[1]):
+        change = np.zeros_like(z)
+        change[0, j] = 1e-6 * max(1e-2, abs(z[0, j]))
+        slope = (problem.linearized(z + change)[0] - problem.linearized(z - change)[0]) / (4.0 * change[0, j])
+        assert gradient[j] == pytest.approx(slope[0], rel=1e-4, abs=1e-7 * np.abs(gradient).max())
+
+
+def test_observers_find_a_joint_from_anywhere():
+    """Up to the samples' hold between rows; parameters that have a sign keep it on every step."""
+    problem, _, _ = observers_of_joint(10.0)
+    starts = problem.starts()
+    assert (starts[:, :3] > 0.0).all()
+    found, cost = least_squares(problem, starts, 60)
+    assert (found[:, :3] > 0.0).all()
+    best = found[np.argmin(cost)]
+    assert best[:5] == pytest.approx(list(JOINT.values()), rel=0.03)
+
+
+def test_observers_of_long_logs_have_fewer_starts():
+    problem, _, _ = observers_of_joint(8.0)
+    longer = replace(problem, samples=np.zeros((100_000, 1)))
+    assert len(problem.starts()) == 256
+    assert 16 <= len(longer.starts()) < 64
 
 
 def test_a_hidden_motion_beside_forces_that_the_model_lacks_is_not_relied_on():

@@ -12,10 +12,10 @@ Ljung 1999, section 7 (prediction errors of observers); Marquardt 1963; Boender,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import casadi as ca
 import numpy as np
@@ -24,12 +24,13 @@ from diransac.arrays import FloatArray, IntArray
 from diransac.identification.nonlinear import ParameterChart
 from diransac.model import Model, Parameter
 from diransac.simulation import Measurements, RolloutBatch, Simulator, rollouts
+from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import ParameterLayout
     from diransac.model.derivation import Symbols
 
-__all__ = ["DrivenStates", "least_squares"]
+__all__ = ["DrivenStates", "held_means", "least_squares", "within_half_a_turn"]
 
 _N_STARTS = 256
 # Largest factor of a positive parameter in a step; integration steps per sample.
@@ -102,6 +103,40 @@ def _free_of_turns(model: Model) -> frozenset[str]:
     return frozenset(n for k, n in enumerate(model.coordinates) if model.units[n] == "rad" and is_free(k))
 
 
+def within_half_a_turn(model: Model, states: Mapping[str, FloatArray], rows_of_logs: Sequence[slice]) -> None:
+    """Move angles that are the same after a whole turn so that each log starts within half a turn of zero, in place.
+
+    Parameters
+    ----------
+    model : Model
+    states : mapping of str to (N,) array
+        In all rows of all logs.
+    rows_of_logs : sequence of slice
+    """
+    for name in _free_of_turns(model).intersection(states):
+        for rows in rows_of_logs:
+            states[name][rows] -= _TURN * np.rint(states[name][rows.start] / _TURN)
+
+
+def held_means(values: FloatArray, rows_of_logs: Sequence[slice]) -> FloatArray:
+    """Values that are held from row to row as an input is: the means of both rows.
+
+    Parameters
+    ----------
+    values : (N, n) array
+        In all rows of all logs.
+    rows_of_logs : sequence of slice
+
+    Returns
+    -------
+    (N, n) array
+    """
+    means = values.copy()
+    for rows in rows_of_logs:
+        means[rows][:-1] = 0.5 * (values[rows][1:] + values[rows][:-1])
+    return means
+
+
 @dataclass(frozen=True)
 class DrivenStates:
     """Least squares of the errors of observers and sensors: states that nothing measures, driven by those of logs.
@@ -160,11 +195,8 @@ class DrivenStates:
     @cached_property
     def _inputs(self) -> FloatArray:
         """Inputs (N, n) of the driven model; they are held from row to row, so that means of the states are taken."""
-        means = self.states.copy()
-        for rows in self.rows_of_logs:
-            means[rows][:-1] = 0.5 * (self.states[rows][1:] + self.states[rows][:-1])
         known = [i for i, n in enumerate(self.model.state) if n not in self.hidden]
-        return np.hstack([means[:, known], self.inputs])
+        return np.hstack([held_means(self.states, self.rows_of_logs)[:, known], self.inputs])
 
     @cached_property
     def _velocities(self) -> FloatArray:
@@ -237,19 +269,27 @@ class DrivenStates:
         series = np.concatenate([self._simulator.trajectories(self._batch(z[None], i))[0] for i in logs])
         rate_of = dict(zip(model.velocities, model.accelerations, strict=True))
         states = dict(zip(self.hidden, series[:, :n].T.copy(), strict=True))
-        for name in _free_of_turns(model).intersection(self.hidden):
-            for rows in self.rows_of_logs:
-                states[name][rows] -= _TURN * np.rint(states[name][rows.start] / _TURN)
+        within_half_a_turn(model, states, self.rows_of_logs)
         rates = zip(self.hidden, series[:, n_driven : n_driven + n].T, strict=True)
         return {**states, **{rate_of[name]: values for name, values in rates if name in rate_of}}
 
 
-def least_squares(problem: DrivenStates, z: FloatArray, n_steps: int) -> tuple[FloatArray, FloatArray]:
+class LeastSquaresProblem(Protocol):
+    """Unknowns ``z (n_starts, n)`` of many searches, and the steps that they may take."""
+
+    def linearized(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Cost (n_starts,), its gradient / 2 (n_starts, n), and the normal matrix (n_starts, n, n)."""
+
+    def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
+        """Unknowns after a step."""
+
+
+def least_squares(problem: LeastSquaresProblem, z: FloatArray, n_steps: int) -> tuple[FloatArray, FloatArray]:
     """Unknowns and their costs after steps of Levenberg and Marquardt from every start.
 
     Parameters
     ----------
-    problem : DrivenStates
+    problem : LeastSquaresProblem
     z : (n_starts, n) array
         Unknowns to start from.
     n_steps : int
@@ -260,16 +300,22 @@ def least_squares(problem: DrivenStates, z: FloatArray, n_steps: int) -> tuple[F
     z : (n_starts, n) array
     cost : (n_starts,) array
         Infinite where every simulation diverges.
+
+    Raises
+    ------
+    TimeLimitError
+        The time limit was reached.
     """
     (cost, gradient, matrix), damping = problem.linearized(z), np.full(len(z), _DAMPING)
     for _ in range(n_steps):
+        check_time()
         scale = np.sqrt(np.einsum("kii->ki", matrix)) + 1e-300
         scaled = matrix / scale[:, :, None] / scale[:, None, :] + damping[:, None, None] * np.eye(z.shape[1])
         step = -np.linalg.solve(scaled, (gradient / scale)[:, :, None])[:, :, 0] / scale
         trial = problem.moved(z, step)
         then = problem.linearized(trial)
         better = then[0] < cost
-        settled = better & (cost - then[0] < _CONVERGED * cost) | (damping >= _DAMPING_BOUNDS[1])
+        settled = better & (then[0] > (1.0 - _CONVERGED) * cost) | (damping >= _DAMPING_BOUNDS[1])
         z = np.where(better[:, None], trial, z)
         cost, gradient, matrix = (
             np.where(better.reshape(-1, *(1,) * (x.ndim - 1)), y, x)

@@ -91,7 +91,7 @@ def predicted_forces(
 ) -> list[PredictedForces]:
     """Forces of the inputs, and as inverse dynamics predict them, of each log; arguments as `force_errors`."""
     try:
-        intervals, motion, _ = prepared(LoDiransac(), dataset, 1)
+        intervals, motion, _ = prepared(LoDiransac(), dataset)
     except LogError:
         return []
     if unmeasured_states(intervals):

@@ -82,7 +82,7 @@ def smoothed_log(dataset: Dataset) -> SmoothedLog | None:
         With one log.
     """
     try:
-        intervals, motion, _ = prepared(LoDiransac(), dataset, 1)
+        intervals, motion, _ = prepared(LoDiransac(), dataset)
     except LogError:
         return None
     (one,), model = dataset.segments, dataset.model

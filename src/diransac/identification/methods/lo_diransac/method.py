@@ -58,6 +58,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
     unmeasured_states,
+    with_observed_states,
     with_unmeasured_states,
 )
 from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
@@ -85,9 +86,6 @@ _ALL_OF_IT = 0.8
 _MUCH = 0.1
 # A significant delay: so many standard errors, and so many samples.
 _SIGNIFICANT, _SMALL_DELAY = 3.0, 0.25
-# Factors by which the motion's time scale is shorter in further searches of doubtful unmeasured states, and its least
-# samples.
-_NARROWER, _FEWEST_SAMPLES = (2, 3), 5
 # Samples of running medians at most: spikes last for samples, however many of them there are in a second.
 _MOST_INPUTS, _MOST_SAMPLES = 15, 31
 _GAUSSIAN = 10_000
@@ -232,14 +230,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     _check_sensors(settings, dataset)
     check_set_points(dataset, settings.set_points)
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
-    best = _searched(settings, dataset, seed, callback)
-    for narrower in _NARROWER if best.is_doubtful else ():
-        with suppress(IdentificationError, TimeLimitError, np.linalg.LinAlgError):
-            further = within(callback, 0.87, 0.9)
-            other = _searched(settings, dataset, seed, further, narrower, best.likeliest.cost)
-            best = min(best, other, key=lambda x: x.likeliest.cost)
-        if not best.is_doubtful:
-            break
+    best = _likeliest(settings, dataset, seed, callback)
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
     notes, refined = best.notes, likeliest.refinement
     report(callback, "estimating parameters", 0.9)
@@ -310,22 +301,50 @@ class _Searched:
         return bool(unmeasured_states(self.likeliest.intervals)) and self.unexplained > _MUCH
 
 
+def _likeliest(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None) -> _Searched:
+    """The likeliest explanation of the logs.
+
+    Where states that nothing measures are not those of an exact model at once, they may have begun on wrong
+    trajectories, for which a resonance that smoothing takes for noise is enough.  A second search begins with the
+    motion of observers, and the likelier explanation counts.
+    """
+    report(callback, "smoothing", 0.0)
+    intervals, motion, notes = prepared(settings, dataset)
+    if not unmeasured_states(intervals):
+        return _searched(settings, intervals, motion, notes, seed, dataset, callback)
+    report(callback, "unmeasured states", 0.05)
+    allowed, measured = len(dataset.model.parameters) - 1, measured_signals(intervals)
+    check_structure(dataset.model, dataset.source, allowed, measured)
+    try:
+        completed = _completed(intervals, motion, dataset)
+        first = _searched(settings, intervals, completed, notes, seed, dataset, callback)
+    except (IdentificationError, np.linalg.LinAlgError):
+        observed = with_observed_states(intervals, motion)
+        if observed is None:
+            raise
+        return _searched(settings, intervals, observed, notes, seed, dataset, within(callback, 0.87, 0.9))
+    if first.likeliest.exact:
+        return first
+    with suppress(IdentificationError, TimeLimitError, np.linalg.LinAlgError):
+        observed, cost = with_observed_states(intervals, motion), first.likeliest.cost
+        if observed is not None:
+            further = within(callback, 0.87, 0.9)
+            other = _searched(settings, intervals, observed, notes, seed, dataset, further, cost)
+            return min(first, other, key=lambda x: x.likeliest.cost)
+    return first
+
+
 def _searched(
     settings: LoDiransac,
-    dataset: Dataset,
+    intervals: ShootingIntervals,
+    motion: Motion,
+    notes: tuple[str, ...],
     seed: int,
+    dataset: Dataset,
     callback: Callback | None,
-    narrower: int = 1,
     to_beat: float = np.inf,
 ) -> _Searched:
-    """A search that begins with a motion of a time scale that is shorter by a factor; it may end behind another one."""
-    report(callback, "smoothing", 0.0)
-    intervals, motion, notes = prepared(settings, dataset, narrower)
-    if unmeasured_states(intervals):
-        report(callback, "unmeasured states", 0.05)
-        allowed, measured = len(dataset.model.parameters) - 1, measured_signals(intervals)
-        check_structure(dataset.model, dataset.source, allowed, measured)
-        motion = _completed(intervals, motion, dataset)
+    """A search that begins with a motion; it may end behind another one."""
     report(callback, "drawing hypotheses", 0.1)
     check_time()
     hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
@@ -442,17 +461,13 @@ def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Ref
 # ---------------------------------------------------------------------- preparation
 
 
-def prepared(
-    settings: LoDiransac, dataset: Dataset, narrower: int
-) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
-    """The logs in intervals of the motion's own time scale, or a part of it, and the motion, row by row of them.
+def prepared(settings: LoDiransac, dataset: Dataset) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
+    """The logs in intervals of the motion's own time scale, and the motion, row by row of them.
 
     Parameters
     ----------
     settings : LoDiransac
     dataset : Dataset
-    narrower : int
-        Factor by which the time scale is shorter.
 
     Returns
     -------
@@ -476,7 +491,6 @@ def prepared(
         for note in said
     ]
     half = choose_half_width(model, samples, dt, settings.smoothing_half_width)
-    half = max(half // narrower, min(half, _FEWEST_SAMPLES))
     n_rows, longest = sum(map(len, dataset.segments)), max(map(len, dataset.segments))
     if n_rows < _FEWEST_INTERVALS * half or longest < half:
         raise LogError(

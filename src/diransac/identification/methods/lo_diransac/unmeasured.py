@@ -7,6 +7,7 @@ hypotheses. Its trajectories take the place of smoothed signals until shooting e
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -17,17 +18,24 @@ from diransac.arrays import FloatArray
 from diransac.identification.driven_states import DrivenStates, least_squares
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.smoothing import Motion
+from diransac.identification.observers import Observers
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.model import Model
 
-__all__ = ["measured_signals", "unmeasured_by_name", "unmeasured_states", "with_unmeasured_states"]
+__all__ = [
+    "measured_signals", "unmeasured_by_name", "unmeasured_states", "with_observed_states", "with_unmeasured_states",
+]  # fmt: skip
 
 # Steps from all starts; the number of those that go on, and their further steps.
 _N_STEPS, _N_FINALISTS, _N_FURTHER_STEPS = 15, 12, 60
 # Memory of the observers, in shooting intervals, over which errors of the smoothed motion average out.
 _MEMORY = 4.0
+# Bandwidths of observers that follow samples, over that of an interval; steps with each, and the number that goes on.
+_STAGES = ((1.5, 60, 64), (0.75, 20, 32), (0.375, 20, 12))
+# Samples further than so many standard deviations from the smoothed motion are outliers.
+_OUTLYING = 5.0
 _TINY = 1e-9
 
 
@@ -112,11 +120,31 @@ def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Moti
     problem = _driven(intervals, motion)
     z, cost = least_squares(problem, problem.starts(), _N_STEPS)
     z, cost = least_squares(problem, z[np.argsort(cost, kind="stable")[:_N_FINALISTS]], _N_FURTHER_STEPS)
-    z, every = z[np.isfinite(cost)], np.arange(len(intervals))
-    completed = [_completed(motion, problem, one) for one in z]
-    pairs = zip(completed, z[:, : len(intervals.layout)], strict=True)
-    scores = [robust_scores(intervals, one, p[None], every)[0] for one, p in pairs]
-    return completed[int(np.argmin(scores))] if np.isfinite(scores).any() else None
+    return _best(intervals, motion, problem, z[np.isfinite(cost)])
+
+
+def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion | None:
+    """The motion of observers that follow the samples, of measured states and of others.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
+        Smoothed motion over the rows of the intervals.
+
+    Returns
+    -------
+    Motion or None
+        None if every observer diverges.
+    """
+    problem = _observers(intervals, motion)
+    z = problem.starts()
+    for width, n_steps, n_kept in _STAGES:
+        problem = replace(problem, bandwidth=width / intervals.duration)
+        z, cost = least_squares(problem, z, n_steps)
+        best = np.argsort(cost, kind="stable")[:n_kept]
+        z, cost = z[best], cost[best]
+    return _best(intervals, motion, problem, z[np.isfinite(cost)])
 
 
 def _driven(intervals: ShootingIntervals, motion: Motion) -> DrivenStates:
@@ -142,8 +170,53 @@ def _driven(intervals: ShootingIntervals, motion: Motion) -> DrivenStates:
     )
 
 
-def _completed(motion: Motion, problem: DrivenStates, z: FloatArray) -> Motion:
-    """The motion with the unmeasured states and their derivatives that unknowns (n,) give."""
+def _observers(intervals: ShootingIntervals, motion: Motion) -> Observers:
+    """Observers of all states, in units of the noise of the samples.
+
+    Outliers, and what is missing, take the smoothed motion as samples, without weight.  So do velocities that
+    kinematics give.
+    """
+    model, hidden, measured = intervals.model, unmeasured_states(intervals), measured_signals(intervals)
+    corrected = {chain[1] for chain in model.chains if chain[0] in measured and len(chain) > 1}
+    sampled = tuple(n for n in model.state if n in measured or (n not in hidden and n not in corrected))
+    columns = [model.signals.index(n) for n in (*sampled, *model.sensors)]
+    smoothed, known = motion.signals[:, columns], intervals.known[:, columns]
+    apart = np.where(known, np.abs(intervals.measured[:, columns] - smoothed), 0.0)
+    noise = np.array([1.4826 * np.median(x[i]) if i.any() else 0.0 for x, i in zip(apart.T, known.T, strict=True)])
+    inlying = known & (apart < _OUTLYING * noise + _TINY)
+    values = np.where(inlying, intervals.measured[:, columns], np.nan_to_num(smoothed))
+    weights = np.where(inlying, 1.0 / np.square(noise + _TINY), 0.0) / max(inlying.sum(), 1)
+    first = np.array([rows.start for rows in intervals.rows_of_logs])
+    scalars = [model.state[four[0]] for four in model.quaternions]
+    begin = motion.signals[first][:, [model.signals.index(n) for n in model.state]]
+    begin = np.where([n in hidden for n in model.state], [float(n in scalars) for n in model.state], begin)
+    return Observers(
+        model,
+        intervals.layout,
+        sampled,
+        values[:, : len(sampled)],
+        intervals.inputs,
+        values[:, len(sampled) :],
+        weights,
+        begin,
+        intervals.rows_of_logs,
+        intervals.dt,
+        bandwidth=1.0 / intervals.duration,
+    )
+
+
+def _best(
+    intervals: ShootingIntervals, motion: Motion, problem: DrivenStates | Observers, z: FloatArray
+) -> Motion | None:
+    """The motion whose parameters simulate the intervals best, of vectors of unknowns ``(k, n)``."""
+    completed, every = [_completed(motion, problem, one) for one in z], np.arange(len(intervals))
+    pairs = zip(completed, z[:, : len(intervals.layout)], strict=True)
+    scores = [robust_scores(intervals, one, p[None], every)[0] for one, p in pairs]
+    return completed[int(np.argmin(scores))] if np.isfinite(scores).any() else None
+
+
+def _completed(motion: Motion, problem: DrivenStates | Observers, z: FloatArray) -> Motion:
+    """The motion with the states and their derivatives that unknowns (n,) give."""
     signals, spread = motion.signals.copy(), motion.spread.copy()
     for name, values in problem.trajectories(z).items():
         column = problem.model.signals.index(name)
