@@ -49,6 +49,18 @@ def test_wraps_are_undone_beside_outliers_of_any_size_and_across_gaps(seed, rate
     assert error[0] / turn == pytest.approx(round(error[0] / turn), abs=1e-9)
 
 
+@pytest.mark.parametrize("fraction", [0.1, 0.3, 0.4])
+@pytest.mark.parametrize("size", [10.0, 30.0])
+def test_an_angle_that_is_not_wrapped_is_kept_however_many_outliers_look_like_turns(fraction, size):
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        t = DT * np.arange(2500)
+        angle = 0.5 * np.sin(rng.uniform(0.5, 2.0) * t) + 0.3 * np.sin(rng.uniform(2.0, 4.0) * t)
+        hit = rng.random(len(t)) < fraction
+        measured = angle + hit * rng.uniform(-size, size, len(t))
+        assert np.array_equal(unwrapped(measured), measured)
+
+
 def test_an_angle_of_few_samples_is_unwrapped_across_those_that_are_missing():
     angle = 4.0 * np.arange(3000) * DT
     sparse = np.where(np.arange(3000) % 10 == 0, wrapped(angle), np.nan)

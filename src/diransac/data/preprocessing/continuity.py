@@ -169,7 +169,7 @@ def _revolutions(values: FloatArray, turn: float) -> IntArray:
     k = np.zeros(len(values), np.int64)
     rows = np.flatnonzero(np.isfinite(values))
     y = values[rows] / turn
-    if len(y) < 2 or np.abs(np.diff(y)).max() <= 0.5:
+    if len(y) < 2 or np.abs(np.diff(y)).max() <= 0.5 or _is_continuous_beside_outliers(y):
         return k
     motion = _motion(y, rows)
     good = _agreeing(y, motion)
@@ -188,6 +188,16 @@ def _revolutions(values: FloatArray, turn: float) -> IntArray:
     close = inside & (np.abs(_remainder(off)) <= np.minimum(_CLOSE + _MUCH_MOTION * motion, _FAR))
     k[rows[close]] = np.round(off[close]).astype(np.int64) - first
     return k
+
+
+def _is_continuous_beside_outliers(y: FloatArray) -> bool:
+    """True if an angle, in turns, is near a running median without leaps: outliers alone leap.
+
+    The median of a wrapped angle leaps with it, or is far from most samples of one that turns within a window.
+    """
+    usual = median_filter(median_filter(y, _WINDOW), _WINDOW)
+    agreeing = median_filter(np.abs(y - usual) <= _FAR, _WINDOW)
+    return bool(np.abs(np.diff(usual)).max() <= 0.5 and agreeing.mean() >= _INSIDE)
 
 
 def _agreeing(y: FloatArray, motion: FloatArray) -> BoolArray:
