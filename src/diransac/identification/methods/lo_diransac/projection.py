@@ -658,8 +658,8 @@ def batch_sums(values: FloatArray) -> FloatArray:
 
     A batch has about sqrt(W) intervals, or as many as a first-order autoregression of a column asks for (Andrews 1991,
     Bartlett's kernel), but a quarter of them at most: a slow current pushes one way for a third of a log.  Sums are
-    increased for their number: by what an estimate takes from them, and by Student's t, so that a normal interval has
-    its level.
+    increased by Student's t for their number, so that a normal interval has its level, and long ones by what an
+    estimate takes from so few.
 
     Parameters
     ----------
@@ -674,17 +674,16 @@ def batch_sums(values: FloatArray) -> FloatArray:
     sums = _sums_of_batches(values, usual)
     for j, length in enumerate(_correlated(values)):
         if length > usual:
-            longer = np.square(_sums_of_batches(values[:, j], length)).sum()
-            sums[:, j] *= np.sqrt(max(longer / (np.square(sums[:, j]).sum() + _TINY), 1.0))
+            few = _sums_of_batches(values[:, j], length)
+            variance = np.square(few).sum() * len(few) / (len(few) - 1)
+            sums[:, j] *= np.sqrt(max(variance / (np.square(sums[:, j]).sum() + _TINY), 1.0))
     return sums
 
 
 def _sums_of_batches(values: FloatArray, length: int) -> FloatArray:
     """Sums over ``length`` intervals each, increased for their number."""
     sums = np.add.reduceat(values, np.arange(0, len(values), length), axis=0)
-    freedom = max(len(sums) - 1, 1)
-    more = np.sqrt(len(sums) / freedom) * student_quantile(freedom, _UPPER) / _NORMAL_UPPER
-    return np.asarray(sums * more)
+    return np.asarray(sums * student_quantile(max(len(sums) - 1, 1), _UPPER) / _NORMAL_UPPER)
 
 
 def _correlated(values: FloatArray) -> IntArray:
