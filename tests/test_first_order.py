@@ -17,9 +17,9 @@ from scipy.integrate import odeint
 import diransac as dr
 from diransac.data.dataset import ParameterLayout
 from diransac.data.preprocessing import differentiate
-from diransac.identification.driven_states import least_squares
 from diransac.identification.identifiability import structural
 from diransac.identification.inspection import inspect
+from diransac.identification.multistart import least_squares
 from diransac.identification.observers import Observers
 from diransac.model import Model, Parameter
 from diransac.simulation import RolloutBatch, rollouts

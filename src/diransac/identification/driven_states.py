@@ -12,33 +12,29 @@ Ljung 1999, section 7 (prediction errors of observers); Marquardt 1963; Boender,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
+from diransac.identification.multistart import SearchOverLogs, held_means, within_half_a_turn
 from diransac.identification.nonlinear import ParameterChart
 from diransac.model import Model, Parameter
-from diransac.simulation import Measurements, RolloutBatch, Simulator, rollouts
-from diransac.time_limit import check_time
+from diransac.simulation import RolloutBatch, Simulator, rollouts
 
 if TYPE_CHECKING:
     from diransac.data.dataset import ParameterLayout
     from diransac.model.derivation import Symbols
 
-__all__ = ["DrivenStates", "held_means", "least_squares", "within_half_a_turn"]
+__all__ = ["DrivenStates"]
 
 _N_STARTS = 256
-# Largest factor of a positive parameter in a step; integration steps per sample.
-_LARGEST_FACTOR, _SUBSTEPS = 10.0, 2
-# Points at which equations are compared after a turn, and the difference up to which they are the same.
-_TURN, _N_POINTS, _SAME = 2.0 * np.pi, 16, 1e-9
-# Damping at the start, its bounds, and its factors after a step down and after one up; the least gain of a step.
-_DAMPING, _DAMPING_BOUNDS, _LESS, _MORE, _CONVERGED = 1e-2, (1e-9, 1e9), 0.2, 6.0, 1e-9
+# Integration steps per sample.
+_SUBSTEPS = 2
 
 
 @lru_cache(maxsize=16)
@@ -81,64 +77,8 @@ def _driven_model(model: Model, hidden: tuple[str, ...], observed: tuple[str, ..
     )
 
 
-@lru_cache(maxsize=64)
-def _free_of_turns(model: Model) -> frozenset[str]:
-    """Coordinates in rad that may gain a whole turn with no effect on the equations, tried at random points."""
-    symbols = [ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup")]
-    parts = [model.residual(*symbols)]
-    if model.kinematics is not None:
-        parts.append(model.kinematics(*symbols[:2]))
-    if model.measurement is not None:
-        parts.append(model.measurement(*symbols))
-    equations, rng = ca.Function("equations", symbols, [ca.vertcat(*parts)]), np.random.default_rng(0)
-    points = [rng.uniform(0.5, 2.0, (x.numel(), _N_POINTS)) for x in symbols]
-    before = np.array(equations(*points))
-
-    def is_free(k: int) -> bool:
-        turned = points[0].copy()
-        turned[k] += _TURN
-        after = np.array(equations(turned, *points[1:]))
-        return np.allclose(before, after, rtol=_SAME, atol=_SAME, equal_nan=True)
-
-    return frozenset(n for k, n in enumerate(model.coordinates) if model.units[n] == "rad" and is_free(k))
-
-
-def within_half_a_turn(model: Model, states: Mapping[str, FloatArray], rows_of_logs: Sequence[slice]) -> None:
-    """Move angles that are the same after a whole turn so that each log starts within half a turn of zero, in place.
-
-    Parameters
-    ----------
-    model : Model
-    states : mapping of str to (N,) array
-        In all rows of all logs.
-    rows_of_logs : sequence of slice
-    """
-    for name in _free_of_turns(model).intersection(states):
-        for rows in rows_of_logs:
-            states[name][rows] -= _TURN * np.rint(states[name][rows.start] / _TURN)
-
-
-def held_means(values: FloatArray, rows_of_logs: Sequence[slice]) -> FloatArray:
-    """Values that are held from row to row as an input is: the means of both rows.
-
-    Parameters
-    ----------
-    values : (N, n) array
-        In all rows of all logs.
-    rows_of_logs : sequence of slice
-
-    Returns
-    -------
-    (N, n) array
-    """
-    means = values.copy()
-    for rows in rows_of_logs:
-        means[rows][:-1] = 0.5 * (values[rows][1:] + values[rows][:-1])
-    return means
-
-
 @dataclass(frozen=True)
-class DrivenStates:
+class DrivenStates(SearchOverLogs):
     """Least squares of the errors of observers and sensors: states that nothing measures, driven by those of logs.
 
     Unknown are the parameters, if they are not given, and the unmeasured states at the beginning of every log.
@@ -205,8 +145,16 @@ class DrivenStates:
 
     @property
     def _n_parameters(self) -> int:
-        """Number of unknown parameters."""
         return len(self.layout) if self.parameters is None else 0
+
+    @cached_property
+    def _unknowns(self) -> tuple[str, ...]:
+        free = self.model.parameters if self.parameters is None else ()
+        return (*free, *self._driven.state[: len(self.hidden)])
+
+    @cached_property
+    def _compared(self) -> FloatArray:
+        return np.hstack([self._velocities, self.readings])
 
     def starts(self) -> FloatArray:
         """Unknowns (n_starts, n) to start from: parameters over the bounds or six decades, states zero.
@@ -219,15 +167,6 @@ class DrivenStates:
             return states[None]
         chart = ParameterChart(self.layout.bounds)
         return np.hstack([chart.to_parameters(chart.starts(_N_STARTS)), np.tile(states, (_N_STARTS, 1))])
-
-    def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
-        """Unknowns (n_starts, n) after a step within the bounds, in which positive parameters change by a factor."""
-        then = now + step
-        for j, bound in enumerate(self.layout.bounds[: self._n_parameters]):
-            then[:, j] = np.clip(then[:, j], bound.lower, bound.upper)
-            if bound.positive:
-                then[:, j] = np.clip(then[:, j], now[:, j] / _LARGEST_FACTOR, now[:, j] * _LARGEST_FACTOR)
-        return then
 
     def _places(self, log: int) -> IntArray:
         """Places of a log's parameters and initial states among the unknowns."""
@@ -244,21 +183,6 @@ class DrivenStates:
         states = np.hstack([own[:, -n:], observed])
         return RolloutBatch(np.hstack([parameters, bandwidth]), states, self._inputs[rows], self.dt)
 
-    def linearized(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cost (n_starts,), infinite after a divergence, its gradient / 2 (n_starts, n), and the normal matrix."""
-        cost, gradient, matrix = np.zeros(len(z)), np.zeros(z.shape), np.zeros((*z.shape, z.shape[1]))
-        free = self.model.parameters if self.parameters is None else ()
-        unknowns = (*free, *self._driven.state[: len(self.hidden)])
-        for i, rows in enumerate(self.rows_of_logs):
-            compared = np.hstack([self._velocities[rows], self.readings[rows]])
-            measured = Measurements(compared, np.ones(len(compared), bool))
-            found = self._simulator.gauss_newton(self._batch(z, i), measured, self.weights[rows], unknowns=unknowns)
-            places = self._places(i)
-            cost += found.cost
-            gradient[:, places] += found.gradient
-            matrix[:, places[:, None], places] += found.normal_matrix
-        return cost, gradient, matrix
-
     def trajectories(self, z: FloatArray) -> dict[str, FloatArray]:
         """Unmeasured states and their derivatives (N,) by name, for one vector of unknowns (n,).
 
@@ -272,56 +196,3 @@ class DrivenStates:
         within_half_a_turn(model, states, self.rows_of_logs)
         rates = zip(self.hidden, series[:, n_driven : n_driven + n].T, strict=True)
         return {**states, **{rate_of[name]: values for name, values in rates if name in rate_of}}
-
-
-class LeastSquaresProblem(Protocol):
-    """Unknowns ``z (n_starts, n)`` of many searches, and the steps that they may take."""
-
-    def linearized(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cost (n_starts,), its gradient / 2 (n_starts, n), and the normal matrix (n_starts, n, n)."""
-
-    def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
-        """Unknowns after a step."""
-
-
-def least_squares(problem: LeastSquaresProblem, z: FloatArray, n_steps: int) -> tuple[FloatArray, FloatArray]:
-    """Unknowns and their costs after steps of Levenberg and Marquardt from every start.
-
-    Parameters
-    ----------
-    problem : LeastSquaresProblem
-    z : (n_starts, n) array
-        Unknowns to start from.
-    n_steps : int
-        Largest number of steps.
-
-    Returns
-    -------
-    z : (n_starts, n) array
-    cost : (n_starts,) array
-        Infinite where every simulation diverges.
-
-    Raises
-    ------
-    TimeLimitError
-        The time limit was reached.
-    """
-    (cost, gradient, matrix), damping = problem.linearized(z), np.full(len(z), _DAMPING)
-    for _ in range(n_steps):
-        check_time()
-        scale = np.sqrt(np.einsum("kii->ki", matrix)) + 1e-300
-        scaled = matrix / scale[:, :, None] / scale[:, None, :] + damping[:, None, None] * np.eye(z.shape[1])
-        step = -np.linalg.solve(scaled, (gradient / scale)[:, :, None])[:, :, 0] / scale
-        trial = problem.moved(z, step)
-        then = problem.linearized(trial)
-        better = then[0] < cost
-        settled = better & (then[0] > (1.0 - _CONVERGED) * cost) | (damping >= _DAMPING_BOUNDS[1])
-        z = np.where(better[:, None], trial, z)
-        cost, gradient, matrix = (
-            np.where(better.reshape(-1, *(1,) * (x.ndim - 1)), y, x)
-            for x, y in zip((cost, gradient, matrix), then, strict=True)
-        )
-        damping = np.clip(np.where(better, _LESS, _MORE) * damping, *_DAMPING_BOUNDS)
-        if settled.all():
-            break
-    return z, cost

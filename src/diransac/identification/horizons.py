@@ -12,9 +12,10 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.segment import Segment, runs
 from diransac.errors import LogError
-from diransac.identification.driven_states import DrivenStates, least_squares
+from diransac.identification.driven_states import DrivenStates
 from diransac.identification.estimate import Resolution
 from diransac.identification.evaluation import Simulation
+from diransac.identification.multistart import least_squares
 
 if TYPE_CHECKING:
     from diransac.identification.window_starts import SmoothedLog, WindowStarts

@@ -25,10 +25,10 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
-from diransac.identification.driven_states import held_means, within_half_a_turn
+from diransac.identification.multistart import SearchOverLogs, held_means, within_half_a_turn
 from diransac.identification.nonlinear import ParameterChart
 from diransac.model import Model, Parameter
-from diransac.simulation import Measurements, RolloutBatch, Simulator, rollouts
+from diransac.simulation import RolloutBatch, Simulator, rollouts
 
 if TYPE_CHECKING:
     from diransac.data.dataset import ParameterLayout
@@ -38,8 +38,8 @@ __all__ = ["Observers"]
 
 # Starts at most and at least, and numbers of all rows and pairs of unknowns of all starts in between.
 _N_STARTS, _FEWEST_STARTS, _NUMBERS = 256, 16, 200_000_000
-# Largest factor of a positive parameter in a step; integration steps per sample.
-_LARGEST_FACTOR, _SUBSTEPS = 10.0, 2
+# Integration steps per sample.
+_SUBSTEPS = 2
 
 
 @lru_cache(maxsize=16)
@@ -83,7 +83,7 @@ def _observer_model(model: Model, sampled: tuple[str, ...]) -> Model:
 
 
 @dataclass(frozen=True)
-class Observers:
+class Observers(SearchOverLogs):
     """Least squares of the errors of observers: all states begin anywhere, parameters are unknown.
 
     Parameters
@@ -136,21 +136,23 @@ class Observers:
         """Inputs (N, n) of the observers."""
         return np.hstack([held_means(self.samples, self.rows_of_logs), self.inputs])
 
+    @property
+    def _n_parameters(self) -> int:
+        return len(self.layout)
+
+    @cached_property
+    def _unknowns(self) -> tuple[str, ...]:
+        return (*self.model.parameters, *self._observer.state)
+
+    @cached_property
+    def _compared(self) -> FloatArray:
+        return np.hstack([self.samples, self.readings])
+
     def starts(self) -> FloatArray:
         """Unknowns (n_starts, n) to start from: parameters over the bounds or six decades; fewer of larger problems."""
         chart, n = ParameterChart(self.layout.bounds), len(self.layout) + self.begin.size
         n_starts = int(np.clip(_NUMBERS // (len(self.samples) * n**2), _FEWEST_STARTS, _N_STARTS))
         return np.hstack([chart.to_parameters(chart.starts(n_starts)), np.tile(self.begin.ravel(), (n_starts, 1))])
-
-    def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
-        """Unknowns (n_starts, n) after a step within the bounds, in which logarithms of positive parameters change."""
-        then = now + step
-        for j, bound in enumerate(self.layout.bounds):
-            if bound.positive:
-                most = np.log(_LARGEST_FACTOR)
-                then[:, j] = now[:, j] * np.exp(np.clip(step[:, j] / now[:, j], -most, most))
-            then[:, j] = np.clip(then[:, j], bound.lower, bound.upper)
-        return then
 
     def _places(self, log: int) -> IntArray:
         """Places of a log's parameters and initial states among the unknowns."""
@@ -162,20 +164,6 @@ class Observers:
         rows, own, n = self.rows_of_logs[log], z[:, self._places(log)], len(self.model.state)
         parameters = np.hstack([own[:, :-n], np.full((len(z), 1), self.bandwidth)])
         return RolloutBatch(parameters, own[:, -n:], self._inputs[rows], self.dt)
-
-    def linearized(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cost (n_starts,), infinite after a divergence, its gradient / 2 (n_starts, n), and the normal matrix."""
-        cost, gradient, matrix = np.zeros(len(z)), np.zeros(z.shape), np.zeros((*z.shape, z.shape[1]))
-        unknowns = (*self.model.parameters, *self._observer.state)
-        for i, rows in enumerate(self.rows_of_logs):
-            compared = np.hstack([self.samples[rows], self.readings[rows]])
-            measured = Measurements(compared, np.ones(len(compared), bool))
-            found = self._simulator.gauss_newton(self._batch(z, i), measured, self.weights[rows], unknowns=unknowns)
-            places = self._places(i)
-            cost += found.cost
-            gradient[:, places] += found.gradient
-            matrix[:, places[:, None], places] += found.normal_matrix
-        return cost, gradient, matrix
 
     def trajectories(self, z: FloatArray) -> dict[str, FloatArray]:
         """States and accelerations (N,) by name, for one vector of unknowns (n,).

@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -325,12 +324,16 @@ def _likeliest(settings: LoDiransac, dataset: Dataset, seed: int, callback: Call
         return _searched(settings, intervals, observed, notes, seed, dataset, within(callback, 0.87, 0.9))
     if first.likeliest.exact:
         return first
-    with suppress(IdentificationError, TimeLimitError, np.linalg.LinAlgError):
+    try:
         observed, cost = with_observed_states(intervals, motion), first.likeliest.cost
         if observed is not None:
             further = within(callback, 0.87, 0.9)
             other = _searched(settings, intervals, observed, notes, seed, dataset, further, cost)
             return min(first, other, key=lambda x: x.likeliest.cost)
+    except TimeLimitError:
+        return replace(first, likeliest=replace(first.likeliest, complete=False))
+    except (IdentificationError, np.linalg.LinAlgError):
+        pass  # the first search stands
     return first
 
 

@@ -15,9 +15,10 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.identification.driven_states import DrivenStates, least_squares
+from diransac.identification.driven_states import DrivenStates
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.smoothing import Motion
+from diransac.identification.multistart import least_squares
 from diransac.identification.observers import Observers
 
 if TYPE_CHECKING:
