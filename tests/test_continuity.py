@@ -61,6 +61,15 @@ def test_an_angle_that_is_not_wrapped_is_kept_however_many_outliers_look_like_tu
         assert np.array_equal(unwrapped(measured), measured)
 
 
+@pytest.mark.parametrize("samples_per_turn", [5, 12, 20, 40])
+@pytest.mark.parametrize("n", [60, 140])
+def test_a_short_spin_between_long_rests_is_unwrapped(samples_per_turn, n):
+    """A running median of the wrapped angle has no leap."""
+    angle = TURN * (0.1 + np.clip(np.arange(3000) - 1000, 0, n - 1) / samples_per_turn)
+    angle += 0.01 * np.random.default_rng(0).standard_normal(3000)
+    assert np.allclose(unwrapped(wrapped(angle)), angle)
+
+
 def test_an_angle_of_few_samples_is_unwrapped_across_those_that_are_missing():
     angle = 4.0 * np.arange(3000) * DT
     sparse = np.where(np.arange(3000) % 10 == 0, wrapped(angle), np.nan)

@@ -191,13 +191,14 @@ def _revolutions(values: FloatArray, turn: float) -> IntArray:
 
 
 def _is_continuous_beside_outliers(y: FloatArray) -> bool:
-    """True if an angle, in turns, is near a running median without leaps: outliers alone leap.
+    """True if the medoids of an angle, in turns, are continuous without turns: outliers alone leap.
 
-    The median of a wrapped angle leaps with it, or is far from most samples of one that turns within a window.
+    Those of a wrapped angle travel around the circle, and need turns from then on.
     """
-    usual = median_filter(median_filter(y, _WINDOW), _WINDOW)
-    agreeing = median_filter(np.abs(y - usual) <= _FAR, _WINDOW)
-    return bool(np.abs(np.diff(usual)).max() <= 0.5 and agreeing.mean() >= _INSIDE)
+    around = _neighbours(len(y), _WINDOW // 2)
+    medoids = y[_medoids(y[:, None], lambda a, b: np.abs(_remainder(a - b)[:, 0]), around)]
+    turns = np.round(np.cumsum(np.r_[medoids[:1], _remainder(np.diff(medoids))]) - medoids)
+    return bool(np.ptp(median_filter(turns, _WINDOW)) == 0.0)
 
 
 def _agreeing(y: FloatArray, motion: FloatArray) -> BoolArray:
