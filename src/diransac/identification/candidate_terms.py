@@ -155,9 +155,20 @@ class CandidateTerms:
         step = max(1, _BLOCK // length)
         for k in range(0, n, step):
             part = slice(k * length, (k + step) * length)
-            values = np.array(entries(*(x[part].T for x in motion))).T * weights[part, None]
+            values = _in_every_row(entries, [x[part] for x in motion]) * weights[part, None]
             found[k : k + step, rows, columns] = values.reshape(-1, length, len(rows)).sum(axis=1)
         return found
+
+
+def _in_every_row(function: ca.Function, arrays: Sequence[FloatArray]) -> FloatArray:
+    """Values (N, n) of a function of vectors over rows (N, n_i), by CasADi: these are too many terms to compile."""
+    inputs, found = [np.ascontiguousarray(x) for x in arrays], np.empty((len(arrays[0]), function.numel_out(0)))
+    buffer, evaluate = function.map(len(found)).buffer()
+    for k, rows in enumerate(inputs):
+        buffer.set_arg(k, memoryview(rows))
+    buffer.set_res(0, memoryview(found))
+    evaluate()
+    return found
 
 
 def candidate_terms(

@@ -287,7 +287,7 @@ class GaussNewtonBatch:
         e' W e, without a factor of one half; infinite in a lane that diverged.
     gradient : (n_lanes, n_z)
         J' W e; zero in a lane that diverged.
-    normal_matrix : (n_lanes, n_z, n_z)
+    normal_matrix : (n_lanes, n_z, n_z), or (0, n_z, n_z) where it is left out
         J' W J; zero in a lane that diverged.
     final_states : (n_lanes, n_x)
         State one row after the last; NaN in a lane that diverged.
@@ -425,6 +425,7 @@ class Simulator(Protocol):
         weights: ArrayLike,
         *,
         unknowns: Sequence[str] | None = None,
+        normal_matrix: bool = True,
         threads: int = 1,
     ) -> GaussNewtonBatch:
         """Sums e' W e, J' W e and J' W J of every lane, J the exact derivative of the errors that `errors` returns.
@@ -441,6 +442,8 @@ class Simulator(Protocol):
             W, inverse of each signal's unit squared: 1 / sigma^2, possibly scaled by robust reweighting.
         unknowns : sequence of str, optional
             Names of parameters, and of states for their initial values; by default all parameters, then all states.
+        normal_matrix : bool, optional
+            False leaves out J' W J, which takes most of the time.
         threads : int
             Number of threads.
         """

@@ -205,6 +205,7 @@ class Rollouts(Simulator):
         weights: ArrayLike,
         *,
         unknowns: Sequence[str] | None = None,
+        normal_matrix: bool = True,
         threads: int = 1,
     ) -> GaussNewtonBatch:
         """Sums e' W e, J' W e and J' W J of every lane; see `Simulator.gauss_newton`."""
@@ -215,11 +216,12 @@ class Rollouts(Simulator):
         final = aligned((n_blocks, len(self._model.state) + int(sensitivities.present.sum()), LANES))
         values = {
             **arranged_weights(lanes, len(self.signals), measurements.values, measurements.valid, weights),
+            "products": int(normal_matrix),
             "sums": sums,
             "final": final,
         }
         self._run("GaussNewtonOutput", batch, lanes, values, threads, unknowns=names)
-        return _unpacked(sensitivities, lanes.n_lanes, sums, final)
+        return _unpacked(sensitivities, lanes.n_lanes, sums, final, normal_matrix=normal_matrix)
 
     def linearized_errors(
         self,
@@ -372,7 +374,9 @@ class Rollouts(Simulator):
         return [repr((sizes, model.quaternions, options)), *(function.serialize() for function in functions)]
 
 
-def _unpacked(sensitivities: Sensitivities, n_lanes: int, sums: FloatArray, final: FloatArray) -> GaussNewtonBatch:
+def _unpacked(
+    sensitivities: Sensitivities, n_lanes: int, sums: FloatArray, final: FloatArray, *, normal_matrix: bool
+) -> GaussNewtonBatch:
     """Results of lanes from the blocks that the time loop writes, without the lanes that fill the last block.
 
     Parameters
@@ -382,16 +386,18 @@ def _unpacked(sensitivities: Sensitivities, n_lanes: int, sums: FloatArray, fina
     final : (n_blocks, n_x + n_entries, 8)
         State, then its derivatives.
     """
-    sums, final = _by_lane(sums, n_lanes), _by_lane(final, n_lanes)
     n_x, n_z = sensitivities.initial.shape
-    cost, gradient = sums[:, 0].copy(), np.take(sums, 1 + sensitivities.places, axis=1)
-    normal_matrix = np.take(sums, 1 + n_z + sensitivities.pairs, axis=1)
+    first, final = _by_lane(sums[:, : 1 + n_z], n_lanes), _by_lane(final, n_lanes)
+    cost, gradient = first[:, 0].copy(), np.take(first, 1 + sensitivities.places, axis=1)
+    matrix = np.empty((0, n_z, n_z))
+    if normal_matrix:
+        matrix = np.take(_by_lane(sums[:, 1 + n_z :], n_lanes), sensitivities.pairs, axis=1)
     diverged = np.isinf(cost)
     slopes = sensitivities.matrix(final[:, n_x:])
     if diverged.any():
         slopes[diverged] = np.nan
     states = final[:, :n_x].copy()
-    return GaussNewtonBatch(sensitivities.unknowns, cost, gradient, normal_matrix, states, slopes, diverged)
+    return GaussNewtonBatch(sensitivities.unknowns, cost, gradient, matrix, states, slopes, diverged)
 
 
 def _by_lane(blocks: FloatArray, n_lanes: int) -> FloatArray:

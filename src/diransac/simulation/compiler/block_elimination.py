@@ -24,17 +24,13 @@ from diransac.simulation.compiler.vectors import DOUBLE, INTEGER, NUMBERS, POINT
 
 __all__ = ["emit_block_elimination"]
 
-# A pivot at least: what rounding leaves of a diagonal of one where a system is singular.
-_LEAST_PIVOT = 1e-16
-
-
 def emit_block_elimination(name: str) -> Value:
     """LLVM module with one function.
 
     Its arguments are the arrays `blocks` (n, k, 2 padded_k + padded_c), `below` (n - 1, k, k), `inverse_below`
     (n - 1, padded_k, padded_k) and `pivots` (n, k), and the sizes n, k, padded_k and padded_c.  A row of a block has
     those of D_w, E_w' and R_w beside each other, padded by zeros to whole vectors, which S_w, Y_w and X_w replace.
-    `inverse_below` is zero at first.
+    `inverse_below` is zero at first; `pivots` are the least that are admitted, which the pivots replace.
 
     Parameters
     ----------
@@ -94,9 +90,10 @@ class _Emitter:
         with self._rows() as j:
             row = self._row(w, j)
             at = b.add(row, j)
-            least, found = ir.Constant(DOUBLE, _LEAST_PIVOT), v.load(self.blocks, at, DOUBLE)
+            place = b.add(b.mul(w, self.k), j)
+            least, found = v.load(self.pivots, place, DOUBLE), v.load(self.blocks, at, DOUBLE)
             pivot = b.select(b.fcmp_unordered("<", found, least), least, found)
-            v.store(pivot, self.pivots, b.add(b.mul(w, self.k), j))
+            v.store(pivot, self.pivots, place)
             v.store(one, self.blocks, at)
             factor = v.splat(b.fdiv(one, pivot))
             with self._vectors(self._width) as column:

@@ -16,10 +16,14 @@ from diransac.arrays import FloatArray
 from diransac.simulation.compiler.machine_code import LANES, MachineCode, compile_function
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from diransac.simulation.compiler.vectors import Value
 
 __all__ = ["BlockSolution", "solve_blocks"]
 
+# Part of its diagonal that a pivot is at least: what rounding leaves where a system is singular.
+_LEAST_PIVOT = 1e-16
 _SIGNATURE = {
     **dict.fromkeys(("blocks", "below", "inverse_below", "pivots"), "pointer"),
     **dict.fromkeys(("n", "k", "padded_k", "padded_c"), "integer"),
@@ -43,27 +47,34 @@ class BlockSolution(NamedTuple):
     log_det: float
 
 
-def solve_blocks(diagonal: FloatArray, below: FloatArray, right: FloatArray) -> BlockSolution:
-    """Solution of a positive definite system; its diagonal should be near one.
+def solve_blocks(
+    diagonal: FloatArray, below: FloatArray, right: Sequence[FloatArray], shift: FloatArray
+) -> BlockSolution:
+    """Solution of a positive definite system, whatever the scales of its unknowns.
 
     Parameters
     ----------
     diagonal : (n, k, k) symmetric blocks
     below : (n - 1, k, k) blocks below the diagonal
-    right : (n, k, c) right-hand sides
+    right : (n, k, c_i) arrays of right-hand sides, c columns in all
+    shift : (n, k), addition to the diagonal
     """
-    n, k, c = right.shape
-    padded_k, padded_c = (-(-size // LANES) * LANES for size in (k, c))
-    blocks = np.zeros((n, k, 2 * padded_k + padded_c))
+    n, k = shift.shape
+    padded_k, padded_c = (-(-size // LANES) * LANES for size in (k, sum(x.shape[2] for x in right)))
+    blocks, c = np.zeros((n, k, 2 * padded_k + padded_c)), 2 * padded_k
     blocks[:, :, :k] = diagonal
+    own = np.einsum("wii->wi", blocks[:, :, :k])
+    own += shift
     blocks[:-1, :, padded_k : padded_k + k] = below.swapaxes(1, 2)
-    blocks[:, :, 2 * padded_k : 2 * padded_k + c] = right
-    coupling = np.ascontiguousarray(below, np.float64)
-    inverse_below, pivots = np.zeros((n - 1, padded_k, padded_k)), np.empty((n, k))
+    for columns in right:
+        blocks[:, :, c : c + columns.shape[2]] = columns
+        c += columns.shape[2]
+    coupling, pivots = np.ascontiguousarray(below, np.float64), _LEAST_PIVOT * own
+    inverse_below = np.zeros((n - 1, padded_k, padded_k))
     arrays = (blocks, coupling, inverse_below, pivots)
     _code().call(*(array.ctypes.data for array in arrays), n, k, padded_k, padded_c)
-    solved = blocks[:, :, 2 * padded_k : 2 * padded_k + c]
-    return BlockSolution(solved, blocks[:, :, :k], inverse_below[:, :k, :k], float(np.log(pivots).sum()))
+    solved, inverse = blocks[:, :, 2 * padded_k : c].copy(), blocks[:, :, :k].copy()
+    return BlockSolution(solved, inverse, inverse_below[:, :k, :k].copy(), float(np.log(pivots).sum()))
 
 
 @cache

@@ -52,6 +52,7 @@ ARGUMENTS = {
     "final": "pointer",  # (n_blocks, n_states, 8) float64
     "step": "number",  # seconds, of one sub-step
     "min_inlier_signals": "integer",
+    "products": "integer",  # 0 leaves out J' W J
     "n_lanes": "integer",
     "n_padded": "integer",  # n_lanes rounded up to whole vectors; the last lane is repeated
     "n_rows": "integer",

@@ -113,6 +113,7 @@ class GaussNewtonOutput(_Output):
     Unknowns are in the order of their groups. The sums exceed the registers: each is loaded, increased and stored in
     its final place, close together for a block. `final` (n_blocks, n_states + n_derivatives, 8) is the state, then the
     derivatives of each group. In a lane that diverged e'we is infinite, the other sums are zero, and `final` is NaN.
+    Without `products` those of J'wJ stay zero.
     """
 
     ends_early = True
@@ -141,8 +142,9 @@ class GaussNewtonOutput(_Output):
         self._add(0, list(zip(weighted, errors, strict=True)))
         for number in range(len(self.columns.groups)):
             self._add_gradient(number, weights, weighted)
-        for left in range(len(self.columns.groups)):
-            self._add_products(left)
+        with self.loop.builder.if_then(self.loop.builder.icmp_signed("!=", self.arguments["products"], integer(0))):
+            for left in range(len(self.columns.groups)):
+                self._add_products(left)
 
     def _add_gradient(self, number: int, weights: list[Value], weighted: list[Value]) -> None:
         """Add a row's J'we of a group, and compute its w J."""

@@ -130,39 +130,28 @@ class Arrowhead:
         return found.step_z, found.step_p
 
     def _solved(self, right_z: FloatArray, right_p: FloatArray, damping: float) -> Factored:
-        """Solutions ``(W, k, c)`` and ``(m, c)`` for as many right-hand sides.
-
-        Unknowns are scaled to a diagonal of one first: metres and radians per second squared differ by decades.
-        """
-        sz, sp = _scale(np.einsum("wii->wi", self.diagonal)), _scale(np.diag(self.corner))
-        k, m = self.border.shape[1:]
-        own, following = sz[:, :, None] * sz[:, None, :], sz[1:, :, None] * sz[:-1, None, :]
-        D, E = self.diagonal * own + (damping + self.ridge) * np.eye(k), self.below * following
-        C = self.corner * np.outer(sp, sp) + (damping + self.ridge) * np.eye(m)
-        right = np.concatenate([self.border * sp, right_z], axis=2)
-        right *= sz[:, :, None]
-        solved, inverse, below, log_det = solve_blocks(D, E, right)
-        solved = np.ascontiguousarray(solved)
-        gain, flat = solved[:, :, :m], solved.reshape(len(D) * k, -1)
-        common = right.reshape(flat.shape)[:, :m].T @ flat
-        left = C - common[:, :m]
-        var_p = _inverse(left)
-        p = var_p @ (right_p * sp[:, None] - common[:, m:])
-        z = solved[:, :, m:] - (flat[:, :m] @ p).reshape(len(D), k, -1)
-        return Factored(
-            z * sz[:, :, None],
-            p * sp[:, None],
-            inverse * own,
-            below * following,
-            var_p * sp[:, None] * sp,
-            gain * sz[:, :, None] / sp,
-            float(log_det + np.linalg.slogdet(left)[1] - 2.0 * (np.log(sz).sum() + np.log(sp).sum())),
-        )
+        """Solutions ``(W, k, c)`` and ``(m, c)`` for as many right-hand sides."""
+        W, k, m = self.border.shape
+        more = damping + self.ridge
+        border, own = np.ascontiguousarray(self.border), np.diag(self.corner)
+        shift = more * _size(np.einsum("wii->wi", self.diagonal))
+        solved, inverse, below, log_det = solve_blocks(self.diagonal, self.below, (border, right_z), shift)
+        flat = solved.reshape(W * k, -1)
+        common = border.reshape(W * k, m).T @ flat
+        # Metres and radians per second squared differ by decades: shared unknowns are scaled to a diagonal of one.
+        scale = 1.0 / np.sqrt(_size(own))
+        scales = np.outer(scale, scale)
+        left = (self.corner - common[:, :m]) * scales + more * np.eye(m)
+        var_p = _inverse(left) * scales
+        p = var_p @ (right_p - common[:, m:])
+        z = solved[:, :, m:] - (flat[:, :m] @ p).reshape(W, k, -1)
+        log_det += float(np.linalg.slogdet(left)[1] - 2.0 * np.log(scale).sum())
+        return Factored(z, p, inverse, below, var_p, solved[:, :, :m], log_det)
 
 
-def _scale(diagonal: FloatArray) -> FloatArray:
-    """Scale of unknowns; 1 where an unknown has no effect and the ridge alone determines it."""
-    return np.asarray(1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)))
+def _size(diagonal: FloatArray) -> FloatArray:
+    """The diagonal; 1 where an unknown has no effect and the ridge alone determines it."""
+    return np.where(diagonal > 0.0, diagonal, 1.0)
 
 
 def _inverse(A: FloatArray) -> FloatArray:

@@ -218,11 +218,17 @@ def _samples(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArr
     """All rows, and random sets of n to ``largest_sample`` n rows of each equation, with n parameters."""
     rng = _generator(seed)
     n, r, n_p = weak.W.shape
-    sizes = np.r_[n, np.minimum(rng.integers(n_p, settings.largest_sample * n_p + 1, settings.n_samples), n)]
+    largest = min(settings.largest_sample * n_p, n)
+    sizes = np.r_[largest, np.minimum(rng.integers(n_p, settings.largest_sample * n_p + 1, settings.n_samples), n)]
     chosen = np.empty((len(sizes), n, r), bool)
-    for mask, size in zip(chosen, sizes, strict=True):
-        drawn = rng.random((n, r))
-        mask[:] = drawn <= np.partition(drawn, size - 1, axis=0)[size - 1]
+    at_a_time = max(1, _NUMBERS_AT_A_TIME // (n * r))
+    for first in range(0, len(sizes), at_a_time):
+        some = slice(first, first + at_a_time)
+        drawn = rng.random((len(sizes[some]), n, r))
+        least = np.sort(np.partition(drawn.swapaxes(1, 2), largest - 1, axis=2)[..., :largest], axis=2)
+        bounds = np.take_along_axis(least, sizes[some, None, None] - 1, axis=2)
+        np.less_equal(drawn, bounds.swapaxes(1, 2), out=chosen[some])
+    chosen[0] = True
     return chosen
 
 

@@ -100,6 +100,8 @@ class NormalEquations:
 
     Parameters
     ----------
+    weights : (N, n_signals) array
+        Weights of the measurements, one over each signal's unit squared.
     system : Arrowhead
     right_z : (W, n_x + n_v) array
     right_s : (n_s,) array
@@ -116,6 +118,7 @@ class NormalEquations:
         Of the jumps.
     """
 
+    weights: FloatArray
     system: Arrowhead
     right_z: FloatArray
     right_s: FloatArray
@@ -215,18 +218,18 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     FP = F.swapaxes(1, 2) * precision[:, None, :]
     H[:-1] += FP @ F
     g[:-1] += np.einsum("wij,wj->wi", FP, jumps)
-    state, latent = np.arange(n_x), np.arange(n_x, k)
-    H[1:, state, state] += precision
+    own_diagonal = np.einsum("wii->wi", H)
+    own_diagonal[1:, :n_x] += precision
     H[1:, :n_x, k:] -= precision[:, :, None] * F[:, :, k:]
     g[1:, :n_x] -= precision * jumps
     E = np.zeros((len(H) - 1, k, k))
-    E[:, :n_x] = -precision[:, :, None] * F[:, :, :k]
+    np.multiply(-precision[:, :, None], F[:, :, :k], out=E[:, :n_x])
     follows, own = following(intervals)[:, None], 1.0 / innovation_std(intervals, fit)
     rho = np.where(follows[1:], fit.rho, 0.0)
     deviation = own * innovations(intervals, fit)
-    H[:, latent, latent] += np.square(own)
-    H[:-1, latent, latent] += np.square(rho * own[1:])
-    E[:, latent, latent] -= rho * np.square(own[1:])
+    own_diagonal[:, n_x:k] += np.square(own)
+    own_diagonal[:-1, n_x:k] += np.square(rho * own[1:])
+    np.einsum("wii->wi", E)[:, n_x:] -= rho * np.square(own[1:])
     g[:, n_x:k] -= deviation
     g[:-1, n_x:k] += rho * deviation[1:]
     beforehand = 1.0 / np.square(fit.prior)
@@ -234,7 +237,7 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     blocks = (H[:, :k, :k], E, border, corner + np.diag(beforehand))
     system = Arrowhead(*blocks, _FINE_RIDGE) if len(intervals.layout.with_prior) else Arrowhead(*blocks)
     right = right - beforehand * (fit.shared - fit.prior_mean)
-    return NormalEquations(system, g[:, :k], right, data_z, data_s, jumps, F, precision)
+    return NormalEquations(weights, system, g[:, :k], right, data_z, data_s, jumps, F, precision)
 
 
 def variances_of_intervals(
@@ -277,7 +280,8 @@ def data_gradient(
     -------
     (W, n_x + n_v) array, (W, n_s) array
     """
-    gradient = -intervals.gauss_newton(fit.shared, fit.x, fit.d, weights, measured=measured).gradient
+    sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights, measured=measured, normal_matrix=False)
+    gradient = -sums.gradient
     k = fit.x.shape[1] + fit.d.shape[1]
     return gradient[:, :k], _in_places(intervals, gradient[:, k:])
 

@@ -638,7 +638,8 @@ def least_squares_gains(W: FloatArray, weights: FloatArray) -> FloatArray:
     normal = rows.T @ rows
     if not np.isfinite(normal).all():  # LAPACK would print to the terminal
         raise np.linalg.LinAlgError("the regressors of the fitted motion are not finite")
-    solved = np.linalg.lstsq(normal, rows.T, rcond=None)[0] / scale[:, None]
+    inverse = np.linalg.lstsq(normal, np.eye(len(normal)), rcond=None)[0]
+    solved = (inverse / scale[:, None]) @ rows.T
     return np.asarray(solved.reshape(-1, *W.shape[:2]) * weights)
 
 
@@ -649,7 +650,8 @@ def _instrumented_gains(W: FloatArray, Z: FloatArray, weights: FloatArray) -> Fl
     sizes = [np.linalg.norm(x, axis=0) for x in (regressors, instruments)]
     of_W, of_Z = (np.where(x > 0.0, x, 1.0) for x in sizes)
     instruments = instruments / of_Z
-    solved = np.linalg.lstsq(instruments.T @ (regressors / of_W), instruments.T, rcond=None)[0] / of_W[:, None]
+    inverse = np.linalg.lstsq(instruments.T @ (regressors / of_W), np.eye(W.shape[2]), rcond=None)[0]
+    solved = (inverse / of_W[:, None]) @ instruments.T
     return np.asarray(solved.reshape(-1, *W.shape[:2]) * weights)
 
 

@@ -40,6 +40,7 @@ from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.arrowhead import Factored
+    from diransac.identification.methods.lo_diransac.normal_equations import NormalEquations
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
@@ -255,11 +256,11 @@ class _Race:
     to_beat: float
     before: float = np.inf
 
-    def is_lost(self, intervals: ShootingIntervals, fit: Fit, steps: int) -> bool:
+    def is_lost(self, intervals: ShootingIntervals, fit: Fit, at: NormalEquations, steps: int) -> bool:
         """True if the fit is behind by more than a few times its latest gain; compared every few steps."""
         if not steps or steps % _COMPARED_STEPS or not np.isfinite(self.to_beat):
             return False
-        now, before = _evidence(intervals, fit)[0], self.before
+        now, before = _evidence(intervals, fit, at)[0], self.before
         self.before = now
         return now - self.to_beat > _PATIENCE * max(before - now, 0.0)
 
@@ -297,17 +298,17 @@ def refine(
         The time limit was reached.
     """
     damping, robust, converged, steps = 0.0, settings.robust_model_error and not settled, False, 0
-    race = _Race(to_beat)
-    while steps < settings.max_steps and (robust or not converged) and not race.is_lost(intervals, fit, steps):
+    race, at = _Race(to_beat), _linearized(intervals, fit)
+    while steps < settings.max_steps and (robust or not converged) and not race.is_lost(intervals, fit, at, steps):
         check_time()
         steps += 1
         robust = robust and not converged
-        moved, solved, damping = _step(intervals, fit, damping)
+        moved, solved, damping = _step(intervals, fit, at, damping)
         updated = _update(settings, intervals, moved, solved, prior, robust=robust)
         errors = np.sqrt(np.diag(solved.var_p)[: intervals.n_p])
         converged = _unchanged(fit, updated, errors)
-        fit = updated
-    return Refinement(fit, *_evidence(intervals, fit), steps, converged and not robust)
+        fit, at = updated, _linearized(intervals, updated)
+    return Refinement(fit, *_evidence(intervals, fit, at), steps, converged and not robust)
 
 
 def refine_exact(
@@ -352,11 +353,12 @@ def _refined_exactly(
     tau = _NEARLY_EXACT * prior.tau
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
-    damping, converged, steps, jumps, race = 0.0, False, 0, fit.continuity_std, _Race(to_beat)
-    while steps < settings.max_steps and not converged and not race.is_lost(intervals, fit, steps):
+    damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
+    race, at = _Race(to_beat), _linearized(intervals, fit)
+    while steps < settings.max_steps and not converged and not race.is_lost(intervals, fit, at, steps):
         check_time()
         steps += 1
-        moved, solved, damping = _step(intervals, fit, damping)
+        moved, solved, damping = _step(intervals, fit, at, damping)
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
         noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
         sizes = fit.prior.copy()
@@ -366,11 +368,16 @@ def _refined_exactly(
         continuity = np.maximum(jumps, _TIGHTENED * fit.continuity_std)
         updated = replace(moved, noise=noise, prior=sizes, tau=tau, continuity_std=continuity)
         converged = bool((tau == fit.tau).all()) and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
-        fit = updated
-    return Refinement(fit, *_evidence(intervals, fit), steps, converged)
+        fit, at = updated, _linearized(intervals, updated)
+    return Refinement(fit, *_evidence(intervals, fit, at), steps, converged)
 
 
-def _evidence(intervals: ShootingIntervals, fit: Fit) -> tuple[float, float]:
+def _linearized(intervals: ShootingIntervals, fit: Fit) -> NormalEquations:
+    """Normal equations at a fit, with its own weights."""
+    return linearize(intervals, fit, weights_of(intervals, fit))
+
+
+def _evidence(intervals: ShootingIntervals, fit: Fit, at: NormalEquations) -> tuple[float, float]:
     """Negative logarithm of the probability of the measurements by Laplace's method, and standard error of the delay.
 
     Up to a constant that fits of the same log have in common, given the scales of a fit at its optimum; both are
@@ -381,7 +388,6 @@ def _evidence(intervals: ShootingIntervals, fit: Fit) -> tuple[float, float]:
     beforehand = cost(intervals, fit, np.zeros_like(fit.residuals))
     if not np.isfinite(loss + beforehand):
         return np.inf, np.inf
-    at = linearize(intervals, fit, weights_of(intervals, fit))
     solved = at.system.solve(at.right_z, at.right_s)
     scales = intervals.linked.sum() * np.log(fit.continuity_std).sum() + np.log(innovation_std(intervals, fit)).sum()
     scales += np.log(fit.prior[np.isfinite(fit.prior)]).sum()
@@ -403,10 +409,11 @@ def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return fit.noise.inlying(fit.residuals, intervals.known) / np.square(fit.noise.sigma)
 
 
-def _step(intervals: ShootingIntervals, fit: Fit, damping: float) -> tuple[Fit, Factored, float]:
+def _step(
+    intervals: ShootingIntervals, fit: Fit, at: NormalEquations, damping: float
+) -> tuple[Fit, Factored, float]:
     """One Gauss-Newton step within the bounds, corrected or damped until the cost falls; damping of the next one."""
-    weights = weights_of(intervals, fit)
-    at = linearize(intervals, fit, weights)
+    weights = at.weights
     before = cost(intervals, fit, weights)
     for _ in range(_MAX_TRIALS):
         right, excess = (at.right_z, at.right_s), np.inf

@@ -473,6 +473,7 @@ class ShootingIntervals:
         *,
         measured: FloatArray | None = None,
         chosen: IntArray | None = None,
+        normal_matrix: bool = True,
     ) -> GaussNewtonBatch:
         """Least-squares sums of all or chosen intervals; other arguments as `batch`.
 
@@ -487,6 +488,8 @@ class ShootingIntervals:
         measured : (N, n_s) array, optional
             Instead of the measured signals.
         chosen : (n,) int array, optional
+        normal_matrix : bool, optional
+            Whether it is needed.
 
         Returns
         -------
@@ -497,7 +500,14 @@ class ShootingIntervals:
         threads = self.threads if len(self.measured) * len(unknowns) ** 2 > _WORTH_THREADS else 1
         y = self.measured if measured is None else measured
         measurements = Measurements(y[:, columns], self.measurements.valid)
-        return derived.gauss_newton(batch, measurements, weights[:, columns], unknowns=unknowns, threads=threads)
+        return derived.gauss_newton(
+            batch,
+            measurements,
+            weights[:, columns],
+            unknowns=unknowns,
+            normal_matrix=normal_matrix,
+            threads=threads,
+        )
 
     @cached_property
     def _derived(self) -> tuple[Simulator, IntArray | slice]:
@@ -514,7 +524,7 @@ class ShootingIntervals:
 
         One Newton step; states are unchanged where it has no solution.
         """
-        sums = self.gauss_newton(shared, x, d, np.zeros(self.measured.shape), chosen=chosen)
+        sums = self.gauss_newton(shared, x, d, np.zeros(self.measured.shape), chosen=chosen, normal_matrix=False)
         jumps, slopes = x[chosen + 1] - sums.final_states, sums.final_slopes[:, :, : x.shape[1]]
         finite = np.isfinite(jumps).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
         usable = np.flatnonzero(finite)
