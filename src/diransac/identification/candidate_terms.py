@@ -165,8 +165,8 @@ def _in_every_row(function: ca.Function, arrays: Sequence[FloatArray]) -> FloatA
     inputs, found = [np.ascontiguousarray(x) for x in arrays], np.empty((len(arrays[0]), function.numel_out(0)))
     buffer, evaluate = function.map(len(found)).buffer()
     for k, rows in enumerate(inputs):
-        buffer.set_arg(k, memoryview(rows))
-    buffer.set_res(0, memoryview(found))
+        buffer.set_arg(k, rows.data)  # type: ignore[call-arg]  # a buffer has a size
+    buffer.set_res(0, found.data)  # type: ignore[call-arg]
     evaluate()
     return found
 

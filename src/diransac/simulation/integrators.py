@@ -194,26 +194,19 @@ class Sensitivities:
         rows, columns = np.array(places, int).reshape(-1, 2).T
         return rows, columns
 
-    def matrix(self, values: FloatArray) -> FloatArray:
-        """Whole matrices (n, n_x, n_z) from the stored derivatives (n, n_entries)."""
-        n_x, n_z = self.initial.shape
-        rows, columns = self.entries
-        whole = np.zeros((len(values), n_x * n_z))
-        whole[:, rows * n_z + columns] = values
-        return whole.reshape(len(values), n_x, n_z)
-
     @cached_property
     def places(self) -> IntArray:
-        """Place of each unknown (n_z,) in the order of the groups, in which the time loop has them."""
-        return np.argsort(list(chain(*self.groups)))
+        """Where `GaussNewtonOutput` writes what it has in the order of the groups: places in a lane's arrays.
 
-    @cached_property
-    def pairs(self) -> IntArray:
-        """Place of each pair of unknowns (n_z, n_z) in the upper triangle of a symmetric matrix in that order."""
-        n_z = len(self.unknowns)
-        upper, pair = np.triu_indices(n_z), np.empty((n_z, n_z), int)
-        pair[upper] = pair[upper[::-1]] = np.arange(len(upper[0]))
-        return pair[np.ix_(self.places, self.places)]
+        Of e'we and J'we in `first` (1 + n_z), of J'wJ's upper triangle in `matrix` (n_z, n_z) and below its diagonal,
+        and of the state and its stored derivatives in `final` (n_x (1 + n_z)).
+        """
+        n_x, n_z = self.initial.shape
+        order, (left, right) = np.array(list(chain(*self.groups))), np.triu_indices(n_z)
+        rows, columns = self.entries
+        above, below = (n_z * order[i] + order[j] for i, j in ((left, right), (right, left)))
+        final = np.r_[np.arange(n_x), n_x + n_z * rows + columns]
+        return np.concatenate([[0], 1 + order, above, below, final]).astype(np.int64)
 
 
 def sensitivities_of(model: SimulatedModel, unknowns: Sequence[str]) -> Sensitivities:

@@ -186,10 +186,10 @@ class Rollouts(Simulator):
         n_signals = len(self.signals)
         lanes = self._lanes(batch)
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_signals))
-        final = aligned((lanes.n_padded // LANES, len(self._model.state), LANES))
+        final = np.empty((lanes.n_lanes, len(self._model.state)))
         values = arranged_measurements(lanes, n_signals, measurements.values, measurements.valid)
         self._run("ErrorOutput", batch, lanes, {**values, "series": series, "final": final}, threads)
-        return series, _by_lane(final, lanes.n_lanes)
+        return series, final
 
     def trajectories(self, batch: RolloutBatch, *, threads: int = 1) -> FloatArray:
         """All signals of the model, (n_lanes, n_rows, n_signals): states, accelerations; NaN from a divergence on."""
@@ -211,17 +211,26 @@ class Rollouts(Simulator):
         """Sums e' W e, J' W e and J' W J of every lane; see `Simulator.gauss_newton`."""
         lanes = self._lanes(batch)
         names, sensitivities = self._unknowns(unknowns)
-        n_z, n_blocks = len(names), lanes.n_padded // LANES
-        sums = aligned((n_blocks, 1 + n_z + n_z * (n_z + 1) // 2, LANES))
-        final = aligned((n_blocks, len(self._model.state) + int(sensitivities.present.sum()), LANES))
+        n, n_x, n_z = lanes.n_lanes, len(self._model.state), len(names)
+        first, matrix = np.empty((n, 1 + n_z)), np.empty((n if normal_matrix else 0, n_z, n_z))
+        final = np.zeros((n, n_x + n_x * n_z))  # derivatives that are always zero are not written
+        places = sensitivities.places
+        n_vectors = len(places) - n_z * (n_z + 1) // 2
         values = {
             **arranged_weights(lanes, len(self.signals), measurements.values, measurements.valid, weights),
             "products": int(normal_matrix),
-            "sums": sums,
+            "places": places,
+            "scratch": aligned((lanes.n_padded // LANES, n_vectors, LANES)),
+            "first": first,
+            "matrix": matrix,
             "final": final,
         }
         self._run("GaussNewtonOutput", batch, lanes, values, threads, unknowns=names)
-        return _unpacked(sensitivities, lanes.n_lanes, sums, final, normal_matrix=normal_matrix)
+        cost, slopes = first[:, 0].copy(), final[:, n_x:].reshape(n, n_x, n_z)
+        diverged = np.isinf(cost)
+        if diverged.any():
+            slopes[diverged] = np.nan
+        return GaussNewtonBatch(names, cost, first[:, 1:], matrix, final[:, :n_x].copy(), slopes, diverged)
 
     def linearized_errors(
         self,
@@ -372,34 +381,3 @@ class Rollouts(Simulator):
         options = (self.signals, unknowns, self._integrator, self._substeps, self._hold)
         functions = (model.dynamics, model.rate_jacobians) if unknowns else (model.dynamics,)
         return [repr((sizes, model.quaternions, options)), *(function.serialize() for function in functions)]
-
-
-def _unpacked(
-    sensitivities: Sensitivities, n_lanes: int, sums: FloatArray, final: FloatArray, *, normal_matrix: bool
-) -> GaussNewtonBatch:
-    """Results of lanes from the blocks that the time loop writes, without the lanes that fill the last block.
-
-    Parameters
-    ----------
-    sums : (n_blocks, 1 + n_z + n_z (n_z + 1) / 2, 8)
-        e' W e, J' W e, and the upper triangle of J' W J, the unknowns group by group.
-    final : (n_blocks, n_x + n_entries, 8)
-        State, then its derivatives.
-    """
-    n_x, n_z = sensitivities.initial.shape
-    first, final = _by_lane(sums[:, : 1 + n_z], n_lanes), _by_lane(final, n_lanes)
-    cost, gradient = first[:, 0].copy(), np.take(first, 1 + sensitivities.places, axis=1)
-    matrix = np.empty((0, n_z, n_z))
-    if normal_matrix:
-        matrix = np.take(_by_lane(sums[:, 1 + n_z :], n_lanes), sensitivities.pairs, axis=1)
-    diverged = np.isinf(cost)
-    slopes = sensitivities.matrix(final[:, n_x:])
-    if diverged.any():
-        slopes[diverged] = np.nan
-    states = final[:, :n_x].copy()
-    return GaussNewtonBatch(sensitivities.unknowns, cost, gradient, matrix, states, slopes, diverged)
-
-
-def _by_lane(blocks: FloatArray, n_lanes: int) -> FloatArray:
-    """Values ``(n_lanes, n)`` from the blocks ``(n_blocks, n, 8)`` of a time loop, without lanes that fill the last."""
-    return blocks.swapaxes(1, 2).reshape(len(blocks) * LANES, blocks.shape[1])[:n_lanes]

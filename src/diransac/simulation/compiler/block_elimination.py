@@ -24,6 +24,7 @@ from diransac.simulation.compiler.vectors import DOUBLE, INTEGER, NUMBERS, POINT
 
 __all__ = ["emit_block_elimination"]
 
+
 def emit_block_elimination(name: str) -> Value:
     """LLVM module with one function.
 

@@ -45,11 +45,15 @@ ARGUMENTS = {
     "weights": "pointer",  # (n_log, n_s) float64
     "squared_thresholds": "pointer",  # (n_s,) float64
     "start_rows": "pointer",  # (n_padded,) int64, read where lanes start at different rows
-    "sums": "pointer",  # float64, written by the output; so are the next four
+    "places": "pointer",  # int64, of sums and final states in the arrays of a lane; see `Sensitivities.places`
+    "scratch": "pointer",  # float64, vectors of a block, for every block
+    "sums": "pointer",  # (n_s, n_padded) float64, written by the output; so are the next six
+    "first": "pointer",  # (n_lanes, 1 + n_z) float64
+    "matrix": "pointer",  # (n_lanes, n_z, n_z) float64
     "counts": "pointer",  # (2, n_padded) int64
     "inlier_bits": "pointer",  # (n_blocks, n_rows) bytes, one bit per lane
     "series": "pointer",  # (n_lanes, n_rows, width) float64
-    "final": "pointer",  # (n_blocks, n_states, 8) float64
+    "final": "pointer",  # (n_lanes, n_states or more) float64
     "step": "number",  # seconds, of one sub-step
     "min_inlier_signals": "integer",
     "products": "integer",  # 0 leaves out J' W J
@@ -277,5 +281,7 @@ def _padded_size(n_lanes: int) -> int:
 
 def _padded(lanes: NDArray[Any]) -> NDArray[Any]:
     """Lanes on the last axis, the last one repeated to fill whole vectors."""
-    padding = np.repeat(lanes[-1:], _padded_size(len(lanes)) - len(lanes), axis=0)
-    return np.ascontiguousarray(np.concatenate([lanes, padding]).T)
+    n, found = len(lanes), np.empty((*lanes.shape[1:], _padded_size(len(lanes))), lanes.dtype)
+    found[..., :n] = lanes.T
+    found[..., n:] = lanes[-1:].T
+    return found

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from llvmlite import ir
 
 from diransac.simulation.compiler.machine_code import LANES
-from diransac.simulation.compiler.vectors import BYTE, DOUBLE, Value, integer
+from diransac.simulation.compiler.vectors import BYTE, DOUBLE, INTEGER, Value, integer
 
 if TYPE_CHECKING:
     from diransac.simulation.compiler.sensitivities import Columns
@@ -39,10 +39,12 @@ class _Output:
     def end(self, block: Block) -> None:
         """Nothing after the last row."""
 
-    def first(self, block: Block, name: str, width: int) -> Value:
-        """First of a block's vectors in an array that holds so many for every block."""
-        start = self.loop.builder.mul(block.first, integer(width))  # block.first is eight times the block
-        return self.loop.builder.gep(self.arguments[name], [start], source_etype=DOUBLE)
+    def lanes(self, block: Block) -> list[Value]:
+        """Numbers of a block's lanes; the last lane stands for those that fill the block."""
+        builder = self.loop.builder
+        last = builder.sub(self.arguments["n_lanes"], integer(1))
+        own = [builder.add(block.first, integer(lane)) for lane in range(LANES)]
+        return [builder.select(builder.icmp_signed("<", x, last), x, last) for x in own]
 
     def errors(self, block: Block, row: LoopRow) -> list[Value]:
         """Simulated less measured; a quaternion, and its derivatives, first take the sign that is nearer."""
@@ -108,12 +110,12 @@ class ScoreOutput(_Output):
 
 
 class GaussNewtonOutput(_Output):
-    """`sums` (n_blocks, 1 + n_z + n_z (n_z + 1) / 2, 8) of e'we, J'we, J'wJ's upper triangle; `final` states.
+    """`first` (n_lanes, 1 + n_z) of e'we and J'we, `matrix` (n_lanes, n_z, n_z) of J'wJ, and `final` states.
 
-    Unknowns are in the order of their groups. The sums exceed the registers: each is loaded, increased and stored in
-    its final place, close together for a block. `final` (n_blocks, n_states + n_derivatives, 8) is the state, then the
-    derivatives of each group. In a lane that diverged e'we is infinite, the other sums are zero, and `final` is NaN.
-    Without `products` those of J'wJ stay zero.
+    The sums exceed the registers: each is loaded, increased and stored, close together for a block, with unknowns in
+    the order of their groups.  At its end they go to their `places`.  `final` (n_lanes, n_states (1 + n_z)) is the
+    state, then its derivatives without those that are always zero.  In a lane that diverged e'we is infinite, the other
+    sums are zero, and `final` is NaN.  Without `products` there is no `matrix`.
     """
 
     ends_early = True
@@ -129,8 +131,11 @@ class GaussNewtonOutput(_Output):
         self.weighted = [self.v.array(len(group.unknowns) * len(group.signals)) for group in groups]
 
     def start(self, block: Block) -> None:
-        """Set the sums to zero."""
-        self.sums = self.first(block, "sums", self.n_sums)
+        """Set the sums to zero; all blocks of a call have the same memory, which stays in the cache."""
+        builder, width = self.loop.builder, self.n_sums + self.n_final
+        start = builder.mul(self.arguments["first_block"], integer(LANES * width))
+        self.sums = builder.gep(self.arguments["scratch"], [start], source_etype=DOUBLE)
+        self.final = builder.gep(self.sums, [integer(LANES * self.n_sums)], source_etype=DOUBLE)
         self.v.each(0, self.n_sums, lambda k: self.v.put(self.v.number(0.0), self.sums, k))
 
     def row(self, block: Block, row: LoopRow) -> None:
@@ -142,7 +147,7 @@ class GaussNewtonOutput(_Output):
         self._add(0, list(zip(weighted, errors, strict=True)))
         for number in range(len(self.columns.groups)):
             self._add_gradient(number, weights, weighted)
-        with self.loop.builder.if_then(self.loop.builder.icmp_signed("!=", self.arguments["products"], integer(0))):
+        with self.loop.builder.if_then(self._wants_products):
             for left in range(len(self.columns.groups)):
                 self._add_products(left)
 
@@ -206,8 +211,7 @@ class GaussNewtonOutput(_Output):
 
     def end(self, block: Block) -> None:
         """Write the sums and the final state; mark lanes in which anything is not finite."""
-        v, guard = self.v, self.loop.guard
-        final = self.first(block, "final", self.n_final)
+        v, builder, guard, final = self.v, self.loop.builder, self.loop.guard, self.final
         for k, variable in enumerate(self.loop.state):
             v.put(v.get(variable), final, k)
         first = self.specification.n_states
@@ -219,10 +223,37 @@ class GaussNewtonOutput(_Output):
         for array, size, _ in written:
             v.each(0, size, partial(self._guard, array))
         diverged = v.is_nan(v.get(guard))
-        with self.loop.builder.if_then(v.any_lane(diverged)):
+        with builder.if_then(v.any_lane(diverged)):
             for array, size, instead in written:
                 v.each(0, size, partial(self._replace, array, diverged, instead))
             self._replace(self.sums, diverged, float("inf"), 0)
+        n_first, n_z = 1 + self.n_z, self.n_z
+        n_pairs, lanes = self.n_sums - n_first, self.lanes(block)
+        self._place(lanes, "first", n_first, (self.sums, 0, n_first), 0)
+        with builder.if_then(self._wants_products):
+            for k in range(2):
+                self._place(lanes, "matrix", n_z * n_z, (self.sums, n_first, n_pairs), n_first + k * n_pairs)
+        width = self.specification.n_states * n_first
+        self._place(lanes, "final", width, (final, 0, self.n_final), n_first + 2 * n_pairs)
+
+    def _place(self, lanes: list[Value], name: str, width: int, source: tuple[Value, int, int], first: int) -> None:
+        """Copy vectors, some of an array from one on, to their places in an array (n_lanes, width)."""
+        v, builder, (array, start, size) = self.v, self.loop.builder, source
+        rows = [builder.mul(lane, integer(width)) for lane in lanes]
+
+        def place(index: Value | int) -> None:
+            vector = v.pick(array, v.affine(index, 1, start))
+            at = v.affine(index, 1, first)
+            column = v.load(self.arguments["places"], integer(at) if isinstance(at, int) else at, INTEGER)
+            for lane, row in enumerate(rows):
+                v.store(v.lane(vector, lane), self.arguments[name], builder.add(row, column))
+
+        v.each(0, size, place)
+
+    @property
+    def _wants_products(self) -> Value:
+        """Whether J'wJ is wanted."""
+        return self.loop.builder.icmp_signed("!=", self.arguments["products"], integer(0))
 
     def _copy(self, source: Value, target: Value, first: int, index: Value | int) -> None:
         """Copy one vector to its place among others."""
@@ -257,11 +288,8 @@ class _SeriesOutput(_Output):
         """Write a row of every lane; lanes that fill the block write the last one again."""
         v, builder = self.v, self.loop.builder
         values = self.values(block, row)
-        last = builder.sub(self.arguments["n_lanes"], integer(1))
         shown = [v.select(row.alive, value, v.number(float("nan"))) for value in values]
-        for lane in range(LANES):
-            own = builder.add(block.first, integer(lane))
-            own = builder.select(builder.icmp_signed("<", own, last), own, last)
+        for lane, own in enumerate(self.lanes(block)):
             place = builder.add(builder.mul(own, self.arguments["n_rows"]), row.index)
             place = builder.mul(place, integer(len(values)))
             for k, value in enumerate(shown):
@@ -285,7 +313,7 @@ class ClosedLoopOutput(_SeriesOutput):
 
 
 class ErrorOutput(_SeriesOutput):
-    """Errors of the scored signals, and `final` states (n_blocks, n_states, 8), NaN in a lane that diverged."""
+    """Errors of the scored signals, and `final` states (n_lanes, n_states), NaN in a lane that diverged."""
 
     def values(self, block: Block, row: LoopRow) -> list[Value]:
         """Errors of the scored signals."""
@@ -293,10 +321,12 @@ class ErrorOutput(_SeriesOutput):
 
     def end(self, block: Block) -> None:
         """Write a block's state after its last row."""
-        v, diverged = self.v, self.v.is_nan(self.v.get(self.loop.guard))
-        final = self.first(block, "final", self.specification.n_states)
-        for k, variable in enumerate(self.loop.state):
-            v.put(v.select(diverged, v.number(float("nan")), v.get(variable)), final, k)
+        v, builder, diverged = self.v, self.loop.builder, self.v.is_nan(self.v.get(self.loop.guard))
+        final = [v.select(diverged, v.number(float("nan")), v.get(x)) for x in self.loop.state]
+        for lane, own in enumerate(self.lanes(block)):
+            place = builder.mul(own, integer(len(final)))
+            for k, value in enumerate(final):
+                v.store(v.lane(value, lane), self.arguments["final"], builder.add(place, integer(k)))
 
 
 class LinearizedErrorOutput(_SeriesOutput):

@@ -12,6 +12,7 @@ MacKay 1992; Schwarz 1978 (the price of a scale).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -146,8 +147,19 @@ class Explanation:
         trial, intervals = self.trial, self.intervals
         if trial is None or trial.length != intervals.length or any(x.of_inputs for x in intervals.all_errors.kinds):
             return False
-        fallen = max(0.0, float((trial.unexplained - _unexplained(self)).max()))
+        fallen = max(0.0, float((trial.unexplained - self.unexplained).max()))
         return bool(trial.behind > intervals.known.sum() * (1.0 + fallen) + max(trial.cost - self.cost, 0.0))
+
+    @cached_property
+    def projected(self) -> FloatArray:
+        """Parameters ``(n,)`` that solve the equations on the fitted motion."""
+        return projected_parameters(self.intervals, self.refinement.fit)
+
+    @cached_property
+    def unexplained(self) -> FloatArray:
+        """Log of the RMS acceleration ``(n_v,)`` that the model does not explain."""
+        left = unexplained(self.intervals, self.refinement.fit, self.projected)[self.intervals.occupied]
+        return np.asarray(np.log(np.sqrt(np.square(left).mean(axis=0)) + 1e-300))
 
 
 @dataclass(frozen=True)
@@ -280,7 +292,7 @@ class LocalSearch:
             fit, likelier = best.refinement.fit, best
             errors = clear_errors(best.intervals, fit, alone, kinds, worth=_WORTH)
             if not best.exact:
-                errors += clear_errors_of_inputs(best.intervals, fit, kinds)
+                errors += clear_errors_of_inputs(best.intervals, fit, best.projected, kinds)
             lag_may_help = True
             for error in errors:
                 if error.kind.what == "lag" and not lag_may_help:
@@ -376,7 +388,7 @@ class LocalSearch:
         """
 
         def explains(x: Explanation) -> bool:
-            lower = _unexplained(now) - _unexplained(x)
+            lower = now.unexplained - x.unexplained
             return bool((lower.max() if of_one else lower.sum()) > least)
 
         others = [x for x in others if x.cost < now.cost - worth and (x.exact or explains(x))]
@@ -447,7 +459,7 @@ class LocalSearch:
         if exact is None or not np.isfinite(exact.cost):
             return flexible
         cost, length = flexible.cost, flexible.intervals.length
-        return replace(flexible, trial=ExactTrial(exact.cost - cost, cost, _unexplained(flexible), length))
+        return replace(flexible, trial=ExactTrial(exact.cost - cost, cost, flexible.unexplained, length))
 
     def _likeliest_exact(self, flexible: Explanation, prior: Prior) -> Explanation | None:
         """The exact model from the parameters of a fit, or those of the best hypothesis; None if both are impossible.
@@ -455,7 +467,7 @@ class LocalSearch:
         Fits are given up that will hardly become as likely as the flexible one.
         """
         intervals, fit = flexible.intervals, flexible.refinement.fit
-        projected, found = projected_parameters(intervals, fit), list[Explanation]()
+        projected, found = flexible.projected, list[Explanation]()
         starts = np.array([projected, self.hypotheses[0]])
         starts = starts[: 1 + bool((np.abs(starts[1] - starts[0]) > _APART * np.abs(starts[0])).any())]
         for p in starts[intervals.layout.admits(starts)]:
@@ -592,13 +604,6 @@ def _states_after(intervals: ShootingIntervals, fit: Fit, rows: int) -> FloatArr
     last = np.array([rows_of_log.stop - 1 for rows_of_log in intervals.rows_of_logs])
     at = np.clip(intervals.starts + rows, intervals.first_of_log[intervals.log_of], last[intervals.log_of])
     return np.asarray(series[at])
-
-
-def _unexplained(found: Explanation) -> FloatArray:
-    """Log of the RMS acceleration ``(n_v,)`` that the model does not explain."""
-    intervals, fit = found.intervals, found.refinement.fit
-    left = unexplained(intervals, fit, projected_parameters(intervals, fit))
-    return np.asarray(np.log(np.sqrt(np.square(left[intervals.occupied]).mean(axis=0)) + 1e-300))
 
 
 def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.normal_equations import following, with_residuals
+from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def _in_doubt(intervals: ShootingIntervals, fit: Fit) -> IntArray:
     share = n_outliers.sum(axis=0) / np.maximum(n.sum(axis=0), 1)
     unusual = n_outliers > share * n + _UNUSUAL * np.sqrt(share * (1.0 - share) * n)
     lost = (unusual & (n_outliers >= np.maximum(_LOST * n, _FEWEST))).any(axis=1)
-    return np.flatnonzero(lost | ~following(intervals))
+    return np.flatnonzero(lost | ~intervals.following)
 
 
 def _estimated(

@@ -17,7 +17,6 @@ from diransac.identification.methods.lo_diransac.projection import (
     inertia_slopes,
     means_of_intervals,
     means_of_windows,
-    projected_parameters,
     residuals_of_motion,
 )
 from diransac.identification.methods.lo_diransac.recording_errors import (
@@ -137,7 +136,9 @@ def short_windows(windows: IntArray, n: int) -> IntArray:
     return np.flatnonzero(place % _LONGEST == 0)
 
 
-def clear_errors_of_inputs(intervals: ShootingIntervals, fit: Fit, kinds: Container[str]) -> list[RecordingError]:
+def clear_errors_of_inputs(
+    intervals: ShootingIntervals, fit: Fit, p: FloatArray, kinds: Container[str]
+) -> list[RecordingError]:
     """The drift of gains, the delay and the lag of inputs that explain most of the unmodelled forces, if much.
 
     Parameters
@@ -145,6 +146,8 @@ def clear_errors_of_inputs(intervals: ShootingIntervals, fit: Fit, kinds: Contai
     intervals : ShootingIntervals
     fit : Fit
         With unmodelled accelerations.
+    p : (n,) array
+        Parameters that solve the equations on its motion.
     kinds : container of str
         Which of "delay", "lag" and "drift" are sought.
 
@@ -156,7 +159,7 @@ def clear_errors_of_inputs(intervals: ShootingIntervals, fit: Fit, kinds: Contai
     tried = [x for x in errors_of_inputs(intervals) if x.what in kinds]
     if not tried:
         return []
-    motion, r, W, _ = residuals_of_motion(intervals, fit, projected_parameters(intervals, fit))
+    motion, r, W, _ = residuals_of_motion(intervals, fit, p)
     slopes = _input_slopes(intervals.model, motion)
     effects = [np.einsum("nij,nj->ni", slopes, change_of_inputs(intervals, x)) for x in tried]
     rows = np.concatenate([np.stack([r, *effects], axis=2), W], axis=2) * intervals.counted[:, None, None]

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ __all__ = [
     "NormalEquations",
     "cost",
     "data_gradient",
-    "following",
     "innovation_std",
     "innovations",
     "linearize",
@@ -224,7 +223,7 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     g[1:, :n_x] -= precision * jumps
     E = np.zeros((len(H) - 1, k, k))
     np.multiply(-precision[:, :, None], F[:, :, :k], out=E[:, :n_x])
-    follows, own = following(intervals)[:, None], 1.0 / innovation_std(intervals, fit)
+    follows, own = intervals.following[:, None], 1.0 / innovation_std(intervals, fit)
     rho = np.where(follows[1:], fit.rho, 0.0)
     deviation = own * innovations(intervals, fit)
     own_diagonal[:, n_x:k] += np.square(own)
@@ -301,20 +300,6 @@ def _in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
     return wide
 
 
-def following(intervals: ShootingIntervals) -> BoolArray:
-    """Mask ``(W,)`` of the intervals that continue the one before.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-
-    Returns
-    -------
-    (W,) bool array
-    """
-    return np.concatenate([[False], intervals.linked])
-
-
 def innovation_std(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     """Standard deviation ``(W, n_v)`` of the unmodelled accelerations, given those of the interval before.
 
@@ -327,7 +312,7 @@ def innovation_std(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     -------
     (W, n_v) array
     """
-    return np.where(following(intervals)[:, None], fit.tau * np.sqrt(1.0 - np.square(fit.rho)), fit.tau)
+    return np.where(intervals.following[:, None], fit.tau * np.sqrt(1.0 - np.square(fit.rho)), fit.tau)
 
 
 def innovations(intervals: ShootingIntervals, fit: Fit) -> FloatArray:

@@ -409,9 +409,7 @@ def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return fit.noise.inlying(fit.residuals, intervals.known) / np.square(fit.noise.sigma)
 
 
-def _step(
-    intervals: ShootingIntervals, fit: Fit, at: NormalEquations, damping: float
-) -> tuple[Fit, Factored, float]:
+def _step(intervals: ShootingIntervals, fit: Fit, at: NormalEquations, damping: float) -> tuple[Fit, Factored, float]:
     """One Gauss-Newton step within the bounds, corrected or damped until the cost falls; damping of the next one."""
     weights = at.weights
     before = cost(intervals, fit, weights)

@@ -221,6 +221,11 @@ class ShootingIntervals:
         return np.asarray((self.log_of[1:] == self.log_of[:-1]) & reached)
 
     @cached_property
+    def following(self) -> BoolArray:
+        """Mask ``(W,)`` of the intervals that continue the one before."""
+        return np.concatenate([[False], self.linked])
+
+    @cached_property
     def _reached(self) -> BoolArray:
         """Rows ``(N,)`` that a simulation reaches from its interval's start without passing through a gap."""
         clear = ~self.gaps.reshape(len(self), self.length)
