@@ -14,6 +14,7 @@
 | `outputs.py` | outputs of the time loop: scores, sums, series |
 | `lanes.py` | arrays of many rollouts, arranged for the time loop |
 | `block_tridiagonal.py`, `block_elimination.py` | block-tridiagonal systems, and their elimination, emitted |
+| `order_statistics.py`, `bisection.py` | order statistics of many rows, and their search, emitted |
 
 LLVM is loaded when something is first compiled.
 """
@@ -21,5 +22,16 @@ LLVM is loaded when something is first compiled.
 from diransac.simulation.compiler.block_tridiagonal import BlockSolution, solve_blocks
 from diransac.simulation.compiler.functions import Map, Scan, compile_map, compile_scan
 from diransac.simulation.compiler.machine_code import Target
+from diransac.simulation.compiler.order_statistics import order_statistics, padded_rows
 
-__all__ = ["BlockSolution", "Map", "Scan", "Target", "compile_map", "compile_scan", "solve_blocks"]
+__all__ = [
+    "BlockSolution",
+    "Map",
+    "Scan",
+    "Target",
+    "compile_map",
+    "compile_scan",
+    "order_statistics",
+    "padded_rows",
+    "solve_blocks",
+]

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
+from diransac.simulation.compiler import order_statistics, padded_rows
 
 __all__ = ["BREAKDOWN", "Mixture", "lower_scale"]
 
@@ -139,12 +140,11 @@ def lower_scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
     (..., n_s) array
         NaN where fewer than 5 samples are known.
     """
-    size = np.abs(residuals.swapaxes(-1, -2), order="C")  # each column's side by side
-    count = np.count_nonzero(known, axis=-2)
-    if count.min(initial=known.shape[-2]) < known.shape[-2]:
-        np.copyto(size, np.inf, where=~known.swapaxes(-1, -2))
-    place = (BREAKDOWN * count).astype(int)
-    # Two places: NumPy's vectorised selection of a single one takes four times as long on some processors (Zen 4).
-    size.partition(np.append(np.unique(place), place.flat[0]), axis=-1)
-    found = np.take_along_axis(size, place[..., None], axis=-1)[..., 0]
+    n, count = residuals.shape[-2], np.count_nonzero(known, axis=-2)
+    sizes = padded_rows((*residuals.shape[:-2], residuals.shape[-1], n))
+    of_rows = sizes[..., :n]
+    np.abs(residuals.swapaxes(-1, -2), out=of_rows)
+    if count.min(initial=n) < n:
+        np.copyto(of_rows, np.inf, where=~known.swapaxes(-1, -2))
+    found = order_statistics(sizes, (BREAKDOWN * count).astype(np.int64))
     return np.where(count >= _FEWEST, found / _OF_NORMAL, np.nan)
