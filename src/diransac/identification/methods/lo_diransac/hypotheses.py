@@ -86,7 +86,8 @@ def find_spikes(
 ) -> tuple[ShootingIntervals, FloatArray, int]:
     """The intervals without spikes of the inputs, where simulations agree better with the logs then.
 
-    A controller's spikes act on the machine, those of a torque sensor do not; both look alike.
+    A controller's spikes act on the machine, those of a torque sensor do not; both look alike.  Where simulations by
+    the best hypothesis agree less well without them, they act, and no other hypotheses are sought.
 
     Parameters
     ----------
@@ -112,8 +113,9 @@ def find_spikes(
     if not n_spikes:
         return intervals, hypotheses, 0
     trial = replace(intervals, recorded=np.concatenate([u for u, _ in cleaned]))
-    found, every = find_hypotheses(settings, trial, motion, seed, dataset), np.arange(len(intervals))
-    if not len(found):
+    every = np.arange(len(intervals))
+    before, after = (robust_scores(x, motion, hypotheses[:1], every)[0] for x in (intervals, trial))
+    if after >= before or not len(found := find_hypotheses(settings, trial, motion, seed, dataset)):
         return intervals, hypotheses, 0
     best = np.concatenate([hypotheses[:1], found[:1]])
     before, after = (robust_scores(x, motion, best, every).min() for x in (intervals, trial))
@@ -372,6 +374,6 @@ def _scores(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray
     )  # fmt: skip
     compared = Measurements(intervals.measured[:, seen], intervals.measurements.valid)
     errors = rollouts(intervals.model, names, hold=intervals.hold).errors(batch, compared).reshape(n, -1, len(names))
-    known = np.broadcast_to(intervals.known[intervals.rows_of(chosen)][:, seen], errors.shape)
+    known = intervals.known[intervals.rows_of(chosen)][:, seen]
     scale = lower_scale(np.nan_to_num(errors, copy=False, nan=np.inf), known)
     return np.asarray(np.log(np.maximum(scale, 1e-4 * motion.spread[seen])).sum(axis=1))

@@ -132,7 +132,7 @@ def lower_scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
     Parameters
     ----------
     residuals : (..., N, n_s) array
-    known : (..., N, n_s) bool array
+    known : (N, n_s) or (..., N, n_s) bool array
         Samples that are measured.
 
     Returns
@@ -140,11 +140,13 @@ def lower_scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
     (..., n_s) array
         NaN where fewer than 5 samples are known.
     """
-    n, count = residuals.shape[-2], np.count_nonzero(known, axis=-2)
+    n = residuals.shape[-2]
     sizes = padded_rows((*residuals.shape[:-2], residuals.shape[-1], n))
     of_rows = sizes[..., :n]
     np.abs(residuals.swapaxes(-1, -2), out=of_rows)
-    if count.min(initial=n) < n:
+    count = np.array(n)
+    if not known.all():
         np.copyto(of_rows, np.inf, where=~known.swapaxes(-1, -2))
+        count = np.count_nonzero(known, axis=-2)
     found = order_statistics(sizes, (BREAKDOWN * count).astype(np.int64))
     return np.where(count >= _FEWEST, found / _OF_NORMAL, np.nan)
