@@ -348,12 +348,15 @@ def _medoids(
     points: FloatArray, distance: Callable[[FloatArray, FloatArray], FloatArray], around: IntArray
 ) -> IntArray:
     """Index ``(N,)`` of the medoid of the neighbours of each of the points ``(N, n)``; of equals, the nearest."""
-    total = np.zeros(around.shape)
-    for i in range(around.shape[1]):
+    n, width = around.shape
+    mirrored = points[np.r_[around[:, 0], around[-1, 1:]]]
+    apart = [distance(mirrored[k:], mirrored[: n + width - 1 - k]) for k in range(width)]
+    total = np.zeros((width, n))
+    for i in range(width):
         for j in range(i):
-            apart = distance(points[around[:, i]], points[around[:, j]])
-            total[:, i] += apart
-            total[:, j] += apart
-    order = np.argsort(np.abs(np.arange(around.shape[1]) - around.shape[1] // 2), kind="stable")
-    chosen = order[np.argmin(total[:, order], axis=1)]
+            pair = apart[i - j][j : j + n]
+            total[i] += pair
+            total[j] += pair
+    order = np.argsort(np.abs(np.arange(width) - width // 2), kind="stable")
+    chosen = order[np.argmin(total[order], axis=0)]
     return np.asarray(around[np.arange(len(points)), chosen])

@@ -23,7 +23,7 @@ from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.missing_terms import clear_errors_of_inputs
 from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
-from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
+from diransac.identification.methods.lo_diransac.normal_equations import linearize, with_residuals
 from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
 from diransac.identification.methods.lo_diransac.recording_errors import (
     clear_errors,
@@ -31,7 +31,7 @@ from diransac.identification.methods.lo_diransac.recording_errors import (
     signal_rates,
     with_errors,
 )
-from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
+from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start, weights_of
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 from diransac.time_limit import check_time
 
@@ -249,6 +249,8 @@ class LocalSearch:
             report(self.callback, "timing of the inputs", 0.6 + 0.1 * k)
             # A free delay suggests the others, even where no delay is admitted.
             is_free = k > 0 or (best.exact and settings.input_delay is not False)
+            if not is_free and not forced and self._delay_is_negligible(best):
+                break
             trial = best if is_free else self._refitted(best, best.intervals, self.prior)
             others = [self._refitted(trial, x) for x in self._timings(trial, free_hold=free_hold)]
             if settings.input_delay is not False and not (settings.input_lag and k == 0):
@@ -259,6 +261,17 @@ class LocalSearch:
                 break
             best = likelier
         return best
+
+    def _delay_is_negligible(self, best: Explanation) -> bool:
+        """True if a free delay of inputs that act as recorded would be too small, and uncertain, by one Newton step."""
+        intervals, fit = best.intervals, best.refinement.fit
+        if intervals.delay or intervals.lag:
+            return False
+        free = replace(fit, prior=np.append(fit.prior[:-1], max(self.prior.delay, _WHOLE_SAMPLE)))
+        at = linearize(intervals, free, weights_of(intervals, free))
+        solved = at.system.solve(at.right_z, at.right_s)
+        late, error = abs(fit.shared[-1] + solved.step_p[-1]), float(np.sqrt(solved.var_p[-1, -1]))
+        return bool(late < _SIGNIFICANT * error and late + _SIGNIFICANT * error < _SMALL_DELAY)
 
     def _with_named_errors(self, best: Explanation) -> Explanation:
         """The explanation with the errors of recordings that the settings name."""
