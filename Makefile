@@ -4,11 +4,14 @@ PYTHON ?= $(firstword $(foreach p,python3 python python3.14 python3.13 python3.1
 BIN := .venv/bin
 # A file runs in one worker; in the order of their names, because few tests of a file may take as long as many.
 PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
+# Stamps in one environment: what the package needs to run, and what its development needs besides.
+RUNTIME := .venv/.runtime
 ENVIRONMENT := .venv/.installed
+INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e
 
 .PHONY: demo test quick fuzz lint bench docs docs-figures coverage lock clean
 
-demo: $(ENVIRONMENT)  ## fly, identify, fly what was identified; writes out/demo/report.html and flight.png
+demo: $(RUNTIME)  ## fly, identify, fly what was identified; writes out/demo/report.html and flight.png
 	$(BIN)/python examples/demo.py
 
 test: lint docs  ## everything that must hold
@@ -47,9 +50,13 @@ lock: $(ENVIRONMENT)  ## pin every dependency anew
 clean:
 	rm -rf .venv out dist build .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis .coverage
 
-# The stamp is written last: an installation that was interrupted is tried again.
-$(ENVIRONMENT): pyproject.toml requirements.lock | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e ".[dev]"
+# A stamp is written last: an installation that was interrupted is tried again.
+$(RUNTIME): pyproject.toml requirements.lock | $(BIN)/python
+	$(INSTALL) .
+	@touch $@
+
+$(ENVIRONMENT): $(RUNTIME)
+	$(INSTALL) ".[dev]"
 	@touch $@
 
 # A Python without ensurepip (a distribution's, without its venv package) lends the environment its own pip.
