@@ -235,6 +235,18 @@ def test_fewer_unknowns_give_a_part_of_the_sums(model):
         np.testing.assert_allclose(part.final_slopes, whole.final_slopes[..., places], rtol=1e-12, atol=1e-13)
 
 
+@EVERY_MODEL
+def test_the_normal_matrix_may_be_left_out_and_nothing_else_changes(model):
+    task = log_of(model, 40)
+    engine, batch = rollouts(model), batch_of(task)
+    whole = sums_of(engine, task)
+    weights = np.linspace(0.5, 2.0, len(engine.signals))
+    part = engine.gauss_newton(batch, measurements_of(engine, task), weights, normal_matrix=False)
+    assert part.normal_matrix.shape == (0, *whole.normal_matrix.shape[1:])
+    for name in ("cost", "gradient", "final_states", "final_slopes", "diverged"):
+        np.testing.assert_array_equal(getattr(part, name), getattr(whole, name), err_msg=name)
+
+
 def test_a_gauss_newton_step_finds_the_parameters_of_a_clean_log():
     task = log_of(ROTORCRAFT, 200)
     engine = rollouts(ROTORCRAFT)
