@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from jinja2 import UndefinedError
 
 import diransac as dr
-from diransac.identification.prediction import bulk_range
+from diransac.data.segment import bulk_range
 from diransac.report import figures, labelled, rendering
 from diransac.report.runs import simulate_on
 from diransac.simulation import RolloutBatch, rollouts

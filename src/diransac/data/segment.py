@@ -86,7 +86,9 @@ class Segment:
         return tuple(parts)
 
     def part(self, rows: slice) -> Segment:
-        """The segment of some of the rows alone."""
+        """The segment of some of the rows alone; the segment itself if these are all."""
+        if rows == slice(0, len(self)):
+            return self
         arrays = {name: getattr(self, name)[rows] for name in ("measured", "inputs", "valid", "gaps")}
         return replace(self, offset=self.offset + rows.start, **arrays)
 
@@ -103,6 +105,11 @@ class Segment:
         """Signals of which this log has at least one sample."""
         some: BoolArray = np.asarray(np.isfinite(self.measured).any(axis=0))
         return tuple(n for n, x in zip(self.signals, some, strict=True) if x)
+
+    @cached_property
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """Smallest and largest value of the bulk of each signal; see `bulk_range`."""
+        return tuple(bulk_range(x) for x in self.measured.T)
 
     def state_arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Coordinates ``(N, n_q)``, velocities and accelerations ``(N, n_v)``; 0 in what the log lacks."""
@@ -249,6 +256,17 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     return Segment(
         model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], notes, gaps[offset:]
     )
+
+
+def bulk_range(values: FloatArray) -> tuple[float, float]:
+    """Range of the values no further from the central 80 % than its width; (0, 0) without finite values."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return 0.0, 0.0
+    low, high = np.quantile(finite, [0.1, 0.9])
+    width = high - low
+    kept = finite[(finite >= low - width) & (finite <= high + width)]
+    return float(kept.min()), float(kept.max())
 
 
 def runs(mask: BoolArray) -> list[slice]:

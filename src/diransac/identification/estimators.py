@@ -25,7 +25,7 @@ from diransac.data import preprocessing
 from diransac.errors import IdentificationError, SettingsError
 from diransac.identification.identifiability import NullSpace, null_space
 from diransac.identification.regression import regression_rows
-from diransac.identification.uncertainty import score_inflation
+from diransac.identification.uncertainty import rows_without, score_inflation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -424,7 +424,7 @@ class _BoundScikitLearn:
         return self._sums.correlations()
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        return self.fit([np.setdiff1d(rows, group) for group in groups])
+        return self.fit([rows_without(rows, group) for group in groups])
 
     def prior_shifts(self, rows: IntArray) -> FloatArray:
         shifted = [self.fit([rows], shift)[0] for shift in self._sums.unit_shifts()]

@@ -26,7 +26,7 @@ from diransac.identification.estimators import (
     solve_definite,
 )
 from diransac.identification.identifiability import NullSpace, null_space
-from diransac.identification.uncertainty import score_inflation
+from diransac.identification.uncertainty import rows_without, score_inflation
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ class _BoundNonlinear:
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
         start = self._chart.to_free(self._fit_equal(rows[None]))[:, None]
-        return np.array([self._likeliest(np.setdiff1d(rows, group)[None], start)[0] for group in groups])
+        return np.array([self._likeliest(rows_without(rows, group)[None], start)[0] for group in groups])
 
     def _fit_equal(self, rows: IntArray) -> FloatArray:
         """Parameters ``(B, n_p)`` from row sets ``(B, n)``: each from the best of its followed starts."""

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Restarts",
     "SimulatedLog",
-    "bulk_range",
     "diagnosed_parts",
     "predictions",
     "restart_rows",
@@ -214,9 +213,8 @@ class SimulatedLog:
     def ranges(self) -> dict[str, tuple[float, float]]:
         """Range of each measured signal: of its bulk, and of samples close to the simulation."""
         found = {}
-        columns = zip(self.observations.measured.T, self.errors.T, strict=True)
-        for name, (measured, error) in zip(self.observations.signals, columns, strict=True):
-            low, high = bulk_range(measured)
+        columns = zip(self.observations.measured.T, self.errors.T, self.observations.ranges, strict=True)
+        for name, (measured, error, (low, high)) in zip(self.observations.signals, columns, strict=True):
             met = measured[np.abs(error) <= _MET * (high - low)]
             found[name] = float(met.min(initial=low)), float(met.max(initial=high))
         return found
@@ -276,17 +274,6 @@ def _nearest_signs(simulated: FloatArray, observations: Segment) -> FloatArray:
             signed = signed.copy()
             signed[:, columns] *= np.where(nearness < 0.0, -1.0, 1.0)
     return signed
-
-
-def bulk_range(values: FloatArray) -> tuple[float, float]:
-    """Range of the values no further from the central 80 % than its width; (0, 0) without finite values."""
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return 0.0, 0.0
-    low, high = np.quantile(finite, [0.1, 0.9])
-    width = high - low
-    kept = finite[(finite >= low - width) & (finite <= high + width)]
-    return float(kept.min()), float(kept.max())
 
 
 def unexplained(diagnosis: Diagnosis, simulated: SimulatedLog) -> dict[str, float]:

@@ -17,7 +17,15 @@ if TYPE_CHECKING:
     from diransac.identification.estimators import BoundEstimator
     from diransac.model import Parameter
 
-__all__ = ["N_BLOCKS", "combined", "jackknife_covariance", "score_inflation", "student_quantile", "students_draws"]
+__all__ = [
+    "N_BLOCKS",
+    "combined",
+    "jackknife_covariance",
+    "rows_without",
+    "score_inflation",
+    "student_quantile",
+    "students_draws",
+]
 
 
 # Few and long: intervals have their nominal coverage while residuals are correlated over up to an eighth of a stretch
@@ -64,12 +72,19 @@ def jackknife_covariance(
     groups = [g for parts in zip(*stretches, strict=True) if len(g := np.concatenate(parts))]
     fits = estimator.fit_without(groups, rows)
     n = len(fits)
-    determined = estimator.select([np.setdiff1d(rows, group) for group in groups]).well_defined()
+    determined = estimator.select([rows_without(rows, group) for group in groups]).well_defined()
     if n < 2 or not determined.all() or not np.isfinite(fits).all():
         return np.full((fits.shape[1], fits.shape[1]), np.inf)
     deviations = fits - fits.mean(axis=0)
     covariance: FloatArray = np.einsum("ni,nj->ij", deviations, deviations) * (n - 1) / n
     return covariance
+
+
+def rows_without(rows: IntArray, group: IntArray) -> IntArray:
+    """Rows ``(n,)``, ascending, without those of a group, which are among them."""
+    left = np.ones(len(rows), bool)
+    left[np.searchsorted(rows, group)] = False
+    return rows[left]
 
 
 def score_inflation(scores: FloatArray, information: FloatArray, variance: float) -> float:

@@ -23,7 +23,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import ModelError, ResultError
 from diransac.model import derivation, expressions
 from diransac.model.derivation import Probe, Symbols
@@ -317,17 +317,21 @@ class Model:
 
     def states_behind(self, signals: Iterable[str]) -> tuple[str, ...]:
         """Names of the states whose initial value affects the simulation of any of these signals."""
+        wanted, (feeds, flows) = set(signals), self._dependence
+        matter = np.any(feeds[[n in wanted for n in self.signals]], axis=0)
+        for _ in self.state:
+            matter = matter | np.any(flows[matter], axis=0)
+        return tuple(n for n, m in zip(self.state, matter, strict=True) if m)
+
+    @cached_property
+    def _dependence(self) -> tuple[BoolArray, BoolArray]:
+        """Dependence of the signals ``(n_signals, n_x)``, and of the states' rates ``(n_x, n_x)``, on the states."""
         x = ca.vertcat(*(ca.SX.sym(n) for n in self.state))
         u, p = ca.SX.sym("u", self.n_u), ca.SX.sym("p", self.n_p)
         rates, accelerations = self.dynamics(x, u, p)
         outputs = ca.vertcat(x, accelerations, self.readings(x, accelerations, u, p))
-        feeds = np.array(ca.DM(ca.jacobian_sparsity(outputs, x), 1), dtype=bool)
-        wanted = set(signals)
-        matter = np.any(feeds[[n in wanted for n in self.signals]], axis=0)
-        flows = np.array(ca.DM(ca.jacobian_sparsity(rates, x), 1), dtype=bool)
-        for _ in self.state:
-            matter = matter | np.any(flows[matter], axis=0)
-        return tuple(n for n, m in zip(self.state, matter, strict=True) if m)
+        feeds, flows = (np.array(ca.DM(ca.jacobian_sparsity(y, x), 1), dtype=bool) for y in (outputs, rates))
+        return feeds, flows
 
     @cached_property
     def quaternions(self) -> tuple[tuple[int, int, int, int], ...]:

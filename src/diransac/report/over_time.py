@@ -11,7 +11,6 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import segment
 from diransac.data.log import Log
 from diransac.identification.estimate import Diagnosis
-from diransac.identification.prediction import bulk_range
 from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, strip, time_axis, time_plot
 from diransac.report.runs import Run
 from diransac.text_table import number, percent, plural, share
@@ -261,7 +260,7 @@ def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timelin
         if run is shown:
             traces.append(_dots(f"{run.label} (outlier)", look, run, errors, apart))
         traces.append(_dots(run.label, f"m{i}", run, errors, ~apart))
-        ranges.append(bulk_range(errors[~apart] if np.mean(apart) < _MOST else errors))
+        ranges.append(segment.bulk_range(errors[~apart] if np.mean(apart) < _MOST else errors))
     level, meaning = _level(name, shown)
     levels = (-level, level) if level > 0.0 else ()
     low, high = shown.ranges[name]
