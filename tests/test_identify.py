@@ -1,12 +1,17 @@
 """The one entry: the truth from clean logs, the claims of the paper from spoilt ones, refusals in one sentence."""
 
+import gc
+import json
+import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import diransac as dr
+from diransac.data.dataset import Dataset
 from diransac.errors import IdentificationError, LogError, ModelError, SettingsError
+from diransac.identification.identify import Identification
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight, rollout, with_outliers
 from user_models import tumbling
@@ -106,6 +111,46 @@ def tumble(truth, torques, dt):
         x[:4] /= np.linalg.norm(x[:4])
     names = ("qw", "qx", "qy", "qz", "wx", "wy", "wz", "wx_dot", "wy_dot", "wz_dot")
     return dict(zip(names, np.array(rows).T, strict=True))
+
+
+# ---------------------------------------------------------------------- methods in company
+
+
+def methods_of_a_trial():
+    """Methods that share samples, and one with other samples."""
+    others = given_to("ols", TABLE_IV)
+    return [
+        dr.LeastSquares(criteria=others),
+        dr.Diransac(TABLE_IV),
+        dr.Diransac(replace(TABLE_IV, refit="none", batch_size=7)),
+        dr.IDiransac(replace(TABLE_IV, stop_inlier_fraction=0.85)),
+        dr.IDiransac(replace(TABLE_IV, sample_size=20)),
+        dr.LoDiransac(),
+        dr.IDiransac(TABLE_IV),
+    ]
+
+
+def test_results_do_not_depend_on_earlier_methods_of_the_same_logs():
+    logs = [as_log(PLANE, *spoilt(seed=k), 0.02) for k in (0, 1)]
+    for some in (logs[:1], logs):
+        together = Identification(MODEL, some)
+        for method in methods_of_a_trial():
+            for seed in (4, 5):
+                alone = dr.identify(MODEL, some, method, seed=seed)
+                assert json.dumps(together.by(method, seed).to_dict()) == json.dumps(alone.to_dict())
+
+
+def test_what_methods_share_is_freed_with_the_dataset():
+    log = as_log(PLANE, *spoilt(), 0.02)
+    dataset = Dataset.of(MODEL, log)
+    dr.IDiransac(TABLE_IV).fit(dataset, 0)
+    watched = weakref.ref(dataset)
+    gc.disable()
+    try:
+        del dataset
+        assert watched() is None
+    finally:
+        gc.enable()
 
 
 # ---------------------------------------------------------------------- fit error and inliers, by other code

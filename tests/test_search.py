@@ -21,6 +21,7 @@ from diransac.identification.methods.ransac import (
     Diransac,
     Evaluator,
     IDiransac,
+    Samples,
     Score,
     ScoredBatch,
     SearchState,
@@ -157,10 +158,10 @@ def run_ours(case: Case, name: str, **changes) -> tuple[SearchState | str, list[
     settings = replace(case.settings, **changes)
     dataset, scoring = observed(case, settings)
     variant = variant_of(name, settings)
-    evaluator = Recorder(Evaluator(dataset, scoring, variant))
+    evaluator = Recorder(Evaluator(dataset, scoring, settings))
     estimator = OrdinaryLeastSquares().bind(dataset)
     try:
-        state = search(variant, estimator, evaluator, shuffled, case.seed)
+        state = search(variant, Samples(estimator, evaluator, shuffled, settings.sample_size, case.seed))
     except IdentificationError as error:
         return str(error), evaluator.inlier_sets
     return state, evaluator.inlier_sets
@@ -331,9 +332,8 @@ class ScriptedBatch:
     found: list[tuple[float, list[int]]]
     n_rows: int
 
-    @property
-    def scores(self):
-        """Of every hypothesis."""
+    def scores(self, *, squared_error):
+        """Of every hypothesis; the script has one error."""
         return [Score(error, len(rows) / self.n_rows) for error, rows in self.found]
 
     def inliers(self, lane):
@@ -348,7 +348,7 @@ def first_two(seed, iterations, n_rows, start, stop):
 
 def run_script(script, variant=IDiransac, sampler=first_two, callback=None, **changes):
     settings = Settings(**{"sample_size": 2, "max_iterations": 1, "stop_inlier_fraction": None, **changes})
-    return search(variant(settings), script, script, sampler, 0, callback)
+    return search(variant(settings), Samples(script, script, sampler, settings.sample_size, 0), callback)
 
 
 def test_refit_that_is_pending_at_the_iteration_limit_never_runs():

@@ -107,7 +107,7 @@ def test_a_method_that_finds_nothing_is_still_judged(tmp_path: Path, monkeypatch
     def nothing(*arguments: object, **more: object) -> dr.Result:
         raise dr.IdentificationError("nothing was found")
 
-    monkeypatch.setattr(trials, "identify", nothing)
+    monkeypatch.setattr(trials.Identification, "by", nothing)
     row = run(tmp_path, trials=1, levels=[0])["0", 0, "ols"]
     assert row["pseudo_true_mass"] == pytest.approx(0.249, rel=1e-9)
     estimates = summarise(tmp_path / "a.db").estimates

@@ -211,12 +211,14 @@ def test_a_search_that_accepts_nothing_is_a_row_without_figures(tmp_path: Path):
 def test_an_error_that_nobody_foresaw_ends_one_trial_and_says_what_it_was(
     whole: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    def breaks(model: object, log: object, method: object, **more: object) -> dr.Result:
+    by = trials.Identification.by
+
+    def breaks(self: trials.Identification, method: object, seed: int) -> dr.Result:
         if method.name == "i-diransac":
             raise ZeroDivisionError("by accident")
-        return dr.identify(model, log, method, **more)
+        return by(self, method, seed)
 
-    monkeypatch.setattr(trials, "identify", breaks)
+    monkeypatch.setattr(trials.Identification, "by", breaks)
     found = run(tmp_path)
     broken = [row["error"] for key, row in found.items() if key[2] == "quick"]
     assert broken == ["internal error: ZeroDivisionError: by accident"] * 4

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
     from diransac.model import Model, Parameter
+
+T = TypeVar("T")
 
 __all__ = ["Dataset", "ParameterLayout", "as_logs", "distinct_logs", "usable_sensors"]
 
@@ -234,6 +236,7 @@ class Dataset:
     segments: tuple[Segment, ...]
     layout: ParameterLayout
     input_hold: str | None = None
+    _kept: list[tuple[object, Any]] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @classmethod
     def of(
@@ -347,6 +350,25 @@ class Dataset:
             parts = [x - np.where(centred, _medians(x), 0.0) for x in parts]
         values = np.concatenate(parts)
         return {n: _spread(values[:, i]) for i, n in enumerate(self.signals)}
+
+    def kept(self, key: object, make: Callable[[], T]) -> T:
+        """The value that was made under an equal key before, or a new one, which lives as long as the dataset.
+
+        Methods that are given the same dataset share what they derive from it.
+
+        Parameters
+        ----------
+        key : object
+            All that the value depends on besides the dataset.
+        make : callable
+            Returns the value.
+        """
+        for known, value in self._kept:
+            if known == key:
+                return cast("T", value)
+        value = make()
+        self._kept.append((key, value))
+        return value
 
     def by_signal(self, values: Mapping[str, float]) -> FloatArray:
         """Values in the signals' order.

@@ -288,7 +288,7 @@ class Simulation:
     ) -> None:
         compared = np.ones(len(dataset.signals), bool) if signals is None else signals
         names = [n for n, j in zip(dataset.signals, compared, strict=True) if j]
-        self._dataset, self._compared = dataset, compared
+        self._segments, self._layout = dataset.segments, dataset.layout
         self._stretches = [stretches_of(one, "first") for one in dataset.segments] if stretches is None else stretches
         self._threads = threads or default_threads()
         self._simulator: Simulator = rollouts(
@@ -312,7 +312,7 @@ class Simulation:
         LogError
             A log lacks a state on which a measured signal depends.
         """
-        pairs = zip(self._dataset.segments, self._stretches, strict=True)
+        pairs = zip(self._segments, self._stretches, strict=True)
         return [[(x.rows, one.part(x.rows).initial_state(x.rule)) for x in stretches] for one, stretches in pairs]
 
     def score(self, parameters: FloatArray, thresholds: FloatArray, min_inlier_signals: int) -> Scores:
@@ -332,8 +332,8 @@ class Simulation:
         Scores
         """
         logs = []
-        for i, one in enumerate(self._dataset.segments):
-            own, measured, found = self._dataset.layout.of_log(parameters, i), self._measured[i], []
+        for i, one in enumerate(self._segments):
+            own, measured, found = self._layout.of_log(parameters, i), self._measured[i], []
             for rows, state in self.starts[i]:
                 lanes = RolloutBatch(own, state, self._inputs[i][rows], one.log.dt)
                 known = Measurements(measured.values[rows], measured.valid[rows])
@@ -387,7 +387,7 @@ class Simulation:
     def _restarted(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
     ) -> tuple[RolloutBatch, Measurements]:
-        one, measured = self._dataset.segments[log], np.nan_to_num(self._measured[log].values)
+        one, measured = self._segments[log], np.nan_to_num(self._measured[log].values)
         more = ((0, max(0, int(start_rows.max()) + n_rows - len(one))), (0, 0))
         inputs, measured = (np.pad(x, more, mode="edge") for x in (self._inputs[log], measured))
         lanes = np.tile(parameters, (len(states), 1))
@@ -517,7 +517,7 @@ def _covered(one: Segment, stretches: tuple[Stretch, ...]) -> Segment:
     gaps = np.ones(len(one), bool)
     for x in stretches:
         gaps[x.rows] = False
-    return replace(one, gaps=gaps, valid=one.valid & ~gaps)
+    return one if np.array_equal(gaps, one.gaps) else replace(one, gaps=gaps, valid=one.valid & ~gaps)
 
 
 def _first_state(one: Segment, log: int, row: int, found: Diagnosis) -> dict[str, float]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from diransac.model import Model
 from diransac.simulation import HOLDS
 from diransac.time_limit import check_time, time_limited
 
-__all__ = ["METHODS", "checked_hold", "identify", "method_object"]
+__all__ = ["METHODS", "Identification", "checked_hold", "identify", "method_object"]
 
 
 def identify(
@@ -193,6 +194,56 @@ def _check_arguments(model: object, seed: object) -> None:
         raise SettingsError(f"seed is {seed!r}; give a whole number")
 
 
+class Identification:
+    """Identification of a model from the same logs by one method after another.
+
+    Each result is that of `identify`.  Methods share what does not depend on them: the logs bound to the model, sums of
+    the regression, and random samples with their scores.
+
+    Parameters
+    ----------
+    model : Model
+        Equations with the parameters to be estimated.
+    logs : Log or iterable of Log
+        One log, or several.
+
+    Raises
+    ------
+    LogError
+        A log is given twice.
+    SettingsError
+        An argument is none of these.
+    """
+
+    def __init__(self, model: Model, logs: Log | Iterable[Log]) -> None:
+        self._given, self._known = distinct_logs(logs), KnownParameters.of(model, None, None)
+        self._datasets: list[tuple[object, Dataset]] = []
+
+    def by(self, method: Method, seed: int = 0) -> Result:
+        """The result of a method.  Raises as `identify` does."""
+        _check_arguments(self._known.model, seed)
+        several = len(self._given) > 1
+        task = _Task(self._known, self._given, method, int(seed), True, None, several, self._dataset)
+        with numerical_failures(self._given):
+            return task.run(self._given)
+
+    def _dataset(self, *logs: Any, **options: Any) -> Dataset:
+        """The dataset of an earlier method with the same arguments, or a new one."""
+        for key, dataset in self._datasets:
+            if key == (logs, options):
+                return dataset
+        dataset = moving_dataset(*logs, **options)
+        self._datasets.append(((logs, options), dataset))
+        return dataset
+
+
+def moving_dataset(*logs: Any, **options: Any) -> Dataset:
+    """`Dataset.of` the arguments.  Raises IdentificationError: nothing moves in the logs."""
+    dataset = Dataset.of(*logs, **options)
+    check_motion(dataset)
+    return dataset
+
+
 @dataclass(frozen=True)
 class _Task:
     """One identification, apart from the preparation of its logs."""
@@ -204,13 +255,14 @@ class _Task:
     pointwise: bool
     input_hold: str | None
     compares: bool
+    dataset_of: Callable[..., Dataset] = moving_dataset
 
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
         """Identify from prepared logs."""
         known, unused = self._observed(logs)
         criteria, model = self.method.criteria, known.free()
         judged = judged_signals(model, logs, criteria)
-        dataset = Dataset.of(
+        dataset = self.dataset_of(
             model,
             logs,
             judged,
@@ -219,7 +271,6 @@ class _Task:
             input_hold=self.input_hold,
             priors=known.priors_of_fit,
         )
-        check_motion(dataset)
         fitted = 0.5 if self.compares else 0.95
         estimate = fit(self.method, dataset, self.seed, within(progress, 0.0, fitted))
         report(progress, "evaluating", fitted)

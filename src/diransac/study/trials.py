@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib.metadata import version
+from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,7 @@ from diransac.errors import DiransacError, PlanningError, StudyError
 from diransac.flight.closed_loop import tracking_error
 from diransac.flight.trajectory import Trajectory
 from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
-from diransac.identification.identify import identify
+from diransac.identification.identify import Identification
 from diransac.model.plant import Plant
 from diransac.study.data import (
     PLANNING_TIME_LIMIT,
@@ -75,9 +77,8 @@ def run_trials(study: str, level: str, trials: Sequence[int], methods: Sequence[
     cases = [_Case(point, trial, label) for trial in trials for label in methods]
     with single_threaded():  # all cores run trials
         point.record(cases)
-        for case in cases:
-            with case.attempt("identify"):
-                case.identify()
+        for _, of_trial in groupby(cases, key=attrgetter("trial")):
+            _identify(list(of_trial))
         for shape in point.study.evaluation.trajectories:
             _evaluate(point, [case for case in cases if case.found], shape)
     return [case.row() for case in cases]
@@ -155,16 +156,14 @@ class _Case:
             self.log = data.log
             self.figures |= {f"pseudo_true_{name}": value for name, value in data.pseudo_true.items()}
 
-    def identify(self) -> None:
+    def identify(self, identification: Identification) -> None:
         """Identify parameters from the log.  Raises DiransacError: there is no estimate."""
-        if self.log is None:
-            return
         plant, method = self.point.plant, self.point.study.methods[self.label]
         if method.method == TRUE:
             self.found = Plant(plant.model, plant.parameters)
         else:
             seed = derived_seed(self.seed, "identify")
-            result = identify(plant.model, self.log, method.object(), seed=seed)
+            result = identification.by(method.object(), seed)
             self.found = Plant(plant.model, result.parameters)
             self.figures |= _ends(result.intervals(_INTERVAL)) if self.point.study.evaluate_parameters else {}
             self.figures |= {
@@ -204,6 +203,17 @@ class _Case:
             "seconds": dict(self.seconds),
             "host": platform.node(),
         }
+
+
+def _identify(cases: Sequence[_Case]) -> None:
+    """Identify parameters in the cases of a trial, which share what does not depend on the method."""
+    log = cases[0].log
+    if log is None:
+        return
+    identification = Identification(cases[0].point.plant.model, log)
+    for case in cases:
+        with case.attempt("identify"):
+            case.identify(identification)
 
 
 # Evaluation ----------------------------------------------------------------------------------------------------------

@@ -145,6 +145,10 @@ def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
     IdentificationError
         A parameter is not identifiable from the whole dataset; the message names it.
     """
+    return dataset.kept((bound_to, estimator), lambda: _checked(estimator, dataset))
+
+
+def _checked(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
     check_structure(dataset.model, dataset.source)
     check_known_terms(dataset)
     bound = estimator.bind(dataset)

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from diransac.identification.nonlinear import NonlinearLeastSquares
 from diransac.identification.refusal import cause_of_refusal, motion_rows
 from diransac.identification.sampling import sample_rows
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
+from diransac.simulation.compiler.machine_code import LANES
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ __all__ = [
     "IDiransac",
     "NothingAcceptedError",
     "RansacMethod",
+    "Samples",
     "Score",
     "ScoredBatch",
     "SearchState",
@@ -58,6 +60,7 @@ __all__ = [
 Sampler = Callable[[int, IntArray, int, int, int], IntArray]
 
 _FIRST_BATCH = 16
+_MOST_KEPT = 2**24  # bytes
 _OUT_OF_BOUNDS = "out of bounds"
 _SEARCH = ("sample_size", "max_iterations", "refit")
 
@@ -140,14 +143,13 @@ class RansacMethod(ABC):
         """
         settings, estimator = self.criteria, self._estimator(dataset.model)
         bound = bound_to(estimator, dataset)
-        evaluator = Evaluator(dataset, choose_scoring(dataset, settings), self)
         if bound.n_rows < settings.sample_size:
             raise LogError(
                 f"{dataset.source}: {bound.n_rows} usable rows are fewer than sample_size = "
                 f"{settings.sample_size}; give a longer log or a smaller sample_size"
             )
         try:
-            found = search(self, bound, evaluator, sample_rows, int(seed), callback)
+            found = search(self, self._samples(bound, dataset, int(seed)), callback)
         except NothingAcceptedError as error:
             if set(error.rejected) != {_OUT_OF_BOUNDS}:
                 raise
@@ -171,6 +173,17 @@ class RansacMethod(ABC):
     def regresses(self, model: Model) -> bool:
         """True unless the estimator is nonlinear."""
         return not isinstance(self._estimator(model), NonlinearLeastSquares)
+
+    def _samples(self, bound: BoundEstimator, dataset: Dataset, seed: int) -> Samples:
+        """Samples of the dataset, which methods that draw, fit and simulate them alike share."""
+        settings = self.criteria
+
+        def make() -> Samples:
+            evaluator = Evaluator(dataset, choose_scoring(dataset, settings), settings)
+            return Samples(bound, evaluator, sample_rows, settings.sample_size, seed)
+
+        alike = [getattr(settings, name) for name in ("sample_size", *JUDGING, *SIMULATION)]
+        return dataset.kept((Samples, bound, seed, alike), make)
 
     def _estimator(self, model: Model) -> Estimator:
         if self.estimator is not None:
@@ -278,18 +291,22 @@ class ScoredBatch:
     Parameters
     ----------
     scores : Scores
-    errors : (n_lanes,) array
-        Model-fit error of each hypothesis.
-    n_rows : int
-        Number of rows that count.
+    weights : (n_s,) array
+        Weights of eq. (2), one over each signal's unit.
     valid : sequence of (N,) bool array
         Rows of each log that count.
     """
 
-    def __init__(self, scores: Scores, errors: FloatArray, n_rows: int, valid: Sequence[BoolArray]) -> None:
-        self._scores, self._valid = scores, valid
-        fractions = scores.inlier_count / n_rows
-        self.scores = [Score(e, f) for e, f in zip(errors.tolist(), fractions.tolist(), strict=True)]
+    def __init__(self, scores: Scores, weights: FloatArray, valid: Sequence[BoolArray]) -> None:
+        self._scores, self._weights, self._valid = scores, weights, valid
+        self._n_rows = sum(int(rows.sum()) for rows in valid)
+
+    def scores(self, *, squared_error: bool) -> list[Score]:
+        """Score of each hypothesis, by the mean squared error or its root."""
+        error_of = mean_squared_error if squared_error else rms_error
+        errors = error_of(self._scores.sum_squares, self._n_rows, self._weights)
+        fractions = self._scores.inlier_count / self._n_rows
+        return [Score(e, f) for e, f in zip(errors.tolist(), fractions.tolist(), strict=True)]
 
     def inliers(self, lane: int) -> IntArray:
         """Usable rows, numbered log after log, that are inliers of one hypothesis, ascending."""
@@ -305,8 +322,8 @@ class Evaluator:
     dataset : Dataset
     scoring : Scoring
         Weights and thresholds.
-    variant : RansacMethod
-        Method whose error and criteria are used.
+    settings : Settings
+        Integrator, initial state and threads.
 
     Raises
     ------
@@ -314,10 +331,9 @@ class Evaluator:
         A log lacks its initial state.
     """
 
-    def __init__(self, dataset: Dataset, scoring: Scoring, variant: RansacMethod) -> None:
-        settings, judged = variant.criteria, scoring.judged
-        self._dataset = dataset
-        self._error_of = mean_squared_error if variant.squared_error else rms_error
+    def __init__(self, dataset: Dataset, scoring: Scoring, settings: Settings) -> None:
+        judged = scoring.judged
+        self._layout = dataset.layout
         self._weights, self._thresholds = scoring.weights[judged], scoring.thresholds[judged]
         self._min_inlier_signals = scoring.min_inlier_signals
         self._valid = [one.valid for one in dataset.segments]
@@ -328,13 +344,12 @@ class Evaluator:
 
     def admits(self, parameters: FloatArray) -> BoolArray:
         """Preliminary test of ``(n_vectors, n)`` parameters: every one within its bounds."""
-        return self._dataset.layout.admits(parameters)
+        return self._layout.admits(parameters)
 
     def score(self, parameters: FloatArray) -> ScoredBatch:
         """Error, inlier fraction and inliers of every hypothesis ``(n_vectors, n)``."""
         scores = self._simulation.score(parameters, self._thresholds, self._min_inlier_signals)
-        n_rows = self._dataset.n_rows
-        return ScoredBatch(scores, self._error_of(scores.sum_squares, n_rows, self._weights), n_rows, self._valid)
+        return ScoredBatch(scores, self._weights, self._valid)
 
 
 @dataclass(frozen=True)
@@ -346,7 +361,7 @@ class Hypothesis:
     parameters : (n,) array
         Each in its unit.
     rows : (n_fitted,) int array
-        Usable rows that the parameters were fitted to, ascending.
+        Usable rows that the parameters were fitted to.
     score : Score
         Error and inlier fraction.
     batch : ScoredBatch
@@ -360,6 +375,135 @@ class Hypothesis:
     score: Score
     batch: ScoredBatch
     lane: int
+
+
+@dataclass(frozen=True)
+class FittedSamples:
+    """Random samples, their parameters, and the scores of those that pass the preliminary test.
+
+    Parameters
+    ----------
+    samples : list of (n_rows,) int array
+        Usable rows of each sample.
+    parameters : (n_samples, n) array
+        Each in its unit.
+    lanes : list of int or None
+        Place of each sample in the scored batch; None where it fails the preliminary test.
+    scored : ScoredBatch, optional
+        None where all of them fail it.
+    """
+
+    samples: list[IntArray]
+    parameters: FloatArray
+    lanes: list[int | None]
+    scored: ScoredBatch | None
+
+    def scores(self, *, squared_error: bool) -> list[Score | None]:
+        """The score of every sample, None where it fails the preliminary test."""
+        scores = [] if self.scored is None else self.scored.scores(squared_error=squared_error)
+        return [None if lane is None else scores[lane] for lane in self.lanes]
+
+    def hypothesis(self, i: int, score: Score) -> Hypothesis:
+        """The hypothesis of a sample that passes the preliminary test."""
+        lane = self.lanes[i]
+        assert self.scored is not None
+        assert lane is not None
+        return Hypothesis(self.parameters[i], self.samples[i], score, self.scored, lane)
+
+
+class Samples:
+    """Random samples of a dataset, which are drawn, fitted and scored a batch at a time.
+
+    Searches that differ in what they accept can share them: batches and refits are kept, up to 16 MiB in all.
+
+    Parameters
+    ----------
+    estimator : BoundEstimator
+        Fit of samples and inlier sets.
+    evaluator : Evaluator
+        Preliminary test and scores of hypotheses.
+    sampler : callable
+        ``(seed, iterations, n_rows, start, stop) -> rows``, as `sampling.sample_rows`.
+    sample_size : int
+        Least number of rows in a sample.
+    seed : int
+    """
+
+    def __init__(
+        self, estimator: BoundEstimator, evaluator: Evaluator, sampler: Sampler, sample_size: int, seed: int
+    ) -> None:
+        self.estimator, self._evaluator = estimator, evaluator
+        self._sampler, self._sample_size, self._seed = sampler, sample_size, seed
+        self._kept: dict[range | bytes, FittedSamples] = {}
+        self._room = _MOST_KEPT
+
+    def batch(self, iterations: range) -> FittedSamples:
+        """Samples of consecutive iterations."""
+        found = self._kept.get(iterations)
+        return found or self._keep(iterations, self._drawn(np.array(iterations)))
+
+    def refit(self, inliers: IntArray) -> FittedSamples | None:
+        """A set of inliers as the only sample; None where it is not well-defined."""
+        key = _fingerprint(inliers, self.estimator.n_rows)
+        found = self._kept.get(key)
+        if found is not None:
+            return found
+        selected = self.estimator.select([inliers])
+        if not selected.well_defined()[0]:
+            return None
+        return self._keep(key, self._scored([inliers], selected.fit()))
+
+    def _keep(self, key: range | bytes, found: FittedSamples) -> FittedSamples:
+        """The samples themselves, which are found under the key from now on, if there is room."""
+        n_blocks = -(-len(found.samples) // LANES)
+        size = sum(rows.nbytes for rows in found.samples) + n_blocks * self.estimator.n_rows
+        if size <= self._room:
+            self._kept[key], self._room = found, self._room - size
+        return found
+
+    def _drawn(self, iterations: IntArray) -> FittedSamples:
+        """New samples, of which those that are not well-defined grow."""
+        estimator = self.estimator
+        samples = list(self._sampler(self._seed, iterations, estimator.n_rows, 0, self._sample_size))
+        selected = estimator.select(samples)
+        poor = np.flatnonzero(~selected.well_defined())
+        for i in poor:
+            samples[i] = self._grown(samples[i], iterations[i : i + 1])
+        return self._scored(samples, (estimator.select(samples) if len(poor) else selected).fit())
+
+    def _scored(self, samples: list[IntArray], parameters: FloatArray) -> FittedSamples:
+        """Samples with their parameters ``(n_samples, n)``, and the scores of those that are admitted."""
+        admitted = self._evaluator.admits(parameters)
+        lanes = (np.cumsum(admitted) - 1).tolist()
+        places = [lane if good else None for lane, good in zip(lanes, admitted.tolist(), strict=True)]
+        scored = self._evaluator.score(parameters[admitted]) if admitted.any() else None
+        return FittedSamples(samples, parameters, places, scored)
+
+    def _grown(self, sample: IntArray, k: IntArray) -> IntArray:
+        """The sample with as many more random observations as make it well-defined (lines 6-10).
+
+        Adding an observation never lowers the smallest eigenvalue: the least number is found by doubling, then
+        bisection.
+        """
+        estimator, low, whole = self.estimator, len(sample), sample
+        while not estimator.select([whole]).well_defined()[0]:
+            low = len(whole)
+            if low == estimator.n_rows:
+                raise IdentificationError("the whole log is not well-defined: its parameters are not identifiable")
+            more = self._sampler(self._seed, k, estimator.n_rows, low, min(2 * low, estimator.n_rows))[0]
+            whole = np.concatenate([whole, more])
+        high = len(whole)
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if estimator.select([whole[:middle]]).well_defined()[0] else (middle, high)
+        return whole[:high]
+
+
+def _fingerprint(rows: IntArray, n_rows: int) -> bytes:
+    """One bit per row: a chain of thousands of refits keeps all its inlier sets."""
+    chosen = np.zeros(n_rows, bool)
+    chosen[rows] = True
+    return np.packbits(chosen).tobytes()
 
 
 # ---------------------------------------------------------------------- the search
@@ -421,26 +565,14 @@ class NothingAcceptedError(IdentificationError):
         )
 
 
-def search(
-    variant: RansacMethod,
-    estimator: BoundEstimator,
-    evaluator: Evaluator,
-    sampler: Sampler,
-    seed: int,
-    callback: Callback | None = None,
-) -> SearchState:
+def search(variant: RansacMethod, samples: Samples, callback: Callback | None = None) -> SearchState:
     """State at the end of Algorithm 1 in the given variant.
 
     Parameters
     ----------
     variant : RansacMethod
-    estimator : BoundEstimator
-        Fit of samples and inlier sets.
-    evaluator : Evaluator
-        Preliminary test and scores of hypotheses.
-    sampler : callable
-        ``(seed, iterations, n_rows, start, stop) -> rows``, as `sampling.sample_rows`.
-    seed : int
+    samples : Samples
+        Random samples, and refits to inliers.
     callback : callable, optional
         Called with a `Progress` after every batch.
 
@@ -463,13 +595,15 @@ def search(
     """
     settings, state = variant.criteria, SearchState()
     try:
-        for batch in _batches(settings):
-            drawn = _speculate(batch, settings.sample_size, estimator, evaluator, sampler, seed)
-            for hypothesis in drawn:
+        for iterations in _batches(settings):
+            batch = samples.batch(iterations)
+            for i, score in enumerate(batch.scores(squared_error=variant.squared_error)):
                 if variant.is_finished(state.score, settings.stop_inlier_fraction):
                     break
+                check_time()
                 state.iterations += 1
-                _replay(hypothesis, state, variant, estimator, evaluator)
+                if _improves(score, state, variant):
+                    _follow(batch.hypothesis(i, score), state, variant, samples)
             fraction = state.iterations / settings.max_iterations
             report(callback, "searching", fraction, f"{state.score.inlier_fraction:.0%} inliers")
             if variant.is_finished(state.score, settings.stop_inlier_fraction):
@@ -486,115 +620,51 @@ def search(
     return state
 
 
-def _batches(settings: Settings) -> Iterator[IntArray]:
+def _batches(settings: Settings) -> Iterator[range]:
     """Iterations in batches, which grow from 16 to ``batch_size`` where the search may stop early."""
     may_stop = settings.stop_inlier_fraction is not None
     start, size = 0, min(_FIRST_BATCH, settings.batch_size) if may_stop else settings.batch_size
     while start < settings.max_iterations:
         stop = min(start + size, settings.max_iterations)
-        yield np.arange(start, stop)
+        yield range(start, stop)
         start, size = stop, min(2 * size, settings.batch_size)
 
 
-def _speculate(
-    batch: IntArray,
-    sample_size: int,
-    estimator: BoundEstimator,
-    evaluator: Evaluator,
-    sampler: Sampler,
-    seed: int,
-) -> list[Hypothesis | None]:
-    """The hypothesis of every sample in the batch, None where it fails the preliminary test."""
-    samples: list[IntArray] = list(sampler(seed, batch, estimator.n_rows, 0, sample_size))
-    selected = estimator.select(samples)
-    poor = np.flatnonzero(~selected.well_defined())
-    for i in poor:
-        samples[i] = _grow(samples[i], batch[i : i + 1], estimator, sampler, seed)
-    parameters = (estimator.select(samples) if len(poor) else selected).fit()
-    admitted = np.flatnonzero(evaluator.admits(parameters))
-    if not len(admitted):
-        return [None] * len(samples)
-    scored, lanes = evaluator.score(parameters[admitted]), {int(i): lane for lane, i in enumerate(admitted)}
-    return [
-        Hypothesis(parameters[i], np.sort(rows), scored.scores[lanes[i]], scored, lanes[i]) if i in lanes else None
-        for i, rows in enumerate(samples)
-    ]
+def _improves(score: Score | None, state: SearchState, variant: RansacMethod) -> TypeGuard[Score]:
+    """True if a hypothesis improves (line 19); otherwise it is rejected, None because of the preliminary test."""
+    state.n_hypotheses += 1
+    if score is not None and variant.improves(score, state.score):
+        return True
+    state.rejected[_OUT_OF_BOUNDS if score is None else _reason(score, "no improvement")] += 1
+    return False
 
 
-def _grow(sample: IntArray, k: IntArray, estimator: BoundEstimator, sampler: Sampler, seed: int) -> IntArray:
-    """The sample with as many more random observations as make it well-defined (lines 6-10).
-
-    Adding an observation never lowers the smallest eigenvalue: the least number is found by doubling, then bisection.
-    """
-    low, whole = len(sample), sample
-    while not estimator.select([whole]).well_defined()[0]:
-        low = len(whole)
-        if low == estimator.n_rows:
-            raise IdentificationError("the whole log is not well-defined: its parameters are not identifiable")
-        more = sampler(seed, k, estimator.n_rows, low, min(2 * low, estimator.n_rows))[0]
-        whole = np.concatenate([whole, more])
-    high = len(whole)
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if estimator.select([whole[:middle]]).well_defined()[0] else (middle, high)
-    return whole[:high]
+def _reason(score: Score, otherwise: str) -> str:
+    """Reason for a rejection."""
+    return "diverged" if score.error == np.inf else otherwise
 
 
-def _replay(
-    hypothesis: Hypothesis | None,
-    state: SearchState,
-    variant: RansacMethod,
-    estimator: BoundEstimator,
-    evaluator: Evaluator,
-) -> None:
-    """One sample and the chain of refits that it starts (lines 13-34)."""
-    settings = variant.criteria
+def _follow(hypothesis: Hypothesis, state: SearchState, variant: RansacMethod, samples: Samples) -> None:
+    """Acceptance of an improving hypothesis, and of those in the chain of refits that it starts (lines 20-34)."""
+    settings, n_rows = variant.criteria, samples.estimator.n_rows
     used: set[bytes] = set()
     while True:
-        check_time()
-        state.n_hypotheses += 1
-        if hypothesis is None:
-            state.rejected[_OUT_OF_BOUNDS] += 1
+        stored = variant.accepts(hypothesis.score, state.score)
+        if stored:
+            state.best = hypothesis
+        else:
+            state.rejected[_reason(hypothesis.score, "not accepted")] += 1
+        if settings.refit == "none" or not variant.refits(stored=stored):
             return
-        stored = _judge(hypothesis, state, variant)
-        if stored is None or settings.refit == "none" or not variant.refits(stored=stored):
-            return
-        used.add(_fingerprint(hypothesis.rows, estimator.n_rows))
+        used.add(_fingerprint(hypothesis.rows, n_rows))
         inliers = hypothesis.batch.inliers(hypothesis.lane)
-        if _fingerprint(inliers, estimator.n_rows) in used:
-            return
-        selected = estimator.select([inliers])
-        if not selected.well_defined()[0]:
-            return
         limit = state.iterations >= settings.max_iterations
         if limit or variant.is_finished(state.score, settings.stop_inlier_fraction):
             return
-        hypothesis = _refit(inliers, selected.fit(), evaluator)
-
-
-def _fingerprint(rows: IntArray, n_rows: int) -> bytes:
-    """One bit per row: a chain of thousands of refits keeps all its inlier sets."""
-    chosen = np.zeros(n_rows, bool)
-    chosen[rows] = True
-    return np.packbits(chosen).tobytes()
-
-
-def _judge(hypothesis: Hypothesis, state: SearchState, variant: RansacMethod) -> bool | None:
-    """True if a hypothesis was stored, False if it improves only, None otherwise (lines 19-23)."""
-    score = hypothesis.score
-    if not variant.improves(score, state.score):
-        state.rejected["diverged" if np.isinf(score.error) else "no improvement"] += 1
-        return None
-    if not variant.accepts(score, state.score):
-        state.rejected["diverged" if np.isinf(score.error) else "not accepted"] += 1
-        return False
-    state.best = hypothesis
-    return True
-
-
-def _refit(inliers: IntArray, parameters: FloatArray, evaluator: Evaluator) -> Hypothesis | None:
-    """The hypothesis of an inlier set with its parameters ``(1, n)``, None where it fails the preliminary test."""
-    if not evaluator.admits(parameters)[0]:
-        return None
-    scored = evaluator.score(parameters)
-    return Hypothesis(parameters[0], inliers, scored.scores[0], scored, 0)
+        if _fingerprint(inliers, n_rows) in used or (refitted := samples.refit(inliers)) is None:
+            return
+        check_time()
+        (score,) = refitted.scores(squared_error=variant.squared_error)
+        if not _improves(score, state, variant):
+            return
+        hypothesis = refitted.hypothesis(0, score)
