@@ -1,5 +1,6 @@
 """The command line: parse, call, print."""
 
+import gc
 import os
 import sys
 from contextlib import suppress
@@ -10,11 +11,15 @@ __all__ = ["INTERRUPTED", "main"]
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
+_ALLOCATIONS = 10_000
+"""New objects between two garbage collections: those of imported modules live as long as the process of a command."""
+
 
 def main() -> None:
     """Run the command line of this process, and end the process with its exit code."""
     if "--debug" not in sys.argv:
         sys.excepthook = _report_internal_error
+    gc.set_threshold(_ALLOCATIONS)
     from diransac.cli.commands import app
     from diransac.user_files import leave_stdout
 
@@ -26,6 +31,7 @@ def main() -> None:
         raise
     finally:
         leave_stdout()
+        gc.freeze()  # the memory of a process that ends needs no garbage collection
 
 
 def _end_now() -> None:
