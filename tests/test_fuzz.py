@@ -299,7 +299,7 @@ def no_code(monkeypatch):
     monkeypatch.setattr(ca.Function, "deserialize", read)
     for name in ("external", "Importer", "StringDeserializer", "FileDeserializer"):
         monkeypatch.setattr(ca, name, refused)
-    monkeypatch.setattr("diransac.cli.study.run_study", kept)
+    monkeypatch.setattr("diransac.cli.commands.study.run_study", kept)
 
 
 @pytest.mark.slow

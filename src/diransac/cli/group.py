@@ -7,7 +7,7 @@ import functools
 import importlib
 import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn, get_args, get_type_hints
@@ -28,11 +28,47 @@ UsageError: type[Any] = typer.BadParameter.__mro__[1]
 _PLAIN, _CHECKED = (str, Path, int, float), ("click_type", "min", "max")
 """Kinds of arguments that are converted by a call, and what makes Typer check or convert an argument otherwise."""
 
-_LATER = {"fleet": "diransac.cli.fleet", "study": "diransac.cli.study"}
-"""Module of each group of commands that is imported on first use."""
-
+_NAMES = (
+    "identify",
+    "compare",
+    "validate",
+    "predict",
+    "cross-validate",
+    "inspect",
+    "map",
+    "simulate",
+    "fly",
+    "design",
+    "export",
+    "models",
+    "cache",
+    "fleet",
+    "study",
+)
+"""Commands, in the order of ``--help``."""
 
 _VERBOSITY = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
+
+
+class _Commands(Mapping[str, Any]):
+    """Commands by name; the module of each, `diransac.cli.commands.*`, is imported on first use."""
+
+    def __init__(self) -> None:
+        self._made = dict[str, Any]()
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in _NAMES:
+            raise KeyError(name)
+        if name not in self._made:
+            module = importlib.import_module(f"diransac.cli.commands.{name.replace('-', '_')}")
+            self._made[name] = typer.main.get_command(module.app)
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_NAMES)
+
+    def __len__(self) -> int:
+        return len(_NAMES)
 
 
 class Group(TyperGroup):
@@ -41,26 +77,15 @@ class Group(TyperGroup):
     The message of a failure has at most three lines.
     """
 
-    def list_commands(self, ctx: Any) -> list[str]:
-        """Names of all commands."""
-        return [*super().list_commands(ctx), *_LATER]
+    def __init__(self, **about: Any) -> None:
+        super().__init__(**about | {"commands": _Commands()})
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """A command by name, imported on first use."""
-        if cmd_name in _LATER and cmd_name not in self.commands:
-            found = typer.main.get_command(getattr(importlib.import_module(_LATER[cmd_name]), cmd_name))
-            found.name = cmd_name
-            self.commands[cmd_name] = found
+        """A command by name."""
         command = super().get_command(ctx, cmd_name)
         if command is not None:
             _convert_plainly(command, ctx)
         return command
-
-    def _all_commands(self) -> dict[str, Any]:
-        """Commands by name, with the groups that are imported on first use."""
-        for name in _LATER:
-            self.get_command(typer.Context(self), name)
-        return {name: command for name, command in self.commands.items() if not getattr(command, "hidden", False)}
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Arguments that are left for the command."""
@@ -79,7 +104,7 @@ class Group(TyperGroup):
         try:
             words, file = _without_config(words)
             if file is not None:
-                extra["default_map"] = config_defaults(file, self._all_commands())
+                extra["default_map"] = config_defaults(file, self.commands)
             code = super().main(words, *positional, **extra)
         except UsageError as error:
             where = error.ctx.command_path if error.ctx else "diransac"

@@ -13,28 +13,28 @@ from diransac.cli.outputs import PAGE, check_ending, checked, staged
 from diransac.study.fleet import export_fleet, fleet_status
 from diransac.study.fleet_findings import summarise_fleet
 
-__all__ = ["fleet"]
+__all__ = ["app"]
 
-fleet = typer.Typer(
+app = typer.Typer(
     name="fleet", add_completion=False, help="Parameters over vehicles and time, from a store of identify --each."
 )
 
 StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="Store of identify --each.")]
 
 
-@fleet.command("show")
+@app.command("show")
 def _show(store: StoreArgument, as_json: JsonFlag = False) -> None:
     """Show the parameters of the fleet, and the vehicles that differ, change or drift."""
     screen.show(summarise_fleet(store), as_json)
 
 
-@fleet.command("status")
+@app.command("status")
 def _status(store: StoreArgument, as_json: JsonFlag = False) -> None:
     """Show the numbers of logs identified, failed and missing, and the reasons."""
     screen.show(fleet_status(store), as_json)
 
 
-@fleet.command("export")
+@app.command("export")
 def _export(
     store: StoreArgument,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.csv", help="File to write.")],
@@ -45,7 +45,7 @@ def _export(
         export_fleet(store, written)
 
 
-@fleet.command("plot")
+@app.command("plot")
 def _plot(
     store: StoreArgument,
     output: Annotated[
@@ -61,7 +61,7 @@ def _plot(
         plot_fleet(summarise_fleet(store), written)
 
 
-@fleet.command("report")
+@app.command("report")
 def _report(
     store: StoreArgument,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.html", help="File to write.")],

@@ -20,9 +20,9 @@ from diransac.study import builtin_names, export, load, run_study, status, templ
 from diransac.study.specification import TRUE
 from diransac.text_table import aligned
 
-__all__ = ["study"]
+__all__ = ["app"]
 
-study = typer.Typer(
+app = typer.Typer(
     name="study", add_completion=False, help="Run grids of Monte-Carlo trials, such as the paper's figures."
 )
 
@@ -50,7 +50,7 @@ def _changes(assignments: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-@study.command("run")
+@app.command("run")
 def _run(
     source: Annotated[str, typer.Argument(metavar="NAME|FILE.toml", help=f"{', '.join(builtin_names())}, or a file.")],
     store: Annotated[
@@ -78,7 +78,7 @@ def _run(
     screen.show(found, as_json)
 
 
-@study.command("new")
+@app.command("new")
 def _new(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="File to write; it must not exist.")],
 ) -> None:
@@ -93,13 +93,13 @@ def _new(
     screen.say(f"{file}: edit it, then run diransac study run {file} --store {file.with_suffix('.db')}")
 
 
-@study.command("status")
+@app.command("status")
 def _status(store: StoreArgument, as_json: JsonFlag = False) -> None:
     """Show the numbers of trials done, failed and missing, by level and method."""
     screen.show(status(store), as_json)
 
 
-@study.command("export")
+@app.command("export")
 def _export(
     store: StoreArgument,
     kind: Annotated[str, typer.Option("--to", metavar="parquet|csv", help="Format of the file.")],
@@ -112,7 +112,7 @@ def _export(
         export(store, written, kind)
 
 
-@study.command("plot")
+@app.command("plot")
 def _plot(
     store: StoreArgument,
     output: Annotated[
@@ -152,7 +152,7 @@ def _plot(
             plot_study(store, written, title=title)
 
 
-@study.command("report")
+@app.command("report")
 def _report(
     store: StoreArgument,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.html", help="File to write.")],
@@ -166,7 +166,7 @@ def _report(
         write_study_report(store, written)
 
 
-@study.command("list")
+@app.command("list")
 def _list(as_json: JsonFlag = False) -> None:
     """List the built-in studies and the methods."""
     screen.show(_Studies(), as_json)

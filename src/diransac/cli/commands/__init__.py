@@ -1,0 +1,41 @@
+"""The command line; each command is a module of this package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from diransac.cli.group import Group
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    cls=Group,
+    name="diransac",
+    help="Turn a messy log of a moving machine into a dynamical model, and say how far it can be trusted.",
+    invoke_without_command=True,
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback()
+def _diransac(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    _debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error, after any command.")] = False,
+    _config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE.toml", help="Options by name, anywhere; those that are given win."),
+    ] = None,
+    _quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no text; anywhere.")] = False,
+    _verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A line for every stage; anywhere.")] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as version_of
+
+        typer.echo(f"diransac {version_of('diransac')}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        context.fail(f"Give a command: {', '.join(sorted(context.command.list_commands(context)))}.")  # type: ignore[attr-defined]

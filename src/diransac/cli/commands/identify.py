@@ -1,0 +1,87 @@
+"""The command ``identify``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from diransac.cli import screen
+from diransac.cli.arguments import model_file
+from diransac.cli.fleet_options import FleetOptions
+from diransac.cli.group import grouped
+from diransac.cli.options import (
+    Derivation,
+    JsonFlag,
+    LogFiles,
+    MethodName,
+    ModelName,
+    Output,
+    Preparation,
+    Report,
+    Search,
+    StrictFlag,
+)
+from diransac.cli.outputs import PAGE, RESULT, STDOUT, check_ending, checked, staged
+from diransac.cli.robot_options import LimbResults, RobotOptions, of_limb
+from diransac.identification.identify import identify
+from diransac.identification.methods import DEFAULT
+from diransac.identification.result import Result
+
+__all__ = ["app"]
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command("identify")
+@grouped
+def _identify(
+    files: LogFiles,
+    model: ModelName,
+    search: Search,
+    derivation: Derivation,
+    preparation: Preparation,
+    robot: RobotOptions,
+    each: FleetOptions,
+    method: MethodName = DEFAULT,
+    with_suggestions: Annotated[
+        bool, typer.Option("--with-suggestions", help="Identify again with the terms that the model seems to lack.")
+    ] = False,
+    output: Output = None,
+    report: Report = None,
+    as_json: JsonFlag = False,
+    strict: StrictFlag = False,
+) -> None:
+    """Identify the parameters of a model from one log, from several logs of one machine, or from each by itself."""
+    (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
+    read = [*files, model_file(model), search.settings]
+    if each.asked():
+        if output or strict:
+            raise typer.BadParameter("--each keeps its results in --store; -o and --strict are of one result")
+        arguments = search.arguments() | derived | {"with_suggestions": with_suggestions}
+        each.run(files, robot.load(model), chosen, preparation, report, arguments, search.time_limit, as_json)
+        return
+    checked([output, report], read)
+    check_ending(output, RESULT)
+    check_ending(report, PAGE)
+    limbs, results = robot.load_limbs(model), dict[str, Result]()
+    if len(limbs) > 1 and output == STDOUT:
+        raise typer.BadParameter("-o - holds one result; this robot has several limbs, give a file")
+    outputs = [of_limb(path, limb) for limb in limbs for path in (output, report)]
+    with staged(outputs, read) as drafts:
+        logs = preparation.read_all(files)
+        for k, (limb, plant) in enumerate(limbs.items()):
+            saved, page = drafts[2 * k : 2 * k + 2]
+            with screen.bar(f"{method} {limb}".rstrip()) as progress:
+                arguments = search.arguments() | derived | {"time_limit": search.time_limit}
+                found = identify(plant, logs, chosen, with_suggestions=with_suggestions, progress=progress, **arguments)
+            results[limb] = found
+            if output:
+                found.save(saved)
+            if report:
+                from diransac.report import write_report
+
+                write_report(found, logs, page, command=screen.command())
+        screen.show(LimbResults(results) if len(results) > 1 else results[""], as_json)
+    for found in results.values():
+        screen.end(found.verdict, strict)

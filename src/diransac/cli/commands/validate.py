@@ -1,0 +1,44 @@
+"""The command ``validate``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from diransac.cli import screen
+from diransac.cli.group import grouped
+from diransac.cli.options import Derivation, JsonFlag, LogFiles, Preparation, Report, ResultFile, StrictFlag
+from diransac.cli.outputs import PAGE, check_ending, staged
+from diransac.identification.result import Result
+from diransac.identification.validation import validate
+
+__all__ = ["app"]
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command("validate")
+@grouped
+def _validate(
+    model: ResultFile,
+    files: LogFiles,
+    derivation: Derivation,
+    preparation: Preparation,
+    horizon: Annotated[float | None, typer.Option(metavar="S", help="Restart the simulation after so long.")] = None,
+    report: Report = None,
+    as_json: JsonFlag = False,
+    strict: StrictFlag = False,
+) -> None:
+    """Predict other logs with an identified model, open loop."""
+    check_ending(report, PAGE)
+    with staged([report], [model, *files]) as (page,):
+        result, derivation = Result.load(model), preparation.completed(derivation)
+        logs = [derivation.derive(log, result.model) for log in preparation.read_all(files)]
+        found = validate(result, logs, horizon)
+        if report:
+            from diransac.report import write_report
+
+            write_report(result, logs, page, horizon=horizon, command=screen.command())
+        screen.show(found, as_json)
+    screen.end(found.verdict, strict)
