@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -87,6 +86,8 @@ def toml_table(text: str) -> dict[str, Any]:
     ValueError
         It is no TOML, nested too deeply, or has a number of thousands of digits.
     """
+    import tomllib
+
     keys = (line.partition("=")[0] for line in text.splitlines())
     if any(key.count(".") > _DEEPEST_KEY and "," not in key for key in keys):  # tomllib takes their number squared
         raise ValueError("it is nested too deeply")

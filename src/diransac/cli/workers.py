@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 import sys
@@ -44,6 +43,8 @@ def running(label: str, store: Path, jobs: int | None, cluster: str | None) -> I
         if cluster is None:
             yield {"jobs": jobs, "progress": progress}
             return
+        import logging
+
         from diransac.study.engine import connected
 
         with connected(cluster) as (executor, tasks):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -197,7 +196,9 @@ def nearest_names(name: str, known: Sequence[str]) -> str:
     -------
     str
     """
-    nearest = difflib.get_close_matches(name, known, cutoff=_NEAR)
+    from difflib import get_close_matches
+
+    nearest = get_close_matches(name, known, cutoff=_NEAR)
     return f"did you mean {' or '.join(nearest)}?" if nearest else f"there are {', '.join(known)}"
 
 

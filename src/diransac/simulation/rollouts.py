@@ -23,7 +23,7 @@ from diransac.simulation.batch import (
     ScoreBatch,
     Simulator,
 )
-from diransac.simulation.compiler.graph import read_graph
+from diransac.simulation.compiler.graph import check_compilable
 from diransac.simulation.compiler.lanes import (
     ARGUMENTS,
     Lanes,
@@ -147,7 +147,7 @@ class Rollouts(Simulator):
         self._specifications: dict[tuple[str, ...], LoopSpecification] = {}
         self._code: dict[tuple[Any, ...], MachineCode] = {}
         self._lock = RLock()
-        read_graph(model.dynamics)  # refuses now what could not be compiled later
+        check_compilable(model.dynamics)
 
     def score(
         self,

@@ -11,7 +11,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
-from diransac.simulation.compiler.graph import read_graph
+from diransac.simulation.compiler.graph import check_compilable, read_graph
 from diransac.simulation.compiler.lanes import ARGUMENTS, arranged_lanes, map_signature, run_time_loop
 from diransac.simulation.compiler.machine_code import LANES, MachineCode, Target, compile_function, run_blocks
 
@@ -35,7 +35,7 @@ class Map:
         self._target = target
         self._code: dict[tuple[bool, ...], MachineCode] = {}
         self._lock = Lock()
-        read_graph(self._function)  # refuses now what could not be compiled later
+        check_compilable(self._function)
 
     def __call__(self, *arrays: ArrayLike, threads: int = 1) -> tuple[FloatArray, ...]:
         """Evaluate the function in every row.
@@ -136,7 +136,7 @@ class Scan:
         self._target = target
         self._code: dict[bool, MachineCode] = {}
         self._lock = Lock()
-        self._graph = read_graph(self._function, (2,), reciprocals=True)  # refuses now what could not be compiled later
+        check_compilable(self._function)
 
     def __call__(self, carry: ArrayLike, rows: ArrayLike, constants: ArrayLike, *, threads: int = 1) -> FloatArray:
         """Outputs of every lane and row.
@@ -201,7 +201,7 @@ class Scan:
         from diransac.simulation.compiler.time_loop import LoopSpecification
 
         return LoopSpecification(
-            step=self._graph,
+            step=read_graph(self._function, (2,), reciprocals=True),
             substeps=1,
             n_states=self._function.numel_in(0),
             n_inputs=self._function.numel_in(1),

@@ -19,7 +19,7 @@ from diransac.model.expressions import steps
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-__all__ = ["Graph", "Instruction", "read_graph"]
+__all__ = ["Graph", "Instruction", "check_compilable", "read_graph"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +103,27 @@ class _Builder:
         return self.add(Instruction(name, operands))
 
 
+def check_compilable(function: ca.Function) -> None:
+    """Raises ModelError: a function is not of SX symbols, or has an operation without a vector form."""
+    if not function.is_a("SXFunction"):
+        raise ModelError(
+            f"function {function.name()!r} cannot be compiled: it is a {function.class_name()}, "
+            "not an expression of SX symbols; expand it: Function.expand()."
+        )
+    operations = {function.instruction_id(k) for k in range(function.n_instructions())}
+    if ca.OP_CALL in operations:
+        raise ModelError(
+            f"function {function.name()!r} cannot be compiled: it calls another function (operation CALL), an "
+            "interpolant for example; write it as an expression, or expand it: Function.expand()."
+        )
+    if ca.OP_PARAMETER in operations:
+        free = ", ".join(str(symbol) for symbol in function.free_sx())
+        raise ModelError(
+            f"function {function.name()!r} cannot be compiled: {free} is a symbol that is none of its arguments "
+            "(operation PARAMETER); make it an argument or a number."
+        )
+
+
 def read_graph(function: ca.Function, invariant_inputs: Collection[int] = (), *, reciprocals: bool = False) -> Graph:
     """Expression graph of an SX function, with products fused into sums.
 
@@ -113,13 +134,9 @@ def read_graph(function: ca.Function, invariant_inputs: Collection[int] = (), *,
     reciprocals : divide by an invariant as `x * (1 / p)`, so that the loop only multiplies. The quotient may differ in
         its last two bits, and where `|p|` lies outside 2**-1022 .. 2**1022 its reciprocal over- or underflows
 
-    Raises ModelError: an operation that has no vector form here, by name.
+    Raises ModelError: as `check_compilable`.
     """
-    if not function.is_a("SXFunction"):
-        raise ModelError(
-            f"function {function.name()!r} cannot be compiled: it is a {function.class_name()}, "
-            "not an expression of SX symbols; expand it: Function.expand()."
-        )
+    check_compilable(function)
     instructions, outputs = _read(function)
     graph = _marked(instructions, outputs, frozenset(invariant_inputs))
     if reciprocals:
@@ -145,9 +162,7 @@ def _read(function: ca.Function) -> tuple[list[Instruction], list[list[int]]]:
         elif step.operation == "const":
             moved.append(builder.constant(step.constant))
         else:
-            name = step.operation.upper()
-            _refuse(name, function)
-            moved.append(builder.operation(name, tuple(moved[k] for k in step.operands)))
+            moved.append(builder.operation(step.operation.upper(), tuple(moved[k] for k in step.operands)))
     return builder.instructions, outputs
 
 
@@ -155,21 +170,6 @@ def _dense_elements(sparsity: ca.Sparsity) -> list[int]:
     """Position of each structural non-zero in the dense matrix, column by column."""
     rows, columns = sparsity.get_triplet()
     return [row + column * sparsity.size1() for row, column in zip(rows, columns, strict=True)]
-
-
-def _refuse(name: str, function: ca.Function) -> None:
-    """Raise where an operation has no vector form."""
-    if name == "CALL":
-        raise ModelError(
-            f"function {function.name()!r} cannot be compiled: it calls another function (operation CALL), an "
-            "interpolant for example; write it as an expression, or expand it: Function.expand()."
-        )
-    if name == "PARAMETER":
-        free = ", ".join(str(symbol) for symbol in function.free_sx())
-        raise ModelError(
-            f"function {function.name()!r} cannot be compiled: {free} is a symbol that is none of its arguments "
-            "(operation PARAMETER); make it an argument or a number."
-        )
 
 
 def _marked(instructions: list[Instruction], outputs: Iterable[Iterable[int]], inputs: frozenset[int]) -> Graph:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -264,6 +263,8 @@ def _clear(apart: FloatArray, held_out: float) -> FloatArray:
     """Standard errors ``(n,)`` beyond which a difference of parameters, so many standard errors, is no chance."""
     if held_out <= _WORSE:
         return np.full(len(apart), _CLEAR)
+    from statistics import NormalDist
+
     of_any = NormalDist().inv_cdf(1.0 - 0.5 * _UNLIKELY / len(apart))
     return np.where(np.abs(apart) == np.abs(apart).max(), _LIKELY, min(of_any, _CLEAR))
 

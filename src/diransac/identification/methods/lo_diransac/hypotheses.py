@@ -21,13 +21,13 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.smoothing import without_spikes
-from diransac.identification.nonlinear import NonlinearLeastSquares
 from diransac.identification.regression import regression_rows
 from diransac.identification.sampling import sample_rows
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset, ParameterLayout
+    from diransac.identification.estimators import BoundEstimator
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
@@ -139,7 +139,7 @@ def _linear(
     if missing.any() and dataset.model.is_affine:
         samples[:, missing] = [1.0 if x.positive else 0.0 for x, m in zip(layout.bounds, missing, strict=True) if m]
     elif missing.any():
-        bound = NonlinearLeastSquares().bind(_smoothed_dataset(intervals, motion, dataset))
+        bound = _of_smoothed_motion(intervals, motion, dataset)
         samples[:, missing] = bound.select([np.arange(bound.n_rows)]).fit()[0][missing]
     samples = _admitted(intervals, samples)
     if not len(samples):
@@ -158,7 +158,7 @@ def _nonlinear(
     settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
 ) -> FloatArray:
     """Finalists of any model: nonlinear least squares of all and of random rows of the smoothed motion."""
-    bound = NonlinearLeastSquares().bind(_smoothed_dataset(intervals, motion, dataset))
+    bound = _of_smoothed_motion(intervals, motion, dataset)
     n, n_p = bound.n_rows, intervals.n_p
     rows = sample_rows(seed, np.arange(settings.n_nonlinear_samples), n, 0, min(n, settings.largest_sample * n_p))
     sizes = _generator(seed).integers(n_p, rows.shape[1] + 1, len(rows))
@@ -166,8 +166,10 @@ def _nonlinear(
     return bound.select([np.arange(n), *samples]).fit()
 
 
-def _smoothed_dataset(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -> Dataset:
-    """The dataset with smoothed signals, of which every row counts."""
+def _of_smoothed_motion(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -> BoundEstimator:
+    """Nonlinear least squares over the dataset with smoothed signals, of which every row counts."""
+    from diransac.identification.nonlinear import NonlinearLeastSquares
+
     segments = tuple(
         replace(
             one,
@@ -177,7 +179,7 @@ def _smoothed_dataset(intervals: ShootingIntervals, motion: Motion, dataset: Dat
         )
         for one, rows in zip(dataset.segments, intervals.rows_of_logs, strict=True)
     )
-    return replace(dataset, segments=segments)
+    return NonlinearLeastSquares().bind(replace(dataset, segments=segments))
 
 
 @dataclass(frozen=True)

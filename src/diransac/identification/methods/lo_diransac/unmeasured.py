@@ -15,14 +15,13 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.identification.driven_states import DrivenStates
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.smoothing import Motion
-from diransac.identification.multistart import least_squares
-from diransac.identification.observers import Observers
 
 if TYPE_CHECKING:
+    from diransac.identification.driven_states import DrivenStates
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.observers import Observers
     from diransac.model import Model
 
 __all__ = [
@@ -118,6 +117,8 @@ def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Moti
     Motion or None
         None if every simulation diverges.
     """
+    from diransac.identification.multistart import least_squares
+
     problem = _driven(intervals, motion)
     z, cost = least_squares(problem, problem.starts(), _N_STEPS)
     z, cost = least_squares(problem, z[np.argsort(cost, kind="stable")[:_N_FINALISTS]], _N_FURTHER_STEPS)
@@ -138,6 +139,8 @@ def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion
     Motion or None
         None if every observer diverges.
     """
+    from diransac.identification.multistart import least_squares
+
     problem = _observers(intervals, motion)
     z = problem.starts()
     for width, n_steps, n_kept in _STAGES:
@@ -150,6 +153,8 @@ def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion
 
 def _driven(intervals: ShootingIntervals, motion: Motion) -> DrivenStates:
     """Least squares in units of the spread of the sensors, and of the accelerations as the observers filter them."""
+    from diransac.identification.driven_states import DrivenStates
+
     model, hidden = intervals.model, unmeasured_states(intervals)
     bandwidth = 1.0 / (_MEMORY * intervals.duration)
     others = [i for i, n in enumerate(model.velocities) if n not in hidden]
@@ -177,6 +182,8 @@ def _observers(intervals: ShootingIntervals, motion: Motion) -> Observers:
     Outliers, and what is missing, take the smoothed motion as samples, without weight.  So do velocities that
     kinematics give.
     """
+    from diransac.identification.observers import Observers
+
     model, hidden, measured = intervals.model, unmeasured_states(intervals), measured_signals(intervals)
     corrected = {chain[1] for chain in model.chains if chain[0] in measured and len(chain) > 1}
     sampled = tuple(n for n in model.state if n in measured or (n not in hidden and n not in corrected))
