@@ -10,13 +10,13 @@ import pytest
 import diransac as dr
 from command_line import run
 from diransac.identification.candidate_terms import candidate_terms
-from diransac.identification.suggestions import (
+from diransac.identification.suggestions import with_terms
+from diransac.identification.term_selection import (
     MeanForces,
     SelectedTerm,
     changes_beside,
     select_terms,
     suggestions_of,
-    with_terms,
 )
 from user_models import tumbling
 

@@ -23,14 +23,11 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import ModelError
+from diransac.identification.suggestions import INPUT_GAIN
 from diransac.model import Model
 from diransac.model.derivation import Symbols, call_user
 
-__all__ = ["INPUT_CHANGES", "INPUT_GAIN", "CandidateTerm", "CandidateTerms", "TermLibrary", "candidate_terms"]
-
-INPUT_GAIN = "input gain"
-INPUT_CHANGES = (INPUT_GAIN, "input offset", "curved input", "dead band", "saturation")
-"""Kinds of the terms that change an input."""
+__all__ = ["CandidateTerm", "CandidateTerms", "TermLibrary", "candidate_terms"]
 
 TermLibrary = Callable[[Symbols, Symbols, Symbols], Mapping[str, Any]]
 """A user's candidates: ``library(q, v, u)`` returns expressions by name, each of which is tried in every equation."""

@@ -21,7 +21,6 @@ from diransac.arrays import FloatArray
 from diransac.errors import TimeLimitError
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
-from diransac.identification.methods.lo_diransac.missing_terms import clear_errors_of_inputs
 from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import linearize, with_residuals
 from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
@@ -305,6 +304,8 @@ class LocalSearch:
             fit, likelier = best.refinement.fit, best
             errors = clear_errors(best.intervals, fit, alone, kinds, worth=_WORTH)
             if not best.exact:
+                from diransac.identification.methods.lo_diransac.missing_terms import clear_errors_of_inputs
+
                 errors += clear_errors_of_inputs(best.intervals, fit, best.projected, kinds)
             lag_may_help = True
             for error in errors:

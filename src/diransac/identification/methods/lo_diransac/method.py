@@ -30,7 +30,6 @@ from diransac.identification.methods.lo_diransac.instruments import (
     instrumented_estimate,
 )
 from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
-from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
     discrepancy_units,
@@ -243,6 +242,8 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
     parts, lacks = compared_parts(likeliest, result, settings.prior_inflation), None
     if settings.suggestions and not likeliest.exact:
+        from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
+
         lacks = missing_terms(intervals, refined.fit, result, settings.candidate_terms)
     ambiguity = _ambiguity(parts.changes, lacks, instrumented)
     checks = (

@@ -25,14 +25,7 @@ from diransac.identification.methods.lo_diransac.recording_errors import (
     errors_of_inputs,
 )
 from diransac.identification.methods.lo_diransac.refinement import weights_of
-from diransac.identification.suggestions import (
-    MeanForces,
-    Suggestion,
-    changes_beside,
-    select_terms,
-    spanned,
-    suggestions_of,
-)
+from diransac.identification.term_selection import MeanForces, changes_beside, select_terms, spanned, suggestions_of
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
@@ -40,6 +33,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.methods.lo_diransac.shooting import ErrorKind, ShootingIntervals
+    from diransac.identification.suggestions import Suggestion
     from diransac.model import Model
     from diransac.simulation.compiler import Map
 

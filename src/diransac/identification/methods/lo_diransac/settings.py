@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.errors import SettingsError
-from diransac.identification.candidate_terms import TermLibrary
 from diransac.identification.settings import JUDGING, Settings, check_substeps, check_used
 
 if TYPE_CHECKING:
+    from diransac.identification.candidate_terms import TermLibrary
     from diransac.model import Model
 
 __all__ = ["LoDiransacSettings"]
