@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import chain
 from threading import RLock
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -372,12 +372,18 @@ class Rollouts(Simulator):
             return stage_module(called_dynamics(model))
 
         sizes = repr((len(model.state), model.n_u))
-        return (Part(emit, (sizes, model.dynamics.serialize()), CALLED),) if calls_dynamics(model) else ()
+        return (Part(emit, (sizes, self._dynamics), CALLED),) if calls_dynamics(model) else ()
 
     def _definition(self, unknowns: tuple[str, ...]) -> list[str]:
         """Texts that determine `loop_specification`: all that it reads of the model, and its other arguments."""
         model = self._model
         sizes = (model.n_q, model.n_u, model.n_p, tuple(model.parameters), model.state, model.signals)
         options = (self.signals, unknowns, self._integrator, self._substeps, self._hold)
-        functions = (model.dynamics, model.rate_jacobians) if unknowns else (model.dynamics,)
-        return [repr((sizes, model.quaternions, options)), *(function.serialize() for function in functions)]
+        jacobians = [model.rate_jacobians.serialize()] if unknowns else []
+        return [repr((sizes, model.quaternions, options)), self._dynamics, *jacobians]
+
+    @cached_property
+    def _dynamics(self) -> str:
+        """The dynamics as a text, for the keys of all variants."""
+        text: str = self._model.dynamics.serialize()
+        return text
