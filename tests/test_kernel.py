@@ -277,6 +277,18 @@ def regressor():
     return ca.Function("w", [q, p], [ca.diag(q) * p[0], q / p[1] + ca.sin(q[0]), ca.SX(2, 2)])
 
 
+def test_every_run_of_a_prepared_map_reads_its_arrays():
+    x, y = ca.SX.sym("x", 2), ca.SX.sym("y")
+    f = compile_map(ca.Function("f", [x, y], [ca.sin(x[0]) * y + x[1], y / x[1]]))
+    rng = np.random.default_rng(3)
+    rows, shared = rng.uniform(1.0, 2.0, (11, 2)), rng.uniform(1.0, 2.0, 1)
+    prepared = f.prepare(rows, shared)
+    for _ in range(2):
+        rows[:], shared[:] = rng.uniform(1.0, 2.0, (11, 2)), rng.uniform(1.0, 2.0)
+        for found, expected in zip(prepared.run(), f(rows, shared), strict=True):
+            np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.parametrize("n_rows", [0, 1, 7, 8, 9, 1000])
 def test_map_gives_dense_outputs_of_every_row(n_rows):
     f = regressor()

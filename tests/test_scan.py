@@ -93,6 +93,29 @@ def test_no_lane_gives_no_outputs():
     assert compile_scan(ROTATING)(np.empty((0, 2)), np.empty((0, 5, 3)), np.empty((0, 2))).shape == (0, 5, 4)
 
 
+@pytest.mark.parametrize("n_lanes", [1, 8, 13])
+def test_every_run_of_a_prepared_scan_has_the_bits_of_a_call(n_lanes):
+    scan = compile_scan(ROTATING)
+    prepared = scan.prepare(n_lanes, 6)
+    for seed in range(2):
+        start, rows, constant = task_of(n_lanes, 6, seed)
+        prepared.rows[:] = rows
+        prepared.set_carry(start)
+        prepared.set_constants(constant[:, :1])
+        prepared.set_constants(constant[:, 1:], 1)
+        np.testing.assert_array_equal(prepared.run(), scan(start, rows, constant))
+
+
+@pytest.mark.parametrize("n_lanes", [1, 8, 13])
+def test_a_prepared_scan_gives_the_last_carry(n_lanes):
+    start, rows, constant = task_of(n_lanes, 1)
+    prepared = compile_scan(SUM).prepare(n_lanes, 50)
+    prepared.rows[:] = rows[:, :, :1]
+    prepared.set_carry(start[:, :1])
+    prepared.set_constants(constant[:, :1])
+    np.testing.assert_array_equal(prepared.run()[:, -1, 1:], prepared.last_carry())
+
+
 def test_an_equal_recurrence_is_compiled_once():
     again = ca.Function.deserialize(ROTATING.serialize())
     assert compile_scan(again) is compile_scan(ROTATING)

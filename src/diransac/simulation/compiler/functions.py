@@ -12,7 +12,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
 from diransac.simulation.compiler.graph import check_compilable, read_graph
-from diransac.simulation.compiler.lanes import ARGUMENTS, arranged_lanes, map_signature, run_time_loop
+from diransac.simulation.compiler.lanes import ARGUMENTS, Lanes, arranged_lanes, map_signature, time_loop_arguments
 from diransac.simulation.compiler.machine_code import LANES, MachineCode, Target, compile_function, run_blocks
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler.vectors import Value
 
 
-__all__ = ["Map", "Scan", "compile_map", "compile_scan"]
+__all__ = ["Map", "PreparedMap", "PreparedScan", "Scan", "compile_map", "compile_scan"]
 
 
 class Map:
@@ -35,6 +35,7 @@ class Map:
         self._target = target
         self._code: dict[tuple[bool, ...], MachineCode] = {}
         self._lock = Lock()
+        self._widths_in, self._widths_out = _widths(self._function)
         check_compilable(self._function)
 
     def __call__(self, *arrays: ArrayLike, threads: int = 1) -> tuple[FloatArray, ...]:
@@ -57,22 +58,25 @@ class Map:
         SettingsError
             An array has another shape.
         """
+        return self.prepare(*arrays).run(threads=threads)
+
+    def prepare(self, *arrays: ArrayLike) -> PreparedMap:
+        """Evaluation of the function in every row of these arrays, for many runs.
+
+        Parameters and exceptions are those of a call. Contiguous arrays of float64 are not copied: each run reads what
+        they hold then.
+        """
         inputs, n_rows = self._checked(arrays)
-        shared = tuple(array.ndim == 1 for array in inputs)
-        outputs = tuple(np.empty((n_rows, self._function.numel_out(k))) for k in range(self._function.n_out()))
-        if n_rows:
-            pointers = [array.ctypes.data for array in (*inputs, *outputs)]
-            run_blocks(self._compiled(shared).call, [*pointers, n_rows], -(-n_rows // LANES), threads)
-        return outputs
+        code = self._compiled(tuple(array.ndim == 1 for array in inputs))
+        return PreparedMap(code, inputs, n_rows, self._widths_out)
 
     def _checked(self, arrays: Sequence[ArrayLike]) -> tuple[list[FloatArray], int]:
         """Contiguous arrays, and their common number of rows."""
-        function = self._function
-        if len(arrays) != function.n_in():
-            raise SettingsError(f"function {function.name()!r} takes {function.n_in()} arrays; found {len(arrays)}.")
+        function, widths = self._function, self._widths_in
+        if len(arrays) != len(widths):
+            raise SettingsError(f"function {function.name()!r} takes {len(widths)} arrays; found {len(arrays)}.")
         inputs = [np.ascontiguousarray(array, np.float64) for array in arrays]
         lengths = {len(array) for array in inputs if array.ndim == 2}
-        widths = [function.numel_in(k) for k in range(function.n_in())]
         fits = all(array.ndim in (1, 2) and array.shape[-1] == n for array, n in zip(inputs, widths, strict=True))
         if not fits or len(lengths) > 1:
             raise SettingsError(
@@ -89,11 +93,11 @@ class Map:
             from diransac.simulation.compiler.operations import emit_map_loop
 
             graph = read_graph(function, [k for k, fixed in enumerate(shared) if fixed])
-            return emit_map_loop(graph, [function.numel_in(k) for k in range(function.n_in())])
+            return emit_map_loop(graph, self._widths_in)
 
         with self._lock:
             if shared not in self._code:
-                signature = map_signature(function.n_in() + function.n_out())
+                signature = map_signature(len(self._widths_in) + len(self._widths_out))
                 self._code[shared] = compile_function(emit, definition, "map_loop", signature, self._target)
             return self._code[shared]
 
@@ -124,6 +128,32 @@ def _map(serialized: str, target: Target | None) -> Map:
     return Map(serialized, target)
 
 
+def _widths(function: ca.Function) -> tuple[list[int], list[int]]:
+    """Number of elements of each input and of each output."""
+    inputs = [function.numel_in(k) for k in range(function.n_in())]
+    return inputs, [function.numel_out(k) for k in range(function.n_out())]
+
+
+class PreparedMap:
+    """Evaluation of a `Map` on the same arrays in every run; made by `Map.prepare`.
+
+    Attributes
+    ----------
+    outputs : (n_rows, n_o) each   results, overwritten by each run
+    """
+
+    def __init__(self, code: MachineCode, inputs: Sequence[FloatArray], n_rows: int, widths: Sequence[int]) -> None:
+        self.outputs = tuple(np.empty((n_rows, width)) for width in widths)
+        self._code, self._inputs, self._n_rows = code, inputs, n_rows
+        self._arguments = [*(array.ctypes.data for array in (*inputs, *self.outputs)), n_rows]
+
+    def run(self, *, threads: int = 1) -> tuple[FloatArray, ...]:
+        """Outputs of every row."""
+        if self._n_rows:
+            run_blocks(self._code.call, self._arguments, -(-self._n_rows // LANES), threads)
+        return self.outputs
+
+
 class Scan:
     """A recurrence over rows, many lanes at once; made by `compile_scan`, compiled when first called.
 
@@ -136,6 +166,7 @@ class Scan:
         self._target = target
         self._code: dict[bool, MachineCode] = {}
         self._lock = Lock()
+        self._widths_in, self._widths_out = _widths(self._function)
         check_compilable(self._function)
 
     def __call__(self, carry: ArrayLike, rows: ArrayLike, constants: ArrayLike, *, threads: int = 1) -> FloatArray:
@@ -163,7 +194,7 @@ class Scan:
             An array has another shape, or there is no row.
         """
         start, row, constant = (np.asarray(array, np.float64) for array in (carry, rows, constants))
-        n_c, n_r, n_k = (self._function.numel_in(k) for k in range(3))
+        n_c, n_r, n_k = self._widths_in
         n_lanes, n_rows = len(start) if start.ndim else 0, row.shape[-2] if row.ndim > 1 else 0
         fits = start.shape == (n_lanes, n_c) and constant.shape == (n_lanes, n_k) and n_rows > 0
         if not fits or row.shape not in ((n_rows, n_r), (n_lanes, n_rows, n_r)):
@@ -172,22 +203,31 @@ class Scan:
                 f"(n_rows, {n_r}) with at least one row, and constants (n_lanes, {n_k}); found {start.shape}, "
                 f"{row.shape} and {constant.shape}."
             )
-        series = np.empty((n_lanes, n_rows, self._function.numel_out(1)))
         if not n_lanes:
-            return series
+            return np.empty((0, n_rows, self._widths_out[1]))
         own = np.arange(n_lanes) * n_rows if row.ndim == 3 and n_lanes > 1 else None
         lanes = arranged_lanes((n_k, n_c, n_r), constant, start, row.reshape(-1, n_r), own, n_rows)
-        run_time_loop(self._compiled(lanes.has_windows), lanes, {"series": series}, threads)
-        return series
+        return self._prepared(lanes).run(threads=threads)
+
+    def prepare(self, n_lanes: int, n_rows: int) -> PreparedScan:
+        """Recurrence of this many lanes, each with this many rows of its own, at least one, for many runs."""
+        n_c, n_r, n_k = self._widths_in
+        starts = np.arange(n_lanes) * n_rows if n_lanes > 1 else None
+        constants, carry = np.zeros((n_lanes, n_k)), np.zeros((n_lanes, n_c))
+        rows = np.zeros((n_lanes * n_rows, n_r))
+        return self._prepared(arranged_lanes((n_k, n_c, n_r), constants, carry, rows, starts, n_rows))
+
+    def _prepared(self, lanes: Lanes) -> PreparedScan:
+        return PreparedScan(self._compiled(lanes.has_windows), lanes, self._widths_in[0], self._widths_out[1])
 
     def _compiled(self, windows: bool) -> MachineCode:
         """Machine code for lanes with rows of their own, or with the same ones."""
 
         def emit() -> Value:
-            from diransac.simulation.compiler.outputs import SignalOutput
+            from diransac.simulation.compiler.outputs import ScanOutput
             from diransac.simulation.compiler.time_loop import emit_time_loop, inputs_from_log
 
-            return emit_time_loop(self._specification(), SignalOutput, inputs_from_log, windows=windows)
+            return emit_time_loop(self._specification(), ScanOutput, inputs_from_log, windows=windows)
 
         definition = ("scan", self._serialized, repr(windows))
         with self._lock:
@@ -203,13 +243,54 @@ class Scan:
         return LoopSpecification(
             step=read_graph(self._function, (2,), reciprocals=True),
             substeps=1,
-            n_states=self._function.numel_in(0),
-            n_inputs=self._function.numel_in(1),
-            n_signals=self._function.numel_out(1),
+            n_states=self._widths_in[0],
+            n_inputs=self._widths_in[1],
+            n_signals=self._widths_out[1],
             scored=(),
             quaternions=(),
             state_quaternions=(),
         )
+
+
+class PreparedScan:
+    """Recurrence of a `Scan` on the same arrays in every run; made by `Scan.prepare`.
+
+    Attributes
+    ----------
+    rows : (n_lanes, n_rows, n_r)   rows of each lane; zero until they are set
+    outputs : (n_lanes, n_rows, n_o)   those of a call, overwritten by each run
+    """
+
+    def __init__(self, code: MachineCode, lanes: Lanes, n_c: int, n_o: int) -> None:
+        self.rows = lanes.arrays["inputs"].reshape(-1, lanes.n_rows, lanes.arrays["inputs"].shape[1])
+        self.outputs = np.empty((lanes.n_lanes, lanes.n_rows, n_o))
+        self._final = np.empty((lanes.n_lanes, n_c))
+        self._code, self._lanes = code, lanes
+        self._arguments = time_loop_arguments(lanes, {"series": self.outputs, "final": self._final})
+
+    def set_carry(self, values: FloatArray, first: int = 0) -> None:
+        """Set elements of the initial carry from `first` on to values (n_lanes, n)."""
+        self._set("initial_states", values, first)
+
+    def set_constants(self, values: FloatArray, first: int = 0) -> None:
+        """Set constants from `first` on to values (n_lanes, n)."""
+        self._set("parameters", values, first)
+
+    def _set(self, name: str, values: FloatArray, first: int) -> None:
+        """Set elements of an array of lanes; the last lane fills the last vector."""
+        n_lanes, n = values.shape
+        array = self._lanes.arrays[name][first : first + n]
+        array[:, :n_lanes] = values.T
+        array[:, n_lanes:] = values[-1:].T
+
+    def run(self, *, threads: int = 1) -> FloatArray:
+        """Outputs of every lane and row."""
+        run_blocks(self._code.call, self._arguments, self._lanes.n_padded // LANES, threads)
+        return self.outputs
+
+    def last_carry(self) -> FloatArray:
+        """Carry (n_lanes, n_c) after the last row of the run; NaN in a lane with an output that is not finite."""
+        return self._final
 
 
 def compile_scan(function: ca.Function, target: Target | None = None) -> Scan:
@@ -218,8 +299,8 @@ def compile_scan(function: ca.Function, target: Target | None = None) -> Scan:
     Parameters
     ----------
     function : casadi.Function
-        SX function (carry, row, constants) -> (carry of the next row, outputs). The last carry is returned only if it
-        is among the outputs.
+        SX function (carry, row, constants) -> (carry of the next row, outputs). A call returns the last carry only if
+        it is among the outputs.
     target : Target, optional
         Processor to compile for; this one by default.
 

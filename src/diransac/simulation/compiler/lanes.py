@@ -31,6 +31,7 @@ __all__ = [
     "map_signature",
     "run_time_loop",
     "squared_thresholds",
+    "time_loop_arguments",
 ]
 
 ARGUMENTS = {
@@ -243,14 +244,18 @@ def squared_thresholds(thresholds: ArrayLike, n_signals: int) -> FloatArray:
 
 def run_time_loop(code: MachineCode, lanes: Lanes, values: Mapping[str, Any], threads: int) -> None:
     """Run a compiled time loop over all blocks of lanes; `values` are its other arguments by name, 0 where absent."""
+    run_blocks(code.call, time_loop_arguments(lanes, values), lanes.n_padded // LANES, threads)
+
+
+def time_loop_arguments(lanes: Lanes, values: Mapping[str, Any]) -> list[Any]:
+    """Arguments of the compiled time loop, all but the blocks; arrays as addresses, which do not keep them alive."""
     sizes = {"n_lanes": lanes.n_lanes, "n_padded": lanes.n_padded, "n_rows": lanes.n_rows}
     known = {**lanes.arrays, **values, **sizes}
-    arguments = [
+    return [
         array.ctypes.data if isinstance(array := known.get(name), np.ndarray) else array or 0
         for name in ARGUMENTS
         if not name.endswith("_block")
     ]
-    run_blocks(code.call, arguments, lanes.n_padded // LANES, threads)
 
 
 def aligned(shape: tuple[int, ...]) -> FloatArray:

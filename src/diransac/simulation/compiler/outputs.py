@@ -20,6 +20,7 @@ __all__ = [
     "ErrorOutput",
     "GaussNewtonOutput",
     "LinearizedErrorOutput",
+    "ScanOutput",
     "ScoreOutput",
     "SignalOutput",
 ]
@@ -304,20 +305,8 @@ class SignalOutput(_SeriesOutput):
         return row.signals
 
 
-class ClosedLoopOutput(_SeriesOutput):
-    """All signals, then the inputs."""
-
-    def values(self, block: Block, row: LoopRow) -> list[Value]:
-        """All signals, then the inputs."""
-        return [*row.signals, *row.inputs]
-
-
-class ErrorOutput(_SeriesOutput):
-    """Errors of the scored signals, and `final` states (n_lanes, n_states), NaN in a lane that diverged."""
-
-    def values(self, block: Block, row: LoopRow) -> list[Value]:
-        """Errors of the scored signals."""
-        return self.errors(block, row)
+class _FinalOutput(_SeriesOutput):
+    """A series, and `final` states (n_lanes, n_states), NaN in a lane that diverged."""
 
     def end(self, block: Block) -> None:
         """Write a block's state after its last row."""
@@ -327,6 +316,30 @@ class ErrorOutput(_SeriesOutput):
             place = builder.mul(own, integer(len(final)))
             for k, value in enumerate(final):
                 v.store(v.lane(value, lane), self.arguments["final"], builder.add(place, integer(k)))
+
+
+class ScanOutput(_FinalOutput):
+    """All signals, and `final` states."""
+
+    def values(self, block: Block, row: LoopRow) -> list[Value]:
+        """All signals."""
+        return row.signals
+
+
+class ClosedLoopOutput(_SeriesOutput):
+    """All signals, then the inputs."""
+
+    def values(self, block: Block, row: LoopRow) -> list[Value]:
+        """All signals, then the inputs."""
+        return [*row.signals, *row.inputs]
+
+
+class ErrorOutput(_FinalOutput):
+    """Errors of the scored signals, and `final` states."""
+
+    def values(self, block: Block, row: LoopRow) -> list[Value]:
+        """Errors of the scored signals."""
+        return self.errors(block, row)
 
 
 class LinearizedErrorOutput(_SeriesOutput):
