@@ -63,9 +63,9 @@ def test_second_derivatives_are_those_of_the_first(problem):
         jacobian = dense(program.jacobian_entries, program.jacobian(x), (len(multipliers), n))
         return factor * program.gradient(x) + multipliers @ jacobian
 
-    hessian = dense(program.hessian_entries, program.hessian(at, factor, multipliers), (n, n))
-    np.testing.assert_array_equal(hessian, hessian.T)
-    np.testing.assert_allclose(hessian, differences(gradient, at), atol=1e-6)
+    triangle = dense(program.hessian_entries, program.hessian(at, factor, multipliers), (n, n))
+    np.testing.assert_array_equal(triangle, np.triu(triangle))
+    np.testing.assert_allclose(triangle, np.triu(differences(gradient, at)), atol=1e-6)
 
 
 def test_every_unknown_and_constraint_stands_in_one_place(problem):

@@ -226,9 +226,8 @@ def trajectory_of(
 ) -> Trajectory:
     """Trajectory of a solution at fixed times, each interval integrated from its knot; the last input is repeated."""
     steps, layout = program.numbers.steps, program.layout
-    moments = program.advance(unknowns)[:-1].transpose(1, 0, 2)
     states, inputs = program.split(unknowns)
-    rows = np.concatenate([moments[steps > 0.0], states[-1:]])
+    rows = np.concatenate([program.steps(unknowns)[steps > 0.0], states[-1:]])
     held = np.repeat(inputs, (steps > 0.0).sum(axis=1), axis=0)
     return Trajectory(
         start + task.dt * np.arange(len(rows), dtype=np.float64),

@@ -225,21 +225,19 @@ class _Structure:
     def __init__(self, program: Program) -> None:
         n, m = program.layout.n_unknowns, program.layout.n_constraints
         self.n_unknowns, self.n_constraints = n, m
-        jacobian, hessian = program.jacobian_entries, program.hessian_entries
-        triangle = hessian[0] <= hessian[1]
-        sorted_jacobian = _sorted(jacobian, (m, n))
-        sorted_hessian = _sorted(hessian, (n, n))
-        sorted_triangle = _sorted((hessian[0][triangle], hessian[1][triangle]), (n, n))
-        every = slice(None)
-        self.parts: dict[str, tuple[ca.Sparsity, Any]] = {
-            "f": (ca.Sparsity.dense(1, 1), every),
-            "g": (ca.Sparsity.dense(m, 1), every),
-            "grad_f_x": (ca.Sparsity.dense(n, 1), every),
-            "grad_gamma_x": (ca.Sparsity.dense(n, 1), every),
-            "grad_gamma_p": (ca.Sparsity.dense(0, 1), every),
-            "jac_g_x": sorted_jacobian,
-            "hess_gamma_x_x": sorted_hessian,
-            "triu_hess_gamma_x_x": (sorted_triangle[0], np.flatnonzero(triangle)[sorted_triangle[1]]),
+        (rows, columns), (upper, right) = program.jacobian_entries, program.hessian_entries
+        lower = np.flatnonzero(upper < right)
+        both = np.concatenate([upper, right[lower]]), np.concatenate([right, upper[lower]])
+        whole, mirrored = _sorted(both, (n, n))
+        self.parts: dict[str, tuple[ca.Sparsity, IntArray]] = {
+            "f": _column(1),
+            "g": _column(m),
+            "grad_f_x": _column(n),
+            "grad_gamma_x": _column(n),
+            "grad_gamma_p": _column(0),
+            "jac_g_x": _sorted((rows, columns), (m, n)),
+            "hess_gamma_x_x": (whole, np.concatenate([np.arange(len(upper)), lower])[mirrored]),
+            "triu_hess_gamma_x_x": _sorted((upper, right), (n, n)),
         }
 
 
@@ -335,10 +333,16 @@ class _Evaluation(ca.Callback):
         try:
             # Derivatives stand last and are computed first; values are by-products of them.
             for name, buffer in reversed(wanted):
-                buffer[:] = self._values(name, given[0], factor, multipliers)[self._structure.parts[name][1]]
+                values = self._values(name, given[0], factor, multipliers)
+                values.take(self._structure.parts[name][1], out=buffer, mode="clip")
         except BaseException:  # noqa: BLE001 - CasADi would print it; `_run` raises it
             return 1
         return 0
+
+
+def _column(n: int) -> tuple[ca.Sparsity, IntArray]:
+    """Sparsity of a dense column, and the order of its entries."""
+    return ca.Sparsity.dense(n, 1), np.arange(n)
 
 
 def _sorted(entries: tuple[IntArray, IntArray], shape: tuple[int, int]) -> tuple[ca.Sparsity, IntArray]:

@@ -10,13 +10,13 @@ Symbols of a stage: ``s`` its state, ``u`` its input, ``z = [s; u]``; ``Z = ds/d
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, IntArray
 from diransac.simulation.compiler import Map, Scan, compile_map, compile_scan
 from diransac.simulation.integrators import INTEGRATORS
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from diransac.model import Model
 
 
-__all__ = ["Costs", "Interval", "Stage", "stage_of"]
+__all__ = ["Costs", "Stage", "Stages", "stage_of"]
 
 
 @dataclass(frozen=True)
@@ -48,91 +48,110 @@ class Costs:
     time: float
 
 
-@dataclass(frozen=True)
-class Interval:
-    """Integrated intervals of a plan, with derivatives.
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """Compiled step, cost and derivatives of one model, from `stage_of`; `Stages` evaluates them.
+
+    Second derivatives are upper triangles (n_z (n_z + 1) / 2,), column by column.
 
     Parameters
     ----------
-    states : (n_steps + 1, N, n_s)   at the start of each step, and at the end
-    transitions : (n_steps + 1, N, n_z, n_s)   Z transposed, at the same moments
-    """
-
-    states: FloatArray
-    transitions: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """Compiled steps, costs and derivatives of one model, from `stage_of`.
-
-    Shapes: N stages, n_s states (with free time the duration of the segment is the last), n_z = n_s + n_u, M steps.
+    n_s, n_u : number of states, of which the last is the duration of the segment with free time, and of inputs
+    step : recurrence over the steps of an interval; carries [s; Z], and outputs it before each step
+    adjoint : recurrence from the last step to the first; carries the derivatives by s of multipliers times the state
+        after the interval, and outputs them after each step
+    curvature : a step's share of the second derivatives by z of multipliers times the state after the interval
+    cost : cost of a knot and its interval, gradient, second derivatives
     """
 
     n_s: int
     n_u: int
-    _step: Scan
-    _sensitivities: Scan
-    _adjoint: Scan
-    _curvature: Map
-    _cost: Map
+    step: Scan
+    adjoint: Scan
+    curvature: Map
+    cost: Map
 
     @property
     def n_z(self) -> int:
         """States and inputs of a stage."""
         return self.n_s + self.n_u
 
-    def advance(self, states: FloatArray, inputs: FloatArray, parameters: FloatArray, steps: FloatArray) -> FloatArray:
-        """States (M + 1, N, n_s) before each step and after the last; steps (N, M) in s, or shares of the duration."""
-        after = self._step(states, steps[:, :, None], _constants(inputs, parameters))
-        return np.concatenate([states[None], after.swapaxes(0, 1)])
+    @cached_property
+    def triangle(self) -> tuple[IntArray, IntArray]:
+        """Row and column of every entry of an upper triangle, column by column."""
+        columns, rows = np.tril_indices(self.n_z)
+        return rows, columns
 
-    def linearize(self, states: FloatArray, inputs: FloatArray, parameters: FloatArray, steps: FloatArray) -> Interval:
-        """Intervals: the states of `advance` with their derivatives."""
-        identity = np.broadcast_to(np.eye(self.n_z, self.n_s).ravel(), (len(states), self.n_z * self.n_s))
-        start = np.hstack([states, identity])
-        after = self._sensitivities(start, steps[:, :, None], _constants(inputs, parameters))
-        moments = np.concatenate([start[None], after.swapaxes(0, 1)])
-        transitions = moments[..., self.n_s :].reshape(*moments.shape[:2], self.n_z, self.n_s)
-        return Interval(np.ascontiguousarray(moments[..., : self.n_s]), transitions)
 
-    def curvature(
-        self, interval: Interval, inputs: FloatArray, parameters: FloatArray, steps: FloatArray, multipliers: FloatArray
-    ) -> FloatArray:
-        """Second derivatives (N, n_z, n_z) of ``multipliers . state after the interval``; multipliers (N, n_s)."""
-        n_steps, n_stages = steps.shape[1], len(steps)
-        adjoints = np.empty((n_steps, n_stages, self.n_s))
-        adjoints[-1] = multipliers
-        if n_steps > 1:
-            backward = np.concatenate([steps[:, :0:-1, None], interval.states[-2:0:-1].swapaxes(0, 1)], axis=-1)
-            before = self._adjoint(multipliers, backward, _constants(inputs, parameters))
-            adjoints[-2::-1] = before.swapaxes(0, 1)
-        rows = n_steps * n_stages
-        (blocks,) = self._curvature(
-            interval.states[:-1].reshape(rows, self.n_s),
-            np.tile(inputs, (n_steps, 1)),
-            parameters,
-            np.ascontiguousarray(steps.T).reshape(rows, 1),
-            adjoints.reshape(rows, self.n_s),
-            interval.transitions[:-1].reshape(rows, -1),
-        )
-        triangle: FloatArray = blocks.reshape(n_steps, n_stages, self.n_z, self.n_z).sum(axis=0)
-        return triangle + triangle.transpose(0, 2, 1) - triangle * np.eye(self.n_z)
+class Stages:
+    """Values and derivatives of the N stages of a plan, each of M steps, at one point after the other.
 
-    def cost(
-        self, states: FloatArray, inputs: FloatArray, lengths: FloatArray, costs: Costs
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cost (n_knots,), its gradient (n_knots, n_z) and its second derivatives (n_knots, n_z, n_z).
+    Arrays are made once; a result is overwritten when it is computed at the next point.
+
+    Parameters
+    ----------
+    parameters : (n_p,)   each parameter's unit
+    steps : (N, M)   s, or shares of the duration of the segment where time is free
+    costs : the objective
+    """
+
+    def __init__(self, stage: Stage, parameters: FloatArray, steps: FloatArray, costs: Costs) -> None:
+        n_stages, n_steps = steps.shape
+        n_s, n_z, n_u = stage.n_s, stage.n_z, stage.n_u
+        self._sizes = n_stages, n_steps, n_z, n_s
+        self._step, self._adjoint = (scan.prepare(n_stages, n_steps) for scan in (stage.step, stage.adjoint))
+        self._step.set_carry(_each(np.eye(n_z, n_s).ravel(), n_stages), n_s)
+        self._step.rows[..., 0], self._adjoint.rows[..., 0] = steps, steps[:, ::-1]
+        for scan in (self._step, self._adjoint):
+            scan.set_constants(_each(parameters, n_stages), n_u)
+        self._inputs_of_steps, self._adjoints = (np.zeros((n_stages, n_steps, n)) for n in (n_u, n_s))
+        arrays = self._step.outputs, self._inputs_of_steps, steps, self._adjoints
+        moved, inputs, lengths, adjoints = (array.reshape(n_stages * n_steps, -1) for array in arrays)
+        self._curvature = stage.curvature.prepare(moved, inputs, parameters, lengths, adjoints)
+        self._states, self._inputs = np.zeros((n_stages + 1, n_s)), _each(costs.trim, n_stages + 1).copy()
+        self._cost = stage.cost.prepare(
+            self._states, self._inputs, np.append(steps.sum(axis=1), 0.0)[:, None], costs.reference, costs.weights,
+            costs.input_weights, costs.trim, np.array([costs.time]),
+        )  # fmt: skip
+
+    def move(self, states: FloatArray, inputs: FloatArray) -> None:
+        """Move to the point with these states (N + 1, n_s) of the knots and inputs (N, n_u) of the intervals."""
+        self._states[:], self._inputs[:-1] = states, inputs
+        self._step.set_carry(states[:-1])
+        self._inputs_of_steps[:] = inputs[:, None]
+        for scan in (self._step, self._adjoint):
+            scan.set_constants(inputs)
+
+    def integrate(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """States (N, M, n_s) before each step; states (N, n_s) and Z transposed (N, n_z, n_s) after the last one."""
+        n_stages, _, n_z, n_s = self._sizes
+        before, after = self._step.run(), self._step.last_carry()
+        return before[..., :n_s], after[:, :n_s], after[:, n_s:].reshape(n_stages, n_z, n_s)
+
+    def curvature(self, multipliers: FloatArray) -> FloatArray:
+        """Second derivatives (N, n_z (n_z + 1) / 2) of multipliers times the state after the interval.
+
+        Only after `integrate` at the same point.
 
         Parameters
         ----------
-        lengths : (n_knots,)   of each knot's interval: s, or a share of the duration where time is free
+        multipliers : (N, n_s)
         """
-        values, gradients, curvatures = self._cost(
-            states, inputs, _column(lengths), costs.reference, costs.weights, costs.input_weights, costs.trim,
-            np.array([costs.time]),
-        )  # fmt: skip
-        return values[:, 0], gradients, curvatures.reshape(-1, self.n_z, self.n_z)
+        n_stages, n_steps, _, n_s = self._sizes
+        self._adjoint.rows[..., 1:] = self._step.outputs[:, ::-1, :n_s]
+        self._adjoint.set_carry(multipliers)
+        self._adjoints[:] = self._adjoint.run()[:, ::-1]
+        (shares,) = self._curvature.run()
+        triangles: FloatArray = shares.reshape(n_stages, n_steps, -1).sum(axis=1)
+        return triangles
+
+    def cost(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Cost (N + 1,) of each knot and its interval, gradient (N + 1, n_z), second derivatives.
+
+        There is no interval after the last knot.
+        """
+        values, gradients, triangles = self._cost.run()
+        return values[:, 0], gradients, triangles
 
 
 @lru_cache(maxsize=32)
@@ -140,31 +159,24 @@ def stage_of(model: Model, free_time: bool) -> Stage:
     """Compiled stage of a model; the same one again for an equal model."""
     n_s = len(model.state) + free_time
     s, u, p, c = (ca.SX.sym(n, size) for n, size in (("s", n_s), ("u", model.n_u), ("p", model.n_p), ("c", 1)))
-    arguments = [s, u, p, c]
-    z = ca.vertcat(s, u)
+    z, constants = ca.vertcat(s, u), ca.vertcat(u, p)
     after = _stepped(model, s, u, p, c, free_time)
     jacobian = ca.jacobian(after, z)
-    multipliers = ca.SX.sym("l", n_s)
-    Z = ca.SX.sym("Z", n_s, z.numel())
+    multipliers, Z = ca.SX.sym("l", n_s), ca.SX.sym("Z", n_s, z.numel())
     whole = ca.vertcat(Z, ca.horzcat(ca.SX(model.n_u, n_s), ca.SX.eye(model.n_u)))
     curved = ca.hessian(ca.dot(multipliers, after), z)[0]
-    constants = ca.vertcat(u, p)
-    moved = ca.vertcat(after, ca.vec(ca.densify(jacobian @ whole)))
-    before = jacobian[:, :n_s].T @ multipliers
-    scans = {
-        "step": ([s, c, constants], after),
-        "sensitivities": ([ca.vertcat(s, ca.vec(Z)), c, constants], moved),
-        "adjoint": ([multipliers, ca.vertcat(c, s), constants], before),
-    }
-    maps = {
-        "curvature": ([*arguments, multipliers, Z], [ca.triu(whole.T @ (curved @ whole))]),
-        "cost": _cost_of(len(model.state), s, u, free_time),
-    }
-    step, sensitivities, adjoint = (
-        compile_scan(_function(name, parts, [result, result])) for name, (parts, result) in scans.items()
+    start, end = ca.vertcat(s, ca.vec(Z)), ca.vertcat(after, ca.vec(ca.densify(jacobian @ whole)))
+    step = [start, c, constants], [end, start]
+    adjoint = [multipliers, ca.vertcat(c, s), constants], [jacobian[:, :n_s].T @ multipliers, multipliers]
+    curvature = [start, u, p, c, multipliers], [_upper(whole.T @ (curved @ whole))]
+    return Stage(
+        n_s,
+        model.n_u,
+        compile_scan(_function("step", *step)),
+        compile_scan(_function("adjoint", *adjoint)),
+        compile_map(_function("curvature", *curvature)),
+        compile_map(_function("cost", *_cost_of(len(model.state), s, u, free_time))),
     )
-    curvature, cost = (compile_map(_function(name, *parts)) for name, parts in maps.items())
-    return Stage(n_s, model.n_u, step, sensitivities, adjoint, curvature, cost)
 
 
 def _stepped(model: Model, s: ca.SX, u: ca.SX, p: ca.SX, c: ca.SX, free_time: bool) -> ca.SX:
@@ -191,17 +203,18 @@ def _cost_of(n_x: int, s: ca.SX, u: ca.SX, free_time: bool) -> tuple[list[ca.SX]
     x = s[:n_x]
     cost = tau * (time + ca.dot(input_weights, (u - trim) ** 2)) + ca.dot(weights, (x - reference) ** 2)
     curved, gradient = ca.hessian(cost, ca.vertcat(s, u))
-    return [s, u, length, reference, weights, input_weights, trim, time], [cost, gradient, curved]
+    return [s, u, length, reference, weights, input_weights, trim, time], [cost, gradient, _upper(curved)]
+
+
+def _upper(matrix: ca.SX) -> ca.SX:
+    """Upper triangle of a matrix, column by column."""
+    return ca.triu(ca.densify(matrix)).nz[:]
 
 
 def _function(name: str, arguments: Sequence[ca.SX], results: Sequence[ca.SX]) -> ca.Function:
     return ca.Function(name, list(arguments), ca.cse([ca.densify(result) for result in results]))
 
 
-def _constants(inputs: FloatArray, parameters: FloatArray) -> FloatArray:
-    """Constants of a stage over its steps: input and parameters (N, n_u + n_p)."""
-    return np.hstack([inputs, np.broadcast_to(parameters, (len(inputs), len(parameters)))])
-
-
-def _column(values: FloatArray) -> FloatArray:
-    return np.ascontiguousarray(values).reshape(-1, 1)
+def _each(values: FloatArray, n: int) -> FloatArray:
+    """Row of values, n times."""
+    return np.broadcast_to(values, (n, len(values)))

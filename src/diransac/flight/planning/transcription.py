@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.flight.planning.stage import Costs, Interval, Stage
+from diransac.flight.planning.stage import Costs, Stage, Stages
 
 __all__ = ["Layout", "Numbers", "Program"]
 
@@ -150,12 +150,17 @@ class Numbers:
 
 
 class Program:
-    """Values and exact derivatives of one nonlinear program, as flat arrays in the order of its sparsity."""
+    """Values and exact derivatives of one nonlinear program, as flat arrays in the order of its sparsity.
+
+    Solvers evaluate every function at the same point: costs and intervals are computed once per point.
+    """
 
     def __init__(self, stage: Stage, layout: Layout, numbers: Numbers) -> None:
         self.stage, self.layout, self.numbers = stage, layout, numbers
+        self._stages = Stages(stage, numbers.parameters, numbers.steps, numbers.costs)
         self._at = np.zeros(0)
-        self._interval: Interval | None = None
+        self._costs: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._intervals: tuple[FloatArray, FloatArray, FloatArray] | None = None
 
     # ------------------------------------------------------------------ values
 
@@ -163,10 +168,9 @@ class Program:
         """States (N + 1, n_s) and inputs (N, n_u)."""
         return unknowns[self.layout.states], unknowns[self.layout.inputs]
 
-    def advance(self, unknowns: FloatArray) -> FloatArray:
-        """States (M + 1, N, n_s) before each integration step of every interval, and after the last."""
-        states, inputs = self.split(unknowns)
-        return self.stage.advance(states[:-1], inputs, self.numbers.parameters, self.numbers.steps)
+    def steps(self, unknowns: FloatArray) -> FloatArray:
+        """States (N, M, n_s) before each integration step of every interval."""
+        return self._integrated(unknowns)[0]
 
     def objective(self, unknowns: FloatArray) -> float:
         """Cost of all knots and intervals."""
@@ -182,8 +186,7 @@ class Program:
 
     def constraints(self, unknowns: FloatArray) -> FloatArray:
         """Defects and distances from the waypoints (n_constraints,), all zero in a solution."""
-        layout, known = self.layout, self._known(unknowns)
-        after = (self.advance(unknowns) if known is None else known.states)[-1].copy()
+        layout, after = self.layout, self._integrated(unknowns)[1].copy()
         after[layout.ends_segment, layout.n_x :] = unknowns[layout.next_durations][:, None]
         values = np.empty(layout.n_constraints)
         values[layout.defects] = unknowns[layout.states[1:]] - after
@@ -206,31 +209,32 @@ class Program:
     def jacobian(self, unknowns: FloatArray) -> FloatArray:
         """Jacobian of the constraints."""
         layout = self.layout
-        blocks = -self._linearized(unknowns).transitions[-1]
+        blocks = -self._integrated(unknowns)[2]
         blocks[layout.ends_segment, :, layout.n_x :] = 0.0
-        others = np.ones(layout.defects.size + len(layout.pins) + len(layout.next_durations))
-        others[len(others) - len(layout.next_durations) :] = -1.0
-        return np.concatenate([blocks.ravel(), others])
+        return np.concatenate([blocks.ravel(), self._constant_entries])
 
     @cached_property
     def hessian_entries(self) -> tuple[IntArray, IntArray]:
-        """Row and column of every entry of the Lagrangian's Hessian, both triangles, in the order of `hessian`."""
-        layout, n_z = self.layout, self.stage.n_z
-        rows = [np.repeat(self._stage_unknowns, n_z, axis=1), np.repeat(layout.states[-1], layout.n_s)]
-        columns = [np.tile(self._stage_unknowns, (1, n_z)), np.tile(layout.states[-1], layout.n_s)]
-        return np.concatenate([a.ravel() for a in rows]), np.concatenate([a.ravel() for a in columns])
+        """Row and column of every entry of the Lagrangian's Hessian, its upper triangle, in the order of `hessian`."""
+        layout, (rows, columns) = self.layout, self.stage.triangle
+        stages, last = self._stage_unknowns, layout.states[-1]
+        n = layout.n_s * (layout.n_s + 1) // 2
+        return (
+            np.concatenate([stages[:, rows].ravel(), last[rows[:n]]]),
+            np.concatenate([stages[:, columns].ravel(), last[columns[:n]]]),
+        )
 
     def hessian(self, unknowns: FloatArray, objective_factor: float, multipliers: FloatArray) -> FloatArray:
-        """Hessian of ``objective_factor * objective + multipliers . constraints``."""
-        layout, numbers = self.layout, self.numbers
-        costs = objective_factor * self._cost(unknowns)[2]
+        """Upper triangle of the Hessian of ``objective_factor * objective + multipliers . constraints``."""
+        layout = self.layout
         # The duration after a segment's end belongs to the next segment: it has no curvature here.
         weights = -multipliers[layout.defects]
         weights[layout.ends_segment, layout.n_x :] = 0.0
-        _, inputs = self.split(unknowns)
-        interval = self._linearized(unknowns)
-        blocks = costs[:-1] + self.stage.curvature(interval, inputs, numbers.parameters, numbers.steps, weights)
-        return np.concatenate([blocks.ravel(), costs[-1, : layout.n_s, : layout.n_s].ravel()])
+        entries = (objective_factor * self._cost(unknowns)[2]).ravel()
+        self._integrated(unknowns)
+        curved = self._stages.curvature(weights)
+        entries[: curved.size] += curved.ravel()
+        return entries[: curved.size + layout.n_s * (layout.n_s + 1) // 2]
 
     # ------------------------------------------------------------------ parts
 
@@ -239,22 +243,29 @@ class Program:
         """Unknowns (N, n_z) of the state and input of each stage."""
         return np.hstack([self.layout.states[:-1], self.layout.inputs])
 
+    @cached_property
+    def _constant_entries(self) -> FloatArray:
+        """Entries of the Jacobian after those of the transitions."""
+        layout = self.layout
+        return np.repeat([1.0, -1.0], [layout.defects.size + len(layout.pins), len(layout.next_durations)])
+
     def _cost(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cost of every knot and its derivatives; after the last there is no interval."""
-        states, inputs = self.split(unknowns)
-        lengths = np.append(self.numbers.steps.sum(axis=1), 0.0)
-        last = self.numbers.costs.trim[None]
-        return self.stage.cost(states, np.concatenate([inputs, last]), lengths, self.numbers.costs)
+        """Cost of every knot and its derivatives."""
+        self._move(unknowns)
+        if self._costs is None:
+            self._costs = self._stages.cost()
+        return self._costs
 
-    def _linearized(self, unknowns: FloatArray) -> Interval:
-        """Intervals with derivatives, cached: solvers evaluate Jacobian and Hessian at the same point."""
-        interval = self._known(unknowns)
-        if interval is None:
-            (states, inputs), numbers = self.split(unknowns), self.numbers
-            interval = self.stage.linearize(states[:-1], inputs, numbers.parameters, numbers.steps)
-            self._at, self._interval = unknowns.copy(), interval
-        return interval
+    def _integrated(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """States before each step, and states and their derivatives after the intervals."""
+        self._move(unknowns)
+        if self._intervals is None:
+            self._intervals = self._stages.integrate()
+        return self._intervals
 
-    def _known(self, unknowns: FloatArray) -> Interval | None:
-        """Cached intervals of these unknowns; None for others."""
-        return self._interval if np.array_equal(self._at, unknowns) else None
+    def _move(self, unknowns: FloatArray) -> None:
+        """Move to a point, unless this is it."""
+        if not np.array_equal(self._at, unknowns):
+            self._costs = self._intervals = None
+            self._stages.move(*self.split(unknowns))
+            self._at = unknowns.copy()
