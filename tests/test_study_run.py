@@ -19,6 +19,7 @@ import diransac as dr
 from diransac.study import connected, load, paths, status, trials
 from diransac.study import data as data_module
 from diransac.study.data import derived_seed
+from diransac.study.specification import Missions
 from studies import TINY, TINY_TOML, command, rows, tiny
 
 PLANT = load(TINY).plant.plant
@@ -105,6 +106,20 @@ def test_without_noise_the_parameters_are_found_and_the_reference_is_flown(whole
         if key[0] == "0":
             assert row["parameter_inertia"] == pytest.approx(PLANT.parameters["inertia"], rel=1e-9)
             assert max(errors_of(row).values()) < 1e-6
+
+
+def test_exact_estimates_share_the_plan_of_the_plants_own_parameters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    plain, planned = Missions.planned, []
+
+    def counted(self: Missions, mission: str, plant: dr.Plant, **options: object) -> dr.Trajectory:
+        planned.append(dict(plant.parameters))
+        return plain(self, mission, plant, **options)
+
+    monkeypatch.setattr(Missions, "planned", counted)
+    found = run(tmp_path, tiny(seed=8), levels=[0], methods=["true", "ols"])
+    exact = {tuple(row[f"parameter_{name}"] for name in PLANT.model.parameters) for row in found.values()}
+    assert len(exact) > 1
+    assert planned == [dict(PLANT.parameters)]
 
 
 def test_the_true_method_identifies_nothing(whole: dict):

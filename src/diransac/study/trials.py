@@ -50,6 +50,9 @@ STAGES = ("record", "identify", "plan", "steer", "fly")
 _INTERVAL = 0.95
 """Level of the intervals that are kept where parameters are evaluated."""
 
+_ROUNDING = 1e-10
+"""Relative difference of parameters below which they have the same plan, to about 1e-12 in states and inputs."""
+
 _PACKAGES = ("diransac", "casadi", "llvmlite", "numpy", "scipy")
 
 
@@ -238,18 +241,27 @@ def _plans(cases: Sequence[_Case], shape: str) -> dict[int, Trajectory]:
     for case in cases:
         assert case.found is not None
         with case.attempt("plan"):
-            plan = _planned(case.point, shape, tuple(case.found.parameters.values()))
+            plan = _planned(case.point, shape, _to_plan_with(case.found, case.point.plant))
             if isinstance(plan, DiransacError):
                 raise PlanningError(f"{shape}: {plan}")
             plans[id(case)] = plan
     return plans
 
 
+def _to_plan_with(found: Plant, plant: Plant) -> tuple[float, ...]:
+    """Parameters of a case in the model's order; the plant's own where the difference is rounding.
+
+    Without noise most estimates are exact but for rounding, each in its own way, and then their plans are, too.
+    """
+    estimates, own = (tuple(one.parameters[name] for name in plant.model.parameters) for one in (found, plant))
+    return own if np.allclose(estimates, own, rtol=_ROUNDING, atol=0.0) else estimates
+
+
 @lru_cache(maxsize=64)
 def _planned(point: _Point, shape: str, parameters: tuple[float, ...]) -> Trajectory | DiransacError:
     """The plan for these parameters from the planner's own first guess, or its error.
 
-    Plans are shared: the true parameters are the same in every trial, and so are estimates from equal logs.
+    Plans are shared: the plant's own parameters are the same in every trial, and so are estimates from equal logs.
     """
     model = point.plant.model
     plant = Plant(model, dict(zip(model.parameters, parameters, strict=True)))
