@@ -13,6 +13,7 @@ With known sigma this is the exact posterior mean of the linear-Gaussian model (
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, Self, cast
@@ -330,11 +331,11 @@ class _BoundSums:
 
     def _gram(self, row_sets: Sequence[IntArray]) -> FloatArray:
         """Sums ``(n_sets, n + 1, n + 1)``, each in the order of its rows."""
-        sums = np.empty((len(row_sets), self._blocks.shape[1]))
-        lengths = np.array([len(rows) for rows in row_sets])
-        for length in np.unique(lengths):
-            alike = np.flatnonzero(lengths == length).tolist()
-            rows = np.stack([row_sets[i] for i in alike], axis=1)
+        sums, by_length = np.empty((len(row_sets), self._blocks.shape[1])), defaultdict[int, list[int]](list)
+        for place, own in enumerate(row_sets):
+            by_length[len(own)].append(place)
+        for alike in by_length.values():
+            rows = np.stack([row_sets[place] for place in alike], axis=1)
             sums[alike] = np.add.reduce(np.take(self._blocks, rows, axis=0), axis=0)
         gram = np.empty((len(row_sets), self._n_p + 1, self._n_p + 1))
         i, j = self._upper

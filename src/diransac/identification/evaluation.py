@@ -260,6 +260,35 @@ def stretches_of(one: Segment, rule: str | Mapping[str, float]) -> tuple[Stretch
     return (Stretch(first, rule), *(Stretch(rows, later) for rows in others))
 
 
+@dataclass(frozen=True)
+class _Run:
+    """Data of the simulation of a stretch: all but its parameters.
+
+    Parameters
+    ----------
+    rows : slice
+        Rows of the log.
+    state : (n_x,) array
+        State at the first row.
+    inputs : (N, n_u) array
+    measured : Measurements
+    is_complete : bool
+        True if no signal is missing in a row that counts.
+    """
+
+    rows: slice
+    state: FloatArray
+    inputs: FloatArray
+    measured: Measurements
+    is_complete: bool
+
+    @classmethod
+    def of(cls, rows: slice, state: FloatArray, inputs: FloatArray, measured: Measurements) -> _Run:
+        """Run over some rows of a log."""
+        own = Measurements(measured.values[rows], measured.valid[rows])
+        return cls(rows, state, inputs[rows], own, not np.isnan(own.values[own.valid]).any())
+
+
 class Simulation:
     """Simulations of the logs of a dataset, driven by their inputs.
 
@@ -332,25 +361,28 @@ class Simulation:
         Scores
         """
         logs = []
-        for i, one in enumerate(self._segments):
-            own, measured, found = self._layout.of_log(parameters, i), self._measured[i], []
-            for rows, state in self.starts[i]:
-                lanes = RolloutBatch(own, state, self._inputs[i][rows], one.log.dt)
-                known = Measurements(measured.values[rows], measured.valid[rows])
-                found.append((rows, self._score(lanes, known, thresholds, min_inlier_signals)))
+        for i, (one, runs_of_log) in enumerate(zip(self._segments, self._runs, strict=True)):
+            own, found = self._layout.of_log(parameters, i), []
+            for run in runs_of_log:
+                lanes = RolloutBatch(own, run.state, run.inputs, one.log.dt)
+                found.append((run.rows, self._score(lanes, run, thresholds, min_inlier_signals)))
             logs.append(LogScores(len(one), tuple(found)))
         sums, counts = logs[0].sum_squares, logs[0].inlier_count
         for other in logs[1:]:
             sums, counts = sums + other.sum_squares, counts + other.inlier_count
         return Scores(sums, counts, tuple(logs))
 
-    def _score(
-        self, lanes: RolloutBatch, measured: Measurements, thresholds: FloatArray, min_inlier_signals: int
-    ) -> ScoreBatch:
+    @cached_property
+    def _runs(self) -> list[list[_Run]]:
+        """Simulations of each log; see `starts`."""
+        parts = zip(self.starts, self._inputs, self._measured, strict=True)
+        return [[_Run.of(*start, inputs, measured) for start in starts] for starts, inputs, measured in parts]
+
+    def _score(self, lanes: RolloutBatch, run: _Run, thresholds: FloatArray, min_inlier_signals: int) -> ScoreBatch:
         """Scores of a stretch."""
-        if np.isnan(measured.values[measured.valid]).any():
-            return _incomplete_scores(self._simulator, lanes, measured, thresholds, min_inlier_signals)
-        return self._simulator.score(lanes, measured, thresholds, min_inlier_signals, threads=self._threads)
+        if not run.is_complete:
+            return _incomplete_scores(self._simulator, lanes, run.measured, thresholds, min_inlier_signals)
+        return self._simulator.score(lanes, run.measured, thresholds, min_inlier_signals, threads=self._threads)
 
     def errors(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int

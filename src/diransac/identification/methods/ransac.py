@@ -598,12 +598,12 @@ def search(variant: RansacMethod, samples: Samples, callback: Callback | None = 
         for iterations in _batches(settings):
             batch = samples.batch(iterations)
             for i, score in enumerate(batch.scores(squared_error=variant.squared_error)):
-                if variant.is_finished(state.score, settings.stop_inlier_fraction):
-                    break
                 check_time()
                 state.iterations += 1
                 if _improves(score, state, variant):
                     _follow(batch.hypothesis(i, score), state, variant, samples)
+                    if variant.is_finished(state.score, settings.stop_inlier_fraction):
+                        break
             fraction = state.iterations / settings.max_iterations
             report(callback, "searching", fraction, f"{state.score.inlier_fraction:.0%} inliers")
             if variant.is_finished(state.score, settings.stop_inlier_fraction):

@@ -66,6 +66,9 @@ ARGUMENTS = {
 }
 """Arguments of the compiled time loop, in order, and their kinds."""
 
+_VALUES = tuple(name for name in ARGUMENTS if not name.endswith("_block"))
+"""Arguments that are the same for all blocks."""
+
 
 def map_signature(n_arrays: int) -> list[str]:
     """Kinds of the compiled function's arguments: inputs and outputs, n_rows, first_block, end_block."""
@@ -252,9 +255,7 @@ def time_loop_arguments(lanes: Lanes, values: Mapping[str, Any]) -> list[Any]:
     sizes = {"n_lanes": lanes.n_lanes, "n_padded": lanes.n_padded, "n_rows": lanes.n_rows}
     known = {**lanes.arrays, **values, **sizes}
     return [
-        array.ctypes.data if isinstance(array := known.get(name), np.ndarray) else array or 0
-        for name in ARGUMENTS
-        if not name.endswith("_block")
+        array.ctypes.data if isinstance(array := known.get(name), np.ndarray) else array or 0 for name in _VALUES
     ]
 
 
