@@ -17,16 +17,8 @@ from diransac.errors import IdentificationError
 from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.evaluation import choose_scoring, judged_signals, mean_squared_error, rms_error
 from diransac.identification.method import Progress
-from diransac.identification.methods.ransac import (
-    Diransac,
-    Evaluator,
-    IDiransac,
-    Samples,
-    Score,
-    ScoredBatch,
-    SearchState,
-    search,
-)
+from diransac.identification.methods.ransac import Diransac, IDiransac, SearchState, search
+from diransac.identification.methods.samples import Evaluator, Samples, Score, ScoredBatch
 from diransac.identification.settings import Settings
 from diransac.model.library import builtin
 from diransac.simulation import RolloutBatch, rollouts

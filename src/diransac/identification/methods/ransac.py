@@ -9,32 +9,23 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import IdentificationError, LogError, TimeLimitError
 from diransac.identification.estimate import TIME_LIMIT, Estimate, Resolution
 from diransac.identification.estimators import Estimator, OrdinaryLeastSquares, as_estimator, name_of
-from diransac.identification.evaluation import (
-    Scores,
-    Scoring,
-    Simulation,
-    choose_scoring,
-    mean_squared_error,
-    rms_error,
-    stretches_of,
-)
+from diransac.identification.evaluation import choose_scoring
 from diransac.identification.method import report
 from diransac.identification.methods.least_squares import bound_to, fitted
+from diransac.identification.methods.samples import Evaluator, Hypothesis, Samples, Score, fingerprint
 from diransac.identification.nonlinear import NonlinearLeastSquares
 from diransac.identification.refusal import cause_of_refusal, motion_rows
 from diransac.identification.sampling import sample_rows
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
-from diransac.simulation.compiler.machine_code import LANES
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -45,43 +36,19 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Diransac",
-    "Evaluator",
-    "Hypothesis",
     "IDiransac",
     "NothingAcceptedError",
     "RansacMethod",
-    "Samples",
-    "Score",
-    "ScoredBatch",
     "SearchState",
     "search",
 ]
 
-Sampler = Callable[[int, IntArray, int, int, int], IntArray]
-
 _FIRST_BATCH = 16
-_MOST_KEPT = 2**24  # bytes
 _OUT_OF_BOUNDS = "out of bounds"
 _SEARCH = ("sample_size", "max_iterations", "refit")
 
 
-# ---------------------------------------------------------------------- consensus
-
-
-@dataclass(frozen=True)
-class Score:
-    """Score of a hypothesis.
-
-    Parameters
-    ----------
-    error : float, optional
-        Eq. (2), or its mean square; infinite where the simulation diverged.
-    inlier_fraction : float, optional
-        Number of inliers over the number of rows that count.
-    """
-
-    error: float = np.inf
-    inlier_fraction: float = 0.0
+# ---------------------------------------------------------------------- variants
 
 
 @dataclass(frozen=True)
@@ -282,230 +249,6 @@ class Diransac(RansacMethod):
         return False
 
 
-# ---------------------------------------------------------------------- hypotheses
-
-
-class ScoredBatch:
-    """Scores of a batch of hypotheses, and the rows that are their inliers.
-
-    Parameters
-    ----------
-    scores : Scores
-    weights : (n_s,) array
-        Weights of eq. (2), one over each signal's unit.
-    valid : sequence of (N,) bool array
-        Rows of each log that count.
-    """
-
-    def __init__(self, scores: Scores, weights: FloatArray, valid: Sequence[BoolArray]) -> None:
-        self._scores, self._weights, self._valid = scores, weights, valid
-        self._n_rows = sum(int(rows.sum()) for rows in valid)
-
-    def scores(self, *, squared_error: bool) -> list[Score]:
-        """Score of each hypothesis, by the mean squared error or its root."""
-        error_of = mean_squared_error if squared_error else rms_error
-        errors = error_of(self._scores.sum_squares, self._n_rows, self._weights)
-        fractions = self._scores.inlier_count / self._n_rows
-        return [Score(e, f) for e, f in zip(errors.tolist(), fractions.tolist(), strict=True)]
-
-    def inliers(self, lane: int) -> IntArray:
-        """Usable rows, numbered log after log, that are inliers of one hypothesis, ascending."""
-        masks = self._scores.inlier_masks(lane)
-        return np.flatnonzero(np.concatenate([m[v] for m, v in zip(masks, self._valid, strict=True)]))
-
-
-class Evaluator:
-    """Preliminary test, simulation, error and inliers of hypotheses over a dataset.
-
-    Parameters
-    ----------
-    dataset : Dataset
-    scoring : Scoring
-        Weights and thresholds.
-    settings : Settings
-        Integrator, initial state and threads.
-
-    Raises
-    ------
-    LogError
-        A log lacks its initial state.
-    """
-
-    def __init__(self, dataset: Dataset, scoring: Scoring, settings: Settings) -> None:
-        judged = scoring.judged
-        self._layout = dataset.layout
-        self._weights, self._thresholds = scoring.weights[judged], scoring.thresholds[judged]
-        self._min_inlier_signals = scoring.min_inlier_signals
-        self._valid = [one.valid for one in dataset.segments]
-        resolution = Resolution(settings.integrator, settings.substeps, dataset.hold)
-        stretches = [stretches_of(one, settings.initial_state) for one in dataset.segments]
-        self._simulation = Simulation(dataset, judged, resolution, stretches, settings.threads)
-        self._simulation.starts  # noqa: B018  refuses a log without an initial state
-
-    def admits(self, parameters: FloatArray) -> BoolArray:
-        """Preliminary test of ``(n_vectors, n)`` parameters: every one within its bounds."""
-        return self._layout.admits(parameters)
-
-    def score(self, parameters: FloatArray) -> ScoredBatch:
-        """Error, inlier fraction and inliers of every hypothesis ``(n_vectors, n)``."""
-        scores = self._simulation.score(parameters, self._thresholds, self._min_inlier_signals)
-        return ScoredBatch(scores, self._weights, self._valid)
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """A hypothesis and its place in a scored batch.
-
-    Parameters
-    ----------
-    parameters : (n,) array
-        Each in its unit.
-    rows : (n_fitted,) int array
-        Usable rows that the parameters were fitted to.
-    score : Score
-        Error and inlier fraction.
-    batch : ScoredBatch
-        Scores of the batch that the hypothesis belongs to.
-    lane : int
-        Index of the hypothesis in the batch.
-    """
-
-    parameters: FloatArray
-    rows: IntArray
-    score: Score
-    batch: ScoredBatch
-    lane: int
-
-
-@dataclass(frozen=True)
-class FittedSamples:
-    """Random samples, their parameters, and the scores of those that pass the preliminary test.
-
-    Parameters
-    ----------
-    samples : list of (n_rows,) int array
-        Usable rows of each sample.
-    parameters : (n_samples, n) array
-        Each in its unit.
-    lanes : list of int or None
-        Place of each sample in the scored batch; None where it fails the preliminary test.
-    scored : ScoredBatch, optional
-        None where all of them fail it.
-    """
-
-    samples: list[IntArray]
-    parameters: FloatArray
-    lanes: list[int | None]
-    scored: ScoredBatch | None
-
-    def scores(self, *, squared_error: bool) -> list[Score | None]:
-        """The score of every sample, None where it fails the preliminary test."""
-        scores = [] if self.scored is None else self.scored.scores(squared_error=squared_error)
-        return [None if lane is None else scores[lane] for lane in self.lanes]
-
-    def hypothesis(self, i: int, score: Score) -> Hypothesis:
-        """The hypothesis of a sample that passes the preliminary test."""
-        lane = self.lanes[i]
-        assert self.scored is not None
-        assert lane is not None
-        return Hypothesis(self.parameters[i], self.samples[i], score, self.scored, lane)
-
-
-class Samples:
-    """Random samples of a dataset, which are drawn, fitted and scored a batch at a time.
-
-    Searches that differ in what they accept can share them: batches and refits are kept, up to 16 MiB in all.
-
-    Parameters
-    ----------
-    estimator : BoundEstimator
-        Fit of samples and inlier sets.
-    evaluator : Evaluator
-        Preliminary test and scores of hypotheses.
-    sampler : callable
-        ``(seed, iterations, n_rows, start, stop) -> rows``, as `sampling.sample_rows`.
-    sample_size : int
-        Least number of rows in a sample.
-    seed : int
-    """
-
-    def __init__(
-        self, estimator: BoundEstimator, evaluator: Evaluator, sampler: Sampler, sample_size: int, seed: int
-    ) -> None:
-        self.estimator, self._evaluator = estimator, evaluator
-        self._sampler, self._sample_size, self._seed = sampler, sample_size, seed
-        self._kept: dict[range | bytes, FittedSamples] = {}
-        self._room = _MOST_KEPT
-
-    def batch(self, iterations: range) -> FittedSamples:
-        """Samples of consecutive iterations."""
-        found = self._kept.get(iterations)
-        return found or self._keep(iterations, self._drawn(np.array(iterations)))
-
-    def refit(self, inliers: IntArray) -> FittedSamples | None:
-        """A set of inliers as the only sample; None where it is not well-defined."""
-        key = _fingerprint(inliers, self.estimator.n_rows)
-        found = self._kept.get(key)
-        if found is not None:
-            return found
-        selected = self.estimator.select([inliers])
-        if not selected.well_defined()[0]:
-            return None
-        return self._keep(key, self._scored([inliers], selected.fit()))
-
-    def _keep(self, key: range | bytes, found: FittedSamples) -> FittedSamples:
-        """The samples themselves, which are found under the key from now on, if there is room."""
-        n_blocks = -(-len(found.samples) // LANES)
-        size = sum(rows.nbytes for rows in found.samples) + n_blocks * self.estimator.n_rows
-        if size <= self._room:
-            self._kept[key], self._room = found, self._room - size
-        return found
-
-    def _drawn(self, iterations: IntArray) -> FittedSamples:
-        """New samples, of which those that are not well-defined grow."""
-        estimator = self.estimator
-        samples = list(self._sampler(self._seed, iterations, estimator.n_rows, 0, self._sample_size))
-        selected = estimator.select(samples)
-        poor = np.flatnonzero(~selected.well_defined())
-        for i in poor:
-            samples[i] = self._grown(samples[i], iterations[i : i + 1])
-        return self._scored(samples, (estimator.select(samples) if len(poor) else selected).fit())
-
-    def _scored(self, samples: list[IntArray], parameters: FloatArray) -> FittedSamples:
-        """Samples with their parameters ``(n_samples, n)``, and the scores of those that are admitted."""
-        admitted = self._evaluator.admits(parameters)
-        lanes = (np.cumsum(admitted) - 1).tolist()
-        places = [lane if good else None for lane, good in zip(lanes, admitted.tolist(), strict=True)]
-        scored = self._evaluator.score(parameters[admitted]) if admitted.any() else None
-        return FittedSamples(samples, parameters, places, scored)
-
-    def _grown(self, sample: IntArray, k: IntArray) -> IntArray:
-        """The sample with as many more random observations as make it well-defined (lines 6-10).
-
-        Adding an observation never lowers the smallest eigenvalue: the least number is found by doubling, then
-        bisection.
-        """
-        estimator, low, whole = self.estimator, len(sample), sample
-        while not estimator.select([whole]).well_defined()[0]:
-            low = len(whole)
-            if low == estimator.n_rows:
-                raise IdentificationError("the whole log is not well-defined: its parameters are not identifiable")
-            more = self._sampler(self._seed, k, estimator.n_rows, low, min(2 * low, estimator.n_rows))[0]
-            whole = np.concatenate([whole, more])
-        high = len(whole)
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (low, middle) if estimator.select([whole[:middle]]).well_defined()[0] else (middle, high)
-        return whole[:high]
-
-
-def _fingerprint(rows: IntArray, n_rows: int) -> bytes:
-    """One bit per row: a chain of thousands of refits keeps all its inlier sets."""
-    chosen = np.zeros(n_rows, bool)
-    chosen[rows] = True
-    return np.packbits(chosen).tobytes()
-
-
 # ---------------------------------------------------------------------- the search
 
 
@@ -656,12 +399,12 @@ def _follow(hypothesis: Hypothesis, state: SearchState, variant: RansacMethod, s
             state.rejected[_reason(hypothesis.score, "not accepted")] += 1
         if settings.refit == "none" or not variant.refits(stored=stored):
             return
-        used.add(_fingerprint(hypothesis.rows, n_rows))
+        used.add(fingerprint(hypothesis.rows, n_rows))
         inliers = hypothesis.batch.inliers(hypothesis.lane)
         limit = state.iterations >= settings.max_iterations
         if limit or variant.is_finished(state.score, settings.stop_inlier_fraction):
             return
-        if _fingerprint(inliers, n_rows) in used or (refitted := samples.refit(inliers)) is None:
+        if fingerprint(inliers, n_rows) in used or (refitted := samples.refit(inliers)) is None:
             return
         check_time()
         (score,) = refitted.scores(squared_error=variant.squared_error)
