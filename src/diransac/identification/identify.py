@@ -227,19 +227,19 @@ class Identification:
         with numerical_failures(self._given):
             return task.run(self._given)
 
-    def _dataset(self, *logs: Any, **options: Any) -> Dataset:
-        """The dataset of an earlier method with the same arguments, or a new one."""
-        for key, dataset in self._datasets:
-            if key == (logs, options):
+    def _dataset(self, *arguments: Any, **options: Any) -> Dataset:
+        """The dataset of an earlier method with the same arguments of `Dataset.of`, or a new one."""
+        for known, dataset in self._datasets:
+            if known == (arguments, options):
                 return dataset
-        dataset = moving_dataset(*logs, **options)
-        self._datasets.append(((logs, options), dataset))
+        dataset = _moving_dataset(*arguments, **options)
+        self._datasets.append(((arguments, options), dataset))
         return dataset
 
 
-def moving_dataset(*logs: Any, **options: Any) -> Dataset:
-    """`Dataset.of` the arguments.  Raises IdentificationError: nothing moves in the logs."""
-    dataset = Dataset.of(*logs, **options)
+def _moving_dataset(*arguments: Any, **options: Any) -> Dataset:
+    """`Dataset.of` these arguments.  Raises IdentificationError: nothing moves in the logs."""
+    dataset = Dataset.of(*arguments, **options)
     check_motion(dataset)
     return dataset
 
@@ -255,7 +255,7 @@ class _Task:
     pointwise: bool
     input_hold: str | None
     compares: bool
-    dataset_of: Callable[..., Dataset] = moving_dataset
+    dataset_of: Callable[..., Dataset] = _moving_dataset
 
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
         """Identify from prepared logs."""
