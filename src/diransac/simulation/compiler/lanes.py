@@ -254,9 +254,7 @@ def time_loop_arguments(lanes: Lanes, values: Mapping[str, Any]) -> list[Any]:
     """Arguments of the compiled time loop, all but the blocks; arrays as addresses, which do not keep them alive."""
     sizes = {"n_lanes": lanes.n_lanes, "n_padded": lanes.n_padded, "n_rows": lanes.n_rows}
     known = {**lanes.arrays, **values, **sizes}
-    return [
-        array.ctypes.data if isinstance(array := known.get(name), np.ndarray) else array or 0 for name in _VALUES
-    ]
+    return [array.ctypes.data if isinstance(array := known.get(name), np.ndarray) else array or 0 for name in _VALUES]
 
 
 def aligned(shape: tuple[int, ...]) -> FloatArray:
