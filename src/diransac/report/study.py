@@ -162,7 +162,10 @@ def _seconds(summary: Summary) -> Table:
     total = of_stages.sum(axis=0)
     rows.append(["all", *(number(x, 3) for x in total), number(float(total.sum()), 3)])
     n_rows = int(summary.ran.sum())
-    caption = f"Seconds of one process, over {plural(n_rows, 'row')}; time spent on several methods together is divided"
+    caption = (
+        f"Seconds of one process, over {plural(n_rows, 'row')}; time spent on several methods together is divided, and "
+        "random samples that methods share count for the first of them"
+    )
     return Table(["method", *compress(summary.stages, there), "all"], rows, caption)
 
 
