@@ -7,7 +7,7 @@ Torr and Zisserman 2000, "MLESAC"; Dempster, Laird, Rubin 1977 (EM).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +24,8 @@ BREAKDOWN, _OF_NORMAL = 0.35, 0.4538
 _FEWEST = 5
 _SHRINK = 0.4
 _FRACTION = (0.002, 0.95)
+# Rows of which densities are computed at a time.
+_ROWS_AT_A_TIME = 4096
 # Sigmas from which on exp(-x^2 / 2) is 0 in double precision.
 _FAR = 40.0
 
@@ -60,31 +62,47 @@ class Mixture:
 
     def inlying(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Probability ``(N, n_s)`` that each sample is not an outlier; 0 where it is missing (the E step)."""
-        core, uniform = self._core(residuals), self.pi / (2.0 * self.span)
+        found = np.empty(residuals.shape)
+        for rows in _parts(len(residuals)):
+            self._inlying(residuals[rows], known[rows], found[rows])
+        return found
+
+    def _inlying(self, residuals: FloatArray, known: BoolArray, out: FloatArray) -> None:
+        """Write the result of `inlying`."""
+        core, uniform = self._core(residuals, out), self.pi / (2.0 * self.span)
+        total = core + uniform
         if (uniform > 0.0).all():
-            core /= core + uniform
+            core /= total
         else:
-            total = core + uniform
-            core = np.divide(core, total, out=np.ones_like(core), where=total > 0.0)
+            is_possible = total > 0.0
+            np.divide(core, total, out=core, where=is_possible)
+            core[~is_possible] = 1.0
         if not known.all():
             core *= known
-        return core
 
     def negative_log_likelihood(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Negative log-likelihood ``(N, n_s)`` of each sample; 0 where it is missing."""
-        total, uniform = self._core(residuals), self.pi / (2.0 * self.span)
+        found = np.empty(residuals.shape)
+        for rows in _parts(len(residuals)):
+            self._loss(residuals[rows], known[rows], found[rows])
+        return found
+
+    def _loss(self, residuals: FloatArray, known: BoolArray, out: FloatArray) -> None:
+        """Write the result of `negative_log_likelihood`."""
+        total, uniform = self._core(residuals, out), self.pi / (2.0 * self.span)
         total += uniform
         if (uniform > 0.0).all():
-            loss = np.negative(np.log(total, out=total), out=total)
+            np.negative(np.log(total, out=total), out=total)
         else:
             with np.errstate(over="ignore"):
                 gaussian = 0.5 * np.square(residuals / self.sigma) + np.log(self.sigma * np.sqrt(2.0 * np.pi))
-            loss = np.negative(np.log(total, out=-gaussian, where=total > 0.0))
-        return loss if known.all() else np.where(known, loss, 0.0)
+            total[...] = -np.log(total, out=-gaussian, where=total > 0.0)
+        if not known.all():
+            total[~known] = 0.0
 
-    def _core(self, residuals: FloatArray) -> FloatArray:
+    def _core(self, residuals: FloatArray, out: FloatArray) -> FloatArray:
         """Density of the Gaussian with its share; exactly 0 beyond 40 sigma, whose squares might overflow."""
-        density = residuals / self.sigma
+        density = np.divide(residuals, self.sigma, out=out)
         np.clip(density, -_FAR, _FAR, out=density)
         np.square(density, out=density)
         density *= -0.5
@@ -124,6 +142,11 @@ class Mixture:
         seen = count >= _FEWEST
         pi = np.where(seen & outliers, pi, self.pi)
         return replace(self, sigma=np.where(seen, sigma, self.sigma), pi=pi)
+
+
+def _parts(n: int) -> Iterator[slice]:
+    """Rows in parts that stay in the cache."""
+    return (slice(k, k + _ROWS_AT_A_TIME) for k in range(0, n, _ROWS_AT_A_TIME))
 
 
 def lower_scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
