@@ -194,6 +194,8 @@ class Rollouts(Simulator):
     def trajectories(self, batch: RolloutBatch, *, threads: int = 1) -> FloatArray:
         """All signals of the model, (n_lanes, n_rows, n_signals): states, accelerations; NaN from a divergence on."""
         lanes = self._lanes(batch)
+        if lanes.n_lanes <= LANES:  # one vector reads rows of its own as fast: one machine code less
+            lanes = lanes.with_windows()
         series = np.empty((lanes.n_lanes, lanes.n_rows, len(self._model.signals)))
         self._run("SignalOutput", batch, lanes, {"series": series}, threads)
         return series

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -104,6 +104,11 @@ class Lanes:
     def has_windows(self) -> bool:
         """True if lanes start at different rows."""
         return "start_rows" in self.arrays
+
+    def with_windows(self) -> Lanes:
+        """The same lanes, as if they started at different rows."""
+        starts = {"start_rows": np.zeros(self.n_padded, np.int64)}
+        return replace(self, arrays={**starts, **self.arrays})
 
 
 def arranged_lanes(
