@@ -17,6 +17,8 @@ from scipy.integrate import odeint
 import diransac as dr
 from diransac.data.dataset import ParameterLayout
 from diransac.data.preprocessing import differentiate
+from diransac.errors import TimeLimitError
+from diransac.identification.estimate import TIME_LIMIT
 from diransac.identification.identifiability import structural
 from diransac.identification.inspection import inspect
 from diransac.identification.multistart import least_squares
@@ -310,6 +312,17 @@ def test_a_resonance_that_smoothing_takes_for_noise_is_found(seed, noise):
     assert found.verdict == "usable"
     for name in ("rotor", "inertia", "stiffness"):
         assert found.parameters[name] == pytest.approx(STIFF[name], rel=0.03)
+
+
+def test_a_time_limit_in_the_search_that_begins_with_observers_is_said(monkeypatch):
+    def late(*_):
+        raise TimeLimitError("the time limit was reached")
+
+    monkeypatch.setattr("diransac.identification.methods.lo_diransac.method.with_observed_states", late)
+    found = dr.identify(flexible_joint(), recorded(stiff_joint_signals(31), ["motor"], 0.005), differentiate=True)
+    assert found.stop_reason == TIME_LIMIT
+    assert found.verdict != "usable"
+    assert any("time limit" in x for x in found.findings)
 
 
 def observers_of_joint(bandwidth):
