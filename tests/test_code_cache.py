@@ -17,7 +17,7 @@ from diransac.atomic import draft
 from diransac.simulation import Measurements, RolloutBatch
 from diransac.simulation.compiler import Map, Scan, machine_code
 from diransac.simulation.compiler.code_cache import CodeCache, hashed
-from diransac.simulation.compiler.machine_code import Target
+from diransac.simulation.compiler.machine_code import LANES, Target
 from diransac.simulation.rollouts import Rollouts
 
 KEY, OTHER_KEY = hashed(["one"]), hashed(["other"])
@@ -111,6 +111,7 @@ def test_every_variant_of_a_loop_has_a_key_of_its_own(compiled: list[str], cache
     rows = np.full((8, 1), 2.5)
     one = RolloutBatch(np.array([[2.0, 1.0]]), np.zeros(2), rows, 0.01)
     two = RolloutBatch(np.repeat(one.parameters, 2, axis=0), np.zeros(2), rows, 0.01, np.array([0, 3]), 4)
+    many = RolloutBatch(np.repeat(one.parameters, LANES + 1, axis=0), np.zeros(2), rows, 0.01)
     narrow = Target("x86-64-v3", "+avx2,+fma,-avx512f") if "avx2" in Target.host().features else Target.host()
 
     def run(which: Rollouts) -> None:
@@ -118,6 +119,7 @@ def test_every_variant_of_a_loop_has_a_key_of_its_own(compiled: list[str], cache
         weights = np.ones(len(which.signals))
         for batch in (one, two):
             which.score(batch, seen, weights, 1)
+        for batch in (one, two, many):  # few lanes share the machine code of lanes that start at different rows
             which.trajectories(batch)
         which.gauss_newton(one, seen, weights, unknowns=["mass"])
         which.gauss_newton(one, seen, weights, unknowns=["mass", "x"])
