@@ -129,7 +129,8 @@ class GaussNewtonOutput(_Output):
         self.n_z = self.first_unknowns[-1]
         self.n_sums = 1 + self.n_z + self.n_z * (self.n_z + 1) // 2
         self.n_final = self.specification.n_states + sum(len(group.unknowns) * len(group.rows) for group in groups)
-        self.weighted = [self.v.array(len(group.unknowns) * len(group.signals)) for group in groups]
+        self.n_weighted = self.n_z * len(self.specification.scored)
+        self.weighted = self.v.array(self.n_weighted)
 
     def start(self, block: Block) -> None:
         """Set the sums to zero; all blocks of a call have the same memory, which stays in the cache."""
@@ -137,7 +138,8 @@ class GaussNewtonOutput(_Output):
         start = builder.mul(self.arguments["first_block"], integer(LANES * width))
         self.sums = builder.gep(self.arguments["scratch"], [start], source_etype=DOUBLE)
         self.final = builder.gep(self.sums, [integer(LANES * self.n_sums)], source_etype=DOUBLE)
-        self.v.each(0, self.n_sums, lambda k: self.v.put(self.v.number(0.0), self.sums, k))
+        for array, size in ((self.sums, self.n_sums), (self.weighted, self.n_weighted)):
+            self.v.each(0, size, partial(self.v.put, self.v.number(0.0), array))
 
     def row(self, block: Block, row: LoopRow) -> None:
         """Add a row to the sums."""
@@ -149,51 +151,46 @@ class GaussNewtonOutput(_Output):
         for number in range(len(self.columns.groups)):
             self._add_gradient(number, weights, weighted)
         with self.loop.builder.if_then(self._wants_products):
-            for left in range(len(self.columns.groups)):
-                self._add_products(left)
+            for number in range(len(self.columns.groups)):
+                self._add_products(number)
 
     def _add_gradient(self, number: int, weights: list[Value], weighted: list[Value]) -> None:
         """Add a row's J'we of a group, and compute its w J."""
-        v, group = self.v, self.columns.groups[number]
+        v, group, first = self.v, self.columns.groups[number], self.first_unknowns[number]
 
         def add(column: Value | int) -> None:
             products = []
+            unknown = v.affine(column, 1, first)
             for k, signal in enumerate(group.signals):
-                place = v.affine(column, len(group.signals), k)
-                slope = v.pick(self.columns.slopes[number], place)
-                v.put(v.mul(weights[signal], slope), self.weighted[number], place)
+                slope = v.pick(self.columns.slopes[number], v.affine(column, len(group.signals), k))
+                v.put(v.mul(weights[signal], slope), self.weighted, v.affine(unknown, len(weights), signal))
                 products.append((slope, weighted[signal]))
-            self._add(v.affine(column, 1, 1 + self.first_unknowns[number]), products)
+            self._add(v.affine(unknown, 1, 1), products)
 
         v.each(0, len(group.unknowns), add)
 
-    def _add_products(self, left: int) -> None:
-        """Add a row's J'wJ of the columns of a group with themselves and with those of later groups."""
-        v, group = self.v, self.columns.groups[left]
+    def _add_products(self, number: int) -> None:
+        """Add a row's J'wJ of the columns of a group with themselves and with all that follow.
+
+        One loop takes what follows whatever its zeros are: a group's code does not grow with the number of groups.
+        """
+        v, group, n_signals = self.v, self.columns.groups[number], len(self.specification.scored)
 
         def add(column: Value | int) -> None:
-            slopes = {
-                signal: v.pick(self.columns.slopes[left], v.affine(column, len(group.signals), k))
-                for k, signal in enumerate(group.signals)
-            }
-            line = self._line(v.affine(column, 1, self.first_unknowns[left]))
-            for right in range(left, len(self.columns.groups)):
-                self._add_line(line, slopes, right, column if left == right else 0)
+            slopes = [
+                v.pick(self.columns.slopes[number], v.affine(column, len(group.signals), k))
+                for k in range(len(group.signals))
+            ]
+            left = v.affine(column, 1, self.first_unknowns[number])
+            line = self._line(left)
+
+            def add_pair(right: Value | int) -> None:
+                weighted = (v.pick(self.weighted, v.affine(right, n_signals, signal)) for signal in group.signals)
+                self._add(v.affine(right, 1, line), list(zip(slopes, weighted, strict=True)))
+
+            v.each(left, self.n_z, add_pair)
 
         v.each(0, len(group.unknowns), add)
-
-    def _add_line(self, line: Value | int, slopes: dict[int, Value], right: int, first: Value | int) -> None:
-        """Add the products of one column with those of a group, from the first on."""
-        v, group = self.v, self.columns.groups[right]
-        common = [(k, signal) for k, signal in enumerate(group.signals) if signal in slopes]
-
-        def add(column: Value | int) -> None:
-            weighted = (v.pick(self.weighted[right], v.affine(column, len(group.signals), k)) for k, _ in common)
-            products = [(slopes[signal], value) for (_, signal), value in zip(common, weighted, strict=True)]
-            self._add(v.affine(column, 1, v.affine(line, 1, self.first_unknowns[right])), products)
-
-        if common:
-            v.each(first, len(group.unknowns), add)
 
     def _line(self, unknown: Value | int) -> Value | int:
         """Place of (unknown, 0) in the upper triangle, had it one: 1 + n_z + unknown (2 n_z - 1 - unknown) / 2."""

@@ -330,7 +330,8 @@ class TimeLoop:
         """Return the columns of a logged array at a row; one load for all lanes if they share their row."""
         v, builder = self.v, self.builder
         at = [builder.add(start, row) for start in block.starts] or [row]
-        columns = [[v.element(self.arguments[name], place, width, k, kind) for place in at] for k in range(width)]
+        rows = [v.row(self.arguments[name], place, width, kind) for place in at]
+        columns = [[v.load(place, integer(k), kind) for place in rows] for k in range(width)]
         return [v.join(column) if self.windows else v.splat(*column) for column in columns]
 
     def _lane_vector(self, name: str, element: int, first: Value) -> Value:
@@ -393,7 +394,8 @@ def _columns(loop: TimeLoop, rows: list[Value]) -> list[list[Value]]:
     """Numbers of the feedback's rows, column by column: u_ref, x_ref, and the gains row by row."""
     n_u, n_x = loop.specification.n_inputs, loop.specification.n_states
     width = n_u + n_x + n_u * n_x
-    return [[loop.v.element(loop.arguments["feedback"], at, width, k, DOUBLE) for at in rows] for k in range(width)]
+    laws = [loop.v.row(loop.arguments["feedback"], at, width, DOUBLE) for at in rows]
+    return [[loop.v.load(law, integer(k), DOUBLE) for law in laws] for k in range(width)]
 
 
 def _feedback_inputs(loop: TimeLoop, law: list[Value]) -> list[Value]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from llvmlite import ir
@@ -49,9 +50,16 @@ class Loop:
     leave: Value
 
 
+@cache
 def integer(value: int) -> Value:
-    """64-bit integer constant, a scalar."""
+    """64-bit integer constant, a scalar; one object for a value, as it keeps its text."""
     return ir.Constant(INTEGER, value)
+
+
+@cache
+def _number(digits: str) -> Value:
+    """Vector of a constant, by its digits, which tell 0 from -0; one object for a value, as it keeps its text."""
+    return ir.Constant(NUMBERS, [ir.Constant(DOUBLE, float.fromhex(digits))] * LANES)
 
 
 class Vectors:
@@ -80,7 +88,7 @@ class Vectors:
     # Constants -----------------------------------------------------------------------------------------------------
     def number(self, value: float) -> Value:
         """Return the constant in every lane."""
-        return ir.Constant(NUMBERS, [ir.Constant(DOUBLE, float(value))] * LANES)
+        return _number(float(value).hex())
 
     def integer(self, value: int) -> Value:
         """Return the 64-bit integer constant in every lane."""
@@ -250,11 +258,11 @@ class Vectors:
     # Lanes and memory ----------------------------------------------------------------------------------------------
     def lane(self, x: Value, lane: int) -> Value:
         """Return one lane as a scalar."""
-        return self.builder.extract_element(x, ir.Constant(INTEGER, lane))
+        return self.builder.extract_element(x, integer(lane))
 
     def with_lane(self, x: Value, scalar: Value, lane: int) -> Value:
         """Return the vector with one lane replaced."""
-        return self.builder.insert_element(x, scalar, ir.Constant(INTEGER, lane))
+        return self.builder.insert_element(x, scalar, integer(lane))
 
     def join(self, scalars: list[Value]) -> Value:
         """Return the vector of these eight scalars."""
@@ -277,9 +285,9 @@ class Vectors:
         address = self.builder.gep(base, [index], source_etype=element)
         return self.builder.load(address, typ=kind, align=1 if element == BYTE else 8)
 
-    def element(self, base: Value, row: Value, width: int, column: int, kind: Value) -> Value:
-        """Load a scalar from a row of a matrix."""
-        return self.load(base, self.builder.add(self.builder.mul(row, integer(width)), integer(column)), kind)
+    def row(self, base: Value, row: Value, width: int, kind: Value) -> Value:
+        """Address of a row of a matrix of scalars."""
+        return self.builder.gep(base, [self.builder.mul(row, integer(width))], source_etype=kind)
 
     def store(self, value: Value, base: Value, index: Value) -> None:
         """Store a scalar or a vector at element `index` of an array of float64 or int64."""
@@ -376,6 +384,6 @@ class Vectors:
         builder.cbranch(builder.icmp_signed("<", counter, end), body, leave)
         builder.position_at_end(body)
         yield Loop(counter, leave)
-        self.set(index, builder.add(counter, ir.Constant(INTEGER, 1)))
+        self.set(index, builder.add(counter, integer(1)))
         builder.branch(test)
         builder.position_at_end(leave)
