@@ -11,13 +11,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from diransac.blas import single_threaded
 from diransac.data.log import Log
 from diransac.errors import PlanningError
 from diransac.flight.closed_loop import fly_batch
 from diransac.flight.corruption import corrupt
 from diransac.flight.tvlqr import Controller, tvlqr
 from diransac.model.plant import Plant
+from diransac.process import single_threaded
 from diransac.study.assessment import pseudo_true_parameters
 from diransac.study.library import load
 from diransac.study.plants import PlantChoice

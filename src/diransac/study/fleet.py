@@ -30,7 +30,6 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.atomic import write_with
-from diransac.blas import single_threaded
 from diransac.data.log import Log
 from diransac.data.readers import read_log
 from diransac.errors import DiransacError, SettingsError, StudyError
@@ -41,6 +40,7 @@ from diransac.identification.result import Result
 from diransac.identification.settings import EXECUTION, Settings
 from diransac.model import Model
 from diransac.plain_data import json_data
+from diransac.process import single_threaded
 from diransac.study.database import (
     AGAIN,
     Database,

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from diransac.blas import single_threaded
 from diransac.data.log import Log
 from diransac.errors import DiransacError, PlanningError, StudyError
 from diransac.flight.closed_loop import tracking_error
@@ -30,6 +29,7 @@ from diransac.flight.trajectory import Trajectory
 from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
 from diransac.identification.identify import Identification
 from diransac.model.plant import Plant
+from diransac.process import single_threaded
 from diransac.study.data import (
     PLANNING_TIME_LIMIT,
     TrialData,

@@ -14,7 +14,6 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.blas import single_threaded
 from diransac.errors import PlanningError, SettingsError
 from diransac.flight.planning.excitation import (
     DesignProblem,
@@ -30,6 +29,7 @@ from diransac.flight.planning.excitation import (
 )
 from diransac.flight.planning.trajectories import check_numbers, inverse_dynamics
 from diransac.flight.trajectory import Trajectory
+from diransac.process import single_threaded
 from diransac.text_table import aligned, number
 from diransac.time_limit import time_left
 

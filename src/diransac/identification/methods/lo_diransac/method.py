@@ -9,13 +9,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.blas import single_threaded
 from diransac.data.input_timing import InputTiming
 from diransac.data.segment import long_runs, silent_rows
 from diransac.errors import IdentificationError, LogError, ModelError, SettingsError, TimeLimitError
@@ -60,6 +60,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     with_unmeasured_states,
 )
 from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
+from diransac.process import memory_kept, single_threaded
 from diransac.simulation import default_threads
 from diransac.time_limit import check_time
 
@@ -88,6 +89,8 @@ _SIGNIFICANT, _SMALL_DELAY = 3.0, 0.25
 _MOST_INPUTS, _MOST_SAMPLES = 15, 31
 _GAUSSIAN = 10_000
 """Degrees of freedom of an interval whose covariance is not itself an estimate from few numbers."""
+_MANY_ROWS = 200_000
+"""Rows from which on temporary arrays are so large that the system's allocator gives them back at once."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +205,8 @@ class LoDiransac(LoDiransacSettings):
         TimeLimitError
             The time limit was reached before the first local optimisation had converged.
         """
-        with single_threaded():  # matrices are small: more threads would only add waiting
+        memory = memory_kept() if dataset.n_rows > _MANY_ROWS else nullcontext()
+        with single_threaded(), memory:  # matrices are small: more threads would only add waiting
             return _fitted(self, dataset, int(seed), callback)
 
 

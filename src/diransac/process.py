@@ -1,0 +1,93 @@
+"""Settings that belong to the whole process, for the time of some work: threads of linear algebra, kept memory."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import sys
+import threading
+from functools import partial
+from typing import TYPE_CHECKING
+
+from threadpoolctl import threadpool_limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+__all__ = ["memory_kept", "single_threaded"]
+
+
+class _Setting:
+    """Context in which a setting of the process holds; the last context to end undoes it, whichever began.
+
+    Threads that each restored their own earlier value would restore each other's.
+
+    Parameters
+    ----------
+    begin : makes the setting, and returns what undoes it
+    """
+
+    def __init__(self, begin: Callable[[], Callable[[], object]]) -> None:
+        self._begin, self._lock, self._n_contexts = begin, threading.Lock(), 0
+        self._undo: Callable[[], object] = _nothing
+
+    @contextlib.contextmanager
+    def __call__(self) -> Iterator[None]:
+        """A context with the setting."""
+        with self._lock:
+            if not self._n_contexts:
+                self._undo = self._begin()
+            self._n_contexts += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._n_contexts -= 1
+                if not self._n_contexts:
+                    self._undo()
+
+
+def _nothing() -> None:
+    """Undo nothing."""
+
+
+def _one_blas_thread() -> Callable[[], object]:
+    limits = threadpool_limits(limits=1, user_api="blas")
+    return partial(limits.restore_original_limits)
+
+
+# Options of glibc's mallopt(3), and the largest threshold of a mapping that its allocator itself would choose.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4
+_LARGEST_THRESHOLD, _DEFAULT_MAPPINGS, _NEVER = 32 << 20, 65536, -1
+
+
+def _freed_memory_kept() -> Callable[[], object]:
+    chosen = any(name == "GLIBC_TUNABLES" or name.startswith("MALLOC_") for name in os.environ)
+    if sys.platform != "linux" or chosen:
+        return _nothing
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "gnu_get_libc_version"):
+        return _nothing
+
+    def undo() -> None:
+        libc.mallopt(_MMAP_MAX, _DEFAULT_MAPPINGS)
+        libc.mallopt(_MMAP_THRESHOLD, _LARGEST_THRESHOLD)
+        libc.mallopt(_TRIM_THRESHOLD, 2 * _LARGEST_THRESHOLD)
+        libc.malloc_trim(0)
+
+    libc.mallopt(_MMAP_MAX, 0)
+    libc.mallopt(_TRIM_THRESHOLD, _NEVER)
+    return undo
+
+
+single_threaded = _Setting(_one_blas_thread)
+"""``with single_threaded():`` BLAS has one thread, also while other threads of the process enter and leave."""
+
+memory_kept = _Setting(_freed_memory_kept)
+"""``with memory_kept():`` freed arrays leave their memory to the next ones, and to the system at the end.
+
+glibc gives arrays of more than 32 MB back at once. The next one then waits for the system to clear new pages: a fit of
+a million rows, of which every temporary array is as large, would spend a quarter of its time there. Nothing changes
+with another allocator, or where the environment has options for this one.
+"""
