@@ -26,7 +26,7 @@ import diransac as dr
 from diransac.data.dataset import Dataset, bind_log
 from diransac.identification.estimators import regression
 from diransac.identification.sampling import sample_rows
-from diransac.simulation import RolloutBatch, rollouts
+from diransac.simulation import LinearFeedback, RolloutBatch, rollouts
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -39,6 +39,8 @@ SETTINGS = replace(dr.Settings.table_iv(), stop_inlier_fraction=None, threads=2)
 DURATION, N_ROWS, N_HYPOTHESES = 25.0, 2500, 1024
 ITERATIONS_OF_LISTING, TRIALS, ROWS_OF_SCIPY = 30, 30, 250
 HOUR_ROWS, HOUR_DT = 3_600_000, 0.001
+ATTITUDE, HEIGHT = {0.35: 0.4, 0.9: 0.15, 2.1: 0.06}, {0.2: 1.0, 0.55: 0.3}
+"""Amplitudes of the sines of the long flight, rad and m, by frequency (Hz)."""
 
 
 @dataclass(frozen=True)
@@ -170,17 +172,34 @@ def compare_lengths(bench: Bench) -> None:
 
 
 def hour_log(n_rows: int = HOUR_ROWS) -> dr.Log:
-    """A wiggle of attitude and height whose inputs follow from the equations, with outliers."""
-    model, true = dr.models.planar_rotorcraft(), dr.models.TABLE_I
-    t = HOUR_DT * np.arange(n_rows)
-    theta, theta_dot, theta_ddot = _sines(t + HOUR_DT / 2, {0.35: 0.4, 0.9: 0.15, 2.1: 0.06})
-    _, _, z_ddot = _sines(t + HOUR_DT / 2, {0.2: 1.0, 0.55: 0.3})
-    inputs = np.column_stack([true["mass"] * (9.81 + z_ddot) / np.cos(theta), true["inertia"] * theta_ddot / 0.177])
-    start = np.array([0.0, 0.0, 0.0, 0.0, 0.0, theta_dot[0]])
-    flown = rollouts(model).trajectories(RolloutBatch(np.array([list(true.values())]), start, inputs, HOUR_DT))[0]
-    columns = dict(zip((*model.signals, *model.inputs), (*flown.T, *inputs.T), strict=True))
+    """A wiggle of attitude and height, whose inputs follow from the equations and from a controller, with outliers.
+
+    Without a controller the attitude drifts, and the induced drag then accelerates the rotorcraft without bounds.
+    """
+    model, true, laws = dr.models.planar_rotorcraft(), dr.models.TABLE_I, 60_000
+    state, parts = np.zeros((1, 6)), []
+    gains = np.zeros((2, 6))
+    gains[0, [1, 4]] = true["mass"] * np.array([4.0, 4.0])
+    gains[1, [2, 5]] = true["inertia"] / 0.177 * np.array([25.0, 10.0])
+    for first in range(0, n_rows, laws):
+        t = HOUR_DT * np.arange(first, min(first + laws, n_rows) + 1)
+        reference = np.zeros((len(t), 6))
+        for k, sines in ((1, HEIGHT), (2, ATTITUDE)):
+            reference[:, k], reference[:, k + 3], _ = _sines(t, sines)
+        theta, _, theta_ddot = _sines(t + HOUR_DT / 2, ATTITUDE)
+        _, _, z_ddot = _sines(t + HOUR_DT / 2, HEIGHT)
+        thrust = true["mass"] * (9.81 + z_ddot) / np.cos(theta)
+        feed_forward = np.column_stack([thrust, true["inertia"] * theta_ddot / 0.177])
+        feedback = LinearFeedback(feed_forward, reference, np.broadcast_to(gains, (len(t), 2, 6)))
+        start = state if first else reference[:1]
+        batch = RolloutBatch(np.array([list(true.values())]), start, feed_forward, HOUR_DT)
+        flown = rollouts(model).fly(batch, feedback)
+        state = flown.signals[:, -1, :6]
+        parts.append(np.hstack([flown.signals[0, :-1], flown.inputs[0, :-1]]))
+    signals = np.concatenate(parts)
+    columns = dict(zip((*model.signals, *model.inputs), signals.T, strict=True))
     noise = dr.Noise(outlier_probability=0.1, outlier_magnitude=80.0)
-    return dr.corrupt(dr.Log.from_arrays(t, columns), noise, seed=1, signals=model.signals)
+    return dr.corrupt(dr.Log.from_arrays(HOUR_DT * np.arange(n_rows), columns), noise, seed=1, signals=model.signals)
 
 
 def _sines(t: Array, amplitudes: dict[float, float]) -> Array:
