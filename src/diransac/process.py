@@ -7,7 +7,6 @@ import ctypes
 import os
 import sys
 import threading
-from functools import partial
 from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
@@ -53,8 +52,8 @@ def _nothing() -> None:
 
 
 def _one_blas_thread() -> Callable[[], object]:
-    limits = threadpool_limits(limits=1, user_api="blas")
-    return partial(limits.restore_original_limits)
+    undo: Callable[[], object] = threadpool_limits(limits=1, user_api="blas").restore_original_limits
+    return undo
 
 
 # Options of glibc's mallopt(3), and the largest threshold of a mapping that its allocator itself would choose.

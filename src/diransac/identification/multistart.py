@@ -70,7 +70,7 @@ class SearchOverLogs(ABC):
     @property
     @abstractmethod
     def _compared(self) -> FloatArray:
-        """What signals (N, n) are compared with."""
+        """Values (N, n) that signals are compared with."""
 
     @abstractmethod
     def _places(self, log: int) -> IntArray:

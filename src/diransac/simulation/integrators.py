@@ -196,7 +196,7 @@ class Sensitivities:
 
     @cached_property
     def places(self) -> IntArray:
-        """Where `GaussNewtonOutput` writes what it has in the order of the groups: places in a lane's arrays.
+        """Places in a lane's arrays of what `GaussNewtonOutput` has in the order of the groups.
 
         Of e'we and J'we in `first` (1 + n_z), of J'wJ's upper triangle in `matrix` (n_z, n_z) and below its diagonal,
         and of the state and its stored derivatives in `final` (n_x (1 + n_z)).
@@ -411,9 +411,8 @@ def _column_group(
     from diransac.simulation.compiler.sensitivities import ColumnGroup
 
     n_rows, n_x = A.shape
-    present, driven = (
-        np.flatnonzero(mask[:, unknowns[0]]).tolist() for mask in (sensitivities.present, sensitivities.driven)
-    )
+    masks = (sensitivities.present, sensitivities.driven)
+    present, driven = (np.flatnonzero(mask[:, unknowns[0]]).tolist() for mask in masks)
     column, h = ca.SX.sym("s", len(present)), ca.SX.sym("h")
     shared: list[ca.SX] = []
     driving: list[ca.SX] = []

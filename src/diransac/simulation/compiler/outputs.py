@@ -250,7 +250,7 @@ class GaussNewtonOutput(_Output):
 
     @property
     def _wants_products(self) -> Value:
-        """Whether J'wJ is wanted."""
+        """Condition that J'wJ is wanted."""
         return self.loop.builder.icmp_signed("!=", self.arguments["products"], integer(0))
 
     def _copy(self, source: Value, target: Value, first: int, index: Value | int) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from llvmlite import ir
@@ -50,13 +50,13 @@ class Loop:
     leave: Value
 
 
-@cache
+@lru_cache(maxsize=4096)
 def integer(value: int) -> Value:
     """64-bit integer constant, a scalar; one object for a value, as it keeps its text."""
     return ir.Constant(INTEGER, value)
 
 
-@cache
+@lru_cache(maxsize=4096)
 def _number(digits: str) -> Value:
     """Vector of a constant, by its digits, which tell 0 from -0; one object for a value, as it keeps its text."""
     return ir.Constant(NUMBERS, [ir.Constant(DOUBLE, float.fromhex(digits))] * LANES)

@@ -113,12 +113,15 @@ def find_spikes(
     if not n_spikes:
         return intervals, hypotheses, 0
     trial = replace(intervals, recorded=np.concatenate([u for u, _ in cleaned]))
-    every = np.arange(len(intervals))
-    before, after = (robust_scores(x, motion, hypotheses[:1], every)[0] for x in (intervals, trial))
-    if after >= before or not len(found := find_hypotheses(settings, trial, motion, seed, dataset)):
+
+    def scores(hypothesis: FloatArray) -> FloatArray:
+        every = np.arange(len(intervals))
+        return np.array([robust_scores(x, motion, hypothesis, every)[0] for x in (intervals, trial)])
+
+    known = scores(hypotheses[:1])
+    if known[1] >= known[0] or not len(found := find_hypotheses(settings, trial, motion, seed, dataset)):
         return intervals, hypotheses, 0
-    best = np.concatenate([hypotheses[:1], found[:1]])
-    before, after = (robust_scores(x, motion, best, every).min() for x in (intervals, trial))
+    before, after = np.minimum(known, scores(found[:1]))
     is_better = before - after > _CLEAR_GAIN * intervals.known.any(axis=0).sum()
     return (trial, found, n_spikes) if is_better else (intervals, hypotheses, 0)
 
