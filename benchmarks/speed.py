@@ -218,7 +218,8 @@ def measure_hour() -> None:
         hour_log().write(path)
         code = (
             "import json, resource, sys, time, diransac as dr; log = dr.read_log(sys.argv[1]); begin = time.time();"
-            "result = dr.identify(dr.models.planar_rotorcraft(), log); used = resource.getrusage(resource.RUSAGE_SELF);"
+            "result = dr.identify(dr.models.planar_rotorcraft(), log, 'i-diransac');"
+            "used = resource.getrusage(resource.RUSAGE_SELF);"
             "print(json.dumps([time.time() - begin, used.ru_maxrss, result.n_hypotheses]))"
         )
         done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
