@@ -27,6 +27,8 @@ from diransac.identification.suggestions import Suggestion
 
 __all__ = [
     "TIME_LIMIT",
+    "Competition",
+    "Competitor",
     "Diagnosis",
     "Estimate",
     "Evaluation",
@@ -302,6 +304,50 @@ class Diagnosis:
         return rows
 
 
+@dataclass(frozen=True)
+class Competitor:
+    """An estimate that took part in the comparison of predictions.
+
+    Parameters
+    ----------
+    name : str
+        Source and variant.
+    errors : tuple of float
+        Root mean square error of the predicted samples at each horizon, over that of the prediction that nothing
+        changes.
+    score : float
+        Mean loss of the predictions of held-out blocks; lower is better.
+    as_good : bool
+        Whether it predicts as well as the best, within the noise of the comparison.
+    parameters : mapping of str to float
+        Its parameters, each in its unit.
+    """
+
+    name: str
+    errors: tuple[Number, ...]
+    score: Number
+    as_good: bool
+    parameters: Values
+
+
+@dataclass(frozen=True)
+class Competition:
+    """Comparison of estimates by the prediction of blocks of the logs that they were not estimated from.
+
+    Parameters
+    ----------
+    winner : str
+        Name of the estimate that is the result.
+    horizons : tuple of float
+        Horizons of the predictions, s.
+    competitors : tuple of Competitor
+    """
+
+    winner: str
+    horizons: tuple[Number, ...]
+    competitors: tuple[Competitor, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Parameters of a model, their covariance, and the search that found them.
@@ -338,6 +384,8 @@ class Estimate:
         Findings of the method's own tests.
     suggestions : tuple of Suggestion, optional
         Terms that the model lacks, by the unmodelled forces; of lo-diransac alone.
+    competition : Competition, optional
+        Comparison with other estimates; None where the exact model predicts the logs within their noise.
     """
 
     parameters: Values
@@ -355,6 +403,7 @@ class Estimate:
     diagnosis: Diagnosis | None = None
     checks: tuple[Finding, ...] = ()
     suggestions: tuple[Suggestion, ...] = ()
+    competition: Competition | None = None
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, np.float64).reshape(len(self.parameters), len(self.parameters))

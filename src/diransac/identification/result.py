@@ -17,7 +17,7 @@ from diransac.atomic import write_text
 from diransac.data.dataset import ParameterLayout
 from diransac.data.log import Log
 from diransac.errors import DiransacError, ResultError, SettingsError
-from diransac.identification.estimate import Diagnosis, Estimate, Evaluation, Finding, LogSummary, Resolution
+from diransac.identification.estimate import Competition, Diagnosis, Estimate, Evaluation, Finding, LogSummary, Resolution
 from diransac.identification.findings import Verdict, findings_of, verdict_of
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
@@ -448,6 +448,11 @@ class Result:
     def suggestions(self) -> tuple[Suggestion, ...]:
         """Terms that would explain the unmodelled forces, the most likely first; from lo-diransac."""
         return self.estimate.suggestions
+
+    @property
+    def competition(self) -> Competition | None:
+        """Comparison of estimates by held-out prediction, from lo-diransac; None where there was no need of one."""
+        return self.estimate.competition
 
     @property
     def fit_error(self) -> float:

@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -19,17 +19,18 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.data.input_timing import InputTiming
 from diransac.data.segment import long_runs, silent_rows
 from diransac.errors import IdentificationError, LogError, ModelError, SettingsError, TimeLimitError
-from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, HausmanTest, Resolution
+from diransac.identification.estimate import TIME_LIMIT, Competition, Diagnosis, Estimate, Finding, HausmanTest, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.checks import compared_parts, findings_of_fit
+from diransac.identification.methods.lo_diransac.competition import Contest, is_settled
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
 from diransac.identification.methods.lo_diransac.instruments import (
     Instrumented,
     check_set_points,
     instrumented_estimate,
 )
-from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
+from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch, fewest_parts
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
     discrepancy_units,
@@ -40,6 +41,7 @@ from diransac.identification.methods.lo_diransac.projection import (
 )
 from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs, lags_of_inputs
 from diransac.identification.methods.lo_diransac.refinement import make_prior
+from diransac.identification.methods.lo_diransac.segments import ActingInputs
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
@@ -87,6 +89,8 @@ _MUCH = 0.1
 _SIGNIFICANT, _SMALL_DELAY = 3.0, 0.25
 # Samples of running medians at most: spikes last for samples, however many of them there are in a second.
 _MOST_INPUTS, _MOST_SAMPLES = 15, 31
+# Samples of the intervals of a second search at most, as far as their number has divisors.
+_SHORT = 25
 _GAUSSIAN = 10_000
 """Degrees of freedom of an interval whose covariance is not itself an estimate from few numbers."""
 _MANY_ROWS = 200_000
@@ -232,7 +236,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     _check_sensors(settings, dataset)
     check_set_points(dataset, settings.set_points)
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
-    best = _likeliest(settings, dataset, seed, callback)
+    best = _competed(settings, dataset, seed, callback)
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
     notes, refined = best.notes, likeliest.refinement
     report(callback, "estimating parameters", 0.9)
@@ -258,10 +262,20 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), parts),
     )
     forced = bool(settings.input_delay or settings.input_lag)
-    found = _Found(dataset, intervals, motion, refined, result, ambiguity, forced, instrumented.tests, lacks)
+    found = _Found(
+        dataset, intervals, motion, refined, result, ambiguity, forced, instrumented.tests, lacks, best.contest
+    )
     end = "converged" if refined.converged else "limit of steps"
     end = end if likeliest.complete else TIME_LIMIT
     return _estimate(settings, found, best.n_hypotheses, end, notes, checks)
+
+
+@dataclass(frozen=True)
+class Decided:
+    """Outcome of a competition: its summary, and the inputs of the winner unless it is an estimate of the fit."""
+
+    summary: Competition
+    acting: ActingInputs | None
 
 
 @dataclass(frozen=True)
@@ -278,6 +292,7 @@ class _Searched:
     likeliest: Explanation
     result: ProjectedEstimate
     impossible: tuple[str, ...]
+    contest: Decided | None = None
 
     @property
     def unexplained(self) -> float:
@@ -305,15 +320,131 @@ class _Searched:
         return bool(unmeasured_states(self.likeliest.intervals)) and self.unexplained > _MUCH
 
 
-def _likeliest(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None) -> _Searched:
+def _competed(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None) -> _Searched:
+    """The likeliest explanation of the logs, with the estimate that predicts best.
+
+    A search that fails, or whose estimates another one beats, is followed by a second one, from that estimate.
+    """
+    report(callback, "smoothing", 0.0)
+    whole = prepared(settings, dataset)
+    refused: Exception | None = None
+    try:
+        first = _likeliest(settings, dataset, seed, callback, whole)
+    except (IdentificationError, np.linalg.LinAlgError) as error:
+        first, refused = None, error
+    if first is not None and (settings.set_points or is_settled(first.likeliest, first.motion)):
+        return first
+    contest = Contest(settings, dataset, *whole[:2], seed, callback)
+    try:
+        found = _decided(settings, contest, first, whole)
+    except TimeLimitError:
+        if first is None:
+            raise
+        return replace(first, likeliest=replace(first.likeliest, complete=False))
+    if found is None:
+        if refused is not None:
+            raise refused
+        assert first is not None
+        return first
+    return found
+
+
+def _decided(
+    settings: LoDiransac,
+    contest: Contest,
+    first: _Searched | None,
+    whole: tuple[ShootingIntervals, Motion, tuple[str, ...]],
+) -> _Searched | None:
+    """The search whose estimate predicts best; None where nothing could be compared."""
+    (intervals, motion, notes), dataset = whole, contest.dataset
+    holds = [dataset.input_hold] if dataset.input_hold else ["zero-order", "linear"]
+    actings = [ActingInputs.recorded(intervals, hold) for hold in holds]
+    starts = [] if settings.start is None else [_start_of(settings.start, dataset)]
+    forced = bool(settings.input_delay or settings.input_lag)
+    if first is not None:
+        fit, own = first.likeliest.refinement.fit, first.likeliest.intervals
+        timing = timing_of(own, first.likeliest.refinement, forced=forced)
+        contest.add_fit(first.likeliest, timing)
+        starts += [first.result.parameters, fit.shared[: own.n_p]]
+        if own.delay or own.lag or own.hold not in holds or own.errors is not None:
+            actings.append(ActingInputs.of_fit(own, fit, timing))
+    contest.add_sources(starts, actings)
+    winner = contest.decide(*_noise_of(first, whole))
+    if winner is None:
+        return None
+    origin = contest.origins[winner]
+    searches = [] if first is None else [first]
+    if isinstance(origin, Motion) and not contest.is_as_good(first):
+        second = _second(settings, contest, winner, whole) if "second fit" in settings.sources else None
+        if second is not None:
+            contest.add_fit(second.likeliest, timing_of(second.likeliest.intervals, second.likeliest.refinement, forced=forced))
+            searches.insert(0, second)
+            winner = contest.decide(*_noise_of(second, whole))
+            assert winner is not None
+            origin = contest.origins[winner]
+    if not searches:
+        return None
+    own = next((x for x in searches if x.likeliest is origin), searches[0])
+    result = contest.result(winner, own.likeliest)
+    is_own = own.likeliest is origin
+    decided = Decided(contest.summary(winner), None if is_own else contest.candidates[winner].acting)
+    return replace(own, result=result, contest=decided, impossible=() if not is_own else own.impossible)
+
+
+def _noise_of(
+    first: _Searched | None, whole: tuple[ShootingIntervals, Motion, tuple[str, ...]]
+) -> tuple[BoolArray, FloatArray]:
+    """Samples that are no outliers ``(N, n_s)``, and the noise ``(n_s,)`` of each signal."""
+    intervals, motion = whole[:2]
+    if first is None or _explains_nothing(first.likeliest.intervals, first.motion, first.likeliest.refinement):
+        every: BoolArray = np.ones(intervals.measured.shape, bool)
+        return every, motion.spread
+    own, fit = first.likeliest.intervals, first.likeliest.refinement.fit
+    inlying = fit.noise.inlying(fit.residuals, own.known) >= _OUTLIER
+    return inlying | ~own.known, fit.noise.sigma
+
+
+def _second(
+    settings: LoDiransac,
+    contest: Contest,
+    winner: int,
+    whole: tuple[ShootingIntervals, Motion, tuple[str, ...]],
+) -> _Searched | None:
+    """A search from an estimate and its simulated motion; None where it fails."""
+    (intervals, _, notes), one, motion = whole, contest.candidates[winner], contest.origins[winner]
+    assert isinstance(motion, Motion)
+    while intervals.length > _SHORT and (parts := fewest_parts(intervals.length)):
+        intervals = intervals.split(parts)
+    intervals = replace(intervals, hold=one.acting.hold)
+    try:
+        return _searched(
+            settings, intervals, motion, notes, contest.seed, contest.dataset, within(contest.callback, 0.88, 0.9),
+            hypotheses=one.parameters[None],
+        )  # fmt: skip
+    except (IdentificationError, np.linalg.LinAlgError):
+        return None
+
+
+def _start_of(start: Mapping[str, float], dataset: Dataset) -> FloatArray:
+    """The user's start, with ones for parameters that it does not name."""
+    names = [name.partition("[")[0] for name in dataset.layout.names]
+    return np.array([start.get(name, 1.0) for name in names])
+
+
+def _likeliest(
+    settings: LoDiransac,
+    dataset: Dataset,
+    seed: int,
+    callback: Callback | None,
+    whole: tuple[ShootingIntervals, Motion, tuple[str, ...]],
+) -> _Searched:
     """The likeliest explanation of the logs.
 
     Where states that nothing measures are not those of an exact model at once, they may have begun on wrong
     trajectories, for which a resonance that smoothing takes for noise is enough.  A second search begins with the
     motion of observers, and the likelier explanation counts.
     """
-    report(callback, "smoothing", 0.0)
-    intervals, motion, notes = prepared(settings, dataset)
+    intervals, motion, notes = whole
     if not unmeasured_states(intervals):
         return _searched(settings, intervals, motion, notes, seed, dataset, callback)
     report(callback, "unmeasured states", 0.05)
@@ -351,12 +482,15 @@ def _searched(
     dataset: Dataset,
     callback: Callback | None,
     to_beat: float = np.inf,
+    hypotheses: FloatArray | None = None,
 ) -> _Searched:
-    """A search that begins with a motion; it may end behind another one."""
+    """A search that begins with a motion, and with hypotheses or samples; it may end behind another one."""
     report(callback, "drawing hypotheses", 0.1)
     check_time()
-    hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
-    intervals, hypotheses, n_spikes = find_spikes(settings, intervals, motion, hypotheses, seed, dataset)
+    n_spikes = 0
+    if hypotheses is None:
+        hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
+        intervals, hypotheses, n_spikes = find_spikes(settings, intervals, motion, hypotheses, seed, dataset)
     if n_spikes:
         notes += (f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; they are interpolated",)
     unit = discrepancy_units(intervals, motion, hypotheses[0])
@@ -563,34 +697,55 @@ class _Found:
     forced: bool
     hausman_tests: tuple[HausmanTest, ...]
     lacks: MissingTerms | None
+    contest: Decided | None
 
     @property
     def late(self) -> float:
         """Delay of the inputs, lag included, samples."""
-        return float(self.intervals.delay + self.intervals.lag + self.refinement.fit.shared[-1])
+        return _late(self.intervals, self.refinement)
 
     @property
     def is_late(self) -> bool:
         """True for a significant delay or lag that all inputs have."""
-        errors = self.intervals.all_errors
-        clear = abs(self.late) > max(_SIGNIFICANT * self.refinement.delay_error, _SMALL_DELAY)
-        own = errors.input_lag if self.intervals.lag else errors.input_delay
-        return clear and not own.any()
+        return _is_late(self.intervals, self.refinement) and (self.contest is None or self.contest.acting is None)
 
     @property
-    def timing(self) -> InputTiming:
-        """Delay or lag of the inputs where it is significant, or forced, and the inputs' own errors."""
-        intervals, fit, errors = self.intervals, self.refinement.fit, self.intervals.all_errors
-        delays, lags = np.zeros((2, intervals.model.n_u))
-        if errors.input_delay.any():
-            delays = delays_of_inputs(intervals, fit)
-        elif not intervals.lag and (self.is_late or self.forced):
-            delays = delays + self.late
-        if errors.input_lag.any():
-            lags = lags_of_inputs(intervals, fit)
-        elif intervals.lag and (self.is_late or self.forced):
-            lags = lags + max(self.late, LEAST_LAG)
-        return InputTiming.of(delays * intervals.dt, lags * intervals.dt, errors.gain_drift)
+    def resolution(self) -> Resolution:
+        """Simulation of the estimate."""
+        acting, substeps = None if self.contest is None else self.contest.acting, self.intervals.substeps
+        if acting is not None:
+            return Resolution("rk4", substeps, acting.hold, acting.timing)
+        timing = timing_of(self.intervals, self.refinement, forced=self.forced)
+        return Resolution("rk4", substeps, self.intervals.hold, timing)
+
+
+def _late(intervals: ShootingIntervals, refinement: Refinement) -> float:
+    """Delay of the inputs, lag included, samples."""
+    return float(intervals.delay + intervals.lag + refinement.fit.shared[-1])
+
+
+def _is_late(intervals: ShootingIntervals, refinement: Refinement) -> bool:
+    """True for a significant delay or lag that all inputs have."""
+    errors = intervals.all_errors
+    clear = abs(_late(intervals, refinement)) > max(_SIGNIFICANT * refinement.delay_error, _SMALL_DELAY)
+    own = errors.input_lag if intervals.lag else errors.input_delay
+    return clear and not own.any()
+
+
+def timing_of(intervals: ShootingIntervals, refinement: Refinement, *, forced: bool) -> InputTiming:
+    """Delay or lag of the inputs where it is significant, or forced, and the inputs' own errors."""
+    fit, errors = refinement.fit, intervals.all_errors
+    late, counts = _late(intervals, refinement), _is_late(intervals, refinement) or forced
+    delays, lags = np.zeros((2, intervals.model.n_u))
+    if errors.input_delay.any():
+        delays = delays_of_inputs(intervals, fit)
+    elif not intervals.lag and counts:
+        delays = delays + late
+    if errors.input_lag.any():
+        lags = lags_of_inputs(intervals, fit)
+    elif intervals.lag and counts:
+        lags = lags + max(late, LEAST_LAG)
+    return InputTiming.of(delays * intervals.dt, lags * intervals.dt, errors.gain_drift)
 
 
 def _estimate(
@@ -622,11 +777,12 @@ def _estimate(
         iterations=settings.n_nonlinear_samples if nonlinear else settings.n_samples,
         n_hypotheses=n_hypotheses,
         stop_reason=end,
-        resolution=Resolution("rk4", settings.substeps, intervals.hold, found.timing),
+        resolution=found.resolution,
         notes=notes,
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),
         checks=checks,
         suggestions=found.lacks.suggestions if found.lacks else (),
+        competition=None if found.contest is None else found.contest.summary,
     )
 
 

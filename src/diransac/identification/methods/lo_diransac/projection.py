@@ -31,7 +31,7 @@ Plumlee 2017 (discrepancies orthogonal to the model); White 1982 (inference unde
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -76,6 +76,7 @@ __all__ = [
     "means_of_intervals",
     "means_of_windows",
     "parameter_units",
+    "projected_candidates",
     "projected_parameters",
     "residuals_of_motion",
     "unexplained",
@@ -189,10 +190,57 @@ def estimate_parameters(
         Within the inclusive bounds; parameters on them have an infinite variance.
     """
     wide = _with_wide_priors(intervals, fit)
-    found, inflated = _solution(intervals, wide, instruments), inflated_prior(intervals, wide, prior_inflation)
+    found, inflated = _of_windows(intervals, wide, instruments), inflated_prior(intervals, wide, prior_inflation)
     change = projected_parameters(intervals, inflated, instruments) - found.parameters
     found = replace(found, covariance=found.covariance + np.outer(change, change))
     return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
+
+
+def projected_candidates(
+    intervals: ShootingIntervals, fit: Fit
+) -> Iterator[tuple[float, Callable[[], ProjectedEstimate], FloatArray, FloatArray]]:
+    """Least squares on the fitted motion over windows of each length, the shortest first.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        Most probable motion.
+
+    Yields
+    ------
+    float
+        Length of the windows, s.
+    callable
+        The estimate with its covariance.
+    (n,) array
+        Parameters.
+    (W, n) array
+        Contributions of the intervals to their error.
+    """
+    wide = _with_wide_priors(intervals, fit)
+    now, rows = wide.shared[: intervals.n_p], _Rows.of(intervals, wide)
+    for windows in _window_lengths(intervals, len(now), rows.latent.shape[1]):
+        p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
+        seconds = intervals.duration * float(np.diff(windows, append=len(intervals)).max())
+
+        def estimate(windows: IntArray = windows, p=p, gains=gains, stuck=stuck) -> ProjectedEstimate:
+            found = _solution(intervals, wide, rows, windows, p, gains, stuck)
+            return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
+
+        yield seconds, estimate, p, _parts(intervals, rows, gains)
+
+
+def _window_lengths(intervals: ShootingIntervals, n: int, n_v: int) -> Iterator[IntArray]:
+    """First intervals of windows of one interval, of two, of four, ..., as long as equations are many."""
+    place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
+    size = 1
+    while True:
+        windows = np.flatnonzero(place % size == 0)
+        if size > 1 and len(windows) * n_v < _EQUATIONS * n:
+            return
+        yield windows
+        size *= 2
 
 
 def projected_parameters(intervals: ShootingIntervals, fit: Fit, instruments: Instruments | None = None) -> FloatArray:
@@ -408,22 +456,32 @@ class _Rows:
         return cls(W, push, means, M, latent, attributed, inertial, Z)
 
 
-def _solution(intervals: ShootingIntervals, fit: Fit, instruments: Instruments | None = None) -> ProjectedEstimate:
+def _of_windows(intervals: ShootingIntervals, fit: Fit, instruments: Instruments | None = None) -> ProjectedEstimate:
+    """The estimate over the windows of `_windows`."""
+    now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit, instruments)
+    windows = _windows(intervals, now, rows)[-1]
+    return _solution(intervals, fit, rows, windows, *_bounded_projection(intervals, now, rows, windows, _REWEIGHTED))
+
+
+def _solution(
+    intervals: ShootingIntervals,
+    fit: Fit,
+    rows: _Rows,
+    windows: IntArray,
+    p: FloatArray,
+    gains: tuple[FloatArray, FloatArray],
+    stuck: BoolArray,
+) -> ProjectedEstimate:
     """Parameters, and the first two parts of their covariance.
 
     The component of the discrepancies and of the unmodelled accelerations in the regressor's column space is attributed
     to the parameters: of the discrepancies row by row; of the accelerations, which are constant over an interval, by
     interval means.
     """
-    now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit, instruments)
-    *shorter, windows = _windows(intervals, now, rows)
-    p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
-    others = [_bounded_projection(intervals, now, rows, windows, 0)[0]]
-    # What windows of half the length change is an upper limit of the attenuation that is left.
-    others += [_bounded_projection(intervals, now, rows, x, _REWEIGHTED)[0] for x in shorter[-1:]]
+    plain = _bounded_projection(intervals, fit.shared[: intervals.n_p], rows, windows, 0)[0]
     covariance = _covariance_of_fit(intervals, fit, rows, gains, np.eye(intervals.n_p))
     sums = batch_sums(_parts(intervals, rows, gains))
-    covariance = covariance + sums.T @ sums + sum(np.outer(x - p, x - p) for x in others)
+    covariance = covariance + sums.T @ sums + np.outer(plain - p, plain - p)
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
     left = _over_windows(unexplained(intervals, fit, p), windows)

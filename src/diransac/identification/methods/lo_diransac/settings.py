@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 __all__ = ["LoDiransacSettings"]
 
 
+SOURCES = ("least squares", "simulation error", "second fit")
+"""Sources of estimates besides the samples of the weak form and the joint fit that begins with them."""
+
+
 @dataclass(frozen=True)
 class LoDiransacSettings:
     """Fields of `LoDiransac`, which documents them."""
@@ -58,6 +62,9 @@ class LoDiransacSettings:
     prior_delay: float = 3e-4
     projection: bool = True
     prior_inflation: float = 10.0
+    sources: tuple[str, ...] = SOURCES
+    start: Mapping[str, float] | None = None
+    horizon: float | None = None
     suggestions: bool = True
     candidate_terms: TermLibrary | None = None
 
@@ -96,9 +103,9 @@ class LoDiransacSettings:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
 
 
-_OBJECTS = ("criteria", "candidate_terms")
+_OBJECTS = ("criteria", "candidate_terms", "start", "horizon")
 _SWITCHES = ("input_delay", "input_lag")
-_NAMES = ("sensor_delays", "sensor_biases", "gain_drifts", "set_points")
+_NAMES = ("sources", "sensor_delays", "sensor_biases", "gain_drifts", "set_points")
 _MAY_BE_ZERO = (
     "n_samples",
     "max_delay_shifts",

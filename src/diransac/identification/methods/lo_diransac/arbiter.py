@@ -1,0 +1,227 @@
+"""Comparison of estimates by prediction of blocks of the logs that they were not estimated from.
+
+Every estimate predicts the same segments, open loop.  The samples at the beginning of a segment determine its initial
+state; the samples after them are predicted, with the parameters as they are without the block.  The error of a signal
+at a horizon counts in units of that of the prediction that nothing changes, by the logarithm of one plus its square:
+a segment in which a prediction is lost counts little more than one in which it is no better than that.
+
+References
+----------
+Shao 1993 (choice by cross-validation); Burman, Chow, Nolan 1994 (blocks of dependent data); Yao et al. 2018 (stacking).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.identification.methods.lo_diransac.segments import Segments, first_states, stretches
+from diransac.identification.uncertainty import student_quantile
+
+if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.methods.lo_diransac.smoothing import Motion
+    from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate
+
+__all__ = ["Comparison", "compared", "horizons_of"]
+
+_SEGMENTS_PER_BLOCK = 12
+_SCALES = (0.5, 2.0, 8.0)
+"""Horizons over the time in which signals change by half of what they ever do."""
+_FEWEST_ROWS = 4
+_LOST = 1e4
+_AS_WELL = 0.02
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Predictions of each candidate.
+
+    Parameters
+    ----------
+    horizons : tuple of float
+        s.
+    errors : (n_candidates, n_horizons) array
+        Root mean square error of the predicted samples over that of the prediction that nothing changes.
+    scores : (n_candidates, n_blocks) array
+        Mean loss of each block; NaN where it has no segment.
+    best : int
+        Index of the winner.
+    as_good : (n_candidates,) bool array
+        Candidates that predict as well, within the noise of the comparison.
+    """
+
+    horizons: tuple[float, ...]
+    errors: FloatArray
+    scores: FloatArray
+    best: int
+    as_good: BoolArray
+
+
+def horizons_of(intervals: ShootingIntervals, motion: Motion, horizon: float | None) -> list[int]:
+    """Horizons in rows, the shortest first: the user's, or multiples of the time scale of the measured states."""
+    dt = intervals.dt
+    if horizon is not None:
+        return [max(1, round(horizon / dt))]
+    n_x = intervals.model.n_q + intervals.model.n_v
+    longest = max((x.stop - x.start for x in stretches(intervals)), default=1)
+    lags = np.unique(np.geomspace(1, max(longest // 4, 1), 40).astype(int))
+    times = []
+    for j in np.flatnonzero(intervals.known[:, :n_x].any(axis=0)):
+        y = np.where(intervals.known[:, j], intervals.measured[:, j], np.nan)
+        changes = []
+        for lag in lags:
+            apart = np.concatenate([np.abs(y[x][lag:] - y[x][:-lag]) for x in stretches(intervals)])
+            changes.append(np.nanmedian(apart) if np.isfinite(apart).any() else np.nan)
+        squares = np.square(changes) - np.square(changes[0])
+        if np.nanmax(squares) > 0.0:
+            times.append(lags[int(np.nanargmax(squares >= 0.25 * np.nanmax(squares)))])
+    scale = float(np.median(times)) if times else 10.0
+    return sorted({int(max(_FEWEST_ROWS, round(s * scale))) for s in _SCALES})
+
+
+def _placed(intervals: ShootingIntervals, blocks: Blocks, n_before: int, n_after: int) -> IntArray:
+    """First rows of segments that lie within a stretch and a block each, spread over these."""
+    n_rows, found = n_before + n_after, []
+    for part in stretches(intervals):
+        own = blocks.of_row[part]
+        for k in np.unique(own):
+            rows = part.start + np.flatnonzero(own == k)
+            free = len(rows) - n_rows
+            if free >= 0:
+                n = min(_SEGMENTS_PER_BLOCK, 1 + 4 * free // n_rows)
+                found.append(rows[0] + np.unique(np.linspace(0, free, max(n, 1)).astype(int)))
+    return np.concatenate(found) if found else np.arange(0)
+
+
+def compared(
+    candidates: Sequence[Candidate],
+    intervals: ShootingIntervals,
+    motion: Motion,
+    inlying: BoolArray,
+    noise: FloatArray,
+    blocks: Blocks,
+    horizon: float | None,
+    n_before: int,
+) -> Comparison | None:
+    """Comparison of candidates by prediction.
+
+    Parameters
+    ----------
+    candidates : sequence of Candidate
+        Of those that are as good, the first is preferred.
+    intervals : ShootingIntervals
+    motion : Motion
+        From which states start that nothing measures.
+    inlying : (N, n_signals) bool array
+        Samples that are no outliers.
+    noise : (n_signals,) array
+        Standard deviation of each signal, by which samples before a prediction are weighted.
+    blocks : Blocks
+    horizon : float, optional
+        s; None: several, from the time scales of the motion.
+    n_before : int
+        Rows that determine the initial state of a segment.
+
+    Returns
+    -------
+    Comparison or None
+        None where the logs are too short.
+    """
+    steps = horizons_of(intervals, motion, horizon)
+    starts = np.arange(0)
+    while steps and not len(starts := _placed(intervals, blocks, n_before, steps[-1])):
+        if len(steps) == 1 and steps[0] > _FEWEST_ROWS:
+            steps = [max(_FEWEST_ROWS, steps[0] // 2)]
+        else:
+            steps.pop()
+    if not len(starts):
+        return None
+    block = blocks.of_row[starts]
+    one = Segments(intervals, candidates[0].acting, starts, n_before + steps[-1])
+    columns = _predicted(one)
+    known = (intervals.sampled & inlying)[one.rows][:, n_before:][:, :, one.columns]
+    trivial = _of_no_change(one, inlying, n_before, steps)
+    losses, errors = [], []
+    for candidate in candidates:
+        segments = replace(one, acting=candidate.acting, intervals=candidate.intervals)
+        predicted = _prediction_errors(segments, candidate, block, motion, inlying, noise, n_before)
+        own, squares = [], []
+        for k, n in enumerate(steps):
+            e, ok = predicted[:, :n], known[:, :n]
+            count = ok.sum(axis=1)
+            mse = np.where(ok, np.square(e), 0.0).sum(axis=1) / np.maximum(count, 1) / np.square(trivial[k])
+            mse = np.where((count > 0) & columns, np.minimum(mse, _LOST), np.nan)
+            own.append(np.log1p(mse))
+            squares.append(np.nanmedian(mse, axis=0))
+        losses.append(np.nanmean(np.stack(own, axis=2), axis=(1, 2)))
+        errors.append([float(np.sqrt(np.nanmean(x))) for x in squares])
+    scores = np.array([[_mean(x[block == k]) for k in range(blocks.n)] for x in losses])
+    best, as_good = _choice(scores)
+    return Comparison(tuple(n * intervals.dt for n in steps), np.array(errors), scores, best, as_good)
+
+
+def _mean(values: FloatArray) -> float:
+    return float(np.nanmean(values)) if np.isfinite(values).any() else np.nan
+
+
+def _predicted(segments: Segments) -> BoolArray:
+    """Mask of the compared signals whose prediction counts: states and sensors, accelerations if there is nothing else."""
+    model = segments.intervals.model
+    names = [model.signals[k] for k in segments.columns]
+    found = np.array([n in model.state or n in model.sensors for n in names])
+    return found if found.any() else np.ones(len(names), bool)
+
+
+def _of_no_change(segments: Segments, inlying: BoolArray, n_before: int, steps: Sequence[int]) -> list[FloatArray]:
+    """Root mean square error of the prediction that nothing changes at each horizon, (n_s,) each."""
+    intervals, rows = segments.intervals, segments.rows
+    y = np.where(intervals.sampled & inlying, intervals.measured, np.nan)[:, segments.columns][rows]
+    few = max(1, min(3, n_before))
+    with np.errstate(all="ignore"):
+        last = np.nanmedian(y[:, n_before - few : n_before], axis=1)
+        whole = np.nanstd(y.reshape(-1, y.shape[2]), axis=0)
+        found = []
+        for n in steps:
+            size = np.sqrt(np.nanmean(np.square(y[:, n_before : n_before + n] - last[:, None]), axis=(0, 1)))
+            size = np.where(np.isfinite(size) & (size > 0.0), size, whole)
+            found.append(np.where(np.isfinite(size) & (size > 0.0), size, 1.0))
+    return found
+
+
+def _prediction_errors(
+    segments: Segments,
+    candidate: Candidate,
+    block: IntArray,
+    motion: Motion,
+    inlying: BoolArray,
+    noise: FloatArray,
+    n_before: int,
+) -> FloatArray:
+    """Errors ``(K, n_after, n_s)`` of the predicted rows."""
+    intervals = segments.intervals
+    lanes = candidate.without[block][None]
+    weights = (intervals.sampled & inlying)[:, segments.columns] / np.square(noise[segments.columns])
+    states = first_states(intervals, motion.signals, inlying, segments.starts)[None]
+    before = segments.cut(n_before)
+    states = before.estimated_states(lanes, states, weights)
+    return segments.errors(lanes, states)[0][:, n_before:]
+
+
+def _choice(scores: FloatArray) -> tuple[int, BoolArray]:
+    """The first of the candidates that predict as well as the best one, and the mask of these."""
+    means = np.nanmean(scores, axis=1)
+    first = int(np.nanargmin(means))
+    apart = scores - scores[first]
+    n = np.isfinite(apart).sum(axis=1)
+    error = np.nanstd(apart, axis=1) / np.sqrt(np.maximum(n - 1, 1))
+    quantile = student_quantile(max(int(n.max()) - 1, 1), 0.975)
+    difference = np.nanmean(apart, axis=1)
+    as_good = difference <= np.minimum(quantile * error, _AS_WELL * max(means[first], 1e-300)) + 1e-12
+    as_good |= difference <= 1e-12
+    best = int(np.flatnonzero(as_good)[0])
+    return best, np.asarray(difference <= quantile * error)
