@@ -28,6 +28,7 @@ __all__ = [
     "numbers",
     "pairs",
     "prior_pairs",
+    "start_values",
     "toml_value",
 ]
 
@@ -132,6 +133,27 @@ def fixed_parameters(option: str, texts: Sequence[str]) -> dict[str, float | Non
             raise typer.BadParameter(f"{option}: {name} is given twice")
         found[name] = None
     return found
+
+
+def start_values(option: str, text: str | None) -> dict[str, float] | None:
+    """``"mass=0.3,drag=0.02"`` as values by name; None without a text.
+
+    Parameters
+    ----------
+    option : str
+        Name of the option in messages.
+    text : str or None
+
+    Returns
+    -------
+    dict of str to float, or None
+
+    Raises
+    ------
+    typer.BadParameter
+        As `numbers`.
+    """
+    return None if text is None else numbers(option, names(text))
 
 
 def prior_pairs(option: str, texts: Sequence[str]) -> dict[str, tuple[float, float]]:

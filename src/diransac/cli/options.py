@@ -191,6 +191,15 @@ class Search:
         typer.Option("--prior", metavar="NAME=MEAN,SD", help="A Gaussian prior of a parameter; repeatable."),
     ] = None
 
+    start: Annotated[
+        str | None,
+        typer.Option(metavar="NAME=VALUE,...", help="Rough values from which lo-diransac starts, too: mass=0.3."),
+    ] = None
+    horizon: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="Time over which the model is to predict; estimates are compared over it."),
+    ] = None
+
     time_limit: TimeLimit = None
 
     def arguments(self) -> dict[str, Any]:
@@ -201,6 +210,8 @@ class Search:
         known = {
             "fixed": fixed_parameters("--fix", self.fixed or ()),
             "priors": prior_pairs("--prior", self.priors or ()),
+            "start": start_values("--start", self.start),
+            "horizon": self.horizon,
         }
         return {"seed": self.seed, "input_hold": self.input_hold, **known}
 

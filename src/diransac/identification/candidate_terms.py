@@ -35,6 +35,7 @@ TermLibrary = Callable[[Symbols, Symbols, Symbols], Mapping[str, Any]]
 # Speed over which sign(v) is smooth, and speeds of the Stribeck effect, over the RMS speed.
 _SMOOTH, _STRIBECK = 0.01, (0.03, 0.06, 0.12, 0.25)
 _HARMONICS = (1, 2, 3)
+_POWERS = ((2, "quadratic"), (3, "cubic"))
 # Widths of a dead band, and levels of saturation, over the RMS input.
 _DEAD_BANDS, _LEVELS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8), (0.6, 0.8, 1.0, 1.3, 1.7)
 # Largest change of an input's gain; how far a coefficient may leave what an actuator can do, as a part of it.
@@ -174,7 +175,7 @@ def candidate_terms(
     """The library of candidates of a model.
 
     In the equation of each velocity v: ``sign(v)``, Stribeck friction at several speeds, ``v``, ``|v| v``, ``|v|``
-    (drag in a current), a constant, the position, harmonics of every angle, other velocities and all products of
+    (drag in a current), a constant, the position, its square and cube, harmonics of every angle, other velocities and all products of
     velocities; besides them the user's expressions, and of each input a gain, an offset, ``|u| u``, a dead band of
     several widths and a saturation at several levels.
 
@@ -259,6 +260,9 @@ class _Maker:
             q = self.symbols[0][k]
             if derived and k == i:
                 yield self._term("stiffness", i, "stiffness", name, f"q.{name}", q, unit)
+                for n, kind in _POWERS if unit != "rad" else ():
+                    code = f"q.{name} ** {n}"
+                    yield self._term(f"{kind} stiffness", i, f"{kind}_stiffness", f"{name}^{n}", code, q**n, f"({unit})^{n}")
             for n in _HARMONICS if unit == "rad" else ():
                 many = f"{n} " if n > 1 else ""
                 kind = f"harmonic {n} of {name}" if n > 1 else f"gravity or first harmonic of {name}"

@@ -347,6 +347,30 @@ class Competition:
     horizons: tuple[Number, ...]
     competitors: tuple[Competitor, ...]
 
+    def lines(self) -> list[list[str]]:
+        """Rows of a table: the best variant of each source, its errors at each horizon, and whether it is as good."""
+        rows = [["estimate", *(f"{h:.2g} s" for h in self.horizons), ""]]
+        for one in self._best_of_sources():
+            said = "chosen" if one.name == self.winner else "as good" if one.as_good else ""
+            rows.append([one.name, *(f"{x:.2g}" for x in one.errors), said])
+        return rows
+
+    def sentence(self) -> str:
+        """The winner, and the errors of the others, in a line."""
+        middle = len(self.horizons) // 2
+        best = self._best_of_sources()
+        own = next(x for x in best if x.name == self.winner)
+        others = ", ".join(f"{x.name} {x.errors[middle]:.2g}" for x in best if x is not own)
+        text = f"held-out prediction over {self.horizons[middle]:.2g} s chose: {self.winner}, error {own.errors[middle]:.2g}"
+        return f"{text} of that of no change" + (f"; {others}" if others else "")
+
+    def _best_of_sources(self) -> list[Competitor]:
+        """The winner, and the best variant of every other source."""
+        best: dict[str, Competitor] = {}
+        for one in sorted(self.competitors, key=lambda x: (x.name != self.winner, x.score)):
+            best.setdefault(one.name.partition(",")[0], one)
+        return list(best.values())
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:

@@ -44,6 +44,8 @@ def identify(
     input_hold: str | None = None,
     fixed: Mapping[str, float | None] | Iterable[str] | None = None,
     priors: Mapping[str, tuple[float, float]] | None = None,
+    start: Mapping[str, float] | None = None,
+    horizon: float | None = None,
     compare_logs: bool = True,
     with_suggestions: bool = False,
     time_limit: float | None = None,
@@ -86,6 +88,12 @@ def identify(
     priors : mapping of str to (float, float), optional
         Mean and standard deviation of a Gaussian prior of a parameter, in its unit; for a per-log parameter, of the
         value in each log.  A prior has the weight that the noise of the log gives it: see `docs/method.md`.
+    start : mapping of str to float, optional
+        Rough values of some parameters, in their units, from which lo-diransac starts a search by simulation error in
+        addition; no more than a start, unlike a prior.
+    horizon : float, optional
+        Time over which the model is to predict, s: lo-diransac compares estimates by predictions of this length.  None:
+        several, from the time scales of the motion.
     compare_logs : bool, optional
         Whether each of several logs is also identified alone, so that logs that disagree with the others are named;
         that takes about as long again.
@@ -120,7 +128,7 @@ def identify(
     ----------
     Dimmig et al. 2023, Algorithm 1.
     """
-    chosen = method_object(method, settings, estimator)
+    chosen = _with_options(method_object(method, settings, estimator), start=start, horizon=horizon)
     given = distinct_logs(logs)
     _check_arguments(model, seed)
     hold = checked_hold(input_hold)
@@ -172,6 +180,15 @@ def method_object(method: object, settings: object, estimator: object) -> Method
             raise SettingsError(f'estimator serves the RANSAC methods; method "{method}" is an estimator itself')
         of_search["estimator"] = estimator_named(estimator) if isinstance(estimator, str) else estimator
     return make(settings or Settings(), **of_search)
+
+
+def _with_options(method: Method, **options: object) -> Method:
+    """The method with options that are given beside it.  Raises SettingsError: it has no use for one."""
+    given = {name: value for name, value in options.items() if value is not None}
+    for name in given:
+        if not hasattr(method, name):
+            raise SettingsError(f"{name} is given, for which method {method.name} has no use; leave it out")
+    return dataclasses.replace(method, **given) if given else method  # type: ignore[type-var]
 
 
 def checked_hold(name: object) -> str | None:

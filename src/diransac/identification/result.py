@@ -706,6 +706,8 @@ class Result:
             lines.append(
                 f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice"
             )
+        if self.competition is not None:
+            lines.append(f"  {self.competition.sentence()}")
         remarks = [log.remark for log in self.logs]
         lines += [f"  {note}" for note in self.notes if note not in remarks]
         return lines + [f"? {suggestion.change}" for suggestion in self.suggestions]

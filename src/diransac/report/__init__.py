@@ -100,6 +100,7 @@ def _content(entries: Sequence[Entry], logs: Sequence[Log]) -> dict[str, Any]:
         "correlations": sections.correlations(entries),
         "diagnosis": sections.diagnosis(entries),
         "suggestions": sections.suggestions(entries),
+        "competitions": sections.competitions(entries),
         "logs": [figures_of(log, runs, len(logs)) for log, runs in zip(logs, by_log, strict=True)],
         "friction": friction_figures(entries),
         "spectra": spectrum_figures(entries),

@@ -30,6 +30,7 @@ __all__ = [
     "sensitivity",
     "short_term_scores",
     "suggestions",
+    "competitions",
 ]
 
 _LEVELS: Mapping[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}
@@ -333,6 +334,21 @@ def suggestions(entries: Sequence[Entry]) -> list[Table]:
         ]
         caption = "Terms that would explain the unmodelled forces"
         if rows:
+            tables.append(Table(header, rows, f"{caption}, by {entry.label}" if len(entries) > 1 else caption))
+    return tables
+
+
+def competitions(entries: Sequence[Entry]) -> list[Table]:
+    """Comparison of estimates by held-out prediction of each result that has one."""
+    tables = []
+    for entry in entries:
+        found = entry.result.competition
+        if found is not None:
+            header, *rows = (tuple(row) for row in found.lines())
+            caption = (
+                "Estimates compared by open-loop prediction of parts of the logs that they were not estimated from: "
+                "error over that of the prediction that nothing changes"
+            )
             tables.append(Table(header, rows, f"{caption}, by {entry.label}" if len(entries) > 1 else caption))
     return tables
 

@@ -53,6 +53,9 @@ class Comparison:
         Index of the winner.
     as_good : (n_candidates,) bool array
         Candidates that predict as well, within the noise of the comparison.
+    weights : (n_candidates,) array
+        Weight of each in the uncertainty of the result: exp(-z^2 / 2) of its difference from the winner, z in standard
+        errors, and 1 for those that predict better.
     """
 
     horizons: tuple[float, ...]
@@ -60,6 +63,7 @@ class Comparison:
     scores: FloatArray
     best: int
     as_good: BoolArray
+    weights: FloatArray
 
 
 def horizons_of(intervals: ShootingIntervals, motion: Motion, horizon: float | None) -> list[int]:
@@ -161,8 +165,7 @@ def compared(
         losses.append(np.nanmean(np.stack(own, axis=2), axis=(1, 2)))
         errors.append([float(np.sqrt(np.nanmean(x))) for x in squares])
     scores = np.array([[_mean(x[block == k]) for k in range(blocks.n)] for x in losses])
-    best, as_good = _choice(scores)
-    return Comparison(tuple(n * intervals.dt for n in steps), np.array(errors), scores, best, as_good)
+    return Comparison(tuple(n * intervals.dt for n in steps), np.array(errors), scores, *_choice(scores))
 
 
 def _mean(values: FloatArray) -> float:
@@ -212,16 +215,26 @@ def _prediction_errors(
     return segments.errors(lanes, states)[0][:, n_before:]
 
 
-def _choice(scores: FloatArray) -> tuple[int, BoolArray]:
-    """The first of the candidates that predict as well as the best one, and the mask of these."""
+def _choice(scores: FloatArray) -> tuple[int, BoolArray, FloatArray]:
+    """The winner, the mask of the candidates that predict as well, and their weights.
+
+    The winner is the first candidate that the best one does not beat by more than the noise of the comparison, nor by
+    more than a fiftieth of its loss.
+    """
     means = np.nanmean(scores, axis=1)
     first = int(np.nanargmin(means))
-    apart = scores - scores[first]
-    n = np.isfinite(apart).sum(axis=1)
-    error = np.nanstd(apart, axis=1) / np.sqrt(np.maximum(n - 1, 1))
+    difference, error = _differences(scores, first)
+    n = np.isfinite(scores).sum(axis=1)
     quantile = student_quantile(max(int(n.max()) - 1, 1), 0.975)
-    difference = np.nanmean(apart, axis=1)
-    as_good = difference <= np.minimum(quantile * error, _AS_WELL * max(means[first], 1e-300)) + 1e-12
-    as_good |= difference <= 1e-12
-    best = int(np.flatnonzero(as_good)[0])
-    return best, np.asarray(difference <= quantile * error)
+    near = np.minimum(quantile * error, _AS_WELL * max(means[first], 0.0))
+    best = int(np.flatnonzero(difference <= near + 1e-12)[0])
+    from_best, error_of_best = _differences(scores, best)
+    z = np.maximum(from_best, 0.0) / np.maximum(error_of_best, 1e-300)
+    return best, np.asarray(difference <= quantile * error), np.where(np.isfinite(z), np.exp(-0.5 * np.square(z)), 0.0)
+
+
+def _differences(scores: FloatArray, reference: int) -> tuple[FloatArray, FloatArray]:
+    """Mean difference ``(n,)`` of the losses from those of one candidate, and its standard error, by blocks."""
+    apart = scores - scores[reference]
+    n = np.isfinite(apart).sum(axis=1)
+    return np.nanmean(apart, axis=1), np.nanstd(apart, axis=1) / np.sqrt(np.maximum(n - 1, 1))

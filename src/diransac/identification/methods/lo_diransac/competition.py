@@ -43,15 +43,18 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["Contest", "explains", "is_settled"]
+__all__ = ["Contest", "is_settled"]
 
-_WITHIN = 0.2
-_INLYING = 0.5
+# Noise over the spread of the signal, and its correlation from sample to sample, up to which an exact model is right.
+_WITHIN, _WHITE = 0.2, 0.5
+_INLYING, _TINY = 0.5, 1e-300
 _LEAST_NOISE = 1e-4
 
 
 def is_settled(explanation: Explanation, motion: Motion) -> bool:
-    """True if the exact model predicts the log within the noise of a state that is measured well.
+    """True if the exact model predicts the log within the noise of its most accurate signal.
+
+    That noise is small beside the signal, and hardly correlated from sample to sample.
 
     Parameters
     ----------
@@ -63,10 +66,16 @@ def is_settled(explanation: Explanation, motion: Motion) -> bool:
     -------
     bool
     """
-    intervals = explanation.intervals
-    seen = intervals.known.any(axis=0)
-    noise = explanation.refinement.fit.noise.sigma[seen] / np.maximum(motion.spread[seen], 1e-300)
-    return bool(explanation.exact and noise.min() < _WITHIN)
+    if not explanation.exact:
+        return False
+    intervals, fit = explanation.intervals, explanation.refinement.fit
+    share = np.where(intervals.known.any(axis=0), fit.noise.sigma / np.maximum(motion.spread, _TINY), np.inf)
+    best = int(np.argmin(share))
+    inlying = fit.noise.inlying(fit.residuals, intervals.known)[:, best] > _INLYING
+    e = np.where(inlying, fit.residuals[:, best], 0.0)
+    both = inlying[1:] & inlying[:-1]
+    correlation = (e[1:] * e[:-1])[both].sum() / max(np.square(e[1:][both]).sum(), _TINY)
+    return bool(share[best] < _WITHIN and correlation < _WHITE)
 
 
 @dataclass
@@ -159,9 +168,9 @@ class Contest:
             covariance[stuck, stuck] = np.inf
             left = unexplained(intervals, fit, one.parameters)
             found = ProjectedEstimate(one.parameters, covariance, left, np.arange(len(intervals)))
-        others = [x.parameters for x, ok in zip(self.candidates, self.comparison.as_good, strict=True) if ok]
-        apart = np.array(others) - found.parameters
-        return replace(found, covariance=found.covariance + apart.T @ apart / max(len(apart), 1))
+        apart, weights = np.array([x.parameters for x in self.candidates]) - found.parameters, self.comparison.weights
+        spread = (weights * apart.T) @ apart / weights.sum()
+        return replace(found, covariance=found.covariance + spread)
 
     def summary(self, winner: int) -> Competition:
         """The comparison, for the result."""

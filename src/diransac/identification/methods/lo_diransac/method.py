@@ -235,6 +235,10 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     """Parameters of the dataset's model, step by step."""
     _check_sensors(settings, dataset)
     check_set_points(dataset, settings.set_points)
+    unknown = [name for name in settings.start or () if name not in dataset.model.parameters]
+    if unknown:
+        has = ", ".join(dataset.model.parameters)
+        raise SettingsError(f'start names "{unknown[0]}", which is not to be identified; these are: {has}')
     check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
     best = _competed(settings, dataset, seed, callback)
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
@@ -359,7 +363,7 @@ def _decided(
     (intervals, motion, notes), dataset = whole, contest.dataset
     holds = [dataset.input_hold] if dataset.input_hold else ["zero-order", "linear"]
     actings = [ActingInputs.recorded(intervals, hold) for hold in holds]
-    starts = [] if settings.start is None else [_start_of(settings.start, dataset)]
+    starts = [] if (given := _given_start(settings, dataset)) is None else [given]
     forced = bool(settings.input_delay or settings.input_lag)
     if first is not None:
         fit, own = first.likeliest.refinement.fit, first.likeliest.intervals
@@ -425,10 +429,19 @@ def _second(
         return None
 
 
-def _start_of(start: Mapping[str, float], dataset: Dataset) -> FloatArray:
-    """The user's start, with ones for parameters that it does not name."""
-    names = [name.partition("[")[0] for name in dataset.layout.names]
-    return np.array([start.get(name, 1.0) for name in names])
+def _given_start(settings: LoDiransac, dataset: Dataset) -> FloatArray | None:
+    """The user's start, means of priors and nominal values, in this order; one where there is none of these.
+
+    None where there is none of any parameter.
+    """
+    layout, start = dataset.layout, settings.start or {}
+    found = []
+    for name, bound, mean, std in zip(layout.names, layout.bounds, layout.prior_mean, layout.prior_std, strict=True):
+        plain = name.partition("[")[0]
+        nominal = mean if np.isfinite(std) else bound.value
+        found.append(start.get(plain, nominal))
+    known = [x for x in found if x is not None]
+    return np.array([1.0 if x is None else x for x in found], float) if known else None
 
 
 def _likeliest(

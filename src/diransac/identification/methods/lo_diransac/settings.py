@@ -83,6 +83,12 @@ class LoDiransacSettings:
             elif f.name not in (*_OBJECTS, *_SWITCHES):
                 object.__setattr__(self, f.name, _checked(f.name, value, f.default))
         check_substeps(self.substeps)
+        unknown = [x for x in self.sources if x not in SOURCES]
+        if unknown:
+            raise SettingsError(f"sources names {unknown[0]!r}; there are {', '.join(SOURCES)}")
+        if self.horizon is not None:
+            object.__setattr__(self, "horizon", _checked("horizon", self.horizon, 1.0))
+        _check_start(self.start)
         if self.candidate_terms is not None and not callable(self.candidate_terms):
             raise SettingsError(
                 f"candidate_terms is {self.candidate_terms!r}; give a function of (q, v, u) that returns expressions "
@@ -99,8 +105,19 @@ class LoDiransacSettings:
 
     def options(self) -> Mapping[str, Any]:
         """All settings but the criteria and the user's candidate terms."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _OBJECTS}
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+        left_out = ("criteria", "candidate_terms")
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in left_out}
+        plain = {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+        return {**plain, "start": None if self.start is None else dict(self.start)}
+
+
+def _check_start(start: object) -> None:
+    """Raises SettingsError: no mapping from names to numbers."""
+    numbers = isinstance(start, Mapping) and all(
+        isinstance(x, int | float | np.number) and not isinstance(x, bool) and np.isfinite(x) for x in start.values()
+    )
+    if start is not None and not numbers:
+        raise SettingsError(f"start is {start!r}; give a number for each parameter that it names, such as mass=0.3")
 
 
 _OBJECTS = ("criteria", "candidate_terms", "start", "horizon")
@@ -140,7 +157,7 @@ def _checked(name: str, value: Any, default: Any) -> Any:
 def _checked_names(name: str, value: Any) -> tuple[str, ...] | None:
     """Names of signals or inputs; one name stands for itself.  Raises SettingsError: a value is no name."""
     names = (value,) if isinstance(value, str) else value
-    by_evidence = name != "set_points"
+    by_evidence = name not in ("set_points", "sources")
     if names is None and by_evidence:
         return None
     if not isinstance(names, list | tuple) or not all(isinstance(x, str) for x in names):

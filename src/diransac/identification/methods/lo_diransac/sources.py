@@ -40,7 +40,7 @@ _BANDWIDTHS = (0.5, 1.0, 2.0, 4.0)
 """Of filtered least squares, over the bandwidth that the package chooses for a log."""
 _N_RANDOM, _N_FOLLOWED, _DECADE = 16, 3, 1.0
 _SHORTEST, _GROWTH, _FEWEST_SEGMENTS = 8, 3, 12
-_ROWS_OF_SEARCH, _SCREENED = 3000, 16
+_ROWS_OF_SEARCH, _MOST_ROWS, _SCREENED = 3000, 50_000, 16
 _STEPS, _CONVERGED = 25, 0.1
 """Steps at most, and the change of the parameters, standard errors, that ends them."""
 _NOISE_MOVES = 0.03
@@ -323,7 +323,7 @@ def _random_starts(intervals: ShootingIntervals, known: FloatArray, seed: int) -
     return np.array(found)
 
 
-def _segments(intervals: ShootingIntervals, acting: ActingInputs, length: int, most_rows: float = np.inf) -> Segments:
+def _segments(intervals: ShootingIntervals, acting: ActingInputs, length: int, most_rows: int = _MOST_ROWS) -> Segments:
     """Segments one after another in all stretches; every so-manieth one where there are too many rows."""
     starts = np.concatenate(
         [np.arange(x.start, x.stop - length + 1, length) for x in stretches(intervals)] or [np.arange(0)]

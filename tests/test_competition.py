@@ -1,0 +1,255 @@
+"""Estimates compete: simulation error without smoothing, comparison by held-out prediction, and what a result says of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import diransac as dr
+from diransac.data.dataset import Dataset
+from diransac.identification.methods.lo_diransac.arbiter import compared
+from diransac.identification.methods.lo_diransac.method import prepared
+from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments, stretches
+from diransac.identification.methods.lo_diransac.sources import (
+    Blocks,
+    Candidate,
+    jackknife,
+    least_squares_candidates,
+    simulation_error_candidates,
+)
+
+TRUTH = {"m": 5.3e-6, "d": 2.3e-4, "k": 1.0, "c": 4.0}
+RATE = 610.35
+
+
+def oscillator() -> dr.Model:
+    return dr.Model(
+        name="oscillator",
+        coordinates={"y": "V"},
+        inputs={"u": "V"},
+        parameters={
+            "m": dr.Parameter("s^2", positive=True),
+            "d": dr.Parameter("s", lower=0.0),
+            "k": dr.Parameter("1", positive=True),
+            "c": dr.Parameter("V^-2"),
+        },
+        equations=lambda q, v, a, u, p: [p.m * a.y + p.d * v.y + p.k * q.y + p.c * q.y**3 - u.u],
+    )
+
+
+def ringing(n: int = 3000, seed: int = 0, lacks: float = 0.0) -> dr.Log:
+    """A lightly damped Duffing oscillator at nine samples a period, inputs interpolated; by RK4 with 40 steps a sample.
+
+    ``lacks`` is a constant force that the model lacks, in V.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) / RATE
+    f = np.arange(1, 60)
+    u = (0.05 * np.cos(2 * np.pi * 3.0 * f[:, None] * t + rng.uniform(0, 2 * np.pi, (len(f), 1)))).sum(axis=0) * 0.2
+    substeps = 40
+    h = 1.0 / RATE / substeps
+
+    def slope(y: float, v: float, force: float) -> tuple[float, float]:
+        return v, (force - TRUTH["d"] * v - TRUTH["k"] * y - TRUTH["c"] * y**3) / TRUTH["m"]
+
+    y, v, found = 0.0, 0.0, np.empty(n)
+    for i in range(n):
+        found[i] = y
+        last = u[min(i + 1, n - 1)] - u[i]
+        for j in range(substeps):
+            s = [u[i] + last * (j + x) / substeps + lacks for x in (0.0, 0.5, 1.0)]
+            k1 = slope(y, v, s[0])
+            k2 = slope(y + 0.5 * h * k1[0], v + 0.5 * h * k1[1], s[1])
+            k3 = slope(y + 0.5 * h * k2[0], v + 0.5 * h * k2[1], s[1])
+            k4 = slope(y + h * k3[0], v + h * k3[1], s[2])
+            y += h / 6.0 * (k1[0] + 2 * k2[0] + 2 * k3[0] + k4[0])
+            v += h / 6.0 * (k1[1] + 2 * k2[1] + 2 * k3[1] + k4[1])
+    noise = 2e-4 * rng.standard_normal(n)
+    return dr.Log.from_arrays(t, {"y": found + noise, "u": u}, units={"y": "V", "u": "V"})
+
+
+@pytest.fixture(scope="module")
+def bound() -> tuple:
+    """Intervals, motion and blocks of a log at nine samples a period."""
+    dataset = Dataset.of(oscillator(), ringing(), pointwise=False)
+    intervals, motion, _ = prepared(dr.LoDiransac(), dataset)
+    return dataset, intervals, motion, Blocks.of(intervals)
+
+
+def truth() -> np.ndarray:
+    return np.array(list(TRUTH.values()))
+
+
+# ---------------------------------------------------------------------- simulation error
+
+
+def test_simulation_error_finds_what_smoothing_cannot_see(bound: tuple) -> None:
+    _, intervals, motion, blocks = bound
+    actings = [ActingInputs.recorded(intervals, hold) for hold in ("zero-order", "linear")]
+    far = truth() * np.array([2.0, 0.3, 0.6, 1.5])
+    found = simulation_error_candidates(intervals, motion, far[None], actings, 0, blocks)
+    last = found[-1][0]
+    assert last.acting.hold == "linear"
+    np.testing.assert_allclose(last.parameters, truth(), rtol=0.02)
+
+
+def test_simulation_error_depends_on_the_seed_alone(bound: tuple) -> None:
+    _, intervals, motion, blocks = bound
+    actings = [ActingInputs.recorded(intervals, "linear")]
+    one, two = (
+        simulation_error_candidates(replace(intervals, threads=n), motion, truth()[None], actings, 3, blocks)
+        for n in (1, 2)
+    )
+    for (a, _), (b, _) in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a.parameters, b.parameters)
+
+
+def test_states_are_those_of_the_simulation(bound: tuple) -> None:
+    _, intervals, _, _ = bound
+    segments = Segments(intervals, ActingInputs.recorded(intervals, "linear"), np.array([100, 900]), 30)
+    lanes = np.tile(truth(), (1, 2, 1))
+    states = np.array([[[0.01, 1.0], [-0.02, 3.0]]])
+    exact = segments.trajectories(lanes, states)[0, :, :, 0]
+    measured = intervals.measured.copy()
+    measured[segments.rows, 0] = exact
+    same = Segments(replace(intervals, measured=measured), segments.acting, segments.starts, 30)
+    found = same.estimated_states(lanes, np.zeros_like(states), np.ones((len(measured), 1)))
+    np.testing.assert_allclose(found, states, rtol=1e-6, atol=1e-9)
+
+
+def test_no_stretch_passes_a_gap(bound: tuple) -> None:
+    _, intervals, _, _ = bound
+    gaps = intervals.gaps.copy()
+    gaps[500:510] = True
+    parts = stretches(replace(intervals, gaps=gaps))
+    assert [(x.start, x.stop) for x in parts] == [(0, 500), (510, int(intervals.is_logged.sum()))]
+
+
+# ---------------------------------------------------------------------- the arbiter
+
+
+def candidate(name: str, parameters: np.ndarray, bound: tuple, without: np.ndarray | None = None) -> Candidate:
+    _, intervals, _, blocks = bound
+    own = np.tile(parameters, (blocks.n, 1)) if without is None else without
+    return Candidate(name, parameters, own, ActingInputs.recorded(intervals, "linear"), intervals)
+
+
+def comparison(candidates: list[Candidate], bound: tuple, horizon: float | None = None):
+    _, intervals, motion, blocks = bound
+    every = np.ones(intervals.measured.shape, bool)
+    return compared(candidates, intervals, motion, every, motion.spread, blocks, horizon, 25)
+
+
+def test_better_predictions_win_whatever_their_order(bound: tuple) -> None:
+    good, bad = candidate("good", truth(), bound), candidate("bad", truth() * 1.3, bound)
+    assert comparison([good, bad], bound).best == 0
+    found = comparison([bad, good], bound)
+    assert found.best == 1
+    assert found.as_good.tolist() == [False, True]
+    assert found.weights[1] == 1.0 and found.weights[0] < 0.05
+
+
+def test_equal_predictions_leave_the_first(bound: tuple) -> None:
+    found = comparison([candidate("a", truth(), bound), candidate("b", truth(), bound)], bound)
+    assert found.best == 0
+    assert found.as_good.all()
+
+
+def test_a_block_is_predicted_without_its_own_estimate(bound: tuple) -> None:
+    """An estimate that is right only where a block itself was used predicts badly."""
+    cheating = candidate("cheating", truth(), bound, np.tile(truth() * 1.3, (bound[3].n, 1)))
+    assert comparison([cheating, candidate("honest", truth() * 1.01, bound)], bound).best == 1
+
+
+def test_horizon_is_the_one_that_is_asked_for(bound: tuple) -> None:
+    found = comparison([candidate("a", truth(), bound)], bound, 0.05)
+    assert len(found.horizons) == 1
+    assert found.horizons[0] == pytest.approx(0.05, abs=1.0 / RATE)
+
+
+def test_jackknife_is_that_of_a_mean() -> None:
+    """Estimates without each of K equal blocks of a mean: the variance of block means over K, times t squared."""
+    rng = np.random.default_rng(1)
+    means = rng.standard_normal((10, 1))
+    without = (means.sum(axis=0) - means) / 9.0
+    expected = means.var(ddof=1) / 10.0 * (2.2621571628 / 1.9599639845) ** 2
+    assert jackknife(without)[0, 0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_least_squares_competes_at_several_bandwidths(bound: tuple) -> None:
+    dataset, intervals, _, blocks = bound
+    names = [x.name for x in least_squares_candidates(dataset, intervals, blocks)]
+    assert sum(name.startswith("ols") for name in names) >= 1
+    assert len(set(names)) == len(names)
+
+
+# ---------------------------------------------------------------------- results
+
+
+@pytest.fixture(scope="module")
+def lacking() -> dr.Result:
+    return dr.identify(oscillator(), ringing(lacks=0.01), differentiate=True)
+
+
+def test_the_result_predicts_as_well_as_every_competitor(lacking: dr.Result) -> None:
+    found = lacking.competition
+    assert found is not None
+    winner = next(x for x in found.competitors if x.name == found.winner)
+    assert winner.score <= 1.03 * min(x.score for x in found.competitors)
+    assert {x.name.partition(",")[0] for x in found.competitors} >= {"ols", "nls", "simulation error", "joint fit"}
+
+
+def test_an_answer_where_smoothing_sees_nothing(lacking: dr.Result) -> None:
+    assert lacking.parameters["m"] == pytest.approx(TRUTH["m"], rel=0.03)
+    assert lacking.estimate.resolution.hold == "linear"
+
+
+def test_the_competition_is_printed_and_stored(lacking: dr.Result, tmp_path) -> None:
+    assert "held-out prediction" in str(lacking)
+    lacking.save(tmp_path / "model.json")
+    assert dr.Result.load(tmp_path / "model.json").competition == lacking.competition
+
+
+def test_a_source_can_be_switched_off() -> None:
+    method = dr.LoDiransac(sources=("least squares",))
+    found = dr.identify(oscillator(), ringing(lacks=0.01), method, differentiate=True).competition
+    assert found is not None
+    assert not any(x.name.startswith("simulation error") for x in found.competitors)
+
+
+def test_exact_logs_have_no_competition() -> None:
+    model, rng = dr.models.underwater_vehicle(), np.random.default_rng(0)
+    t = np.arange(0.0, 60.0, 0.05)
+    thrust = 40.0 * np.sin(0.4 * t) + 25.0 * np.sin(1.3 * t)
+    values = dict(zip(model.parameters, (120.0, 20.0, 35.0, 3.0), strict=True))
+    blank = {name: np.zeros(len(t)) for name in model.signals}
+    inputs = dr.Log.from_arrays(t, {**blank, "thrust": thrust})
+    log = dr.simulate(dr.Plant(model, values), inputs, initial_state=dict.fromkeys(model.state, 0.0))
+    signals = {"x": log["x"] + 1e-3 * rng.standard_normal(len(t)), "thrust": thrust}
+    found = dr.identify(model, dr.Log.from_arrays(t, signals), differentiate=True)
+    assert found.competition is None
+    for name, value in values.items():
+        assert found.parameters[name] == pytest.approx(value, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"start": {"mass": 0.3}}, "mass"),
+        ({"start": {"m": "heavy"}}, "heavy"),
+        ({"start": [1.0]}, "start"),
+        ({"horizon": -1.0}, "horizon"),
+        ({"method": "ols", "horizon": 1.0}, "horizon"),
+        ({"method": "ols", "start": {"m": 1.0}}, "start"),
+    ],
+)
+def test_start_and_horizon_are_checked(options: dict, what: str) -> None:
+    with pytest.raises(dr.SettingsError, match=what):
+        dr.identify(oscillator(), ringing(600), differentiate=True, **options)
+
+
+def test_an_unknown_source_is_refused() -> None:
+    with pytest.raises(dr.SettingsError, match="sources"):
+        dr.LoDiransac(sources=("guess",))
