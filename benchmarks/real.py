@@ -2,7 +2,7 @@
 
 ``python benchmarks/real.py [--data ../shared/data] [--only silverbox,emps] [--methods default] [--out rows.jsonl]``
 
-Every record is split into a training and a held-out part (`real_records`).  The methods:
+Every record is split into a training and a held-out part (`real_records` has the list).  The methods:
 
 - ``default``: ``dr.identify(model, logs, differentiate=True)``, no setting;
 - ``ols``, ``nls``: the package's least squares of filtered derivatives;
@@ -33,7 +33,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from real_records import RECORDS, Found, Record
+from real_records import RECORDS as MACHINES
+from real_records import Found, Record
+from real_robots import RECORDS as ROBOTS
 from real_simulation import Inputs
 
 import diransac as dr
@@ -45,6 +47,7 @@ METHODS = ("default", *OTHERS, "published")
 FAILURES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError, np.linalg.LinAlgError)
 """Of a method that neither answers nor refuses."""
 Row = dict[str, Any]
+RECORDS = {**MACHINES, **ROBOTS}
 
 
 # ---------------------------------------------------------------------- rows

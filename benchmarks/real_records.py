@@ -167,20 +167,20 @@ def least_squares(model: dr.Model, train: Sequence[dr.Log]) -> Array | None:
 # ---------------------------------------------------------------------- the records
 
 
-PENDULUM = dict(
-    inertia1=0.1, moment1=0.3, inertia2=0.05, moment2=0.1, rotor_inertia=1e-4,
-    viscous_friction1=0.01, dry_friction1=0.1, viscous_friction2=0.01, dry_friction2=0.1,
-)  # fmt: skip
+PENDULUM = {
+    "inertia1": 0.1, "moment1": 0.3, "inertia2": 0.05, "moment2": 0.1, "rotor_inertia": 1e-4,
+    "viscous_friction1": 0.01, "dry_friction1": 0.1, "viscous_friction2": 0.01, "dry_friction2": 0.1,
+}  # fmt: skip
 """Round numbers."""
-A0 = dict(
-    inertia1=0.10786, moment1=0.34912, inertia2=0.023924, moment2=0.11107, rotor_inertia=7.66e-5,
-    viscous_friction1=0.001, dry_friction1=0.093, viscous_friction2=0.001, dry_friction2=0.078,
-)  # fmt: skip
+A0 = {
+    "inertia1": 0.10786, "moment1": 0.34912, "inertia2": 0.023924, "moment2": 0.11107, "rotor_inertia": 7.66e-5,
+    "viscous_friction1": 0.001, "dry_friction1": 0.093, "viscous_friction2": 0.001, "dry_friction2": 0.078,
+}  # fmt: skip
 """Base parameters of model 2.0 of design A.0, as published beside the records."""
-C0 = dict(
-    inertia1=0.049268, moment1=0.24113, inertia2=0.053878, moment2=0.18117, rotor_inertia=9.94e-5,
-    viscous_friction1=0.001, dry_friction1=0.093, viscous_friction2=0.001, dry_friction2=0.078,
-)  # fmt: skip
+C0 = {
+    "inertia1": 0.049268, "moment1": 0.24113, "inertia2": 0.053878, "moment2": 0.18117, "rotor_inertia": 9.94e-5,
+    "viscous_friction1": 0.001, "dry_friction1": 0.093, "viscous_friction2": 0.001, "dry_friction2": 0.078,
+}  # fmt: skip
 """Those of model 3.0 of design C.0."""
 
 
@@ -208,8 +208,8 @@ def emps(data: Path) -> Record:
     model = dr.models.servo_axis()
     log = dr.read_log(data / "emps" / "DATA_EMPS.csv", rename={"t": "t_s", "position": "q_m", "force": "force_N"})
     first, second = log.split(0.5)
-    guess = dict(mass=100.0, viscous_friction=100.0, dry_friction=10.0, offset=-1.0)
-    janot = dict(mass=95.1089, viscous_friction=203.5034, dry_friction=20.3935, offset=-3.1648)
+    guess = {"mass": 100.0, "viscous_friction": 100.0, "dry_friction": 10.0, "offset": -1.0}
+    janot = {"mass": 95.1089, "viscous_friction": 203.5034, "dry_friction": 20.3935, "offset": -3.1648}
 
     def mujoco_sysid() -> Found:
         from gauntlet_mujoco import fitted
@@ -243,7 +243,7 @@ def silverbox(data: Path, with_offset: bool) -> Record:
     simulator, names = Simulator(oscillator, 3), list(model.parameters)
     low, spread = low_bounds(model), np.array([np.std(y[part])])
     problem = OutputError(simulator, [motion(model, log)], low, spread, 250 * dt, 5)
-    guess = dict(m=1e-5, d=1e-4, k1=1.0, k3=1.0, k2=0.1, c=0.01)
+    guess = {"m": 1e-5, "d": 1e-4, "k1": 1.0, "k3": 1.0, "k2": 0.1, "c": 0.01}
 
     def judge(parameters: Mapping[str, float], inputs: Inputs) -> Score:
         """Chunks of 1,000 rows, each after 1,000 rows from rest, far longer than the oscillator rings."""

@@ -1,6 +1,6 @@
 """Simulation, scores and output error of `real.py`, apart from the package.  Nothing happens when this file is run.
 
-A machine is a function ``rates(x, u, p)`` over lanes: states ``(n_x, L)``, inputs ``(n_u, L)``, parameters ``(n_p, L)``.
+A machine is ``rates(x, u, p)`` over lanes: states ``(n_x, L)``, inputs ``(n_u, L)``, parameters ``(n_p, L)``.
 The first ``n_y`` states are measured positions, the next their velocities.
 
 References
@@ -249,8 +249,8 @@ class _Segments:
         kept = np.unique(np.linspace(0, number - 1, number if most is None else min(most, number)).astype(int))
         states = np.concatenate([log.states(problem.width) for log in problem.train], axis=1)
         return cls(
-            problem, inputs, log.dt, np.concatenate(measured, axis=2)[..., kept], np.concatenate(first, axis=1)[:, kept],
-            np.concatenate(stages), np.concatenate(begins)[kept],
+            problem, inputs, log.dt, np.concatenate(measured, axis=2)[..., kept],
+            np.concatenate(first, axis=1)[:, kept], np.concatenate(stages), np.concatenate(begins)[kept],
             np.unique(np.linspace(0, steps, min(ROWS, steps + 1)).astype(int)), np.std(states, axis=1) + 1e-9,
         )  # fmt: skip
 
