@@ -134,7 +134,7 @@ def in_windows(
     spread = np.std(np.concatenate([log.y for log in (*own, *others)]), axis=0)
     simulator = Simulator(rates)
     windows = Windows(simulator, others, spread, horizons, width)
-    problem = OutputError(simulator, own, low_bounds(model), spread, length, width)
+    problem = OutputError(Simulator(rates, 1), own, low_bounds(model), spread, length, width)
     names = list(model.parameters)
 
     def judge(parameters: Mapping[str, float], inputs: Inputs) -> Score:

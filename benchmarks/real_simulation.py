@@ -26,8 +26,8 @@ CAP, KEPT = 10.0, 0.95
 """Greatest error of a window in spreads; part of the windows that a robust error keeps."""
 STEP, ROWS, BEND = 1e-5, 50, 0.1
 """Relative step of derivatives; residuals per segment and signal; where the loss bends at first, spreads."""
-STARTS, PARTS, FEW = 8, 5, 40
-"""Starts; the segments on which they compete: parts of a long one, and their number."""
+STARTS, PARTS, FEW, TOLERANCE = 8, 5, 24, 1e-5
+"""Starts; the segments on which they compete: parts of a long one, and their number; relative, of cost and steps."""
 FAR = 1e6
 
 
@@ -267,6 +267,7 @@ class _Segments:
         fit = least_squares(
             lambda z: self._residual(z, size) / scale, z, lambda z: self._jacobian(z, size) / scale,
             bounds=(low, np.inf), loss="soft_l1", x_scale="jac", max_nfev=evaluations,
+            ftol=TOLERANCE, xtol=TOLERANCE,
         )  # fmt: skip
         fit.x = fit.x * np.concatenate([size, np.ones(self.first.size)])
         return fit
