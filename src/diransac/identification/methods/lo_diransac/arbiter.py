@@ -29,10 +29,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Comparison", "compared", "horizons_of"]
 
-_SEGMENTS_PER_BLOCK = 12
-_SCALES = (0.5, 2.0, 8.0)
+_SEGMENTS_PER_BLOCK = 20
+_SCALES = (0.125, 0.5, 2.0, 8.0)
 """Horizons over the time in which signals change by half of what they ever do."""
-_FEWEST_ROWS = 4
+_FEWEST_ROWS, _PART = 4, 3
+"""Rows of the shortest horizon, and stretches over segments at least."""
 _LOST = 1e4
 _AS_WELL = 0.02
 
@@ -88,18 +89,25 @@ def horizons_of(intervals: ShootingIntervals, motion: Motion, horizon: float | N
     return sorted({int(max(_FEWEST_ROWS, round(s * scale))) for s in _SCALES})
 
 
-def _placed(intervals: ShootingIntervals, blocks: Blocks, n_before: int, n_after: int) -> IntArray:
-    """First rows of segments that lie within a stretch and a block each, spread over these."""
-    n_rows, found = n_before + n_after, []
+def _placed(intervals: ShootingIntervals, blocks: Blocks, n_before: int, n_after: int) -> tuple[IntArray, IntArray]:
+    """First rows of segments within a stretch, spread over the blocks, and the block that each has no part in.
+
+    That is the block of the middle of the predicted rows: long predictions are of others in part, but few parameters
+    are determined by many rows.
+    """
+    n_rows, starts, left_out = n_before + n_after, [], []
     for part in stretches(intervals):
         own = blocks.of_row[part]
-        for k in np.unique(own):
-            rows = part.start + np.flatnonzero(own == k)
-            free = len(rows) - n_rows
-            if free >= 0:
-                n = min(_SEGMENTS_PER_BLOCK, 1 + 4 * free // n_rows)
-                found.append(rows[0] + np.unique(np.linspace(0, free, max(n, 1)).astype(int)))
-    return np.concatenate(found) if found else np.arange(0)
+        first = np.arange(part.start, part.stop - n_rows + 1)
+        block = own[: len(first) + n_before + n_after // 2][n_before + n_after // 2 :]
+        for k in np.unique(block):
+            rows = first[block == k]
+            some = rows[np.unique(np.linspace(0, len(rows) - 1, min(_SEGMENTS_PER_BLOCK, len(rows))).astype(int))]
+            starts.append(some)
+            left_out.append(np.full(len(some), k))
+    if not starts:
+        return np.arange(0), np.arange(0)
+    return np.concatenate(starts), np.concatenate(left_out)
 
 
 def compared(
@@ -136,16 +144,12 @@ def compared(
     Comparison or None
         None where the logs are too short.
     """
-    steps = horizons_of(intervals, motion, horizon)
-    starts = np.arange(0)
-    while steps and not len(starts := _placed(intervals, blocks, n_before, steps[-1])):
-        if len(steps) == 1 and steps[0] > _FEWEST_ROWS:
-            steps = [max(_FEWEST_ROWS, steps[0] // 2)]
-        else:
-            steps.pop()
-    if not len(starts):
+    longest = max((x.stop - x.start for x in stretches(intervals)), default=0) // _PART
+    n_before = min(n_before, longest // 2)
+    steps = sorted({min(x, longest - n_before) for x in horizons_of(intervals, motion, horizon)})
+    if n_before < 1 or steps[0] < 1:
         return None
-    block = blocks.of_row[starts]
+    starts, block = _placed(intervals, blocks, n_before, steps[-1])
     one = Segments(intervals, candidates[0].acting, starts, n_before + steps[-1])
     columns = _predicted(one)
     known = (intervals.sampled & inlying)[one.rows][:, n_before:][:, :, one.columns]

@@ -47,6 +47,8 @@ __all__ = ["Contest", "is_settled"]
 
 # Noise over the spread of the signal, and its correlation from sample to sample, up to which an exact model is right.
 _WITHIN, _WHITE = 0.2, 0.5
+# Error of the best estimate over that of the prediction that nothing changes, where a search was refused.
+_PREDICTS = 0.5
 _INLYING, _TINY = 0.5, 1e-300
 _LEAST_NOISE = 1e-4
 
@@ -146,6 +148,11 @@ class Contest:
             self.intervals.length,
         )  # fmt: skip
         return None if self.comparison is None else self.comparison.best
+
+    @property
+    def predicts(self) -> bool:
+        """True if the best estimate predicts much better than that nothing changes."""
+        return self.comparison is not None and bool(self.comparison.errors[self.comparison.best].min() < _PREDICTS)
 
     def is_as_good(self, search: _Searched | None) -> bool:
         """True if an estimate of a search's fit predicts as well as the best."""

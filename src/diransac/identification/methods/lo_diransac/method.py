@@ -345,12 +345,10 @@ def _competed(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callb
         if first is None:
             raise
         return replace(first, likeliest=replace(first.likeliest, complete=False))
-    if found is None:
-        if refused is not None:
-            raise refused
-        assert first is not None
-        return first
-    return found
+    if first is None and (found is None or not contest.predicts):
+        assert refused is not None
+        raise refused
+    return found or first  # type: ignore[return-value]  # one of them is there
 
 
 def _decided(
