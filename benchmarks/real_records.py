@@ -13,7 +13,7 @@
 | go2-FL, go2-FR, go2-RL, go2-RR | first half | second half |
 | px4 | all of it | nothing: no method should answer |
 
-The splits are fixed.  The single run is the first whose motion is lively in A.0; C.0 has the same number.
+The splits are fixed.  The single run is the first that the row before holds out.
 """
 
 from __future__ import annotations
@@ -54,7 +54,6 @@ class Record:
     unit : of the score
     published : parameters of the machine, where they are known
     baselines : further methods by name
-    options : of the package's least squares
     """
 
     name: str
@@ -151,8 +150,13 @@ def in_windows(
 
 
 def motion(model: dr.Model, log: dr.Log) -> Motion:
-    """Positions and inputs of a log."""
-    y, u = (np.column_stack([log[n] for n in names]) for names in (model.coordinates, model.inputs))
+    """Positions and inputs of a log, with gaps, of a few milliseconds in these records, interpolated."""
+
+    def bridged(name: str) -> Array:
+        seen = np.isfinite(log[name])
+        return np.interp(log.time, log.time[seen], log[name][seen])
+
+    y, u = (np.column_stack([bridged(name) for name in names]) for names in (model.coordinates, model.inputs))
     return Motion(y, u, log.dt)
 
 
