@@ -382,7 +382,7 @@ class LocalSearch:
         if now.exact:
             refined = refine_exact(self.settings, intervals, begin, now.prior, to_beat)
         else:
-            refined = refine(self.settings, intervals, begin, now.prior, settled=True, to_beat=to_beat)
+            refined = refine(self.settings, intervals, begin, now.prior, to_beat)
         return replace(now, intervals=intervals, refinement=refined)
 
     def _better(
@@ -503,7 +503,7 @@ class LocalSearch:
         rho = fit.rho ** (1.0 / parts)
         begin = with_residuals(intervals, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
         to_beat = coarse.refinement.cost
-        refined = refine(self.settings, intervals, begin, coarse.prior, settled=True, to_beat=to_beat)
+        refined = refine(self.settings, intervals, begin, coarse.prior, to_beat)
         return replace(coarse, intervals=intervals, refinement=refined)
 
     def _timings(self, now: Explanation, *, free_hold: bool) -> list[ShootingIntervals]:
@@ -546,7 +546,7 @@ class LocalSearch:
         if now.exact:
             refined = refine_exact(self.settings, intervals, begin, prior, now.cost)
             return Explanation(intervals, refined, prior, exact=True)
-        refined = refine(self.settings, intervals, begin, prior, settled=True)
+        refined = refine(self.settings, intervals, begin, prior)
         return self._simplest(Explanation(intervals, refined, prior, exact=False, trial=now.trial), prior)
 
     def _with_likeliest_lag(self, intervals: ShootingIntervals) -> ShootingIntervals:

@@ -148,19 +148,13 @@ class LoDiransac(LoDiransacSettings):
         Largest number of Gauss-Newton steps of a local optimisation; 0: the best hypothesis is the estimate.
     outliers : bool, optional
         Whether the noise of each signal has outliers; otherwise it is Gaussian.
-    neighbouring_starts : bool, optional
-        Whether initial states are propagated from neighbouring intervals where that has a higher likelihood.
-    gradual_continuity : bool, optional
-        Whether the motion is made continuous gradually rather than from the start.
-    robust_model_error : bool, optional
-        Whether the size of unmodelled accelerations follows the median interval until the first convergence.
     model_error : bool, optional
         Whether the size of unmodelled accelerations is estimated; otherwise they vanish.
     prior_model_error : float, optional
         Prior size of the unmodelled accelerations, over the spread of the accelerations.
     prior_discrepancy, initial_discrepancy : float, optional
-        Prior size of input gain and bias discrepancies, over that which equals an equation's inertial force: after, and
-        until the first convergence.
+        Size of input gain and bias discrepancies, over that which equals an equation's inertial force: of the prior,
+        and before the evidence determines it.
     prior_delay : float, optional
         Prior standard deviation of the input delay, s.
     projection : bool, optional
