@@ -22,7 +22,7 @@ from diransac.errors import TimeLimitError
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
-from diransac.identification.methods.lo_diransac.normal_equations import linearize, with_residuals
+from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
 from diransac.identification.methods.lo_diransac.recording_errors import (
     clear_errors,
@@ -30,7 +30,7 @@ from diransac.identification.methods.lo_diransac.recording_errors import (
     signal_rates,
     with_errors,
 )
-from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start, weights_of
+from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 from diransac.time_limit import check_time
 
@@ -182,7 +182,7 @@ class LocalSearch:
     prior: Prior
     callback: Callback | None
 
-    def likeliest(self, intervals: ShootingIntervals, *, free_hold: bool, to_beat: float = np.inf) -> Explanation:
+    def likeliest(self, intervals: ShootingIntervals, *, free_hold: bool) -> Explanation:
         """The likeliest explanation of the log.
 
         Parameters
@@ -191,8 +191,6 @@ class LocalSearch:
             With inputs as recorded.
         free_hold : bool
             Whether another hold of the inputs may be an explanation.
-        to_beat : float, optional
-            Cost of another explanation; the search ends early if this one is behind before it is elaborated.
 
         Returns
         -------
@@ -205,7 +203,7 @@ class LocalSearch:
         """
         best: Explanation | None = None
         try:
-            for found in self._ever_likelier(intervals, free_hold=free_hold, to_beat=to_beat):
+            for found in self._ever_likelier(intervals, free_hold=free_hold):
                 best = found
         except TimeLimitError:
             if best is None:
@@ -214,7 +212,7 @@ class LocalSearch:
         assert best is not None
         return best
 
-    def _ever_likelier(self, intervals: ShootingIntervals, *, free_hold: bool, to_beat: float) -> Iterator[Explanation]:
+    def _ever_likelier(self, intervals: ShootingIntervals, *, free_hold: bool) -> Iterator[Explanation]:
         """The likeliest explanation so far after each stage of the search."""
         report(self.callback, "searching for a delay", 0.1)
         delay = self._likeliest_delay(intervals)
@@ -227,8 +225,6 @@ class LocalSearch:
             other = self._simplest(self._from_hypotheses(delayed, 1), self._prior_of(delayed))
             best = self._better(best, [other])
             yield best
-        if best.cost > to_beat:
-            return
         best = self._with_timing(best, free_hold=free_hold)
         yield best
         found = self._with_errors_of_recordings(self._with_named_errors(best))
@@ -248,8 +244,6 @@ class LocalSearch:
             report(self.callback, "timing of the inputs", 0.6 + 0.1 * k)
             # A free delay suggests the others, even where no delay is admitted.
             is_free = k > 0 or (best.exact and settings.input_delay is not False)
-            if not is_free and not forced and self._delay_is_negligible(best):
-                break
             trial = best if is_free else self._refitted(best, best.intervals, self.prior)
             others = [self._refitted(trial, x) for x in self._timings(trial, free_hold=free_hold)]
             if settings.input_delay is not False and not (settings.input_lag and k == 0):
@@ -260,17 +254,6 @@ class LocalSearch:
                 break
             best = likelier
         return best
-
-    def _delay_is_negligible(self, best: Explanation) -> bool:
-        """True if a free delay of inputs that act as recorded would be too small, and uncertain, by one Newton step."""
-        intervals, fit = best.intervals, best.refinement.fit
-        if intervals.delay or intervals.lag:
-            return False
-        free = replace(fit, prior=np.append(fit.prior[:-1], max(self.prior.delay, _WHOLE_SAMPLE)))
-        at = linearize(intervals, free, weights_of(intervals, free))
-        solved = at.system.solve(at.right_z, at.right_s)
-        late, error = abs(fit.shared[-1] + solved.step_p[-1]), float(np.sqrt(solved.var_p[-1, -1]))
-        return bool(late < _SIGNIFICANT * error and late + _SIGNIFICANT * error < _SMALL_DELAY)
 
     def _with_named_errors(self, best: Explanation) -> Explanation:
         """The explanation with the errors of recordings that the settings name."""
@@ -311,7 +294,7 @@ class LocalSearch:
             for error in errors:
                 if error.kind.what == "lag" and not lag_may_help:
                     continue
-                trial = self._with_errors(best, [error], to_beat=likelier.cost)
+                trial = self._with_errors(best, [error])
                 if error.kind.of_inputs and error.kind.what == "delay":  # which acts much like a lag
                     lag_may_help = trial.cost < best.cost
                 share = _EXPLAINS_DRIFT if error.kind.what == "drift" else _EXPLAINS
@@ -368,22 +351,15 @@ class LocalSearch:
         as_likely = found.cost / retimed.known.sum() < (now.cost + _AS_LIKELY) / intervals.known.sum()
         return found if as_likely else now
 
-    def _with_errors(
-        self, now: Explanation, errors: Sequence[RecordingError], *, to_beat: float = np.inf
-    ) -> Explanation:
-        """The explanation with more errors, with the same freedom; given up where it will hardly beat a cost."""
+    def _with_errors(self, now: Explanation, errors: Sequence[RecordingError]) -> Explanation:
+        """The explanation with more errors, with the same freedom."""
         intervals = with_errors(now.intervals, now.refinement.fit, errors)
-        return self._optimised(now, intervals, with_residuals(intervals, now.refinement.fit), to_beat)
+        return self._optimised(now, intervals, with_residuals(intervals, now.refinement.fit))
 
-    def _optimised(
-        self, now: Explanation, intervals: ShootingIntervals, begin: Fit, to_beat: float = np.inf
-    ) -> Explanation:
+    def _optimised(self, now: Explanation, intervals: ShootingIntervals, begin: Fit) -> Explanation:
         """The explanation of other intervals with the same freedom."""
-        if now.exact:
-            refined = refine_exact(self.settings, intervals, begin, now.prior, to_beat)
-        else:
-            refined = refine(self.settings, intervals, begin, now.prior, to_beat)
-        return replace(now, intervals=intervals, refinement=refined)
+        fitted = refine_exact if now.exact else refine
+        return replace(now, intervals=intervals, refinement=fitted(self.settings, intervals, begin, now.prior))
 
     def _better(
         self,
@@ -476,10 +452,7 @@ class LocalSearch:
         return replace(flexible, trial=ExactTrial(exact.cost - cost, cost, flexible.unexplained, length))
 
     def _likeliest_exact(self, flexible: Explanation, prior: Prior) -> Explanation | None:
-        """The exact model from the parameters of a fit, or those of the best hypothesis; None if both are impossible.
-
-        Fits are given up that will hardly become as likely as the flexible one.
-        """
+        """The exact model from the parameters of a fit, or the best hypothesis; None if both are impossible."""
         intervals, fit = flexible.intervals, flexible.refinement.fit
         projected, found = flexible.projected, list[Explanation]()
         starts = np.array([projected, self.hypotheses[0]])
@@ -487,7 +460,7 @@ class LocalSearch:
         for p in starts[intervals.layout.admits(starts)]:
             begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
             is_left = any(x.of_inputs for x in intervals.all_errors.kinds)
-            refined = refine_exact(self.settings, intervals, begin, prior, np.inf if is_left else flexible.cost)
+            refined = refine_exact(self.settings, intervals, begin, prior)
             exact = Explanation(intervals, refined, prior, exact=True)
             found.append(self._with_refined_errors(exact) if is_left else exact)
             if found[-1].cost < flexible.cost:
@@ -502,9 +475,7 @@ class LocalSearch:
         x = series[:, :: intervals.length, :n_x].reshape(-1, n_x)
         rho = fit.rho ** (1.0 / parts)
         begin = with_residuals(intervals, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
-        to_beat = coarse.refinement.cost
-        refined = refine(self.settings, intervals, begin, coarse.prior, to_beat)
-        return replace(coarse, intervals=intervals, refinement=refined)
+        return self._optimised(coarse, intervals, begin)
 
     def _timings(self, now: Explanation, *, free_hold: bool) -> list[ShootingIntervals]:
         """Other timings of the inputs that the fit suggests: whole samples of delay, a lag, or another hold."""
@@ -544,7 +515,7 @@ class LocalSearch:
         sizes = np.append(fit.prior[:-1], max(prior.delay, _WHOLE_SAMPLE) if is_wide else prior.delay)
         begin = with_residuals(intervals, replace(fit, shared=np.append(fit.shared[:-1], left), prior=sizes))
         if now.exact:
-            refined = refine_exact(self.settings, intervals, begin, prior, now.cost)
+            refined = refine_exact(self.settings, intervals, begin, prior)
             return Explanation(intervals, refined, prior, exact=True)
         refined = refine(self.settings, intervals, begin, prior)
         return self._simplest(Explanation(intervals, refined, prior, exact=False, trial=now.trial), prior)

@@ -324,10 +324,10 @@ def _likeliest(settings: LoDiransac, dataset: Dataset, seed: int, callback: Call
     if first.likeliest.exact:
         return first
     try:
-        observed, cost = with_observed_states(intervals, motion), first.likeliest.cost
+        observed = with_observed_states(intervals, motion)
         if observed is not None:
             further = within(callback, 0.87, 0.9)
-            other = _searched(settings, intervals, observed, notes, seed, dataset, further, cost)
+            other = _searched(settings, intervals, observed, notes, seed, dataset, further)
             return min(first, other, key=lambda x: x.likeliest.cost)
     except TimeLimitError:
         return replace(first, likeliest=replace(first.likeliest, complete=False))
@@ -344,9 +344,8 @@ def _searched(
     seed: int,
     dataset: Dataset,
     callback: Callback | None,
-    to_beat: float = np.inf,
 ) -> _Searched:
-    """A search that begins with a motion; it may end behind another one."""
+    """A search that begins with a motion."""
     report(callback, "drawing hypotheses", 0.1)
     check_time()
     hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
@@ -355,7 +354,7 @@ def _searched(
         notes += (f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; they are interpolated",)
     unit = discrepancy_units(intervals, motion, hypotheses[0])
     search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
-    likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None, to_beat=to_beat)
+    likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
     return _Searched(motion, notes, len(hypotheses), likeliest, *_parameters(settings, likeliest))
 
 

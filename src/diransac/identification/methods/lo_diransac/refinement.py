@@ -57,8 +57,6 @@ _SIGMA_FLOOR = 1e-5
 _LEAST_PRIOR = 1e-6
 # Discrepancies of a model that is taken to be exact, over their prior sizes.
 _EXACT = 1e-3
-# Steps after which a fit is compared with a likelier one, each time; gains of so many steps that it may need to win.
-_COMPARED_STEPS, _PATIENCE = 6, 4
 # Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
 # the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
 _UNBROKEN = 0.01
@@ -192,29 +190,7 @@ def start(
     return Fit(shared, x, d, residuals, ends, noise, tau, np.zeros(n_v), motion.spread[:n_x].copy(), sizes, mean)
 
 
-@dataclass
-class _Race:
-    """A fit that is given up where it will hardly become likelier than another one."""
-
-    to_beat: float
-    before: float = np.inf
-
-    def is_lost(self, intervals: ShootingIntervals, fit: Fit, at: NormalEquations, steps: int) -> bool:
-        """True if the fit is behind by more than a few times its latest gain; compared every few steps."""
-        if not steps or steps % _COMPARED_STEPS or not np.isfinite(self.to_beat):
-            return False
-        now, before = _evidence(intervals, fit, at)[0], self.before
-        self.before = now
-        return now - self.to_beat > _PATIENCE * max(before - now, 0.0)
-
-
-def refine(
-    settings: LoDiransacSettings,
-    intervals: ShootingIntervals,
-    fit: Fit,
-    prior: Prior,
-    to_beat: float = np.inf,
-) -> Refinement:
+def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
     """Fit after steps and updates of every scale until convergence.
 
     Parameters
@@ -224,8 +200,6 @@ def refine(
     fit : Fit
         Initial fit, as from `start`.
     prior : Prior
-    to_beat : float, optional
-        Negative log evidence of another fit; this one is given up where it will hardly become likelier.
 
     Returns
     -------
@@ -236,9 +210,8 @@ def refine(
     TimeLimitError
         The time limit was reached.
     """
-    damping, converged, steps = 0.0, False, 0
-    race, at = _Race(to_beat), _linearized(intervals, fit)
-    while steps < settings.max_steps and not converged and not race.is_lost(intervals, fit, at, steps):
+    damping, converged, steps, at = 0.0, False, 0, _linearized(intervals, fit)
+    while steps < settings.max_steps and not converged:
         check_time()
         steps += 1
         moved, solved, damping = _step(intervals, fit, at, damping)
@@ -249,9 +222,7 @@ def refine(
     return Refinement(fit, *_evidence(intervals, fit, at), steps, converged)
 
 
-def refine_exact(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, to_beat: float
-) -> Refinement:
+def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
     """Fit of the model as it is, without unmodelled accelerations and input gain and bias discrepancies.
 
     Parameters
@@ -261,8 +232,6 @@ def refine_exact(
     fit : Fit
         Initial fit, as from `refine`.
     prior : Prior
-    to_beat : float
-        Negative log evidence of another fit; this one is given up where it will hardly become likelier.
 
     Returns
     -------
@@ -273,16 +242,14 @@ def refine_exact(
     TimeLimitError
         The time limit was reached.
     """
-    found = _refined_exactly(settings, intervals, fit, prior, to_beat)
+    found = _refined_exactly(settings, intervals, fit, prior)
     again = with_lost_intervals_restarted(intervals, found.fit) if found.converged else None
     if again is None:
         return found
-    return min(found, _refined_exactly(settings, intervals, again, prior, found.cost), key=lambda x: x.cost)
+    return min(found, _refined_exactly(settings, intervals, again, prior), key=lambda x: x.cost)
 
 
-def _refined_exactly(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, to_beat: float
-) -> Refinement:
+def _refined_exactly(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
     """As `refine_exact`, from one start."""
     n_p, least = intervals.n_p, _EXACT * prior.tau
     shared, sizes = fit.shared.copy(), fit.prior.copy()
@@ -292,8 +259,8 @@ def _refined_exactly(
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
     damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
-    race, at = _Race(to_beat), _linearized(intervals, fit)
-    while steps < settings.max_steps and not converged and not race.is_lost(intervals, fit, at, steps):
+    at = _linearized(intervals, fit)
+    while steps < settings.max_steps and not converged:
         check_time()
         steps += 1
         moved, solved, damping = _step(intervals, fit, at, damping)
