@@ -27,7 +27,6 @@ from diransac.identification.methods.lo_diransac.projection import projected_par
 from diransac.identification.methods.lo_diransac.recording_errors import (
     clear_errors,
     errors_of,
-    signal_rates,
     with_errors,
 )
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
@@ -71,8 +70,6 @@ _EXPLAINS, _EXPLAINS_DRIFT = float(np.log(1.25)), float(np.log(4.0))
 _FIXED = 1e-6
 # Decrease of the log residuals of each signal by which a delay is worth to be tried.
 _SMALL_GAIN = 0.03
-# Gain of evidence, nats, that an error of a recording is worth.
-_WORTH = 20.0
 # Newton steps of the errors of recordings at most; changes over standard errors that end them.
 _REFINEMENTS, _REFINED = 4, 0.1
 # Inputs that vary between samples act half a sample before held ones.
@@ -232,9 +229,7 @@ class LocalSearch:
         if found is best:
             return
         # Inputs are late, or early, with respect to sensors that are so themselves.
-        found = self._with_refined_errors(self._with_timing(found, free_hold=free_hold))
-        yield found
-        yield self._with_refined_errors(self._with_fewest_delays(found))
+        yield self._with_refined_errors(self._with_timing(found, free_hold=free_hold))
 
     def _with_timing(self, best: Explanation, *, free_hold: bool) -> Explanation:
         """The explanation with another timing of the inputs, where that makes it likelier or is required."""
@@ -285,7 +280,7 @@ class LocalSearch:
         for k in range(settings.max_sensor_errors):
             report(self.callback, "errors of the recordings", 0.8 + 0.01 * k)
             fit, likelier = best.refinement.fit, best
-            errors = clear_errors(best.intervals, fit, alone, kinds, worth=_WORTH)
+            errors = clear_errors(best.intervals, fit, alone, kinds, worth=_AS_LIKELY)
             if not best.exact:
                 from diransac.identification.methods.lo_diransac.missing_terms import clear_errors_of_inputs
 
@@ -298,7 +293,7 @@ class LocalSearch:
                 if error.kind.of_inputs and error.kind.what == "delay":  # which acts much like a lag
                     lag_may_help = trial.cost < best.cost
                 share = _EXPLAINS_DRIFT if error.kind.what == "drift" else _EXPLAINS
-                if trial.cost < likelier.cost and self._better(best, [trial], _WORTH, share, of_one=True) is trial:
+                if trial.cost < likelier.cost and self._better(best, [trial], share, of_one=True) is trial:
                     likelier = trial
             if likelier is best:
                 break
@@ -327,30 +322,6 @@ class LocalSearch:
             best = self._with_errors(best, errors)
         return best
 
-    def _with_fewest_delays(self, now: Explanation) -> Explanation:
-        """The explanation with delays that are equal as one, in the time of the inputs if fewer are needed in it.
-
-        Time has no origin: inputs that are late, and some sensors early alike, are the other sensors late.
-        """
-        intervals, fit, settings = now.intervals, now.refinement.fit, self.settings
-        is_asked_for = settings.input_delay or settings.sensor_delays is not None
-        if intervals.errors is None or intervals.lag or is_asked_for:
-            return now
-        late = intervals.delay + fit.shared[-1]
-        late = late if abs(late) > _SMALL_DELAY else 0.0
-        delays = np.where(intervals.known.any(axis=0), intervals.errors.delay + late, 0.0)
-        delays = _grouped(delays, _SMALL_DELAY)
-        before = np.count_nonzero(np.unique(intervals.errors.delay)) + bool(late)
-        if np.count_nonzero(np.unique(delays)) >= before:
-            return now
-        retimed = intervals.with_delays(delays, signal_rates(intervals, fit))
-        x = _states_after(intervals, fit, round(late))
-        begin = with_residuals(retimed, replace(fit, x=x, shared=np.append(fit.shared[:-1], 0.0)))
-        found = self._optimised(now, retimed, begin)
-        # Samples at the ends of the logs differ.
-        as_likely = found.cost / retimed.known.sum() < (now.cost + _AS_LIKELY) / intervals.known.sum()
-        return found if as_likely else now
-
     def _with_errors(self, now: Explanation, errors: Sequence[RecordingError]) -> Explanation:
         """The explanation with more errors, with the same freedom."""
         intervals = with_errors(now.intervals, now.refinement.fit, errors)
@@ -365,7 +336,6 @@ class LocalSearch:
         self,
         now: Explanation,
         others: Sequence[Explanation],
-        worth: float = _AS_LIKELY,
         least: float = _EXPLAINS,
         *,
         of_one: bool = False,
@@ -381,7 +351,7 @@ class LocalSearch:
             lower = now.unexplained - x.unexplained
             return bool((lower.max() if of_one else lower.sum()) > least)
 
-        others = [x for x in others if x.cost < now.cost - worth and (x.exact or explains(x))]
+        others = [x for x in others if x.cost < now.cost - _AS_LIKELY and (x.exact or explains(x))]
         return min(others, key=lambda x: x.cost, default=now)
 
     def _from_hypotheses(self, intervals: ShootingIntervals, k: int) -> Explanation:
@@ -570,25 +540,6 @@ def fewest_parts(length: int) -> int:
         The smallest above one with parts that are not too short; 0 where there is none.
     """
     return next((k for k in range(2, length // _SHORTEST + 1) if length % k == 0), 0)
-
-
-def _grouped(values: FloatArray, apart: float) -> FloatArray:
-    """The values with neighbours that are nearer to each other replaced by their mean; 0 where they are near 0."""
-    found = np.where(np.abs(values) > apart, values, 0.0)
-    distinct = np.unique(found[found != 0.0])
-    first = np.flatnonzero(np.diff(distinct, prepend=-np.inf) > apart)
-    for group in np.split(distinct, first)[1:]:
-        found[np.isin(found, group)] = group.mean()
-    return found
-
-
-def _states_after(intervals: ShootingIntervals, fit: Fit, rows: int) -> FloatArray:
-    """States ``(W, n_x)`` of a fit so many rows after the intervals' starts; at an end of a log those of its edge."""
-    series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
-    series = series.reshape(len(intervals.measured), -1)[:, : fit.x.shape[1]]
-    last = np.array([rows_of_log.stop - 1 for rows_of_log in intervals.rows_of_logs])
-    at = np.clip(intervals.starts + rows, intervals.first_of_log[intervals.log_of], last[intervals.log_of])
-    return np.asarray(series[at])
 
 
 def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:

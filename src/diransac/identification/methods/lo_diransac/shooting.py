@@ -374,30 +374,6 @@ class ShootingIntervals:
         """
         return replace(self, errors=self.all_errors.plus({kind: size}))
 
-    def with_delays(self, delay: FloatArray, rates: FloatArray) -> ShootingIntervals:
-        """The intervals with other delays of the sensors, and inputs that are not late as a whole.
-
-        Parameters
-        ----------
-        delay : (n_s,) array
-            Samples by which each signal is recorded late; those of one group are equal.
-        rates : (N, n_s) array
-            Change of each signal per sample, for the fractions of a sample.
-
-        Returns
-        -------
-        ShootingIntervals
-            With the other errors of these.
-        """
-        late = {
-            ErrorKind(tuple(np.flatnonzero(delay == x).tolist()), "delay"): float(x)
-            for x in np.unique(delay[delay != 0.0])
-        }
-        old = self.all_errors
-        others = tuple(x for x in old.kinds if x.of_inputs or x.what != "delay")
-        recorded = replace(self, delay=0, errors=replace(old, delay=np.zeros_like(old.delay), kinds=others))
-        return recorded.corrected(late, rates)
-
     def split(self, parts: int) -> ShootingIntervals:
         """The same rows in intervals of a fraction of the length."""
         return replace(self, length=self.length // parts, log_of=np.repeat(self.log_of, parts))
