@@ -30,7 +30,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     unexplained,
 )
 from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
-from diransac.identification.methods.lo_diransac.shooting import ErrorKind, ShootingIntervals
+from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
     Samples,
     choose_half_width,
@@ -382,21 +382,6 @@ def test_a_corrected_step_keeps_to_tight_continuity_along_curved_rollouts():
     assert kept < 0.01 * broken
     assert np.square(corrected.residuals).sum() < 1.1 * np.square(plain.residuals).sum()
     assert kept < best
-
-
-def test_delays_are_those_of_sensors_in_another_time():
-    """Inputs one sample late and velocities one early are coordinates one late."""
-    intervals, signals = intervals_of(n_rows=100)
-    rates = np.gradient(signals, axis=0)
-    velocities, coordinates = ErrorKind((3, 4, 5), "delay"), ErrorKind((0, 1, 2), "delay")
-    bias = {ErrorKind((8,), "bias"): 0.25}
-    late = replace(intervals, delay=1).corrected({velocities: -1.02, **bias}, rates)
-    found = late.with_delays(np.r_[np.full(3, 1.02), np.zeros(6)], rates)
-    expected = intervals.corrected({coordinates: 1.02, **bias}, rates)
-    assert found.delay == 0
-    assert set(found.errors.kinds) == {coordinates, *bias}
-    assert (found.measured == expected.measured).all()
-    assert (found.known == expected.known).all()
 
 
 # ---------------------------------------------------------------------- projection

@@ -22,15 +22,14 @@ from diransac.errors import TimeLimitError
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
-from diransac.identification.methods.lo_diransac.normal_equations import linearize, with_residuals
+from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
 from diransac.identification.methods.lo_diransac.recording_errors import (
     clear_errors,
     errors_of,
-    signal_rates,
     with_errors,
 )
-from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start, weights_of
+from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 from diransac.time_limit import check_time
 
@@ -71,8 +70,6 @@ _EXPLAINS, _EXPLAINS_DRIFT = float(np.log(1.25)), float(np.log(4.0))
 _FIXED = 1e-6
 # Decrease of the log residuals of each signal by which a delay is worth to be tried.
 _SMALL_GAIN = 0.03
-# Gain of evidence, nats, that an error of a recording is worth.
-_WORTH = 20.0
 # Newton steps of the errors of recordings at most; changes over standard errors that end them.
 _REFINEMENTS, _REFINED = 4, 0.1
 # Inputs that vary between samples act half a sample before held ones.
@@ -182,7 +179,7 @@ class LocalSearch:
     prior: Prior
     callback: Callback | None
 
-    def likeliest(self, intervals: ShootingIntervals, *, free_hold: bool, to_beat: float = np.inf) -> Explanation:
+    def likeliest(self, intervals: ShootingIntervals, *, free_hold: bool) -> Explanation:
         """The likeliest explanation of the log.
 
         Parameters
@@ -191,8 +188,6 @@ class LocalSearch:
             With inputs as recorded.
         free_hold : bool
             Whether another hold of the inputs may be an explanation.
-        to_beat : float, optional
-            Cost of another explanation; the search ends early if this one is behind before it is elaborated.
 
         Returns
         -------
@@ -205,7 +200,7 @@ class LocalSearch:
         """
         best: Explanation | None = None
         try:
-            for found in self._ever_likelier(intervals, free_hold=free_hold, to_beat=to_beat):
+            for found in self._ever_likelier(intervals, free_hold=free_hold):
                 best = found
         except TimeLimitError:
             if best is None:
@@ -214,7 +209,7 @@ class LocalSearch:
         assert best is not None
         return best
 
-    def _ever_likelier(self, intervals: ShootingIntervals, *, free_hold: bool, to_beat: float) -> Iterator[Explanation]:
+    def _ever_likelier(self, intervals: ShootingIntervals, *, free_hold: bool) -> Iterator[Explanation]:
         """The likeliest explanation so far after each stage of the search."""
         report(self.callback, "searching for a delay", 0.1)
         delay = self._likeliest_delay(intervals)
@@ -227,8 +222,6 @@ class LocalSearch:
             other = self._simplest(self._from_hypotheses(delayed, 1), self._prior_of(delayed))
             best = self._better(best, [other])
             yield best
-        if best.cost > to_beat:
-            return
         best = self._with_timing(best, free_hold=free_hold)
         yield best
         found = self._with_errors_of_recordings(self._with_named_errors(best))
@@ -236,9 +229,7 @@ class LocalSearch:
         if found is best:
             return
         # Inputs are late, or early, with respect to sensors that are so themselves.
-        found = self._with_refined_errors(self._with_timing(found, free_hold=free_hold))
-        yield found
-        yield self._with_refined_errors(self._with_fewest_delays(found))
+        yield self._with_refined_errors(self._with_timing(found, free_hold=free_hold))
 
     def _with_timing(self, best: Explanation, *, free_hold: bool) -> Explanation:
         """The explanation with another timing of the inputs, where that makes it likelier or is required."""
@@ -248,8 +239,6 @@ class LocalSearch:
             report(self.callback, "timing of the inputs", 0.6 + 0.1 * k)
             # A free delay suggests the others, even where no delay is admitted.
             is_free = k > 0 or (best.exact and settings.input_delay is not False)
-            if not is_free and not forced and self._delay_is_negligible(best):
-                break
             trial = best if is_free else self._refitted(best, best.intervals, self.prior)
             others = [self._refitted(trial, x) for x in self._timings(trial, free_hold=free_hold)]
             if settings.input_delay is not False and not (settings.input_lag and k == 0):
@@ -260,17 +249,6 @@ class LocalSearch:
                 break
             best = likelier
         return best
-
-    def _delay_is_negligible(self, best: Explanation) -> bool:
-        """True if a free delay of inputs that act as recorded would be too small, and uncertain, by one Newton step."""
-        intervals, fit = best.intervals, best.refinement.fit
-        if intervals.delay or intervals.lag:
-            return False
-        free = replace(fit, prior=np.append(fit.prior[:-1], max(self.prior.delay, _WHOLE_SAMPLE)))
-        at = linearize(intervals, free, weights_of(intervals, free))
-        solved = at.system.solve(at.right_z, at.right_s)
-        late, error = abs(fit.shared[-1] + solved.step_p[-1]), float(np.sqrt(solved.var_p[-1, -1]))
-        return bool(late < _SIGNIFICANT * error and late + _SIGNIFICANT * error < _SMALL_DELAY)
 
     def _with_named_errors(self, best: Explanation) -> Explanation:
         """The explanation with the errors of recordings that the settings name."""
@@ -302,7 +280,7 @@ class LocalSearch:
         for k in range(settings.max_sensor_errors):
             report(self.callback, "errors of the recordings", 0.8 + 0.01 * k)
             fit, likelier = best.refinement.fit, best
-            errors = clear_errors(best.intervals, fit, alone, kinds, worth=_WORTH)
+            errors = clear_errors(best.intervals, fit, alone, kinds, worth=_AS_LIKELY)
             if not best.exact:
                 from diransac.identification.methods.lo_diransac.missing_terms import clear_errors_of_inputs
 
@@ -311,11 +289,11 @@ class LocalSearch:
             for error in errors:
                 if error.kind.what == "lag" and not lag_may_help:
                     continue
-                trial = self._with_errors(best, [error], to_beat=likelier.cost)
+                trial = self._with_errors(best, [error])
                 if error.kind.of_inputs and error.kind.what == "delay":  # which acts much like a lag
                     lag_may_help = trial.cost < best.cost
                 share = _EXPLAINS_DRIFT if error.kind.what == "drift" else _EXPLAINS
-                if trial.cost < likelier.cost and self._better(best, [trial], _WORTH, share, of_one=True) is trial:
+                if trial.cost < likelier.cost and self._better(best, [trial], share, of_one=True) is trial:
                     likelier = trial
             if likelier is best:
                 break
@@ -344,52 +322,20 @@ class LocalSearch:
             best = self._with_errors(best, errors)
         return best
 
-    def _with_fewest_delays(self, now: Explanation) -> Explanation:
-        """The explanation with delays that are equal as one, in the time of the inputs if fewer are needed in it.
-
-        Time has no origin: inputs that are late, and some sensors early alike, are the other sensors late.
-        """
-        intervals, fit, settings = now.intervals, now.refinement.fit, self.settings
-        is_asked_for = settings.input_delay or settings.sensor_delays is not None
-        if intervals.errors is None or intervals.lag or is_asked_for:
-            return now
-        late = intervals.delay + fit.shared[-1]
-        late = late if abs(late) > _SMALL_DELAY else 0.0
-        delays = np.where(intervals.known.any(axis=0), intervals.errors.delay + late, 0.0)
-        delays = _grouped(delays, _SMALL_DELAY)
-        before = np.count_nonzero(np.unique(intervals.errors.delay)) + bool(late)
-        if np.count_nonzero(np.unique(delays)) >= before:
-            return now
-        retimed = intervals.with_delays(delays, signal_rates(intervals, fit))
-        x = _states_after(intervals, fit, round(late))
-        begin = with_residuals(retimed, replace(fit, x=x, shared=np.append(fit.shared[:-1], 0.0)))
-        found = self._optimised(now, retimed, begin)
-        # Samples at the ends of the logs differ.
-        as_likely = found.cost / retimed.known.sum() < (now.cost + _AS_LIKELY) / intervals.known.sum()
-        return found if as_likely else now
-
-    def _with_errors(
-        self, now: Explanation, errors: Sequence[RecordingError], *, to_beat: float = np.inf
-    ) -> Explanation:
-        """The explanation with more errors, with the same freedom; given up where it will hardly beat a cost."""
+    def _with_errors(self, now: Explanation, errors: Sequence[RecordingError]) -> Explanation:
+        """The explanation with more errors, with the same freedom."""
         intervals = with_errors(now.intervals, now.refinement.fit, errors)
-        return self._optimised(now, intervals, with_residuals(intervals, now.refinement.fit), to_beat)
+        return self._optimised(now, intervals, with_residuals(intervals, now.refinement.fit))
 
-    def _optimised(
-        self, now: Explanation, intervals: ShootingIntervals, begin: Fit, to_beat: float = np.inf
-    ) -> Explanation:
+    def _optimised(self, now: Explanation, intervals: ShootingIntervals, begin: Fit) -> Explanation:
         """The explanation of other intervals with the same freedom."""
-        if now.exact:
-            refined = refine_exact(self.settings, intervals, begin, now.prior, to_beat)
-        else:
-            refined = refine(self.settings, intervals, begin, now.prior, settled=True, to_beat=to_beat)
-        return replace(now, intervals=intervals, refinement=refined)
+        fitted = refine_exact if now.exact else refine
+        return replace(now, intervals=intervals, refinement=fitted(self.settings, intervals, begin, now.prior))
 
     def _better(
         self,
         now: Explanation,
         others: Sequence[Explanation],
-        worth: float = _AS_LIKELY,
         least: float = _EXPLAINS,
         *,
         of_one: bool = False,
@@ -405,7 +351,7 @@ class LocalSearch:
             lower = now.unexplained - x.unexplained
             return bool((lower.max() if of_one else lower.sum()) > least)
 
-        others = [x for x in others if x.cost < now.cost - worth and (x.exact or explains(x))]
+        others = [x for x in others if x.cost < now.cost - _AS_LIKELY and (x.exact or explains(x))]
         return min(others, key=lambda x: x.cost, default=now)
 
     def _from_hypotheses(self, intervals: ShootingIntervals, k: int) -> Explanation:
@@ -476,10 +422,7 @@ class LocalSearch:
         return replace(flexible, trial=ExactTrial(exact.cost - cost, cost, flexible.unexplained, length))
 
     def _likeliest_exact(self, flexible: Explanation, prior: Prior) -> Explanation | None:
-        """The exact model from the parameters of a fit, or those of the best hypothesis; None if both are impossible.
-
-        Fits are given up that will hardly become as likely as the flexible one.
-        """
+        """The exact model from the parameters of a fit, or the best hypothesis; None if both are impossible."""
         intervals, fit = flexible.intervals, flexible.refinement.fit
         projected, found = flexible.projected, list[Explanation]()
         starts = np.array([projected, self.hypotheses[0]])
@@ -487,7 +430,7 @@ class LocalSearch:
         for p in starts[intervals.layout.admits(starts)]:
             begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
             is_left = any(x.of_inputs for x in intervals.all_errors.kinds)
-            refined = refine_exact(self.settings, intervals, begin, prior, np.inf if is_left else flexible.cost)
+            refined = refine_exact(self.settings, intervals, begin, prior)
             exact = Explanation(intervals, refined, prior, exact=True)
             found.append(self._with_refined_errors(exact) if is_left else exact)
             if found[-1].cost < flexible.cost:
@@ -502,9 +445,7 @@ class LocalSearch:
         x = series[:, :: intervals.length, :n_x].reshape(-1, n_x)
         rho = fit.rho ** (1.0 / parts)
         begin = with_residuals(intervals, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
-        to_beat = coarse.refinement.cost
-        refined = refine(self.settings, intervals, begin, coarse.prior, settled=True, to_beat=to_beat)
-        return replace(coarse, intervals=intervals, refinement=refined)
+        return self._optimised(coarse, intervals, begin)
 
     def _timings(self, now: Explanation, *, free_hold: bool) -> list[ShootingIntervals]:
         """Other timings of the inputs that the fit suggests: whole samples of delay, a lag, or another hold."""
@@ -544,9 +485,9 @@ class LocalSearch:
         sizes = np.append(fit.prior[:-1], max(prior.delay, _WHOLE_SAMPLE) if is_wide else prior.delay)
         begin = with_residuals(intervals, replace(fit, shared=np.append(fit.shared[:-1], left), prior=sizes))
         if now.exact:
-            refined = refine_exact(self.settings, intervals, begin, prior, now.cost)
+            refined = refine_exact(self.settings, intervals, begin, prior)
             return Explanation(intervals, refined, prior, exact=True)
-        refined = refine(self.settings, intervals, begin, prior, settled=True)
+        refined = refine(self.settings, intervals, begin, prior)
         return self._simplest(Explanation(intervals, refined, prior, exact=False, trial=now.trial), prior)
 
     def _with_likeliest_lag(self, intervals: ShootingIntervals) -> ShootingIntervals:
@@ -599,25 +540,6 @@ def fewest_parts(length: int) -> int:
         The smallest above one with parts that are not too short; 0 where there is none.
     """
     return next((k for k in range(2, length // _SHORTEST + 1) if length % k == 0), 0)
-
-
-def _grouped(values: FloatArray, apart: float) -> FloatArray:
-    """The values with neighbours that are nearer to each other replaced by their mean; 0 where they are near 0."""
-    found = np.where(np.abs(values) > apart, values, 0.0)
-    distinct = np.unique(found[found != 0.0])
-    first = np.flatnonzero(np.diff(distinct, prepend=-np.inf) > apart)
-    for group in np.split(distinct, first)[1:]:
-        found[np.isin(found, group)] = group.mean()
-    return found
-
-
-def _states_after(intervals: ShootingIntervals, fit: Fit, rows: int) -> FloatArray:
-    """States ``(W, n_x)`` of a fit so many rows after the intervals' starts; at an end of a log those of its edge."""
-    series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
-    series = series.reshape(len(intervals.measured), -1)[:, : fit.x.shape[1]]
-    last = np.array([rows_of_log.stop - 1 for rows_of_log in intervals.rows_of_logs])
-    at = np.clip(intervals.starts + rows, intervals.first_of_log[intervals.log_of], last[intervals.log_of])
-    return np.asarray(series[at])
 
 
 def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:

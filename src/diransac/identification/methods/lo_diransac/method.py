@@ -152,19 +152,13 @@ class LoDiransac(LoDiransacSettings):
         Largest number of Gauss-Newton steps of a local optimisation; 0: the best hypothesis is the estimate.
     outliers : bool, optional
         Whether the noise of each signal has outliers; otherwise it is Gaussian.
-    neighbouring_starts : bool, optional
-        Whether initial states are propagated from neighbouring intervals where that has a higher likelihood.
-    gradual_continuity : bool, optional
-        Whether the motion is made continuous gradually rather than from the start.
-    robust_model_error : bool, optional
-        Whether the size of unmodelled accelerations follows the median interval until the first convergence.
     model_error : bool, optional
         Whether the size of unmodelled accelerations is estimated; otherwise they vanish.
     prior_model_error : float, optional
         Prior size of the unmodelled accelerations, over the spread of the accelerations.
     prior_discrepancy, initial_discrepancy : float, optional
-        Prior size of input gain and bias discrepancies, over that which equals an equation's inertial force: after, and
-        until the first convergence.
+        Size of input gain and bias discrepancies, over that which equals an equation's inertial force: of the prior,
+        and before the evidence determines it.
     prior_delay : float, optional
         Prior standard deviation of the input delay, s.
     projection : bool, optional
@@ -472,10 +466,10 @@ def _likeliest(
     if first.likeliest.exact:
         return first
     try:
-        observed, cost = with_observed_states(intervals, motion), first.likeliest.cost
+        observed = with_observed_states(intervals, motion)
         if observed is not None:
             further = within(callback, 0.87, 0.9)
-            other = _searched(settings, intervals, observed, notes, seed, dataset, further, cost)
+            other = _searched(settings, intervals, observed, notes, seed, dataset, further)
             return min(first, other, key=lambda x: x.likeliest.cost)
     except TimeLimitError:
         return replace(first, likeliest=replace(first.likeliest, complete=False))
@@ -492,10 +486,9 @@ def _searched(
     seed: int,
     dataset: Dataset,
     callback: Callback | None,
-    to_beat: float = np.inf,
     hypotheses: FloatArray | None = None,
 ) -> _Searched:
-    """A search that begins with a motion, and with hypotheses or samples; it may end behind another one."""
+    """A search that begins with a motion, and with hypotheses or samples."""
     report(callback, "drawing hypotheses", 0.1)
     check_time()
     n_spikes = 0
@@ -506,7 +499,7 @@ def _searched(
         notes += (f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; they are interpolated",)
     unit = discrepancy_units(intervals, motion, hypotheses[0])
     search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
-    likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None, to_beat=to_beat)
+    likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
     return _Searched(motion, notes, len(hypotheses), likeliest, *_parameters(settings, likeliest))
 
 

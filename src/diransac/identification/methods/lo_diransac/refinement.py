@@ -9,8 +9,7 @@ Gauss-Newton steps on `normal_equations`, each followed by an update of every sc
 - the size of the input gain and bias discrepancies, and of the delay, likewise.
 
 All scales decrease gradually from large values, and so does the standard deviation of continuity: far from the solution
-intervals are independent problems, near it they are one (graduated non-convexity).  Until convergence tau follows the
-median interval, so that intervals with large residuals give way to their neighbours.
+intervals are independent problems, near it they are one (graduated non-convexity).
 
 References
 ----------
@@ -25,7 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.lost_intervals import with_lost_intervals_restarted
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
@@ -58,8 +57,6 @@ _SIGMA_FLOOR = 1e-5
 _LEAST_PRIOR = 1e-6
 # Discrepancies of a model that is taken to be exact, over their prior sizes.
 _EXACT = 1e-3
-# Steps after which a fit is compared with a likelier one, each time; gains of so many steps that it may need to win.
-_COMPARED_STEPS, _PATIENCE = 6, 4
 # Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
 # the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
 _UNBROKEN = 0.01
@@ -69,9 +66,7 @@ _FREE_DELAY, _PINNED = 1.0, 1e-5
 _NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
 # Correlation of unmodelled accelerations from interval to interval at most.
 _MOST_ALIKE = 0.98
-# Tau until convergence, over its prior: noise must not absorb model error.
-_GUARDED = 10.0
-_MAX_TRIALS, _MAX_SWEEPS = 8, 12
+_MAX_TRIALS = 8
 # Part of what is left of the excess of its cost when a step is corrected for the curvature of the rollouts, at most.
 _CORRECTED = 0.3
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
@@ -88,9 +83,9 @@ class Prior:
     unit : (n_s,) array
         Discrepancy that equals an equation's inertial force; a sample of delay; infinite for parameters.
     discrepancy : float
-        Prior size of the discrepancies in those units, after the first convergence.
+        Prior size of the discrepancies in those units.
     guarded : float
-        The same until then.
+        Size with which a fit starts, before the evidence determines it.
     delay : float
         Prior size of the input delay, samples.
     """
@@ -160,7 +155,7 @@ def _accelerations(model: Model, motion: Motion) -> FloatArray:
 def start(
     settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, p: FloatArray, prior: Prior
 ) -> Fit:
-    """Initial fit from a hypothesis and the smoothed motion at the intervals' starts, or their neighbours' ends.
+    """Initial fit from a hypothesis and the smoothed motion at the intervals' starts.
 
     Parameters
     ----------
@@ -192,89 +187,11 @@ def start(
     sizes[: len(p)] = intervals.layout.prior_std
     mean = np.concatenate([intervals.layout.prior_mean, np.zeros(len(shared) - len(p))])
     tau = _TAU_START * _accelerations(intervals.model, motion)
-    continuity = motion.spread[:n_x].copy() if settings.gradual_continuity else _continuity(intervals, tau)
-    fit = Fit(shared, x, d, residuals, ends, noise, tau, np.zeros(n_v), continuity, sizes, mean)
-    return _anchored(intervals, fit) if settings.neighbouring_starts else fit
+    return Fit(shared, x, d, residuals, ends, noise, tau, np.zeros(n_v), motion.spread[:n_x].copy(), sizes, mean)
 
 
-def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
-    """The fit with initial states propagated from neighbouring intervals, where they have a higher likelihood.
-
-    Where outliers are in the majority for longer than an interval, its state follows from its neighbours alone.
-    """
-    n, losses = len(intervals), _losses(intervals, fit.noise, fit.residuals, np.arange(len(intervals)))
-    # States that changed since those of their neighbours were last propagated from them: others give what they gave.
-    forward, backward = np.ones(n, bool), np.ones(n, bool)
-    for _ in range(_MAX_SWEEPS):
-        after = 1 + np.flatnonzero(intervals.linked & forward[:-1])
-        fit, losses, forward = _better(intervals, fit, losses, after, np.nan_to_num(fit.ends[after - 1]))
-        backward |= forward
-        before = np.flatnonzero(intervals.linked & (backward[:-1] | backward[1:]))
-        if len(before):
-            found = intervals.origins(fit.shared, fit.x, fit.d, before)
-            fit, losses, backward = _better(intervals, fit, losses, before, found)
-            forward |= backward
-        if not forward.any():
-            break
-    return fit
-
-
-def _better(
-    intervals: ShootingIntervals, fit: Fit, losses: FloatArray, chosen: IntArray, states: FloatArray
-) -> tuple[Fit, FloatArray, BoolArray]:
-    """The fit with other initial states of chosen intervals where they have a higher likelihood, and its losses.
-
-    The last result is the mask ``(W,)`` of the intervals whose states are new.
-    """
-    changed = np.zeros(len(intervals), bool)
-    if not len(chosen):
-        return fit, losses, changed
-    x, residuals, ends = fit.x.copy(), fit.residuals.copy(), fit.ends.copy()
-    x[chosen] = states
-    simulated, ended = intervals.simulated(fit.shared, x, fit.d, chosen)
-    found = _losses(intervals, fit.noise, simulated, chosen)
-    better = found < losses[chosen]
-    x[chosen[~better]] = fit.x[chosen[~better]]
-    changed[chosen[better]] = True
-    residuals[np.repeat(changed, intervals.length)] = simulated[np.repeat(better, intervals.length)]
-    ends[changed] = ended[better]
-    losses = losses.copy()
-    losses[changed] = found[better]
-    return replace(fit, x=x, residuals=residuals, ends=ends), losses, changed
-
-
-def _losses(intervals: ShootingIntervals, noise: Mixture, residuals: FloatArray, chosen: IntArray) -> FloatArray:
-    """Negative log-likelihood ``(n,)`` of the samples of chosen intervals, from their residuals."""
-    known = intervals.known if len(chosen) == len(intervals) else intervals.known[intervals.rows_of(chosen)]
-    return np.asarray(noise.negative_log_likelihood(residuals, known).reshape(len(chosen), -1).sum(axis=1))
-
-
-@dataclass
-class _Race:
-    """A fit that is given up where it will hardly become likelier than another one."""
-
-    to_beat: float
-    before: float = np.inf
-
-    def is_lost(self, intervals: ShootingIntervals, fit: Fit, at: NormalEquations, steps: int) -> bool:
-        """True if the fit is behind by more than a few times its latest gain; compared every few steps."""
-        if not steps or steps % _COMPARED_STEPS or not np.isfinite(self.to_beat):
-            return False
-        now, before = _evidence(intervals, fit, at)[0], self.before
-        self.before = now
-        return now - self.to_beat > _PATIENCE * max(before - now, 0.0)
-
-
-def refine(
-    settings: LoDiransacSettings,
-    intervals: ShootingIntervals,
-    fit: Fit,
-    prior: Prior,
-    *,
-    settled: bool = False,
-    to_beat: float = np.inf,
-) -> Refinement:
-    """Fit after steps and updates until convergence, first with a robust tau, then with that of the evidence.
+def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
+    """Fit after steps and updates of every scale until convergence.
 
     Parameters
     ----------
@@ -283,10 +200,6 @@ def refine(
     fit : Fit
         Initial fit, as from `start`.
     prior : Prior
-    settled : bool, optional
-        Whether the initial fit is near the solution already.
-    to_beat : float, optional
-        Negative log evidence of another fit; this one is given up where it will hardly become likelier.
 
     Returns
     -------
@@ -297,23 +210,19 @@ def refine(
     TimeLimitError
         The time limit was reached.
     """
-    damping, robust, converged, steps = 0.0, settings.robust_model_error and not settled, False, 0
-    race, at = _Race(to_beat), _linearized(intervals, fit)
-    while steps < settings.max_steps and (robust or not converged) and not race.is_lost(intervals, fit, at, steps):
+    damping, converged, steps, at = 0.0, False, 0, _linearized(intervals, fit)
+    while steps < settings.max_steps and not converged:
         check_time()
         steps += 1
-        robust = robust and not converged
         moved, solved, damping = _step(intervals, fit, at, damping)
-        updated = _update(settings, intervals, moved, solved, prior, robust=robust)
+        updated = _update(settings, intervals, moved, solved, prior)
         errors = np.sqrt(np.diag(solved.var_p)[: intervals.n_p])
         converged = _unchanged(fit, updated, errors)
         fit, at = updated, _linearized(intervals, updated)
-    return Refinement(fit, *_evidence(intervals, fit, at), steps, converged and not robust)
+    return Refinement(fit, *_evidence(intervals, fit, at), steps, converged)
 
 
-def refine_exact(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, to_beat: float
-) -> Refinement:
+def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
     """Fit of the model as it is, without unmodelled accelerations and input gain and bias discrepancies.
 
     Parameters
@@ -323,8 +232,6 @@ def refine_exact(
     fit : Fit
         Initial fit, as from `refine`.
     prior : Prior
-    to_beat : float
-        Negative log evidence of another fit; this one is given up where it will hardly become likelier.
 
     Returns
     -------
@@ -335,16 +242,14 @@ def refine_exact(
     TimeLimitError
         The time limit was reached.
     """
-    found = _refined_exactly(settings, intervals, fit, prior, to_beat)
+    found = _refined_exactly(settings, intervals, fit, prior)
     again = with_lost_intervals_restarted(intervals, found.fit) if found.converged else None
     if again is None:
         return found
-    return min(found, _refined_exactly(settings, intervals, again, prior, found.cost), key=lambda x: x.cost)
+    return min(found, _refined_exactly(settings, intervals, again, prior), key=lambda x: x.cost)
 
 
-def _refined_exactly(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, to_beat: float
-) -> Refinement:
+def _refined_exactly(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
     """As `refine_exact`, from one start."""
     n_p, least = intervals.n_p, _EXACT * prior.tau
     shared, sizes = fit.shared.copy(), fit.prior.copy()
@@ -354,8 +259,8 @@ def _refined_exactly(
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
     damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
-    race, at = _Race(to_beat), _linearized(intervals, fit)
-    while steps < settings.max_steps and not converged and not race.is_lost(intervals, fit, at, steps):
+    at = _linearized(intervals, fit)
+    while steps < settings.max_steps and not converged:
         check_time()
         steps += 1
         moved, solved, damping = _step(intervals, fit, at, damping)
@@ -447,31 +352,17 @@ def _bounded(intervals: ShootingIntervals, now: FloatArray, then: FloatArray) ->
 
 
 def _update(
-    settings: LoDiransacSettings,
-    intervals: ShootingIntervals,
-    fit: Fit,
-    solved: Factored,
-    prior: Prior,
-    *,
-    robust: bool,
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, solved: Factored, prior: Prior
 ) -> Fit:
     """The fit with every scale updated from residuals, unmodelled accelerations and discrepancies."""
-    n_x, n_p = fit.x.shape[1], intervals.n_p
     inlying = fit.noise.inlying(fit.residuals, intervals.known)
     noise = fit.noise.updated(fit.residuals, intervals.known, inlying, outliers=settings.outliers)
-    if robust:
-        squares = len(fit.d) * np.square(1.4826 * np.median(np.abs(fit.d), axis=0))
-        variance = solved.var_z[:, n_x:]
-        determined = (1.0 - variance / np.square(fit.tau)).clip(0.0).sum(axis=0)
-        expected, rho = _GUARDED * prior.tau, fit.rho
-    else:
-        expected = prior.tau
-        squares, determined, rho = _process(intervals, fit, solved, expected)
-    tau = _size(expected, fit.tau, squares, determined)
+    squares, determined, rho = _process(intervals, fit, solved, prior.tau)
+    tau = _size(prior.tau, fit.tau, squares, determined)
     if not settings.model_error:
-        tau = np.maximum(_SHRINK * fit.tau, 1e-3 * expected)
+        tau = np.maximum(_SHRINK * fit.tau, 1e-3 * prior.tau)
     continuity = np.maximum(_continuity(intervals, tau), _SHRINK * fit.continuity_std)
-    sizes = fit.prior if robust else _discrepancies(fit, prior, np.diag(solved.var_p), n_p)
+    sizes = _discrepancies(fit, prior, np.diag(solved.var_p), intervals.n_p)
     return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity, prior=sizes)
 
 

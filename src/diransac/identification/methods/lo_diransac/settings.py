@@ -52,9 +52,6 @@ class LoDiransacSettings:
     max_fits: int = 8
     max_steps: int = 60
     outliers: bool = True
-    neighbouring_starts: bool = True
-    gradual_continuity: bool = True
-    robust_model_error: bool = True
     model_error: bool = True
     prior_model_error: float = 1e-3
     prior_discrepancy: float = 0.1

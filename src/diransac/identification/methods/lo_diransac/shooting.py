@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["ErrorKind", "ShootingIntervals"]
 
 _DIVERGED = 1e6
-_WELL_CONDITIONED = 1e8
 # Rows times squared unknowns from which on derivatives take longer than threads take to be told (a few milliseconds).
 _WORTH_THREADS = 4e6
 
@@ -375,30 +374,6 @@ class ShootingIntervals:
         """
         return replace(self, errors=self.all_errors.plus({kind: size}))
 
-    def with_delays(self, delay: FloatArray, rates: FloatArray) -> ShootingIntervals:
-        """The intervals with other delays of the sensors, and inputs that are not late as a whole.
-
-        Parameters
-        ----------
-        delay : (n_s,) array
-            Samples by which each signal is recorded late; those of one group are equal.
-        rates : (N, n_s) array
-            Change of each signal per sample, for the fractions of a sample.
-
-        Returns
-        -------
-        ShootingIntervals
-            With the other errors of these.
-        """
-        late = {
-            ErrorKind(tuple(np.flatnonzero(delay == x).tolist()), "delay"): float(x)
-            for x in np.unique(delay[delay != 0.0])
-        }
-        old = self.all_errors
-        others = tuple(x for x in old.kinds if x.of_inputs or x.what != "delay")
-        recorded = replace(self, delay=0, errors=replace(old, delay=np.zeros_like(old.delay), kinds=others))
-        return recorded.corrected(late, rates)
-
     def split(self, parts: int) -> ShootingIntervals:
         """The same rows in intervals of a fraction of the length."""
         return replace(self, length=self.length // parts, log_of=np.repeat(self.log_of, parts))
@@ -523,20 +498,6 @@ class ShootingIntervals:
         names = [name for name, has in zip(signals, seen, strict=True) if has]
         simulator = rollouts(self.augmented.model, names, substeps=self.substeps, hold=self.hold)
         return simulator, slice(None) if seen.all() else np.flatnonzero(seen)
-
-    def origins(self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray) -> FloatArray:
-        """Initial states (n, n_x) for which chosen intervals end in their successors' initial states.
-
-        One Newton step; states are unchanged where it has no solution.
-        """
-        sums = self.gauss_newton(shared, x, d, np.zeros(self.measured.shape), chosen=chosen, normal_matrix=False)
-        jumps, slopes = x[chosen + 1] - sums.final_states, sums.final_slopes[:, :, : x.shape[1]]
-        finite = np.isfinite(jumps).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
-        usable = np.flatnonzero(finite)
-        usable = usable[np.linalg.cond(slopes[usable]) < _WELL_CONDITIONED]
-        found = x[chosen]
-        found[usable] += np.linalg.solve(slopes[usable], jumps[usable][:, :, None])[:, :, 0]
-        return found
 
 
 def _filled_up(values: FloatArray, more: int) -> FloatArray:
