@@ -14,9 +14,11 @@ Torr, Zisserman 2000.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
@@ -137,7 +139,7 @@ def _linear(
     weak, layout = weak_form(intervals, motion), dataset.layout
     n = len(intervals)
     few = np.unique(np.linspace(0, n - 1, min(settings.n_screening_intervals, n)).astype(int))
-    samples = weak.solve(_samples(settings, weak, seed), layout)
+    samples = weak.solve_sized(_samples(settings, weak, seed), layout)
     missing = _in_sensors_alone(dataset) & ~weak.W.any(axis=(0, 1)) & np.isinf(layout.prior_std)
     if missing.any() and dataset.model.is_affine:
         samples[:, missing] = [1.0 if x.positive else 0.0 for x, m in zip(layout.bounds, missing, strict=True) if m]
@@ -199,11 +201,37 @@ class WeakForm:
     W: FloatArray
     b: FloatArray
 
+    @cached_property
+    def has_known_terms(self) -> BoolArray:
+        """Mask ``(r,)`` of the equations in which b is more than a rounding error beside that of another one."""
+        largest = np.abs(self.b).max(axis=0)
+        return np.asarray(largest > _ROUNDING * largest.max())
+
     def solve(self, chosen: BoolArray, layout: ParameterLayout | None = None) -> FloatArray:
         """Parameters ``(n_sets, n_p)`` by least squares of each set of rows ``(n_sets, n, r)``.
 
         Rows have residuals of order one; the priors of a layout are further rows.
         """
+        return _solved(*self._normal_equations(chosen, layout))
+
+    def solve_sized(self, chosen: BoolArray, layout: ParameterLayout | None = None) -> FloatArray:
+        """Parameters as by `solve`, which noise in equations without a known term (``b = 0``) does not shrink.
+
+        Zeros solve such an equation, too: it determines ratios of the parameters that it connects.  Given the ratios,
+        the size of each group of connected parameters is that of least squares of the other equations.
+        """
+        p, known = self.solve(chosen, layout), self.has_known_terms
+        if known.all() or not known.any():
+            return p
+        sized = WeakForm(np.ascontiguousarray(self.W[:, known]), self.b[:, known])
+        G, h = sized._normal_equations(chosen[:, :, known], layout)
+        ratios = p[:, :, None] * _connected(self.W[:, ~known])
+        transposed = ratios.swapaxes(1, 2)
+        sizes = _solved(transposed @ G @ ratios, (transposed @ h[:, :, None])[:, :, 0])
+        return np.asarray((ratios @ sizes[:, :, None])[:, :, 0])
+
+    def _normal_equations(self, chosen: BoolArray, layout: ParameterLayout | None) -> tuple[FloatArray, FloatArray]:
+        """Sums ``(n_sets, n_p, n_p)`` and ``(n_sets, n_p)`` over sets of rows."""
         n, r, n_p = self.W.shape
         products = np.einsum("nri,nrj->nrij", self.W, self.W).reshape(n * r, -1)
         known = (self.W * self.b[:, :, None]).reshape(n * r, -1)
@@ -216,9 +244,21 @@ class WeakForm:
         if layout is not None:
             precision = 1.0 / np.square(layout.prior_std)
             G, h = G + np.diag(precision), h + precision * layout.prior_mean
-        d = np.sqrt(np.einsum("kii->ki", G)) + 1e-300
-        G = G / d[:, :, None] / d[:, None, :] + 1e-10 * np.eye(n_p)
-        return np.asarray(np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d)
+        return G, h
+
+
+def _solved(G: FloatArray, h: FloatArray) -> FloatArray:
+    """Solutions ``(n_sets, n)`` of normal equations; 0 for an unknown that no row has."""
+    d = np.sqrt(np.einsum("kii->ki", G)) + 1e-300
+    G = G / d[:, :, None] / d[:, None, :] + 1e-10 * np.eye(G.shape[-1])
+    return np.asarray(np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d)
+
+
+def _connected(W: FloatArray) -> BoolArray:
+    """Mask ``(n_p, n_groups)`` of the parameters that some equations ``(n, r, n_p)`` connect; others are alone."""
+    used = W.any(axis=0).astype(int)
+    labels = connected_components(used.T @ used, directed=False)[1]
+    return np.asarray(labels[:, None] == np.unique(labels))
 
 
 def _samples(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArray:
@@ -300,8 +340,8 @@ def _sensor_scale(W: FloatArray, b: FloatArray) -> float:
 def equation_scales(rows: WeakForm) -> FloatArray:
     """Scale of each equation: the median of its residuals, and a hundredth of its terms at least.
 
-    An equation without a known term (``b = 0``) is also solved by parameters of zero.  Its scale is that of its terms
-    with the parameters that the other equations determine, so that it cannot dominate them.
+    Sizes of the terms of equations without a known term (``b = 0``) are those of `WeakForm.solve_sized`: parameters
+    that such an equation shrinks would shrink its scale, and a smaller scale the parameters.
 
     Parameters
     ----------
@@ -311,17 +351,14 @@ def equation_scales(rows: WeakForm) -> FloatArray:
     Returns
     -------
     (r,) array
+        1 for an equation whose size no other one determines.
     """
-    largest, everything = np.abs(rows.b).max(axis=0), np.ones((1, *rows.b.shape), bool)
-    known = largest > _ROUNDING * largest.max()
+    everything = np.ones((1, *rows.b.shape), bool)
     scale = _median_size(rows.b - np.median(rows.b, axis=0))
-    scale = np.where(scale > 0.0, scale, largest) * known
+    scale = np.where(scale > 0.0, scale, np.abs(rows.b).max(axis=0)) * rows.has_known_terms
     for residuals in (False, False, False, True, True):
         scale = np.where(scale > 0.0, scale, np.inf)
-        terms = rows.W * WeakForm(rows.W / scale[:, None], rows.b / scale).solve(everything)[0]
-        # Noise in equations without a known term shrinks all parameters; the others determine their size.
-        sums, aim = (terms.sum(axis=2) / scale)[:, known], (rows.b / scale)[:, known]
-        terms *= max((sums * aim).sum() / (np.square(sums).sum() + 1e-300), 1.0)
+        terms = rows.W * WeakForm(rows.W / scale[:, None], rows.b / scale).solve_sized(everything)[0]
         scale = _median_size(np.sqrt(np.square(terms).sum(axis=2) + np.square(rows.b)))
         if residuals:
             scale = np.maximum(_median_size(terms.sum(axis=2) - rows.b), _SMALL_RESIDUAL * scale)
