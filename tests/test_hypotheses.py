@@ -1,9 +1,10 @@
-"""Hypotheses of lo-diransac: equations without known terms."""
+"""Hypotheses of lo-diransac: equations without known terms, and samples that depend on seed and index alone."""
 
 import numpy as np
 import pytest
 
-from diransac.identification.methods.lo_diransac.hypotheses import WeakForm, equation_scales
+import diransac as dr
+from diransac.identification.methods.lo_diransac.hypotheses import WeakForm, equation_scales, random_sets
 
 TRUTH = np.array([9e-3, 1.8e-3, 2.6e-3, 4e-3, 3e-4])
 
@@ -46,3 +47,23 @@ def test_exact_rows_give_exact_parameters_in_any_unit_of_the_equations():
     units = np.array([1e6, 1e-6])
     (found,) = WeakForm(rows.W * units[:, None], rows.b * units).solve_sized(np.ones((1, *rows.b.shape), bool))
     np.testing.assert_allclose(found, TRUTH, rtol=1e-5)
+
+
+def test_sample_k_depends_on_seed_and_k_alone():
+    rows = noisy_rows(0)
+    few, more, other = (random_sets(dr.LoDiransac(n_samples=n), rows, seed) for n, seed in ((50, 3), (51, 3), (50, 4)))
+    np.testing.assert_array_equal(few, more[:51])
+    assert not (few[1:] == other[1:]).all(axis=(1, 2)).any()
+
+
+def test_random_sets_have_as_many_rows_of_each_equation_and_up_to_the_largest_sample():
+    rows, settings = noisy_rows(0), dr.LoDiransac(n_samples=300, largest_sample=3)
+    every, *sets = random_sets(settings, rows, 0)
+    counts = np.array([one.sum(axis=0) for one in sets])
+    assert every.all()
+    np.testing.assert_array_equal(counts[:, 0], counts[:, 1])
+    assert (counts.min(), counts.max()) == (5, 15)
+    assert not np.array_equal(sets[0][:, 0], sets[0][:, 1])
+    # Each row is drawn as often as chance has it: a mean of 300 samples of 10 of 400 rows, within 6 standard errors.
+    share = np.mean(sets, axis=(0, 2))
+    assert np.abs(share - 10 / 400).max() < 6.0 * np.sqrt(10 / 400 / 600)

@@ -482,7 +482,7 @@ def test_consensus_is_the_sum_of_log_scales_of_a_plain_simulation():
     machine = MACHINES["planar-rotorcraft"]
     starts = motion.signals[intervals.starts, :6]
     simulated = [
-        rollout(machine, p, x, intervals.inputs[a : a + 25], 0.01)
+        rollout(machine, p, x, intervals.inputs[a : a + 25], 0.01, intervals.substeps)
         for x, a in zip(starts, intervals.starts, strict=True)
     ]
     size = np.sort(np.abs(np.vstack(simulated) - signals), axis=0)[35] / 0.4538

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["WeakForm", "equation_scales", "find_hypotheses", "find_spikes", "robust_scores", "weak_form"]
+__all__ = ["WeakForm", "equation_scales", "find_hypotheses", "find_spikes", "random_sets", "robust_scores", "weak_form"]
 
 _OVERLAP = 5
 # Numbers that are held at a time for several hypotheses: bounds the memory, whatever the length of the logs.
@@ -139,7 +139,7 @@ def _linear(
     weak, layout = weak_form(intervals, motion), dataset.layout
     n = len(intervals)
     few = np.unique(np.linspace(0, n - 1, min(settings.n_screening_intervals, n)).astype(int))
-    samples = weak.solve_sized(_samples(settings, weak, seed), layout)
+    samples = weak.solve_sized(random_sets(settings, weak, seed), layout)
     missing = _in_sensors_alone(dataset) & ~weak.W.any(axis=(0, 1)) & np.isinf(layout.prior_std)
     if missing.any() and dataset.model.is_affine:
         samples[:, missing] = [1.0 if x.positive else 0.0 for x, m in zip(layout.bounds, missing, strict=True) if m]
@@ -164,10 +164,10 @@ def _nonlinear(
 ) -> FloatArray:
     """Finalists of any model: nonlinear least squares of all and of random rows of the smoothed motion."""
     bound = _of_smoothed_motion(intervals, motion, dataset)
-    n, n_p = bound.n_rows, intervals.n_p
-    rows = sample_rows(seed, np.arange(settings.n_nonlinear_samples), n, 0, min(n, settings.largest_sample * n_p))
-    sizes = _generator(seed).integers(n_p, rows.shape[1] + 1, len(rows))
-    samples = [np.sort(some[:size]) for some, size in zip(rows, sizes, strict=True)]
+    n, n_p, largest = bound.n_rows, intervals.n_p, settings.largest_sample
+    k = np.arange(settings.n_nonlinear_samples)
+    rows = sample_rows(seed, k, n, 0, min(n, largest * n_p))
+    samples = [np.sort(some[:size]) for some, size in zip(rows, _sizes(seed, k, n, n_p, largest), strict=True)]
     return bound.select([np.arange(n), *samples]).fit()
 
 
@@ -261,26 +261,37 @@ def _connected(W: FloatArray) -> BoolArray:
     return np.asarray(labels[:, None] == np.unique(labels))
 
 
-def _samples(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArray:
-    """All rows, and random sets of n to ``largest_sample`` n rows of each equation, with n parameters."""
-    rng = _generator(seed)
+def random_sets(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArray:
+    """All rows, and random sets of n to ``largest_sample`` n rows of each equation, with n parameters.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    weak : WeakForm
+    seed : int
+        Set k depends on the seed and k alone.
+
+    Returns
+    -------
+    (1 + n_samples, n_rows, r) bool array
+    """
     n, r, n_p = weak.W.shape
-    largest = min(settings.largest_sample * n_p, n)
-    sizes = np.r_[largest, np.minimum(rng.integers(n_p, settings.largest_sample * n_p + 1, settings.n_samples), n)]
-    chosen = np.empty((len(sizes), n, r), bool)
-    at_a_time = max(1, _NUMBERS_AT_A_TIME // (n * r))
-    for first in range(0, len(sizes), at_a_time):
-        some = slice(first, first + at_a_time)
-        drawn = rng.random((len(sizes[some]), n, r))
-        least = np.sort(np.partition(drawn.swapaxes(1, 2), largest - 1, axis=2)[..., :largest], axis=2)
-        bounds = np.take_along_axis(least, sizes[some, None, None] - 1, axis=2)
-        np.less_equal(drawn, bounds.swapaxes(1, 2), out=chosen[some])
+    k = np.arange(settings.n_samples)
+    sizes = _sizes(seed, k, n, n_p, settings.largest_sample)
+    draws = r * k[:, None] + np.arange(r)
+    rows = sample_rows(seed, draws.ravel(), n, 0, min(settings.largest_sample * n_p, n)).reshape(len(k), r, -1)
+    inside = np.broadcast_to(np.arange(rows.shape[2]) < sizes[:, None, None], rows.shape)
+    sample, equation, _ = np.nonzero(inside)
+    chosen = np.zeros((1 + len(k), n, r), bool)
     chosen[0] = True
+    chosen[1 + sample, rows[inside], equation] = True
     return chosen
 
 
-def _generator(seed: int) -> np.random.Generator:
-    return np.random.default_rng([int(seed < 0), abs(seed)])
+def _sizes(seed: int, k: IntArray, n: int, n_p: int, largest: int) -> IntArray:
+    """Number of rows of samples k: n_p to ``largest`` n_p, of n rows; keys from the end are no sample's."""
+    drawn = sample_rows(seed, ~k.astype(np.uint64), (largest - 1) * n_p + 1, 0, 1)[:, 0]
+    return np.asarray(np.minimum(n_p + drawn, n))
 
 
 def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
@@ -415,7 +426,8 @@ def _scores(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray
         intervals.length, intervals.first_of_log,
     )  # fmt: skip
     compared = Measurements(intervals.measured[:, seen], intervals.measurements.valid)
-    errors = rollouts(intervals.model, names, hold=intervals.hold).errors(batch, compared).reshape(n, -1, len(names))
+    simulator = rollouts(intervals.model, names, substeps=intervals.substeps, hold=intervals.hold)
+    errors = simulator.errors(batch, compared).reshape(n, -1, len(names))
     known = intervals.known[intervals.rows_of(chosen)][:, seen]
     scale = lower_scale(np.nan_to_num(errors, copy=False, nan=np.inf), known)
     return np.asarray(np.log(np.maximum(scale, 1e-4 * motion.spread[seen])).sum(axis=1))
