@@ -231,7 +231,8 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     """Parameters of the dataset's model, step by step."""
     _check_sensors(settings, dataset)
     check_set_points(dataset, settings.set_points)
-    check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
+    allowed = len(dataset.model.parameters) - 1
+    check_structure(dataset.model, dataset.source, allowed, ranges=dataset.ranges)
     best = _likeliest(settings, dataset, seed, callback)
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
     notes, refined = best.notes, likeliest.refinement
@@ -318,7 +319,7 @@ def _likeliest(settings: LoDiransac, dataset: Dataset, seed: int, callback: Call
         return _searched(settings, intervals, motion, notes, seed, dataset, callback)
     report(callback, "unmeasured states", 0.05)
     allowed, measured = len(dataset.model.parameters) - 1, measured_signals(intervals)
-    check_structure(dataset.model, dataset.source, allowed, measured)
+    check_structure(dataset.model, dataset.source, allowed, measured, dataset.ranges)
     try:
         completed = _completed(intervals, motion, dataset)
         first = _searched(settings, intervals, completed, notes, seed, dataset, callback)
@@ -608,7 +609,7 @@ def _estimate(
     lost = ~((spans < units) | (spans < np.abs(result.parameters)))
     measured = measured_signals(intervals) if unmeasured_states(intervals) else None
     lost, combinations = unidentifiable(
-        dataset.model, dataset.layout, result.parameters, result.covariance, lost, measured
+        dataset.model, dataset.layout, result.parameters, result.covariance, lost, measured, dataset.ranges
     )
     covariance = result.covariance + found.ambiguity
     covariance[lost] = covariance[:, lost] = np.inf
