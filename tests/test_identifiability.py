@@ -2,10 +2,12 @@
 
 import re
 
+import casadi as ca
 import numpy as np
 import pytest
 
 import diransac as dr
+from diransac.data.dataset import Dataset
 from diransac.errors import IdentificationError
 from diransac.identification.identifiability import collinear, structural
 from diransac.model.library import BUILTIN, builtin
@@ -264,3 +266,41 @@ def test_a_coordinate_at_rest_says_nothing_of_the_others():
     columns = {name: slide()[name] for name in ("s", "s_dot", "force")} | {"y": np.zeros(N), "y_dot": np.zeros(N)}
     found = dr.identify(track, dr.Log.from_arrays(DT * np.arange(N), columns), differentiate=True)
     assert found.parameters == pytest.approx({"mass": MASS, "drag": DRAG}, rel=0.02)
+
+
+def reactor() -> dr.Model:
+    """A rate by Arrhenius' law at a temperature in kelvin: zero at a few kelvin."""
+    return dr.Model(
+        "reactor",
+        {},
+        {"heat": "K"},
+        {"k": dr.Parameter("1/s", positive=True), "E": dr.Parameter("1e5 K", positive=True), "U": dr.Parameter("1/s")},
+        lambda q, v, a, u, p: [a.T + p.U * (v.T - u.heat) - p.k * ca.exp(-1e5 * p.E / ca.sqrt(v.T**2 + 1.0))],
+        first_order={"T": "K"},
+    )
+
+
+def test_a_term_that_vanishes_at_every_random_motion_is_determined_in_the_range_of_a_log():
+    (found,) = structural(reactor())
+    assert (found.names, found.n_determined) == (("k", "E"), 0)
+    assert structural(reactor(), None, (("T", 900.0, 1300.0), ("heat", -1.0, 1.0))) == ()
+    assert structural(reactor(), ("T",), (("T", 9e4, 13e4), ("heat", -1.0, 1.0))) == ()
+
+
+def test_ambiguities_of_the_equations_are_those_of_any_range():
+    puck = model(lambda q, v, a, u, p: (p.mass + p.k) * a.s - u.force, mass=POSITIVE, k=POSITIVE)
+    assert structural(puck) == structural(puck, None, (("s", 300.0, 301.0), ("s_dot", -1e-6, 1e-6)))
+    assert len(structural(puck)) == 1
+
+
+def test_ranges_of_a_dataset_are_those_of_all_logs_without_outliers():
+    time = np.linspace(0.0, 10.0, 101)
+    logs = [
+        dr.Log.from_arrays(
+            time, {"T": np.where(time == 5.0, 1e9, low + time), "T_dot": 1.0 + 0 * time, "heat": 0 * time}
+        )
+        for low in (300.0, 320.0)
+    ]
+    ranges = {name: (low, high) for name, low, high in Dataset.of(reactor(), logs).ranges}
+    assert ranges["T"] == (300.0, 330.0)
+    assert ranges["heat"] == (0.0, 0.0)

@@ -29,6 +29,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     residuals_of_motion,
     unexplained,
 )
+from diransac.identification.methods.lo_diransac.recording_errors import effect_on
 from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
@@ -467,11 +468,18 @@ def test_consensus_is_the_sum_of_log_scales_of_a_plain_simulation():
     machine = MACHINES["planar-rotorcraft"]
     starts = motion.signals[intervals.starts, :6]
     simulated = [
-        rollout(machine, p, x, intervals.inputs[a : a + 25], 0.01)
+        rollout(machine, p, x, intervals.inputs[a : a + 25], 0.01, intervals.substeps)
         for x, a in zip(starts, intervals.starts, strict=True)
     ]
     size = np.sort(np.abs(np.vstack(simulated) - signals), axis=0)[35] / 0.4538
     assert robust_scores(intervals, motion, p[None], np.arange(4))[0] == pytest.approx(np.log(size).sum(), rel=1e-9)
+
+
+def test_delays_that_are_withdrawn_have_no_effect_on_a_covariance():
+    intervals, signals = intervals_of()
+    none = intervals.with_delays(np.zeros(9), np.gradient(signals, axis=0))
+    assert none.all_errors.kinds == ()
+    assert not effect_on(none, None, np.ones((8, 3, 2)), np.ones((4, 2))).any()
 
 
 # ---------------------------------------------------------------------- screening

@@ -646,3 +646,5 @@ def test_a_derived_log_has_the_per_log_values_of_the_log_that_it_comes_from():
     derived = dr.differentiate(bare[0], SLIDER)
     assert result.parameters_in(derived) == result.parameters_in(bare[0])
     assert result.parameters_in(bare[0])["bias"] == result.per_log["bias"][0]
+    with pytest.raises(SettingsError, match=r"log is 0; give a dr.Log \(result.per_log has the parameters by index\)"):
+        result.parameters_in(0)

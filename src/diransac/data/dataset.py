@@ -12,7 +12,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.log import Log
-from diransac.data.segment import Segment, bind_log
+from diransac.data.segment import Segment, bind_log, bulk_range
 from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
@@ -350,6 +350,18 @@ class Dataset:
             parts = [x - np.where(centred, _medians(x), 0.0) for x in parts]
         values = np.concatenate(parts)
         return {n: _spread(values[:, i]) for i, n in enumerate(self.signals)}
+
+    @cached_property
+    def ranges(self) -> tuple[tuple[str, float, float], ...]:
+        """Smallest and largest value of the bulk of each signal and input over all logs, with its name."""
+        found: dict[str, list[float]] = {}
+        for one in self.segments:
+            of_inputs = (bulk_range(u) for u in one.inputs.T)
+            pairs = (*zip(one.signals, one.ranges, strict=True), *zip(self.model.inputs, of_inputs, strict=True))
+            for name, (low, high) in pairs:
+                if np.isfinite([low, high]).all():
+                    found.setdefault(name, []).extend((low, high))
+        return tuple((name, min(x), max(x)) for name, x in found.items())
 
     def kept(self, key: object, make: Callable[[], T]) -> T:
         """The value that was made under an equal key before, or a new one, which lives as long as the dataset.

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 __all__ = ["DrivenStates"]
 
 _N_STARTS = 256
-# Integration steps per sample.
-_SUBSTEPS = 2
 
 
 @lru_cache(maxsize=16)
@@ -105,6 +103,8 @@ class DrivenStates(SearchOverLogs):
         Bandwidth of the observers, 1/s.
     parameters : (n_p,) array, optional
         Known parameters.
+    substeps : int, optional
+        Integration steps per sample.
     """
 
     model: Model
@@ -118,6 +118,7 @@ class DrivenStates(SearchOverLogs):
     dt: float
     bandwidth: float
     parameters: FloatArray | None = None
+    substeps: int = 2
 
     @cached_property
     def _observed(self) -> tuple[str, ...]:
@@ -130,7 +131,7 @@ class DrivenStates(SearchOverLogs):
     @cached_property
     def _simulator(self) -> Simulator:
         compared = (*self._driven.state[len(self.hidden) :], *self._driven.sensors)
-        return rollouts(self._driven, compared, substeps=_SUBSTEPS)
+        return rollouts(self._driven, compared, substeps=self.substeps)
 
     @cached_property
     def _inputs(self) -> FloatArray:

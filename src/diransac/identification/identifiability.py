@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Ambiguity",
     "NullSpace",
+    "Ranges",
     "check_structure",
     "collinear",
     "in_words",
@@ -41,9 +42,9 @@ __all__ = [
     "vague_parameters",
 ]
 
-# Parameter vectors at which dr/dp is evaluated; random motions for each, at least and per parameter; their decades.
-_N_VECTORS, _N_MOTIONS, _PER_PARAMETER = 3, 60, 4
-_DECADES = (-2.0, 1.0)
+# Parameter vectors at which dr/dp is evaluated; random motions for each, at least and per parameter; the decades below
+# half a range that they cover, and half the range of a signal of which no log shows it.
+_N_VECTORS, _N_MOTIONS, _PER_PARAMETER, _DECADES, _HALF_RANGE = 3, 60, 4, 3.0, 10.0
 # Random motions of which some signals are measured, their steps per unknown, and a step over the fastest time constant.
 _N_TRAJECTORIES, _STEPS_PER_UNKNOWN, _STEP = 4, 2, 0.2
 # Singular value over the largest below which it is zero, of dr/dp and of sensitivities, whose sizes differ by decades;
@@ -55,6 +56,9 @@ _PART_OF_LOG = 0.1
 _COLLINEAR, _PART_OF_CORRELATION = 0.05, 0.2
 # Standard errors of a 95 % interval to either side.
 _TWO_SIDED = 1.96
+Ranges = tuple[tuple[str, float, float], ...]
+"""Smallest and largest value of states and inputs, by name."""
+
 _UNMEASURED = "since not all states are measured"
 _HOMOGENEOUS = "since each term has one of them as a factor (b = 0 in W p = b)"
 
@@ -123,7 +127,9 @@ class Ambiguity:
 
 
 @lru_cache(maxsize=64)
-def structural(model: Model, measured: tuple[str, ...] | None = None) -> tuple[Ambiguity, ...]:
+def structural(
+    model: Model, measured: tuple[str, ...] | None = None, ranges: Ranges | None = None
+) -> tuple[Ambiguity, ...]:
     """Parameters that no log determines one by one, from the null space of ``dr/dp`` at random motions.
 
     Where states are not measured, it is the null space of the sensitivities of the measured signals, for any initial
@@ -133,11 +139,16 @@ def structural(model: Model, measured: tuple[str, ...] | None = None) -> tuple[A
     that does not depend on the parameters leaves sums, one of ``dp/p`` that does not leaves products and ratios.  A
     parameter whose bounds coincide is known.
 
+    Random motions are of several magnitudes.  A term may vanish at all of them, as a rate ``exp(-E/T)`` does at a few
+    kelvin: with the ranges of a log, an ambiguity is also one of motions in these ranges.
+
     Parameters
     ----------
     model : Model
     measured : tuple of str, optional
         Signals that are measured; None: all.
+    ranges : tuple of (str, float, float), optional
+        Of states and inputs, in which a log's motion is.
 
     Returns
     -------
@@ -145,14 +156,19 @@ def structural(model: Model, measured: tuple[str, ...] | None = None) -> tuple[A
         Empty where each parameter is identifiable from these signals, random motions give no finite equations, or the
         number of ambiguities depends on the parameters.
     """
+    if ranges is not None and not structural(model, measured):
+        return ()
     rng = np.random.default_rng(20240607)
     bounds = list(model.parameters.values())
     free = np.flatnonzero([x.lower < x.upper for x in bounds])
     vectors = [_random_parameters(bounds, rng) for _ in range(_N_VECTORS)]
-    jacobians = [
-        (_random_jacobian(model, p, rng) if measured is None else _output_jacobian(model, p, rng, measured))[:, free]
-        for p in vectors
-    ]
+
+    def jacobian(p: FloatArray, ranges: Ranges) -> FloatArray:
+        if measured is None:
+            return _random_jacobian(model, p, rng, ranges)
+        return _output_jacobian(model, p, rng, measured, ranges)
+
+    jacobians = [np.concatenate([jacobian(p, x) for x in ((), ranges) if x is not None])[:, free] for p in vectors]
     if not len(free) or min(map(len, jacobians)) < len(free):
         return ()
     spaces = [_null_space(J, _RANK if measured is None else _RANK_OF_OUTPUTS) for J in jacobians]
@@ -170,7 +186,13 @@ def structural(model: Model, measured: tuple[str, ...] | None = None) -> tuple[A
     return _joined(found)
 
 
-def check_structure(model: Model, source: str, allow: int = 0, measured: tuple[str, ...] | None = None) -> None:
+def check_structure(
+    model: Model,
+    source: str,
+    allow: int = 0,
+    measured: tuple[str, ...] | None = None,
+    ranges: Ranges | None = None,
+) -> None:
     """Raise IdentificationError for parameters that the equations do not determine, whatever the motion.
 
     Parameters
@@ -182,8 +204,10 @@ def check_structure(model: Model, source: str, allow: int = 0, measured: tuple[s
         Number of such parameters that the caller can do with.
     measured : tuple of str, optional
         Signals that are measured; None: all.
+    ranges : tuple of (str, float, float), optional
+        As `structural`.
     """
-    found = structural(model, measured)
+    found = structural(model, measured, ranges)
     if sum(len(x.names) for x in found) > allow:
         raise IdentificationError(f"{source}: {'; '.join(x.sentence(x.of_equations()) for x in found)}")
 
@@ -205,7 +229,7 @@ def structural_slopes(model: Model, parameters: FloatArray, given: IntArray) -> 
     (n_p, k) array
         1 and 0 in the rows of the given ones.
     """
-    space = _null_space(_random_jacobian(model, parameters, np.random.default_rng(20240607)), _RANK)
+    space = _null_space(_random_jacobian(model, parameters, np.random.default_rng(20240607), ()), _RANK)
     directions = space.directions / space.scale
     return np.asarray((np.linalg.pinv(directions[:, given]) @ directions).T)
 
@@ -221,10 +245,21 @@ def _random_parameters(bounds: Sequence[Parameter], rng: np.random.Generator) ->
     return np.where(has_lower & has_upper, low + draw / 3.0 * (high - low), open_ended)
 
 
-def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _centres(model: Model, ranges: Ranges) -> tuple[FloatArray, FloatArray]:
+    """Middle and half width ``(n_x + n_u,)`` of the range of each state and input."""
+    found = {name: (0.5 * (low + high), 0.5 * (high - low)) for name, low, high in ranges}
+    pairs = [found.get(name, (0.0, 0.0)) for name in (*model.state, *model.inputs)]
+    middle, half = np.array(pairs).reshape(-1, 2).T
+    return middle, np.where(half > 0.0, half, _HALF_RANGE)
+
+
+def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, ranges: Ranges) -> FloatArray:
     """Rows ``(n, n_p)`` of ``dr/dp`` and ``dy/dp`` at random motions that satisfy the equations, each of unit size."""
     n = max(_N_MOTIONS, _PER_PARAMETER * model.n_p)
-    q, v, u = (_random_numbers((size, n), rng) for size in (model.n_q, model.n_v, model.n_u))
+    middle, half = (x[:, None] for x in _centres(model, ranges))
+    sizes = (model.n_q, model.n_v, model.n_u)
+    drawn = middle + half * np.concatenate([_random_numbers((size, n), rng) for size in sizes])
+    q, v, u = np.split(drawn, np.cumsum(sizes)[:2])
     for four in model.quaternions:
         q[list(four)] /= np.linalg.norm(q[list(four)], axis=0)
     repeated = np.repeat(p[:, None], n, axis=1)
@@ -240,20 +275,24 @@ def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator) -> F
     return np.asarray(J[usable] / size[usable, None])
 
 
-def _output_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, measured: Sequence[str]) -> FloatArray:
+def _output_jacobian(
+    model: Model, p: FloatArray, rng: np.random.Generator, measured: Sequence[str], ranges: Ranges
+) -> FloatArray:
     """Derivatives ``(n, n_p)`` of measured signals in random motions, without what initial states can explain.
 
     Motions are sequences of Euler's steps, which have the symmetries of the equations.
     """
     n_x, n_q, sensor_slopes = len(model.state), model.n_q, _sensor_slopes(model)
+    middle, half = _centres(model, ranges)
+    half = half / (1.0 if ranges else _HALF_RANGE)
     rows, blocks = [model.signals.index(n) for n in measured], []
     for _ in range(_N_TRAJECTORIES):
-        x, step = rng.normal(size=n_x), 0.0
+        x, step = middle[:n_x] + half[:n_x] * rng.normal(size=n_x), 0.0
         of_x, of_p, seen_x, seen_p = np.eye(n_x), np.zeros((n_x, model.n_p)), list[FloatArray](), list[FloatArray]()
         for _ in range(_STEPS_PER_UNKNOWN * (n_x + model.n_p)):
             for four in model.quaternions:
                 x[list(four)] /= np.linalg.norm(x[list(four)])
-            u = rng.normal(size=model.n_u)
+            u = middle[n_x:] + half[n_x:] * rng.normal(size=model.n_u)
             A, _, P = (np.array(ca.DM(J)) for J in model.rate_jacobians(x, u, p))
             step = step or _STEP / max(1.0, float(np.linalg.norm(A)))
             moved_x, moved_p = A @ of_x, A @ of_p + P
@@ -280,8 +319,8 @@ def _sensor_slopes(model: Model) -> ca.Function:
 
 
 def _random_numbers(shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:
-    """Numbers of both signs and several magnitudes, so that a saturation is neither always on nor never."""
-    return np.asarray(rng.choice([-1.0, 1.0], shape) * 10.0 ** rng.uniform(*_DECADES, shape))
+    """Numbers of both signs, up to 1 and of several magnitudes: a saturation is neither always on nor never."""
+    return np.asarray(rng.choice([-1.0, 1.0], shape) * 10.0 ** rng.uniform(-_DECADES, 0.0, shape))
 
 
 @dataclass(frozen=True)
@@ -550,6 +589,7 @@ def unidentifiable(
     covariance: FloatArray,
     uncertain: BoolArray,
     measured: tuple[str, ...] | None = None,
+    ranges: Ranges | None = None,
 ) -> tuple[BoolArray, tuple[str, ...]]:
     """Parameters of an estimate that are not identifiable, by the equations or from the log.
 
@@ -565,6 +605,8 @@ def unidentifiable(
         Parameters whose error is too large for the estimate to be of use.
     measured : tuple of str, optional
         Signals that are measured; None: all.
+    ranges : tuple of (str, float, float), optional
+        As `structural`.
 
     Returns
     -------
@@ -573,7 +615,7 @@ def unidentifiable(
     sentences : tuple of str
         The names, the combinations that are determined, and what to do.
     """
-    of_model = structural(model, measured)
+    of_model = structural(model, measured, ranges)
     ambiguous = {name for x in of_model for name in x.names}
     by_equations = np.array([name.partition("[")[0] in ambiguous for name in layout.names])
     from_log = collinear(layout.names, values, covariance, uncertain & ~by_equations)

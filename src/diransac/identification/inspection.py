@@ -268,7 +268,7 @@ def _fitness(log: Log, model: Model) -> Fitness:
         model = model.with_sensors(usable_sensors(model, [derived], regression=True)[0])
         dataset = Dataset.of(model, derived)
         check_motion(dataset)
-        ambiguous = structural(model)
+        ambiguous = structural(model, ranges=dataset.ranges)
         if ambiguous:
             reason = "; ".join(x.sentence(x.of_equations()) for x in ambiguous)
             return Fitness(model.name, missing, derivable, _not_excited(ambiguous, model), reason)

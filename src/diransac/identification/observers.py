@@ -38,8 +38,6 @@ __all__ = ["Observers"]
 
 # Starts at most and at least, and numbers of all rows and pairs of unknowns of all starts in between.
 _N_STARTS, _FEWEST_STARTS, _NUMBERS = 256, 16, 200_000_000
-# Integration steps per sample.
-_SUBSTEPS = 2
 
 
 @lru_cache(maxsize=16)
@@ -108,6 +106,8 @@ class Observers(SearchOverLogs):
         Sampling time, s.
     bandwidth : float
         1/s.
+    substeps : int, optional
+        Integration steps per sample.
     """
 
     model: Model
@@ -121,6 +121,7 @@ class Observers(SearchOverLogs):
     rows_of_logs: Sequence[slice]
     dt: float
     bandwidth: float
+    substeps: int = 2
 
     @cached_property
     def _observer(self) -> Model:
@@ -129,7 +130,7 @@ class Observers(SearchOverLogs):
     @cached_property
     def _simulator(self) -> Simulator:
         compared = [self._observer.state[self.model.state.index(n)] for n in self.sampled]
-        return rollouts(self._observer, (*compared, *self._observer.sensors), substeps=_SUBSTEPS)
+        return rollouts(self._observer, (*compared, *self._observer.sensors), substeps=self.substeps)
 
     @cached_property
     def _inputs(self) -> FloatArray:

@@ -15,8 +15,17 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.checks import rows_per_sample
+from diransac.data.segment import bulk_range
 from diransac.errors import IdentificationError
-from diransac.identification.identifiability import Ambiguity, NullSpace, in_words, null_space, of_log, structural
+from diransac.identification.identifiability import (
+    Ambiguity,
+    NullSpace,
+    Ranges,
+    in_words,
+    null_space,
+    of_log,
+    structural,
+)
 from diransac.identification.regression import regression_rows
 
 if TYPE_CHECKING:
@@ -154,7 +163,7 @@ def cause_of_refusal(model: Model, layout: ParameterLayout, logs: Sequence[Motio
     -------
     str
     """
-    of_model = structural(model)
+    of_model = structural(model, ranges=_ranges(model, logs))
     found = None if model.nonlinear_parameters else _solved(model, layout, logs)
     if any(x.noun == "ratio" for x in of_model) or (found is None and of_model):
         return "; ".join(x.sentence(x.of_equations()) for x in of_model)
@@ -164,6 +173,12 @@ def cause_of_refusal(model: Model, layout: ParameterLayout, logs: Sequence[Motio
     if not found.has_known_terms:
         return _no_known_terms(model, layout, logs)
     return _cause_of_solution(_Alternatives(model, layout, logs, found), of_model)
+
+
+def _ranges(model: Model, logs: Sequence[MotionRows]) -> Ranges:
+    """Range of the bulk of each state and input; 0 of one that is missing."""
+    columns = np.concatenate([np.hstack([one.q, one.v, one.u]) for one in logs]).T
+    return tuple((n, *bulk_range(x)) for n, x in zip((*model.state, *model.inputs), columns, strict=True))
 
 
 def _cause_of_solution(alternatives: _Alternatives, of_model: Sequence[Ambiguity]) -> str:
@@ -224,7 +239,11 @@ def check_signs(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows
     signed = {
         n for n, x in zip(layout.names, layout.bounds, strict=True) if x.positive or x.lower >= 0.0 or x.upper <= 0.0
     }
-    found = None if model.nonlinear_parameters or structural(model) else _solved(model, layout, logs)
+    found = (
+        None
+        if model.nonlinear_parameters or structural(model, ranges=_ranges(model, logs))
+        else _solved(model, layout, logs)
+    )
     if found is None or not signed or not signed <= set(layout.violations(found.parameters)):
         return
     if _Alternatives(model, layout, logs, found).signs():

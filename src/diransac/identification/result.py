@@ -190,7 +190,15 @@ class Result:
         return {**self.parameters, **{name: values[index] for name, values in self.per_log.items()}}
 
     def index_of(self, log: Log) -> int | None:
-        """Index of a log among those identified from; None if it is not one of them."""
+        """Index of a log among those identified from; None if it is not one of them.
+
+        Raises
+        ------
+        SettingsError
+            What is given is no log.
+        """
+        if not isinstance(log, Log):
+            raise SettingsError(f"log is {log!r}; give a dr.Log (result.per_log has the parameters by index)")
         known = [(one.fingerprint, one.prepared_fingerprint) for one in self.logs]
         return next((i for i, own in enumerate(known) if log.fingerprint in own), None)
 

@@ -149,7 +149,7 @@ def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
 
 
 def _checked(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
-    check_structure(dataset.model, dataset.source)
+    check_structure(dataset.model, dataset.source, ranges=dataset.ranges)
     check_known_terms(dataset)
     bound = estimator.bind(dataset)
     if bound.select([np.arange(bound.n_rows)]).well_defined()[0]:

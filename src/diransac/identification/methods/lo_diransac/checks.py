@@ -370,7 +370,7 @@ def _of_plain_least_squares(
         return
     weak = weak_form(intervals, motion)
     everything: BoolArray = np.ones((1, *weak.b.shape), bool)
-    plain = weak.solve(everything)[0]
+    plain = weak.solve_sized(everything)[0]
     both, seen = np.array([plain, result.parameters]), intervals.known.any(axis=0)
     worse, own = robust_scores(intervals, motion, both, np.arange(len(intervals)))
     if not worse < own + _AS_WELL * seen.sum():

@@ -14,9 +14,11 @@ Torr, Zisserman 2000.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["WeakForm", "equation_scales", "find_hypotheses", "find_spikes", "robust_scores", "weak_form"]
+__all__ = ["WeakForm", "equation_scales", "find_hypotheses", "find_spikes", "random_sets", "robust_scores", "weak_form"]
 
 _OVERLAP = 5
 # Numbers that are held at a time for several hypotheses: bounds the memory, whatever the length of the logs.
@@ -137,7 +139,7 @@ def _linear(
     weak, layout = weak_form(intervals, motion), dataset.layout
     n = len(intervals)
     few = np.unique(np.linspace(0, n - 1, min(settings.n_screening_intervals, n)).astype(int))
-    samples = weak.solve(_samples(settings, weak, seed), layout)
+    samples = weak.solve_sized(random_sets(settings, weak, seed), layout)
     missing = _in_sensors_alone(dataset) & ~weak.W.any(axis=(0, 1)) & np.isinf(layout.prior_std)
     if missing.any() and dataset.model.is_affine:
         samples[:, missing] = [1.0 if x.positive else 0.0 for x, m in zip(layout.bounds, missing, strict=True) if m]
@@ -162,10 +164,10 @@ def _nonlinear(
 ) -> FloatArray:
     """Finalists of any model: nonlinear least squares of all and of random rows of the smoothed motion."""
     bound = _of_smoothed_motion(intervals, motion, dataset)
-    n, n_p = bound.n_rows, intervals.n_p
-    rows = sample_rows(seed, np.arange(settings.n_nonlinear_samples), n, 0, min(n, settings.largest_sample * n_p))
-    sizes = _generator(seed).integers(n_p, rows.shape[1] + 1, len(rows))
-    samples = [np.sort(some[:size]) for some, size in zip(rows, sizes, strict=True)]
+    n, n_p, largest = bound.n_rows, intervals.n_p, settings.largest_sample
+    k = np.arange(settings.n_nonlinear_samples)
+    rows = sample_rows(seed, k, n, 0, min(n, largest * n_p))
+    samples = [np.sort(some[:size]) for some, size in zip(rows, _sizes(seed, k, n, n_p, largest), strict=True)]
     return bound.select([np.arange(n), *samples]).fit()
 
 
@@ -199,11 +201,37 @@ class WeakForm:
     W: FloatArray
     b: FloatArray
 
+    @cached_property
+    def has_known_terms(self) -> BoolArray:
+        """Mask ``(r,)`` of the equations in which b is more than a rounding error beside that of another one."""
+        largest = np.abs(self.b).max(axis=0)
+        return np.asarray(largest > _ROUNDING * largest.max())
+
     def solve(self, chosen: BoolArray, layout: ParameterLayout | None = None) -> FloatArray:
         """Parameters ``(n_sets, n_p)`` by least squares of each set of rows ``(n_sets, n, r)``.
 
         Rows have residuals of order one; the priors of a layout are further rows.
         """
+        return _solved(*self._normal_equations(chosen, layout))
+
+    def solve_sized(self, chosen: BoolArray, layout: ParameterLayout | None = None) -> FloatArray:
+        """Parameters as by `solve`, which noise in equations without a known term (``b = 0``) does not shrink.
+
+        Zeros solve such an equation, too: it determines ratios of the parameters that it connects.  Given the ratios,
+        the size of each group of connected parameters is that of least squares of the other equations.
+        """
+        p, known = self.solve(chosen, layout), self.has_known_terms
+        if known.all() or not known.any():
+            return p
+        sized = WeakForm(np.ascontiguousarray(self.W[:, known]), self.b[:, known])
+        G, h = sized._normal_equations(chosen[:, :, known], layout)
+        ratios = p[:, :, None] * _connected(self.W[:, ~known])
+        transposed = ratios.swapaxes(1, 2)
+        sizes = _solved(transposed @ G @ ratios, (transposed @ h[:, :, None])[:, :, 0])
+        return np.asarray((ratios @ sizes[:, :, None])[:, :, 0])
+
+    def _normal_equations(self, chosen: BoolArray, layout: ParameterLayout | None) -> tuple[FloatArray, FloatArray]:
+        """Sums ``(n_sets, n_p, n_p)`` and ``(n_sets, n_p)`` over sets of rows."""
         n, r, n_p = self.W.shape
         products = np.einsum("nri,nrj->nrij", self.W, self.W).reshape(n * r, -1)
         known = (self.W * self.b[:, :, None]).reshape(n * r, -1)
@@ -216,31 +244,54 @@ class WeakForm:
         if layout is not None:
             precision = 1.0 / np.square(layout.prior_std)
             G, h = G + np.diag(precision), h + precision * layout.prior_mean
-        d = np.sqrt(np.einsum("kii->ki", G)) + 1e-300
-        G = G / d[:, :, None] / d[:, None, :] + 1e-10 * np.eye(n_p)
-        return np.asarray(np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d)
+        return G, h
 
 
-def _samples(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArray:
-    """All rows, and random sets of n to ``largest_sample`` n rows of each equation, with n parameters."""
-    rng = _generator(seed)
+def _solved(G: FloatArray, h: FloatArray) -> FloatArray:
+    """Solutions ``(n_sets, n)`` of normal equations; 0 for an unknown that no row has."""
+    d = np.sqrt(np.einsum("kii->ki", G)) + 1e-300
+    G = G / d[:, :, None] / d[:, None, :] + 1e-10 * np.eye(G.shape[-1])
+    return np.asarray(np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d)
+
+
+def _connected(W: FloatArray) -> BoolArray:
+    """Mask ``(n_p, n_groups)`` of the parameters that some equations ``(n, r, n_p)`` connect; others are alone."""
+    used = W.any(axis=0).astype(int)
+    labels = connected_components(used.T @ used, directed=False)[1]
+    return np.asarray(labels[:, None] == np.unique(labels))
+
+
+def random_sets(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArray:
+    """All rows, and random sets of n to ``largest_sample`` n rows of each equation, with n parameters.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    weak : WeakForm
+    seed : int
+        Set k depends on the seed and k alone.
+
+    Returns
+    -------
+    (1 + n_samples, n_rows, r) bool array
+    """
     n, r, n_p = weak.W.shape
-    largest = min(settings.largest_sample * n_p, n)
-    sizes = np.r_[largest, np.minimum(rng.integers(n_p, settings.largest_sample * n_p + 1, settings.n_samples), n)]
-    chosen = np.empty((len(sizes), n, r), bool)
-    at_a_time = max(1, _NUMBERS_AT_A_TIME // (n * r))
-    for first in range(0, len(sizes), at_a_time):
-        some = slice(first, first + at_a_time)
-        drawn = rng.random((len(sizes[some]), n, r))
-        least = np.sort(np.partition(drawn.swapaxes(1, 2), largest - 1, axis=2)[..., :largest], axis=2)
-        bounds = np.take_along_axis(least, sizes[some, None, None] - 1, axis=2)
-        np.less_equal(drawn, bounds.swapaxes(1, 2), out=chosen[some])
+    k = np.arange(settings.n_samples)
+    sizes = _sizes(seed, k, n, n_p, settings.largest_sample)
+    draws = r * k[:, None] + np.arange(r)
+    rows = sample_rows(seed, draws.ravel(), n, 0, min(settings.largest_sample * n_p, n)).reshape(len(k), r, -1)
+    inside = np.broadcast_to(np.arange(rows.shape[2]) < sizes[:, None, None], rows.shape)
+    sample, equation, _ = np.nonzero(inside)
+    chosen = np.zeros((1 + len(k), n, r), bool)
     chosen[0] = True
+    chosen[1 + sample, rows[inside], equation] = True
     return chosen
 
 
-def _generator(seed: int) -> np.random.Generator:
-    return np.random.default_rng([int(seed < 0), abs(seed)])
+def _sizes(seed: int, k: IntArray, n: int, n_p: int, largest: int) -> IntArray:
+    """Number of rows of samples k: n_p to ``largest`` n_p, of n rows; keys from the end are no sample's."""
+    drawn = sample_rows(seed, ~k.astype(np.uint64), (largest - 1) * n_p + 1, 0, 1)[:, 0]
+    return np.asarray(np.minimum(n_p + drawn, n))
 
 
 def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
@@ -300,8 +351,8 @@ def _sensor_scale(W: FloatArray, b: FloatArray) -> float:
 def equation_scales(rows: WeakForm) -> FloatArray:
     """Scale of each equation: the median of its residuals, and a hundredth of its terms at least.
 
-    An equation without a known term (``b = 0``) is also solved by parameters of zero.  Its scale is that of its terms
-    with the parameters that the other equations determine, so that it cannot dominate them.
+    Sizes of the terms of equations without a known term (``b = 0``) are those of `WeakForm.solve_sized`: parameters
+    that such an equation shrinks would shrink its scale, and a smaller scale the parameters.
 
     Parameters
     ----------
@@ -311,17 +362,14 @@ def equation_scales(rows: WeakForm) -> FloatArray:
     Returns
     -------
     (r,) array
+        1 for an equation whose size no other one determines.
     """
-    largest, everything = np.abs(rows.b).max(axis=0), np.ones((1, *rows.b.shape), bool)
-    known = largest > _ROUNDING * largest.max()
+    everything = np.ones((1, *rows.b.shape), bool)
     scale = _median_size(rows.b - np.median(rows.b, axis=0))
-    scale = np.where(scale > 0.0, scale, largest) * known
+    scale = np.where(scale > 0.0, scale, np.abs(rows.b).max(axis=0)) * rows.has_known_terms
     for residuals in (False, False, False, True, True):
         scale = np.where(scale > 0.0, scale, np.inf)
-        terms = rows.W * WeakForm(rows.W / scale[:, None], rows.b / scale).solve(everything)[0]
-        # Noise in equations without a known term shrinks all parameters; the others determine their size.
-        sums, aim = (terms.sum(axis=2) / scale)[:, known], (rows.b / scale)[:, known]
-        terms *= max((sums * aim).sum() / (np.square(sums).sum() + 1e-300), 1.0)
+        terms = rows.W * WeakForm(rows.W / scale[:, None], rows.b / scale).solve_sized(everything)[0]
         scale = _median_size(np.sqrt(np.square(terms).sum(axis=2) + np.square(rows.b)))
         if residuals:
             scale = np.maximum(_median_size(terms.sum(axis=2) - rows.b), _SMALL_RESIDUAL * scale)
@@ -378,7 +426,8 @@ def _scores(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray
         intervals.length, intervals.first_of_log,
     )  # fmt: skip
     compared = Measurements(intervals.measured[:, seen], intervals.measurements.valid)
-    errors = rollouts(intervals.model, names, hold=intervals.hold).errors(batch, compared).reshape(n, -1, len(names))
+    simulator = rollouts(intervals.model, names, substeps=intervals.substeps, hold=intervals.hold)
+    errors = simulator.errors(batch, compared).reshape(n, -1, len(names))
     known = intervals.known[intervals.rows_of(chosen)][:, seen]
     scale = lower_scale(np.nan_to_num(errors, copy=False, nan=np.inf), known)
     return np.asarray(np.log(np.maximum(scale, 1e-4 * motion.spread[seen])).sum(axis=1))

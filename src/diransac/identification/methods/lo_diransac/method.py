@@ -233,7 +233,8 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     if unknown:
         has = ", ".join(dataset.model.parameters)
         raise SettingsError(f'start names "{unknown[0]}", which is not to be identified; these are: {has}')
-    check_structure(dataset.model, dataset.source, allow=len(dataset.model.parameters) - 1)
+    allowed = len(dataset.model.parameters) - 1
+    check_structure(dataset.model, dataset.source, allowed, ranges=dataset.ranges)
     best = _competed(settings, dataset, seed, callback)
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
     notes, refined = best.notes, likeliest.refinement
@@ -454,7 +455,7 @@ def _likeliest(
         return _searched(settings, intervals, motion, notes, seed, dataset, callback)
     report(callback, "unmeasured states", 0.05)
     allowed, measured = len(dataset.model.parameters) - 1, measured_signals(intervals)
-    check_structure(dataset.model, dataset.source, allowed, measured)
+    check_structure(dataset.model, dataset.source, allowed, measured, dataset.ranges)
     try:
         completed = _completed(intervals, motion, dataset)
         first = _searched(settings, intervals, completed, notes, seed, dataset, callback)
@@ -767,7 +768,7 @@ def _estimate(
     lost = ~((spans < units) | (spans < np.abs(result.parameters)))
     measured = measured_signals(intervals) if unmeasured_states(intervals) else None
     lost, combinations = unidentifiable(
-        dataset.model, dataset.layout, result.parameters, result.covariance, lost, measured
+        dataset.model, dataset.layout, result.parameters, result.covariance, lost, measured, dataset.ranges
     )
     covariance = result.covariance + found.ambiguity
     covariance[lost] = covariance[:, lost] = np.inf

@@ -166,10 +166,11 @@ def effect_on(intervals: ShootingIntervals, fit: Fit, z: FloatArray, s: FloatArr
     (n, n) array
         0 without such errors.
     """
-    if intervals.errors is None:
+    kinds = intervals.all_errors.kinds
+    if not kinds:
         return np.zeros((s.shape[1], s.shape[1]))
     scores = _Scores(intervals, fit)
-    _, covariance, of_z, of_s = scores.together([scores.slope(x) for x in intervals.errors.kinds])
+    _, covariance, of_z, of_s = scores.together([scores.slope(x) for x in kinds])
     slopes = np.einsum("wkn,wke->ne", z, of_z) + s.T @ of_s
     return np.asarray(slopes @ covariance @ slopes.T)
 

@@ -173,6 +173,7 @@ def _driven(intervals: ShootingIntervals, motion: Motion) -> DrivenStates:
         intervals.rows_of_logs,
         intervals.dt,
         bandwidth,
+        substeps=intervals.substeps,
     )
 
 
@@ -210,6 +211,7 @@ def _observers(intervals: ShootingIntervals, motion: Motion) -> Observers:
         intervals.rows_of_logs,
         intervals.dt,
         bandwidth=1.0 / intervals.duration,
+        substeps=intervals.substeps,
     )
 
 
