@@ -23,6 +23,7 @@ from diransac.identification.serialization import (
     Values,
     WholeNumbers,
 )
+from diransac.identification.structure import PossibleTerm
 from diransac.identification.suggestions import Suggestion
 
 __all__ = [
@@ -338,6 +339,8 @@ class Estimate:
         Findings of the method's own tests.
     suggestions : tuple of Suggestion, optional
         Terms that the model lacks, by the unmodelled forces; of lo-diransac alone.
+    possible_terms : tuple of PossibleTerm, optional
+        Terms that the model may lack, with their weights; None: they were not tested.
     """
 
     parameters: Values
@@ -355,6 +358,7 @@ class Estimate:
     diagnosis: Diagnosis | None = None
     checks: tuple[Finding, ...] = ()
     suggestions: tuple[Suggestion, ...] = ()
+    possible_terms: tuple[PossibleTerm, ...] | None = None
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, np.float64).reshape(len(self.parameters), len(self.parameters))

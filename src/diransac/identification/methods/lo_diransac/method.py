@@ -52,6 +52,7 @@ from diransac.identification.methods.lo_diransac.smoothing import (
     smooth,
     stuck_rows,
 )
+from diransac.identification.methods.lo_diransac.structural import possible_terms
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
@@ -169,7 +170,8 @@ class LoDiransac(LoDiransacSettings):
     prior_inflation : float, optional
         Factor of the prior on model error whose effect on the parameters is added to their covariance.
     suggestions : bool, optional
-        Whether terms are searched that would explain the unmodelled forces.
+        Whether terms are searched that would explain the unmodelled forces, and terms that the model may lack are
+        weighted for `Result.structural_intervals`.
     candidate_terms : callable, optional
         Further candidates of that search: ``candidate_terms(q, v, u)`` returns expressions by name.
 
@@ -627,6 +629,9 @@ def _estimate(
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),
         checks=checks,
         suggestions=found.lacks.suggestions if found.lacks else (),
+        possible_terms=possible_terms(intervals, found.refinement.fit, result, covariance, settings.candidate_terms)
+        if settings.suggestions
+        else None,
     )
 
 
