@@ -6,7 +6,7 @@ equations (`score_tests`).  One Newton step of all unknowns together gives the e
 counts what neighbouring intervals have in common, and the change g of the parameters per unit of theta.
 
 The prior is the same for every machine: ``theta ~ N(0, s^2)`` with s such that the RMS force of the term is a tenth of
-the RMS inertial force of its equation; and models that lack a term of one kind at one place are as probable as the
+that of the largest force of its equation; and models that lack a term of one kind at one place are as probable as the
 complete one, whatever the number of terms of that kind.
 The Bayes factor of a term against the complete model is that of two normal distributions,
 
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CandidateTests", "candidates_tested", "possible_terms", "weighted"]
 
-# Prior: RMS force of a term over the inertial force of its equation; odds of the terms of a kind and place, together.
+# Prior: RMS force of a term over the largest force of its equation; odds of the terms of a kind and place, together.
 _RELATIVE, _ODDS = 0.1, 1.0
 # Part of the variance of a parameter that a term must add to be kept.
 _KEPT = 1e-3
@@ -60,7 +60,7 @@ _KEPT = 1e-3
 _DETERMINED, _EQUIVALENT = 1e-12, 1e-6
 # Draws of a motion, and as many per parameter and equation; the seed.
 _DRAWS, _PER_PARAMETER, _SEED = 200, 4, 0
-# Factor of the prior of discrepancies that holds them at zero; part of the inertial force that is none.
+# Factor of the prior of discrepancies that holds them at zero; part of the largest force that is none.
 _HELD, _NO_FORCE = 1e-3, 1e-9
 # Numbers of the slopes that are held at a time.
 _NUMBERS_AT_A_TIME = 10_000_000
@@ -75,7 +75,7 @@ class CandidateTests:
     ----------
     terms : tuple of CandidateTerm
     units : (K,) array
-        Coefficients with which the RMS force of a term is the inertial force of its equation.
+        Coefficients with which the RMS force of a term is that of the largest force of its equation.
     estimates, variances : (K,) array
         Of the coefficients; 0 and infinite where the log does not determine one.
     effects : (n, K) array
@@ -143,7 +143,7 @@ def weighted(
     ----------
     tests : CandidateTests
     relative : float, optional
-        Prior RMS force of a term, over the inertial force of its equation.
+        Prior RMS force of a term, over that of the largest force of its equation.
     odds : float, optional
         Prior odds of the terms of one kind and place, together, against a complete model.
 
@@ -185,9 +185,9 @@ def candidates_tested(
     CandidateTests
         Of those that act on the logs, and that parameters do not equal whatever the motion.
     """
-    motion, _, _, M = residuals_of_motion(intervals, fit, fit.shared[: intervals.n_p])
+    motion, r, W, M = residuals_of_motion(intervals, fit, fit.shared[: intervals.n_p])
     candidates, terms = candidates_of(intervals, motion, library)
-    relative = _relative_forces(intervals, motion, M, terms)
+    relative = _relative_forces(terms[intervals.occupied], _largest_forces(intervals, fit, motion, r, W, M))
     chosen = np.flatnonzero((relative > _NO_FORCE) & ~_replaceable(intervals, motion, candidates))
     M = means_of_intervals(intervals, M)
     accelerations = np.zeros((*terms.shape[:2], len(chosen)))
@@ -222,13 +222,27 @@ def _tested(
     return found
 
 
-def _relative_forces(
-    intervals: ShootingIntervals, motion: Sequence[FloatArray], M: FloatArray, terms: FloatArray
+def _largest_forces(
+    intervals: ShootingIntervals,
+    fit: Fit,
+    motion: Sequence[FloatArray],
+    r: FloatArray,
+    W: FloatArray,
+    M: FloatArray,
 ) -> FloatArray:
-    """RMS force (K,) of each term per unit, over the inertial force of the equation in which that is largest."""
-    inertial = np.einsum("nij,nj->ni", M, motion[2])[intervals.counted]
-    inertial, forces = (np.sqrt(np.square(x).mean(axis=0)) for x in (inertial, terms[intervals.occupied]))
-    relative = (forces / (inertial[:, None] + _TINY)).max(axis=0)
+    """RMS (n_v,) of the largest force of each equation: inertial, of a parameter, or without one.
+
+    In steady motion the inertial force is the smallest of all, and no measure of what a model may lack.
+    """
+    of_parameters = W * fit.shared[: intervals.n_p]
+    inertial, known = np.einsum("nij,nj->ni", M, motion[2]), of_parameters.sum(axis=2) - r
+    forces = np.concatenate([of_parameters, inertial[:, :, None], known[:, :, None]], axis=2)[intervals.counted]
+    return np.asarray(np.sqrt(np.square(forces).mean(axis=0)).max(axis=1))
+
+
+def _relative_forces(terms: FloatArray, largest: FloatArray) -> FloatArray:
+    """RMS force (K,) of terms (W, n_v, K) per unit, over the largest one of the equation in which that is most."""
+    relative = (np.sqrt(np.square(terms).mean(axis=0)) / (largest[:, None] + _TINY)).max(axis=0)
     return np.asarray(np.where(np.isfinite(relative), relative, 0.0))
 
 
