@@ -39,6 +39,8 @@ class Record:
     regime, seed, method : which
     errors : by parameter, %, signed; empty without an estimate
     inside : by parameter, whether its 95 % interval holds the truth; empty without intervals
+    inside_structural : by parameter, whether that of a model that may lack a term does
+    widening : by parameter, width of the latter over that of the former
     verdict : of three; empty of baselines
     findings : sentences that a user is told
     refusal : why there is no estimate
@@ -51,6 +53,8 @@ class Record:
     method: str
     errors: Mapping[str, float] = field(default_factory=dict)
     inside: Mapping[str, bool] = field(default_factory=dict)
+    inside_structural: Mapping[str, bool] = field(default_factory=dict)
+    widening: Mapping[str, float] = field(default_factory=dict)
     verdict: str = ""
     findings: tuple[str, ...] = ()
     refusal: str = ""
@@ -65,7 +69,15 @@ class Record:
     @property
     def off(self) -> bool:
         """Whether a parameter is off by more than `WRONG` and outside its interval."""
-        return any(not abs(x) <= WRONG and not self.inside.get(name, True) for name, x in self.errors.items())
+        return self._outside(self.inside)
+
+    @property
+    def off_structurally(self) -> bool:
+        """Whether a parameter is off by more than `WRONG` and outside the interval of a model that may lack a term."""
+        return self._outside(self.inside_structural)
+
+    def _outside(self, inside: Mapping[str, bool]) -> bool:
+        return any(not abs(x) <= WRONG and not inside.get(name, True) for name, x in self.errors.items())
 
     @property
     def names_cause(self) -> bool:
@@ -118,9 +130,20 @@ def _lo(regime: Regime, recording: Recording) -> dict[str, Any]:
         result = dr.identify(regime.machine.model, recording.log, differentiate=True)
     truth, intervals = recording.truth, result.intervals(0.95)
     finite = {name: pair for name, pair in intervals.items() if np.isfinite(pair).all()}
-    inside = {name: bool(low <= truth[name] <= high) for name, (low, high) in finite.items()}
+    structural = {name: pair for name, pair in result.structural_intervals(0.95).items() if name in finite}
     verdict, findings = _said(result)
-    return {"errors": _errors(result.parameters, truth), "inside": inside, "verdict": verdict, "findings": findings}
+    return {
+        "errors": _errors(result.parameters, truth),
+        "inside": _inside(finite, truth),
+        "inside_structural": _inside(structural, truth),
+        "widening": {n: (high - low) / (finite[n][1] - finite[n][0]) for n, (low, high) in structural.items()},
+        "verdict": verdict,
+        "findings": findings,
+    }
+
+
+def _inside(intervals: Mapping[str, tuple[float, float]], truth: Mapping[str, float]) -> dict[str, bool]:
+    return {name: bool(low <= truth[name] <= high) for name, (low, high) in intervals.items()}
 
 
 def _said(result: dr.Result) -> tuple[str, tuple[str, ...]]:

@@ -23,6 +23,7 @@ from regime_flights import REGIMES
 from regime_judging import METHODS, Record, judge
 
 ONE_THREAD = ("DIRANSAC_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+JUDGED = ("off", "off_structurally", "confidently_wrong", "names_cause")
 VERDICTS = ("usable", "usable with care", "do not rely on this")
 
 
@@ -115,7 +116,8 @@ def _place(record: Record) -> tuple[int, ...]:
 def _tables(records: Sequence[Record], methods: Sequence[str]) -> Iterable[str]:
     """Markdown: a row a regime, and the totals of exact and of mismatched regimes."""
     baselines = [name for name in methods if name != "lo"]
-    titles = ["regime", "exact", "error %", "coverage", "usable / care / not", "off", "wrong", "cause", "refused", "s"]
+    titles = ["regime", "exact", "error %", "coverage", "structural", "widening", "usable / care / not"]
+    titles += ["off", "structurally", "wrong", "cause", "refused", "s"]
     rows = [[*titles, *(f"{name} %" for name in baselines)]]
     for name in dict.fromkeys(record.regime for record in records):
         rows.append(_row(name, [record for record in records if record.regime == name], baselines))
@@ -125,8 +127,9 @@ def _tables(records: Sequence[Record], methods: Sequence[str]) -> Iterable[str]:
 
 def _row(regime: str, records: Sequence[Record], baselines: Sequence[str]) -> list[str]:
     own = [record for record in records if record.method == "lo"]
-    cells = [regime, "yes" if REGIMES[regime].exact else "no", _spread(own), _coverage(own), _verdicts(own)]
-    cells += [str(sum(getattr(record, name) for record in own)) for name in ("off", "confidently_wrong", "names_cause")]
+    cells = [regime, "yes" if REGIMES[regime].exact else "no", _spread(own), _coverage(own)]
+    cells += [_coverage(own, "inside_structural"), _widening(own), _verdicts(own)]
+    cells += [str(sum(getattr(record, name) for record in own)) for name in JUDGED]
     cells += [_refusals(own), f"{median(record.seconds for record in own):.1f}" if own else ""]
     return [*cells, *(_spread([record for record in records if record.method == name]) for name in baselines)]
 
@@ -147,9 +150,15 @@ def _spread(records: Sequence[Record]) -> str:
     return f"{_number(median(errors))} / {_number(max(errors))}" if errors else "–"
 
 
-def _coverage(records: Sequence[Record]) -> str:
-    inside = [x for record in records for x in record.inside.values()]
+def _coverage(records: Sequence[Record], which: str = "inside") -> str:
+    inside = [x for record in records for x in getattr(record, which).values()]
     return f"{sum(inside) / len(inside):.2f}" if inside else "–"
+
+
+def _widening(records: Sequence[Record]) -> str:
+    """Median width of the structural intervals, over that of the others."""
+    ratios = [x for record in records for x in record.widening.values() if math.isfinite(x)]
+    return f"{median(ratios):.2f}" if ratios else "–"
 
 
 def _totals(records: Sequence[Record]) -> Iterable[str]:
@@ -161,7 +170,9 @@ def _totals(records: Sequence[Record]) -> Iterable[str]:
             yield (
                 f"{'Exact' if exact else 'Mismatched'} models, {len(some)} runs: {sum(one.off for one in some)} off, "
                 f"{wrong} confidently wrong ({100.0 * wrong / len(some):.1f} %), {named} name a cause, "
-                f"refused {_refusals(some)}, coverage {_coverage(some)}."
+                f"refused {_refusals(some)}, coverage {_coverage(some)}; if the model may lack a term: "
+                f"{sum(one.off_structurally for one in some)} off, coverage {_coverage(some, 'inside_structural')}, "
+                f"intervals {_widening(some)} times as wide."
             )
 
 
@@ -185,8 +196,7 @@ def _as_json(records: Sequence[Record]) -> str:
             return {name: plain(x) for name, x in value.items()}
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    judged = ("off", "names_cause", "confidently_wrong")
-    found = [plain(dataclasses.asdict(one) | {name: getattr(one, name) for name in judged}) for one in records]
+    found = [plain(dataclasses.asdict(one) | {name: getattr(one, name) for name in JUDGED}) for one in records]
     return json.dumps(found, indent=1, allow_nan=False) + "\n"
 
 

@@ -272,6 +272,12 @@ def _estimate(model: PortableModel, name: str) -> dict[str, Any]:
     return {
         "value": model.parameters[name],
         "standard_error": model.standard_errors[name],
+        **({"interval_95": list(model.intervals[name])} if name in model.intervals else {}),
+        **(
+            {"interval_95_if_a_term_is_missing": list(model.structural_intervals[name])}
+            if name in model.structural_intervals
+            else {}
+        ),
         "unit": about.unit,
         "lower": max(about.lower, 0.0) if about.positive else about.lower,
         "upper": about.upper,

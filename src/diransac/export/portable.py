@@ -47,6 +47,8 @@ class PortableModel:
         Values of each parameter that has one per log; what is exported is their mean.
     name : str, optional
         Name in the file, of which the names of C's functions begin; empty: that of the model.
+    intervals, structural_intervals : mapping of str to (float, float), optional
+        95 % interval of each parameter if the model is complete, and if it may lack a term; empty where not known.
     """
 
     model: Model
@@ -58,6 +60,8 @@ class PortableModel:
     hold: str = "zero-order"
     per_log: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     name: str = ""
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    structural_intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def of_sensors(self) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from diransac.identification.serialization import (
     Values,
     WholeNumbers,
 )
+from diransac.identification.structure import PossibleTerm
 from diransac.identification.suggestions import Suggestion
 
 __all__ = [
@@ -410,6 +411,8 @@ class Estimate:
         Terms that the model lacks, by the unmodelled forces; of lo-diransac alone.
     competition : Competition, optional
         Comparison with other estimates; None where the exact model predicts the logs within their noise.
+    possible_terms : tuple of PossibleTerm, optional
+        Terms that the model may lack, with their weights; None: they were not tested.
     """
 
     parameters: Values
@@ -428,6 +431,7 @@ class Estimate:
     checks: tuple[Finding, ...] = ()
     suggestions: tuple[Suggestion, ...] = ()
     competition: Competition | None = None
+    possible_terms: tuple[PossibleTerm, ...] | None = None
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, np.float64).reshape(len(self.parameters), len(self.parameters))

@@ -26,6 +26,8 @@ _MOST, _HALF, _FEW = 0.7, 0.5, 0.01
 _BREAKDOWN = 2.0 / 3.0
 """Fraction of outliers beyond which the estimate of lo-diransac is arbitrary."""
 _UNCERTAIN = 0.5
+_WIDENED, _AMBIGUOUS = 2.0, 0.1
+"""Widening of an interval by terms that a model may lack, and half of its width over the parameter, that need care."""
 _LISTED = 3
 """Stretches that a sentence names."""
 _CONTRADICTION = 3.0
@@ -55,6 +57,7 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
             *_inliers(result.logs, result.inlier_fraction, restarted=result.diagnosis is not None),
             *_diagnosis(result),
             *_uncertainty(result),
+            *_structure(result),
             *_bandwidth(result),
             *_search(result),
             *_logs(result),
@@ -353,6 +356,29 @@ def _uncertainty(result: Result) -> Iterator[Finding]:
         name = max(widths, key=lambda n: widths[n])
         what = f"{name} is" if len(widths) == 1 else f"The least certain parameter is {name},"
         yield Finding("good", f"{what} uncertain by ±{percent(widths[name])} (95 % interval).")
+
+
+def _structure(result: Result) -> Iterator[Finding]:
+    """The parameter that is most uncertain because the model may lack a term."""
+    if not result.has_structure:
+        return
+    intervals, widths = result.structural_intervals(), dict[str, float]()
+    for name, found in result.structure.items():
+        half, value = 0.5 * (intervals[name][1] - intervals[name][0]), abs(result.parameters[name])
+        if found.widening > _WIDENED and half > _AMBIGUOUS * value and name not in result.unidentifiable:
+            widths[name] = half / value if value > 0.0 else np.inf
+    if not widths:
+        return
+    name = max(widths, key=lambda n: widths[n])
+    found, others = result.structure[name], [n for n in widths if n != name]
+    low, high = (number(x, 3) for x in intervals[name])
+    also = f"; {', '.join(others)} likewise" if others else ""
+    yield Finding(
+        "care",
+        f"If the model lacks a term, {name} may be anywhere from {low} to {high}, an interval that is "
+        f"{number(found.widening, 2)} times as wide{also}: {_these(result.logs)} cannot exclude {found.term}. Record "
+        f"{found.motion}.",
+    )
 
 
 def _bandwidth(result: Result) -> Iterator[Finding]:

@@ -21,6 +21,7 @@ from diransac.identification.estimate import Competition, Diagnosis, Estimate, E
 from diransac.identification.findings import Verdict, findings_of, verdict_of
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
+from diransac.identification.structure import StructuralUncertainty, largest, mixture_intervals
 from diransac.identification.suggestions import Suggestion
 from diransac.identification.uncertainty import student_quantile, students_draws
 from diransac.model import Model
@@ -30,10 +31,11 @@ from diransac.text_table import aligned, telling_digits
 
 if TYPE_CHECKING:
     from diransac.export import PortableModel
+    from diransac.identification.structure import PossibleTerm
 
 __all__ = ["MARKS", "Result"]
 
-_FORMAT = 7
+_FORMAT = 8
 _LATEST = 1e9
 """Bound of delays and lags, s, and of the drift of gains."""
 _BY_LOG = ("parameters", "covariance")
@@ -110,6 +112,8 @@ class _Derived:
     units: Mapping[str, str]
     standard_errors: Values
     intervals_95: NumberPairs
+    structural_intervals_95: NumberPairs | None
+    structure: Mapping[str, StructuralUncertainty] | None
     violations: tuple[str, ...]
     verdict: Verdict
     findings: tuple[Finding, ...]
@@ -252,6 +256,82 @@ class Result:
         errors = self.standard_errors
         return {n: (x - width * errors[n], x + width * errors[n]) for n, x in self.parameters.items()}
 
+    def structural_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Interval of each parameter, if the model may lack a term.
+
+        Candidate terms that the log does not exclude widen the intervals of the parameters that they are correlated
+        with, by their evidence; `intervals` are those of a complete model.
+
+        Parameters
+        ----------
+        level : float, optional
+            Probability, between 0 and 1.
+
+        Returns
+        -------
+        dict of str to (float, float)
+            Lower and upper limit in the parameter's unit; never narrower than `intervals`.
+
+        Raises
+        ------
+        SettingsError
+            The level is not between 0 and 1.
+        ResultError
+            The method has not tested any terms.
+        """
+        terms, intervals = self._tested_terms(), self.intervals(level)
+        effects = np.array([[x.effects.get(n, 0.0) for n in self.layout.names] for x in terms])
+        effects = effects.reshape(-1, len(self.layout)) @ self._of_parameters.T
+        means, variances = (np.array([getattr(x, n) for x in terms])[:, None] for n in ("mean", "variance"))
+        found = mixture_intervals(
+            np.array(list(self.parameters.values())),
+            np.array(list(self.standard_errors.values())),
+            np.array([x.weight for x in terms]),
+            effects * means,
+            np.square(effects) * variances,
+            level,
+            student_quantile(self.degrees_of_freedom, 0.5 + level / 2.0),
+        )
+        return dict(zip(intervals, map(tuple, found.tolist()), strict=True))
+
+    @cached_property
+    def structure(self) -> Mapping[str, StructuralUncertainty]:
+        """Of each parameter that a possible term widens: the term that does so most, and the motion that would tell.
+
+        Raises
+        ------
+        ResultError
+            The method has not tested any terms.
+        """
+        terms, ordinary, structural = self._tested_terms(), self.intervals(), self.structural_intervals()
+        found = dict[str, StructuralUncertainty]()
+        for place, (name, (low, high)) in zip(self._of_parameters, structural.items(), strict=True):
+            width = ordinary[name][1] - ordinary[name][0]
+            term = largest(terms, dict(zip(self.layout.names, place.tolist(), strict=True)))
+            if term is not None and 0.0 < width < np.inf:
+                found[name] = StructuralUncertainty(str(term), term.weight, (high - low) / width, term.motion)
+        return found
+
+    @property
+    def has_structure(self) -> bool:
+        """True if terms that the model may lack were tested, and structural intervals are known."""
+        return self.estimate.possible_terms is not None
+
+    @property
+    def _of_parameters(self) -> FloatArray:
+        """Derivatives ``(n_p, n)`` of `parameters` with respect to the values of the estimate."""
+        return np.eye(len(self.layout)) if self.layout.is_shared else self.layout.mean_map
+
+    def _tested_terms(self) -> tuple[PossibleTerm, ...]:
+        """Terms that the model may lack.  Raises ResultError: none were tested."""
+        terms = self.estimate.possible_terms
+        if terms is None:
+            raise ResultError(
+                f"{self.method} has not tested what the model may lack: structural intervals are those of lo-diransac "
+                "with suggestions=True; identify with it"
+            )
+        return terms
+
     def sample(self, n: int, seed: int = 0) -> dict[str, FloatArray]:
         """Draws from the joint distribution of the parameters, for simulations with random parameters.
 
@@ -376,6 +456,8 @@ class Result:
             resolution.hold,
             {} if self.layout.is_shared else self.per_log,
             name or "",
+            self.intervals(),
+            self.structural_intervals() if self.has_structure else {},
         )
 
     @property
@@ -513,7 +595,14 @@ class Result:
 
     def _derived(self) -> _Derived:
         return _Derived(
-            self.units, self.standard_errors, self.intervals(), self.violations, self.verdict, self.findings
+            self.units,
+            self.standard_errors,
+            self.intervals(),
+            self.structural_intervals() if self.has_structure else None,
+            self.structure if self.has_structure else None,
+            self.violations,
+            self.verdict,
+            self.findings,
         )
 
     @classmethod
@@ -659,18 +748,28 @@ class Result:
         rate = rates[0] if len(rates) == 1 else f"{rates[0]} to {rates[-1]}"
         return f"{self.model.name} by {self.method} from {source} ({seconds:.4g} s at {rate} Hz)"
 
-    def _cells(self) -> list[tuple[str, str, str, str]]:
+    def _cells(self) -> list[tuple[str, ...]]:
         """Header and rows of the table of parameters."""
-        rows = [("parameter", "estimate", "95 % interval", "unit")]
-        for name, (low, high) in self.intervals().items():
-            digits = telling_digits(low, high)
-            interval = f"{low:.{digits}g} .. {high:.{digits}g}" if np.isfinite(high - low) else "unknown"
-            interval = "fixed" if name in self.fixed else interval
+        columns = {"95 % interval": self.intervals()}
+        if self.has_structure:
+            columns = {
+                "95 % interval if the model is complete": self.intervals(),
+                "if it may lack a term": self.structural_intervals(),
+            }
+        rows = [("parameter", "estimate", *columns, "unit")]
+        for name in self.parameters:
+            intervals = [self._interval(name, *x[name]) for x in columns.values()]
             estimate = "?" if name in self.unidentifiable else f"{self.parameters[name]:.6g}"
             varies = not self.layout.is_shared and self.model.parameters[name].per_log
             averaged = varies and name not in self.fixed
-            rows.append((f"{name} (mean of logs)" if averaged else name, estimate, interval, self.units[name]))
+            rows.append((f"{name} (mean of logs)" if averaged else name, estimate, *intervals, self.units[name]))
         return rows
+
+    def _interval(self, name: str, low: float, high: float) -> str:
+        """An interval of a parameter as text."""
+        digits = telling_digits(low, high)
+        interval = f"{low:.{digits}g} .. {high:.{digits}g}" if np.isfinite(high - low) else "unknown"
+        return "fixed" if name in self.fixed else interval
 
     def _prior_lines(self) -> list[str]:
         """The priors, in a line; none without them."""

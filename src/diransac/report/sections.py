@@ -184,6 +184,7 @@ class Estimate:
     look: str
     value: str = ""
     interval: str = ""
+    structural: str = ""
     width: str = ""
     is_outside: bool = False
     whisker: Whisker | None = None
@@ -251,19 +252,24 @@ def _estimate(name: str, entry: Entry, look: str, scale: Scale) -> Estimate:
     value, (low, high) = result.parameters[name], result.intervals()[name]
     if name in result.fixed:
         at = _whisker(name, entry, look, scale)
-        return Estimate(entry.label, look, number(value, 6), "fixed", "–", whisker=at)
+        return Estimate(entry.label, look, number(value, 6), "fixed", "fixed", "–", whisker=at)
     known = np.isfinite(high - low)
-    digits = telling_digits(low, high)
     width = "includes 0" if low <= 0.0 <= high else percent(0.5 * (high - low) / abs(value))
     return Estimate(
         label=entry.label,
         look=look,
         value=number(value, 6),
-        interval=f"{number(low, digits)} … {number(high, digits)}" if known else "unknown",
+        interval=_interval_text(low, high),
+        structural=_interval_text(*result.structural_intervals()[name]) if result.has_structure else "not tested",
         width=width if known else "–",
         is_outside=name in result.violations,
         whisker=_whisker(name, entry, look, scale),
     )
+
+
+def _interval_text(low: float, high: float) -> str:
+    digits = telling_digits(low, high)
+    return f"{number(low, digits)} … {number(high, digits)}" if np.isfinite(high - low) else "unknown"
 
 
 def _whisker(name: str, entry: Entry, look: str, scale: Scale) -> Whisker:

@@ -174,7 +174,9 @@ class Contest:
             covariance[stuck] = covariance[:, stuck] = 0.0
             covariance[stuck, stuck] = np.inf
             left = unexplained(intervals, fit, one.parameters)
-            found = ProjectedEstimate(one.parameters, covariance, left, np.arange(len(intervals)))
+            n, k = len(one.parameters), fit.x.shape[1] + fit.d.shape[1]
+            of_z, of_s = np.zeros((len(intervals), k, n)), np.eye(len(fit.shared), n)
+            found = ProjectedEstimate(one.parameters, covariance, left, np.arange(len(intervals)), of_z, of_s)
         apart, weights = np.array([x.parameters for x in self.candidates]) - found.parameters, self.comparison.weights
         spread = (weights * apart.T) @ apart / weights.sum()
         return replace(found, covariance=found.covariance + spread)

@@ -54,6 +54,7 @@ from diransac.identification.methods.lo_diransac.smoothing import (
     smooth,
     stuck_rows,
 )
+from diransac.identification.methods.lo_diransac.structural import possible_terms
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
@@ -167,7 +168,8 @@ class LoDiransac(LoDiransacSettings):
     prior_inflation : float, optional
         Factor of the prior on model error whose effect on the parameters is added to their covariance.
     suggestions : bool, optional
-        Whether terms are searched that would explain the unmodelled forces.
+        Whether terms are searched that would explain the unmodelled forces, and terms that the model may lack are
+        weighted for `Result.structural_intervals`.
     candidate_terms : callable, optional
         Further candidates of that search: ``candidate_terms(q, v, u)`` returns expressions by name.
 
@@ -788,6 +790,9 @@ def _estimate(
         checks=checks,
         suggestions=found.lacks.suggestions if found.lacks else (),
         competition=None if found.contest is None else found.contest.summary,
+        possible_terms=possible_terms(intervals, found.refinement.fit, result, covariance, settings.candidate_terms)
+        if settings.suggestions
+        else None,
     )
 
 

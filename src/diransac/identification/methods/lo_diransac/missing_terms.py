@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.simulation.compiler import Map
 
-__all__ = ["MissingTerms", "clear_errors_of_inputs", "missing_terms", "short_windows"]
+__all__ = ["MissingTerms", "candidates_of", "clear_errors_of_inputs", "missing_terms", "short_windows"]
 
 # Part of the force of an equation that an error of inputs must explain: a payload that is dropped is half a drift.
 _EXPLAINS = {"delay": 0.3, "lag": 0.3, "drift": 0.9}
@@ -92,11 +92,7 @@ def missing_terms(
     """
     windows = short_windows(result.windows, len(intervals))
     rows = _Rows(intervals, windows, *residuals_of_motion(intervals, fit, result.parameters))
-    speeds = np.sqrt(np.square(rows.motion[1][intervals.counted]).mean(axis=0))
-    inputs = rows.motion[3][intervals.counted]
-    sizes = np.stack([np.sqrt(np.square(inputs).mean(axis=0)), np.quantile(np.abs(inputs), _MOSTLY, axis=0)], axis=1)
-    candidates = candidate_terms(intervals.model, speeds, sizes, library)
-    terms = candidates.means(rows.motion, rows.weights, intervals.length)
+    candidates, terms = candidates_of(intervals, rows.motion, library)
     means = _mean_forces(rows, fit, candidates, terms)
     selected = select_terms(means)
     helpful = [x for x in selected if x.explained > 0.0]
@@ -105,6 +101,39 @@ def missing_terms(
     accelerations = -np.einsum("wij,wj->wi", np.linalg.pinv(rows.M[intervals.starts]), forces)
     change = changes_beside(means, selected)[: intervals.n_p]
     return MissingTerms(suggestions_of(candidates, helpful), change, accelerations)
+
+
+def candidates_of(
+    intervals: ShootingIntervals, motion: Sequence[FloatArray], library: TermLibrary | None = None
+) -> tuple[CandidateTerms, FloatArray]:
+    """Candidate terms of a motion, and their means over intervals.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : sequence of (N, n) array
+        q, v, a, u and p of every row.
+    library : callable, optional
+        The user's candidates.
+
+    Returns
+    -------
+    CandidateTerms
+    (W, n_v, K) array
+        0 where an interval has no row that counts.
+    """
+    speeds = np.sqrt(np.square(motion[1][intervals.counted]).mean(axis=0))
+    inputs = motion[3][intervals.counted]
+    sizes = np.stack([np.sqrt(np.square(inputs).mean(axis=0)), np.quantile(np.abs(inputs), _MOSTLY, axis=0)], axis=1)
+    candidates = candidate_terms(intervals.model, speeds, sizes, library)
+    return candidates, candidates.means(motion, weights_of_rows(intervals), intervals.length)
+
+
+def weights_of_rows(intervals: ShootingIntervals) -> FloatArray:
+    """Weights ``(N,)`` of the rows of each interval in its mean: equal for those that count, 0 for others."""
+    counted = intervals.counted.astype(float)
+    counts = np.maximum(counted.reshape(len(intervals), -1).sum(axis=1), 1.0)
+    return np.asarray(counted / np.repeat(counts, intervals.length))
 
 
 def short_windows(windows: IntArray, n: int) -> IntArray:
@@ -206,9 +235,7 @@ class _Rows:
         M: FloatArray,
     ) -> None:
         self.intervals, self.motion, self.r, self.W, self.M = intervals, motion, r, W, M
-        counted = intervals.counted.astype(float)
-        counts = np.maximum(counted.reshape(len(intervals), -1).sum(axis=1), 1.0)
-        self.weights = counted / np.repeat(counts, intervals.length)
+        self.weights = weights_of_rows(intervals)
         window = np.searchsorted(windows, np.flatnonzero(intervals.occupied), side="right")
         self.windows = np.flatnonzero(np.diff(window, prepend=-1))
 

@@ -38,6 +38,7 @@ __all__ = [
     "innovation_std",
     "innovations",
     "linearize",
+    "sum_in_places",
     "variances_of_intervals",
     "with_residuals",
 ]
@@ -159,20 +160,21 @@ class NormalEquations:
         Parameters
         ----------
         intervals : ShootingIntervals
-        more : (W - 1, n_x) array
+        more : (W - 1, n_x, ...) array
             0 is taken where a log or a gap ends.
 
         Returns
         -------
-        (W, k) array, (n_s,) array
+        (W, k, ...) array, (n_s, ...) array
         """
         n_x, k = more.shape[1], self.right_z.shape[1]
-        force = self.precision * np.where(intervals.linked[:, None], more, 0.0)
-        pulled = -np.einsum("wij,wi->wj", self.slopes, force)
-        of_z = np.zeros_like(self.right_z)
+        along = (slice(None), slice(None), *(None,) * (more.ndim - 2))
+        force = self.precision[along] * np.where(intervals.linked[:, None][along], more, 0.0)
+        pulled = -np.einsum("wij,wi...->wj...", self.slopes, force, optimize=True)
+        of_z = np.zeros((*self.right_z.shape, *more.shape[2:]))
         of_z[:-1] += pulled[:, :k]
         of_z[1:, :n_x] += force
-        return of_z, _in_places(intervals, pulled[:, k:]).sum(axis=0)
+        return of_z, sum_in_places(intervals, pulled[:, k:])
 
 
 def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
@@ -298,6 +300,27 @@ def _in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
     wide = np.zeros((len(values), intervals.n_shared))
     np.put_along_axis(wide, _places(intervals)[intervals.log_of[: len(values)]], values, axis=1)
     return wide
+
+
+def sum_in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
+    """Sums over intervals, in the places of their logs.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    values : (n, n_own, ...) array
+        Of the shared unknowns of the first intervals' own logs.
+
+    Returns
+    -------
+    (n_s, ...) array
+    """
+    if intervals.layout.is_shared:
+        return np.asarray(values.sum(axis=0))
+    found = np.zeros((intervals.n_shared, *values.shape[2:]))
+    for i, at in enumerate(_places(intervals)):
+        found[at] += values[intervals.log_of[: len(values)] == i].sum(axis=0)
+    return found
 
 
 def innovation_std(intervals: ShootingIntervals, fit: Fit) -> FloatArray:

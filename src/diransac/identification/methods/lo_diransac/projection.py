@@ -65,6 +65,7 @@ __all__ = [
     "batch_sums",
     "discrepancy_units",
     "effect_of_intervals",
+    "equations_of_rows",
     "estimate_parameters",
     "fitted_parameters",
     "inertia_slopes",
@@ -113,12 +114,16 @@ class ProjectedEstimate:
         interval has no row that counts.
     windows : (n_windows,) int array
         First intervals of the windows over which the equations were averaged.
+    of_z, of_s : (W, k, n) and (n_s, n) array
+        Derivatives of the parameters with respect to the unknowns of the fit.
     """
 
     parameters: FloatArray
     covariance: FloatArray
     unexplained: FloatArray
     windows: IntArray
+    of_z: FloatArray
+    of_s: FloatArray
 
 
 @dataclass(frozen=True)
@@ -291,7 +296,7 @@ def instrumented_contrast(intervals: ShootingIntervals, fit: Fit, instruments: I
     found, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
     of_plain, plain_gains, plain_stuck = _bounded_projection(intervals, now, plain, windows, _REWEIGHTED)
     apart = (gains[0] - plain_gains[0], gains[1] - plain_gains[1])
-    covariance = _covariance_of_fit(intervals, wide, rows, apart, np.zeros((n, n)))
+    covariance = _covariance_of_fit(intervals, wide, *_slopes(intervals, wide, rows, apart, np.zeros((n, n))))
     sums = batch_sums(_parts(intervals, rows, gains) - _parts(intervals, plain, plain_gains))
     free = ~(stuck | plain_stuck) & rows.means.any(axis=(0, 1))
     strength, acts = np.full(n, np.nan), rows.means.any(axis=0).astype(float)
@@ -329,7 +334,8 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     more = np.sqrt(np.maximum(1.0, scatter / (np.diag(effect.covariance) + _TINY)))
     p = fit.shared[: intervals.n_p]
     covariance = effect.covariance * np.outer(more, more) + effect_on(intervals, fit, effect.z, effect.s)
-    return ProjectedEstimate(p, covariance, unexplained(intervals, fit, p), np.arange(len(intervals)))
+    left, windows = unexplained(intervals, fit, p), np.arange(len(intervals))
+    return ProjectedEstimate(p, covariance, left, windows, np.zeros_like(effect.z), np.eye(*effect.s.shape))
 
 
 @dataclass(frozen=True)
@@ -479,19 +485,20 @@ def _solution(
     interval means.
     """
     plain = _bounded_projection(intervals, fit.shared[: intervals.n_p], rows, windows, 0)[0]
-    covariance = _covariance_of_fit(intervals, fit, rows, gains, np.eye(intervals.n_p))
+    slopes = _slopes(intervals, fit, rows, gains, np.eye(intervals.n_p))
+    covariance = _covariance_of_fit(intervals, fit, *slopes)
     sums = batch_sums(_parts(intervals, rows, gains))
     covariance = covariance + sums.T @ sums + np.outer(plain - p, plain - p)
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
     left = _over_windows(unexplained(intervals, fit, p), windows)
-    return ProjectedEstimate(p, covariance, left, windows)
+    return ProjectedEstimate(p, covariance, left, windows, *(x * ~stuck for x in slopes))
 
 
-def _covariance_of_fit(
+def _slopes(
     intervals: ShootingIntervals, fit: Fit, rows: _Rows, gains: tuple[FloatArray, FloatArray], own: FloatArray
-) -> FloatArray:
-    """Covariance (n, n) of the fit and of the errors of its sensors, propagated through the projection.
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives (W, k, n) and (n_s, n) of projected parameters with respect to the unknowns of the fit.
 
     ``own (n, n)`` is the effect of the fit's parameters: the identity for an estimate, 0 for a difference of two.
     """
@@ -502,6 +509,11 @@ def _covariance_of_fit(
     of_s[:n_p] = own
     of_s[n_p:-1] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
     of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means * rows.attributed, rows.M)
+    return of_z, of_s
+
+
+def _covariance_of_fit(intervals: ShootingIntervals, fit: Fit, of_z: FloatArray, of_s: FloatArray) -> FloatArray:
+    """Covariance (n, n) of the fit and of the errors of its sensors, propagated through the projection."""
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(of_z, of_s)
     return np.asarray(np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s + effect_on(intervals, fit, z, s))
@@ -802,6 +814,31 @@ def residuals_of_motion(
     r, W, M = _residual_map(model)(*motion, p)
     rows = np.broadcast_to(p, (len(r), model.n_p))
     return (*motion, rows), r, _regressors(intervals, W), _matrices(M, model.n_v)
+
+
+def equations_of_rows(
+    model: Model, q: FloatArray, v: FloatArray, u: FloatArray, p: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Accelerations of the model at any states and inputs, and its regressors there.
+
+    Parameters
+    ----------
+    model : Model
+    q, v, u, p : (N, n) array
+        In every row.
+
+    Returns
+    -------
+    (N, n_v) array, (N, n_v, n_p) array
+        Not finite where the model has no acceleration.
+    """
+    r, _, M = _residual_map(model)(q, v, np.zeros((len(q), model.n_v)), u, p)
+    M = _matrices(M, model.n_v)
+    usable = np.flatnonzero(np.isfinite(M).all(axis=(1, 2)) & np.isfinite(r).all(axis=1))
+    usable = usable[np.linalg.matrix_rank(M[usable]) == model.n_v]
+    a: FloatArray = np.full((len(q), model.n_v), np.nan)
+    a[usable] = -np.linalg.solve(M[usable], r[usable, :, None])[:, :, 0]
+    return a, np.asarray(_matrices(_residual_map(model)(q, v, a, u, p)[1], model.n_p))
 
 
 def inertia_slopes(intervals: ShootingIntervals, motion: Sequence[FloatArray], rows: IntArray) -> FloatArray:

@@ -25,6 +25,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.normal_equations import data_gradient, linearize, with_residuals
 from diransac.identification.methods.lo_diransac.refinement import weights_of
+from diransac.identification.methods.lo_diransac.score_tests import ScoreTests, Slopes, scores_tested
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 
 if TYPE_CHECKING:
@@ -257,23 +258,32 @@ class _Scores:
     def tested(self, kinds: Sequence[ErrorKind]) -> list[RecordingError]:
         """Estimates of errors one by one, given all else that is estimated; without those not determined by the log."""
         slopes = self._slopes_of_signals(kinds)
-        of_z, of_s = np.stack([x.of_z for x in slopes], axis=-1), np.stack([x.of_s for x in slopes], axis=-1)
-        z, s = self.at.system.functional(of_z, of_s)
-        found = (self._estimate(x, z[..., k], s[:, k]) for k, x in enumerate(slopes))
-        return [x for x in found if x is not None]
+        n, weighted = len(self.intervals), [self.weights * x.sensitivity for x in slopes]
 
-    def _estimate(self, slope: _Slope, z: FloatArray, s: FloatArray) -> RecordingError | None:
-        """Estimate of an error from the inverse times its slope, or None if the log does not determine it."""
-        n, weighted = len(self.intervals), self.weights * slope.sensitivity
-        share = (weighted * slope.sensitivity).sum(axis=1).reshape(n, -1).sum(axis=1)
-        information = float(share.sum() - (slope.of_z * z).sum() - slope.of_s @ s)
-        if information <= _DETERMINED * share.sum():
+        def by_interval(values: Sequence[FloatArray]) -> FloatArray:
+            pairs = zip(weighted, values, strict=True)
+            return np.stack([(x * y).sum(axis=1).reshape(n, -1).sum(axis=1) for x, y in pairs], axis=1)
+
+        tests = scores_tested(
+            self.at,
+            Slopes(
+                share=by_interval([x.sensitivity for x in slopes]),
+                rows=by_interval([self.fit.residuals] * len(slopes)),
+                of_z=np.stack([x.of_z for x in slopes], axis=-1),
+                of_s=np.stack([x.of_s for x in slopes], axis=-1),
+                by_jumps=np.zeros(len(slopes)),
+                score_of_jumps=np.zeros(len(slopes)),
+            ),
+        )
+        return [x for k, slope in enumerate(slopes) if (x := self._estimate(slope, tests, k)) is not None]
+
+    def _estimate(self, slope: _Slope, tests: ScoreTests, k: int) -> RecordingError | None:
+        """Estimate of the k-th error, or None if the log does not determine it."""
+        information = float(tests.information[k])
+        if information <= _DETERMINED * tests.direct[k]:
             return None
-        rows = (weighted * self.fit.residuals).sum(axis=1).reshape(n, -1).sum(axis=1)
-        scores = rows + (self.at.data_z * z).sum(axis=1) + self.at.data_s @ s
-        # An error that is there has a score of one sign in each batch; only the rest of the scores scatters.
-        scores = scores - slope.score * share / max(share.sum(), _TINY)
-        batches = np.add.reduceat(scores, np.arange(0, n, max(1, round(np.sqrt(n)))))
+        n = len(self.intervals)
+        batches = np.add.reduceat(tests.scores[:, k], np.arange(0, n, max(1, round(np.sqrt(n)))))
         variance = max(information, float(np.square(batches).sum()))
         gain = 0.5 * slope.score**2 / information
         return RecordingError(slope.kind, -slope.score / information, abs(slope.score) / np.sqrt(variance), gain)

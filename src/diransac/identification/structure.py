@@ -1,0 +1,199 @@
+"""Uncertainty of parameters by terms that a model may lack: a mixture over such terms.
+
+Either the model is complete, or it lacks one of the terms that the log does not exclude, each with its weight.  Given
+the coefficient of a term, the estimate is another one, by ``g`` times the coefficient.  The distribution of a
+parameter is therefore a mixture of normal ones: ``N(p, C)`` of the complete model, and ``N(p + g m, C + v g^2)`` with a
+term whose coefficient has the mean m and the variance v.
+
+References
+----------
+Draper 1995 (model uncertainty); Hoeting, Madigan, Raftery, Volinsky 1999 (Bayesian model averaging); Leamer 1978.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.identification.serialization import Number, Values
+from diransac.identification.suggestions import INPUT_CHANGES, INPUT_GAIN
+
+__all__ = ["PossibleTerm", "StructuralUncertainty", "largest", "mixture_intervals"]
+
+_BISECTIONS = 60
+_FAR = 9.0
+"""Standard deviations beyond which a normal distribution has nothing, to rounding errors."""
+_MOTIONS = {
+    "Coulomb friction": "reversals of {place} at low speed",
+    "Stribeck friction": "reversals of {place} at low speed",
+    "viscous friction": "speeds of {place} over a wider range",
+    "quadratic drag": "speeds of {place} over a wider range",
+    "asymmetric drag": "motion of {place} in both directions",
+    "linear term": "a wider range of {place}",
+    "quadratic term": "a wider range of {place}",
+    "constant term": "a wider range of {place}",
+    "constant force": "larger accelerations of {place}, of both signs",
+    "stiffness": "a wider range of {place}",
+    "product of velocities": "motion in which the velocities of {formula} vary independently",
+    "input gain": "a wider range of {place}",
+    "input offset": "a wider range of {place}, of both signs",
+    "curved input": "a wider range of {place}",
+    "dead band": "small and large values of {place}",
+    "saturation": "small and large values of {place}",
+}
+"""Motion, by kind, that separates a term from the parameters."""
+_PREFIXES = {
+    "harmonic ": "a wider range of {other}",
+    "gravity ": "a wider range of {other}",
+    "coupling ": "motion in which {other} and {place} vary independently",
+}
+
+
+@dataclass(frozen=True)
+class PossibleTerm:
+    """A term that the model may lack: its evidence, its coefficient, and its effect on the parameters.
+
+    Parameters
+    ----------
+    kind : str
+        Effect, such as ``"Coulomb friction"``.
+    place : str
+        Coordinate or velocity whose equation may lack the term; the input, for a change of one.
+    formula : str
+        The term for readers, such as ``sign(x_dot)``; may be empty.
+    weight : float
+        Probability of the term, by its evidence and its prior.
+    mean, variance : float
+        Of its coefficient, if the model lacks the term.
+    effects : mapping of str to float
+        Change of each parameter per unit of the coefficient.
+    """
+
+    kind: str
+    place: str
+    formula: str
+    weight: Number
+    mean: Number
+    variance: Number
+    effects: Values
+
+    def __str__(self) -> str:
+        formula = f", {self.formula}" if self.formula and self.kind != INPUT_GAIN else ""
+        return f"{self.kind} {'of' if self.kind in INPUT_CHANGES else 'on'} {self.place}{formula}"
+
+    @property
+    def motion(self) -> str:
+        """Motion that separates the term from the parameters."""
+        other = self.kind.partition(" of " if " of " in self.kind else " to ")[2]
+        found = _MOTIONS.get(self.kind)
+        found = found or next((x for start, x in _PREFIXES.items() if self.kind.startswith(start)), None)
+        return (found or "richer motion of {place}").format(place=self.place, formula=self.formula, other=other)
+
+
+@dataclass(frozen=True)
+class StructuralUncertainty:
+    """Uncertainty of one parameter by terms that the model may lack.
+
+    Parameters
+    ----------
+    term : str
+        The term that contributes most.
+    weight : float
+        Probability of that term.
+    widening : float
+        Width of the 95 % interval if the model may lack a term, over that if it is complete.
+    motion : str
+        Motion that separates the term from the parameters.
+    """
+
+    term: str
+    weight: float
+    widening: float
+    motion: str
+
+
+def mixture_intervals(
+    values: FloatArray,
+    errors: FloatArray,
+    weights: FloatArray,
+    shifts: FloatArray,
+    variances: FloatArray,
+    probability: float,
+    reach: float,
+) -> FloatArray:
+    """Central intervals of mixtures of normal distributions, which hold those of the complete model.
+
+    Parameters
+    ----------
+    values, errors : (n,) array
+        Mean and standard deviation of each parameter, if the model is complete.
+    weights : (K,) array
+        Of the terms; the complete model has the rest of 1.
+    shifts, variances : (K, n) array
+        What each term adds to mean and variance.
+    probability : float
+        Of the intervals.
+    reach : float
+        Half width of the interval of a complete model, standard deviations.
+
+    Returns
+    -------
+    (n, 2) array
+        Infinite where an error is.
+    """
+    # Normal tails as long as those of Student's t at this level.
+    scale = reach / NormalDist().inv_cdf(0.5 + 0.5 * probability)
+    ordinary = np.stack([values - reach * errors, values + reach * errors], axis=1)
+    known = np.flatnonzero(np.isfinite(errors) & (errors > 0.0))
+    if not (len(known) and len(weights)):
+        return ordinary
+    share = np.append(weights, 1.0 - weights.sum())
+    means = np.vstack([shifts[:, known], np.zeros((1, len(known)))])
+    deviations = scale * np.sqrt(np.square(errors[known]) + np.vstack([variances[:, known], np.zeros((1, len(known)))]))
+    for side, level in enumerate((0.5 - 0.5 * probability, 0.5 + 0.5 * probability)):
+        found = values[known] + _quantiles(share, means, deviations, level)
+        ordinary[known, side] = (np.minimum, np.maximum)[side](ordinary[known, side], found)
+    return ordinary
+
+
+def _quantiles(weights: FloatArray, means: FloatArray, deviations: FloatArray, level: float) -> FloatArray:
+    """Quantile ``(n,)`` of each mixture (K, n), by bisection."""
+    low, high = (means - _FAR * deviations).min(axis=0), (means + _FAR * deviations).max(axis=0)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        below = weights @ _normal((middle - means) / deviations) < level
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return np.asarray(0.5 * (low + high))
+
+
+def _normal(x: FloatArray) -> FloatArray:
+    """Normal distribution function; SciPy's import takes as long as an identification."""
+    found = [0.5 * math.erfc(-y / math.sqrt(2.0)) for y in x.ravel().tolist()]
+    return np.array(found).reshape(x.shape)
+
+
+def largest(terms: Sequence[PossibleTerm], shares: Mapping[str, float]) -> PossibleTerm | None:
+    """The term that contributes most to the spread of a sum of shares of parameters; None where none does.
+
+    Parameters
+    ----------
+    terms : sequence of PossibleTerm
+    shares : mapping of str to float
+        Of each parameter of the estimate; those that are not named have none.
+
+    Returns
+    -------
+    PossibleTerm or None
+    """
+
+    def spread(x: PossibleTerm) -> float:
+        effect = sum(share * x.effects.get(name, 0.0) for name, share in shares.items())
+        return float(x.weight * effect**2 * (x.variance + x.mean**2))
+
+    found = max(terms, key=spread, default=None)
+    return found if found is not None and spread(found) > 0.0 else None
