@@ -6,6 +6,8 @@ Nothing happens when this file is run.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -136,7 +138,8 @@ def leg(data: Path, name: str) -> Record:
         return scored(driven(go2.alone(name).compile(), values, position, velocity, stages, begins, steps))
 
     def sysid() -> Found:
-        found, _, _ = go2.sysid(name, first)
+        with redirect_stdout(StringIO()):  # its solver prints every iteration
+            found, _, _ = go2.sysid(name, first)
         return dict(zip(model.parameters, found.tolist(), strict=True)), Inputs()
 
     still = np.repeat(measured[:1], steps + 1, axis=0)
