@@ -204,6 +204,7 @@ def pendulum(data: Path, design: str, one_run: bool) -> Record:
     return in_windows(
         f"pendulum-{design}{'-one-run' if one_run else ''}", dr.models.double_pendulum(upper_length=length),
         double_pendulum(length), train, held, PENDULUM, published=known, width=21, length=0.5,
+        horizons=(0.1, 0.25, 0.5),
     )  # fmt: skip
 
 

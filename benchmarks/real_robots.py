@@ -6,7 +6,10 @@ Nothing happens when this file is run.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from real_records import Found, Record, Score, rms
@@ -130,13 +133,18 @@ def leg(data: Path, name: str) -> Record:
         return Score(overall(by_horizon), {f"{h:g} s": rms(x) for h, x in by_horizon.items()})
 
     def judge(parameters: Mapping[str, float], inputs: Inputs) -> Score:
-        """Negative values, which MuJoCo lacks, count as zero."""
+        """Better of sharp dry friction and MuJoCo's softer one; negative values, which it lacks, count as zero."""
         values = np.maximum([parameters[n] for n in model.parameters], 0.0)
         stages = inputs.between(targets, second.dt, go2.STEPS)[:, : 2 * go2.STEPS : 2]
-        return scored(driven(go2.alone(name).compile(), values, position, velocity, stages, begins, steps))
+        found = [
+            driven(go2.alone(name).compile(), values, position, velocity, stages, begins, steps, s)
+            for s in (True, False)
+        ]
+        return min(map(scored, found), key=lambda score: score.error)
 
     def sysid() -> Found:
-        found, _, _ = go2.sysid(name, first)
+        with redirect_stdout(StringIO()):  # its solver prints every iteration
+            found, _, _ = go2.sysid(name, first)
         return dict(zip(model.parameters, found.tolist(), strict=True)), Inputs()
 
     still = np.repeat(measured[:1], steps + 1, axis=0)
@@ -144,15 +152,25 @@ def leg(data: Path, name: str) -> Record:
 
 
 def driven(
-    machine: object, values: Array, position: Array, velocity: Array, stages: Array, begins: Array, steps: int
+    model: Any,
+    values: Array,
+    position: Array,
+    velocity: Array,
+    stages: Array,
+    begins: Array,
+    steps: int,
+    sharp: bool,
 ) -> Array:
-    """Joints ``(steps + 1, 3, windows)`` under targets ``(rows, steps of MuJoCo, 3)``, with sharp dry friction."""
+    """Joints ``(steps + 1, 3, windows)`` under targets ``(rows, steps of MuJoCo, 3)``.
+
+    Sharp dry friction is that of the package's models; otherwise MuJoCo's default holds, with which its own tool fits.
+    """
     import go2
     import mujoco
 
-    model = machine
     model.dof_armature[:], model.dof_damping[:], model.dof_frictionloss[:] = values.reshape(3, 3).T
-    model.dof_solref[:, 0] = 2.0 * model.opt.timestep
+    if sharp:
+        model.dof_solref[:, 0] = 2.0 * model.opt.timestep
     found = np.empty((steps + 1, 3, len(begins)))
     for i, begin in enumerate(begins):
         data = mujoco.MjData(model)
