@@ -1,4 +1,4 @@
-"""Estimates compete: simulation error without smoothing, comparison by held-out prediction, and what a result says of it."""
+"""Estimates compete: simulation error without smoothing, held-out prediction, and what a result says of it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from diransac.data.dataset import Dataset
 from diransac.identification.methods.lo_diransac.arbiter import compared
 from diransac.identification.methods.lo_diransac.method import prepared
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments, stretches
+from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
 from diransac.identification.methods.lo_diransac.sources import (
     Blocks,
     Candidate,
     jackknife,
     least_squares_candidates,
-    simulation_error_candidates,
 )
 
 TRUTH = {"m": 5.3e-6, "d": 2.3e-4, "k": 1.0, "c": 4.0}
@@ -148,7 +148,8 @@ def test_better_predictions_win_whatever_their_order(bound: tuple) -> None:
     found = comparison([bad, good], bound)
     assert found.best == 1
     assert found.as_good.tolist() == [False, True]
-    assert found.weights[1] == 1.0 and found.weights[0] < 0.05
+    assert found.weights[1] == 1.0
+    assert found.weights[0] < 0.05
 
 
 def test_equal_predictions_leave_the_first(bound: tuple) -> None:

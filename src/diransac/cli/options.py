@@ -11,7 +11,16 @@ from typing import Annotated, Any
 
 import typer
 
-from diransac.cli.arguments import fixed_parameters, load_methods, load_settings, names, numbers, pairs, prior_pairs
+from diransac.cli.arguments import (
+    fixed_parameters,
+    load_methods,
+    load_settings,
+    names,
+    numbers,
+    pairs,
+    prior_pairs,
+    start_values,
+)
 from diransac.data import preprocessing
 from diransac.data.log import Log
 from diransac.data.readers import read_log

@@ -175,9 +175,9 @@ def candidate_terms(
     """The library of candidates of a model.
 
     In the equation of each velocity v: ``sign(v)``, Stribeck friction at several speeds, ``v``, ``|v| v``, ``|v|``
-    (drag in a current), a constant, the position, its square and cube, harmonics of every angle, other velocities and all products of
-    velocities; besides them the user's expressions, and of each input a gain, an offset, ``|u| u``, a dead band of
-    several widths and a saturation at several levels.
+    (drag in a current), a constant, the position, its square and cube, harmonics of every angle, other velocities and
+    all products of velocities; besides them the user's expressions, and of each input a gain, an offset, ``|u| u``, a
+    dead band of several widths and a saturation at several levels.
 
     Parameters
     ----------
@@ -262,7 +262,9 @@ class _Maker:
                 yield self._term("stiffness", i, "stiffness", name, f"q.{name}", q, unit)
                 for n, kind in _POWERS if unit != "rad" else ():
                     code = f"q.{name} ** {n}"
-                    yield self._term(f"{kind} stiffness", i, f"{kind}_stiffness", f"{name}^{n}", code, q**n, f"({unit})^{n}")
+                    yield self._term(
+                        f"{kind} stiffness", i, f"{kind}_stiffness", f"{name}^{n}", code, q**n, f"({unit})^{n}"
+                    )
             for n in _HARMONICS if unit == "rad" else ():
                 many = f"{n} " if n > 1 else ""
                 kind = f"harmonic {n} of {name}" if n > 1 else f"gravity or first harmonic of {name}"

@@ -362,8 +362,9 @@ class Competition:
         best = self._best_of_sources()
         own = next(x for x in best if x.name == self.winner)
         others = ", ".join(f"{x.name} {x.errors[middle]:.2g}" for x in best if x is not own)
-        text = f"held-out prediction over {self.horizons[middle]:.2g} s chose: {self.winner}, error {own.errors[middle]:.2g}"
-        return f"{text} of that of no change" + (f"; {others}" if others else "")
+        text = f"held-out prediction over {self.horizons[middle]:.2g} s chose: {self.winner}"
+        error = f"error {own.errors[middle]:.2g} of that of no change"
+        return f"{text}, {error}" + (f"; {others}" if others else "")
 
     def _best_of_sources(self) -> list[Competitor]:
         """The winner, and the best variant of every other source."""

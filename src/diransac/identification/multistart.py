@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import casadi as ca
 import numpy as np
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from diransac.data.dataset import ParameterLayout
     from diransac.model import Model
 
-__all__ = ["SearchOverLogs", "held_means", "least_squares", "within_half_a_turn"]
+__all__ = ["LeastSquaresProblem", "SearchOverLogs", "held_means", "least_squares", "within_half_a_turn"]
 
 # Largest factor of a positive parameter in a step.
 _LARGEST_FACTOR = 10.0
@@ -33,6 +33,16 @@ _LARGEST_FACTOR = 10.0
 _TURN, _N_POINTS, _SAME = 2.0 * np.pi, 16, 1e-9
 # Damping at the start, its bounds, and its factors after a step down and after one up; the least gain of a step.
 _DAMPING, _DAMPING_BOUNDS, _LESS, _MORE, _CONVERGED = 1e-2, (1e-9, 1e9), 0.2, 6.0, 1e-9
+
+
+class LeastSquaresProblem(Protocol):
+    """Sums of squares of many lanes."""
+
+    def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
+        """Unknowns (n_lanes, n) after a step, within their bounds."""
+
+    def linearized(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Cost (n_lanes,), infinite after a divergence, its gradient / 2 (n_lanes, n), and the normal matrix."""
 
 
 class SearchOverLogs(ABC):
@@ -104,12 +114,12 @@ class SearchOverLogs(ABC):
         return cost, gradient, matrix
 
 
-def least_squares(problem: SearchOverLogs, z: FloatArray, n_steps: int) -> tuple[FloatArray, FloatArray]:
+def least_squares(problem: LeastSquaresProblem, z: FloatArray, n_steps: int) -> tuple[FloatArray, FloatArray]:
     """Unknowns and their costs after steps of Levenberg and Marquardt from every start.
 
     Parameters
     ----------
-    problem : SearchOverLogs
+    problem : LeastSquaresProblem
     z : (n_starts, n) array
         Unknowns to start from.
     n_steps : int

@@ -17,7 +17,15 @@ from diransac.atomic import write_text
 from diransac.data.dataset import ParameterLayout
 from diransac.data.log import Log
 from diransac.errors import DiransacError, ResultError, SettingsError
-from diransac.identification.estimate import Competition, Diagnosis, Estimate, Evaluation, Finding, LogSummary, Resolution
+from diransac.identification.estimate import (
+    Competition,
+    Diagnosis,
+    Estimate,
+    Evaluation,
+    Finding,
+    LogSummary,
+    Resolution,
+)
 from diransac.identification.findings import Verdict, findings_of, verdict_of
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings

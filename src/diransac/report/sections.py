@@ -20,6 +20,7 @@ from diransac.text_table import number, percent, plural, telling_digits
 
 __all__ = [
     "card",
+    "competitions",
     "correlations",
     "diagnosis",
     "differences",
@@ -30,7 +31,6 @@ __all__ = [
     "sensitivity",
     "short_term_scores",
     "suggestions",
-    "competitions",
 ]
 
 _LEVELS: Mapping[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}

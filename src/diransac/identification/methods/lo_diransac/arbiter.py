@@ -67,7 +67,7 @@ class Comparison:
     weights: FloatArray
 
 
-def horizons_of(intervals: ShootingIntervals, motion: Motion, horizon: float | None) -> list[int]:
+def horizons_of(intervals: ShootingIntervals, horizon: float | None) -> list[int]:
     """Horizons in rows, the shortest first: the user's, or multiples of the time scale of the measured states."""
     dt = intervals.dt
     if horizon is not None:
@@ -146,7 +146,7 @@ def compared(
     """
     longest = max((x.stop - x.start for x in stretches(intervals)), default=0) // _PART
     n_before = min(n_before, longest // 2)
-    steps = sorted({min(x, longest - n_before) for x in horizons_of(intervals, motion, horizon)})
+    steps = sorted({min(x, longest - n_before) for x in horizons_of(intervals, horizon)})
     if n_before < 1 or steps[0] < 1:
         return None
     starts, block = _placed(intervals, blocks, n_before, steps[-1])
@@ -177,7 +177,7 @@ def _mean(values: FloatArray) -> float:
 
 
 def _predicted(segments: Segments) -> BoolArray:
-    """Mask of the compared signals whose prediction counts: states and sensors, accelerations if there is nothing else."""
+    """Mask of the compared signals whose prediction counts: states and sensors; without these, all."""
     model = segments.intervals.model
     names = [model.signals[k] for k in segments.columns]
     found = np.array([n in model.state or n in model.sensors for n in names])
@@ -216,7 +216,7 @@ def _prediction_errors(
     states = first_states(intervals, motion.signals, inlying, segments.starts)[None]
     before = segments.cut(n_before)
     states = before.estimated_states(lanes, states, weights)
-    return segments.errors(lanes, states)[0][:, n_before:]
+    return np.asarray(segments.errors(lanes, states)[0][:, n_before:])
 
 
 def _choice(scores: FloatArray) -> tuple[int, BoolArray, FloatArray]:

@@ -1,35 +1,36 @@
 """Competition of estimates: sources propose them, and the arbiter compares their predictions.
 
-Where the exact model predicts a log within its noise, there is no competition.  Elsewhere the estimates of the joint fit
-compete with least squares of all rows and with simulation error.  If one of these predicts better, a second joint fit
-begins with its parameters and its simulated motion, and its estimates compete, too.
+Where the exact model predicts a log within its noise, there is no competition.  Elsewhere the estimates of the joint
+fit compete with least squares of all rows and with simulation error.  If one of these predicts better, a second joint
+fit begins with its parameters and its simulated motion, and its estimates compete, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.estimate import Competition, Competitor
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.arbiter import compared
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
+    effect_of_intervals,
     fitted_parameters,
     projected_candidates,
     unexplained,
 )
 from diransac.identification.methods.lo_diransac.segments import ActingInputs
+from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
 from diransac.identification.methods.lo_diransac.sources import (
     Blocks,
     Candidate,
     jackknife,
     least_squares_candidates,
-    simulation_error_candidates,
 )
 
 if TYPE_CHECKING:
@@ -191,7 +192,13 @@ class Contest:
             self.candidates[winner].name,
             c.horizons,
             tuple(
-                Competitor(one.name, tuple(e.tolist()), float(m), bool(ok), dict(zip(names, one.parameters.tolist(), strict=True)))
+                Competitor(
+                    one.name,
+                    tuple(e.tolist()),
+                    float(m),
+                    bool(ok),
+                    dict(zip(names, one.parameters.tolist(), strict=True)),
+                )
                 for one, e, m, ok in zip(self.candidates, c.errors, means, c.as_good, strict=True)
             ),
         )
@@ -209,17 +216,17 @@ def _estimates_of_fit(
             if intervals.layout.violations(parameters) or not np.isfinite(parameters).all():
                 continue
             name = f"least squares on the fitted motion, {seconds:.2g} s"
-            yield Candidate(name, parameters, _left_out(parameters, parts, block, blocks, intervals), acting, intervals, estimate)
+            yield Candidate(
+                name, parameters, _left_out(parameters, parts, block, blocks, intervals), acting, intervals, estimate
+            )
     own = fitted_parameters(intervals, fit)
-    from diransac.identification.methods.lo_diransac.projection import effect_of_intervals
-
     steps = effect_of_intervals(intervals, fit).steps
     without = _left_out(own.parameters, -steps, block, blocks, intervals)
     yield Candidate("joint fit", own.parameters, without, acting, intervals, lambda: own)
 
 
 def _left_out(
-    parameters: FloatArray, parts: FloatArray, block: FloatArray, blocks: Blocks, intervals: ShootingIntervals
+    parameters: FloatArray, parts: FloatArray, block: IntArray, blocks: Blocks, intervals: ShootingIntervals
 ) -> FloatArray:
     """Parameters without each block, to first order, from the contribution of each interval to their error."""
     K = blocks.n

@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,15 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.data.input_timing import InputTiming
 from diransac.data.segment import long_runs, silent_rows
 from diransac.errors import IdentificationError, LogError, ModelError, SettingsError, TimeLimitError
-from diransac.identification.estimate import TIME_LIMIT, Competition, Diagnosis, Estimate, Finding, HausmanTest, Resolution
+from diransac.identification.estimate import (
+    TIME_LIMIT,
+    Competition,
+    Diagnosis,
+    Estimate,
+    Finding,
+    HausmanTest,
+    Resolution,
+)
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.checks import compared_parts, findings_of_fit
@@ -355,7 +363,7 @@ def _decided(
     whole: tuple[ShootingIntervals, Motion, tuple[str, ...]],
 ) -> _Searched | None:
     """The search whose estimate predicts best; None where nothing could be compared."""
-    (intervals, motion, notes), dataset = whole, contest.dataset
+    intervals, dataset = whole[0], contest.dataset
     holds = [dataset.input_hold] if dataset.input_hold else ["zero-order", "linear"]
     actings = [ActingInputs.recorded(intervals, hold) for hold in holds]
     starts = [] if (given := _given_start(settings, dataset)) is None else [given]
@@ -376,18 +384,20 @@ def _decided(
     if isinstance(origin, Motion) and not contest.is_as_good(first):
         second = _second(settings, contest, winner, whole) if "second fit" in settings.sources else None
         if second is not None:
-            contest.add_fit(second.likeliest, timing_of(second.likeliest.intervals, second.likeliest.refinement, forced=forced))
+            contest.add_fit(
+                second.likeliest, timing_of(second.likeliest.intervals, second.likeliest.refinement, forced=forced)
+            )
             searches.insert(0, second)
             winner = contest.decide(*_noise_of(second, whole))
             assert winner is not None
             origin = contest.origins[winner]
     if not searches:
         return None
-    own = next((x for x in searches if x.likeliest is origin), searches[0])
-    result = contest.result(winner, own.likeliest)
-    is_own = own.likeliest is origin
-    decided = Decided(contest.summary(winner), None if is_own else contest.candidates[winner].acting)
-    return replace(own, result=result, contest=decided, impossible=() if not is_own else own.impossible)
+    of_fit = next((x for x in searches if x.likeliest is origin), None)
+    chosen = of_fit or searches[0]
+    result = contest.result(winner, chosen.likeliest)
+    decided = Decided(contest.summary(winner), None if of_fit else contest.candidates[winner].acting)
+    return replace(chosen, result=result, contest=decided, impossible=of_fit.impossible if of_fit else ())
 
 
 def _noise_of(

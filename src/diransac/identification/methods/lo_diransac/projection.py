@@ -33,7 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -229,11 +229,26 @@ def projected_candidates(
         p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
         seconds = intervals.duration * float(np.diff(windows, append=len(intervals)).max())
 
-        def estimate(windows: IntArray = windows, p=p, gains=gains, stuck=stuck) -> ProjectedEstimate:
-            found = _solution(intervals, wide, rows, windows, p, gains, stuck)
-            return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
+        yield (
+            seconds,
+            partial(_completed, intervals, fit, rows, windows, p, gains, stuck),
+            p,
+            _parts(intervals, rows, gains),
+        )
 
-        yield seconds, estimate, p, _parts(intervals, rows, gains)
+
+def _completed(
+    intervals: ShootingIntervals,
+    fit: Fit,
+    rows: _Rows,
+    windows: IntArray,
+    p: FloatArray,
+    gains: tuple[FloatArray, FloatArray],
+    stuck: BoolArray,
+) -> ProjectedEstimate:
+    """The estimate over some windows with its covariance, and with priors."""
+    found = _solution(intervals, _with_wide_priors(intervals, fit), rows, windows, p, gains, stuck)
+    return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
 
 
 def _window_lengths(intervals: ShootingIntervals, n: int, n_v: int) -> Iterator[IntArray]:

@@ -96,6 +96,17 @@ class Segments:
         return np.asarray(self.starts[:, None] + np.arange(self.n_rows))
 
     @cached_property
+    def known(self) -> BoolArray:
+        """Measured samples ``(K, n_rows, n_s)`` of the compared signals."""
+        return self.intervals.sampled[self.rows][:, :, self.columns]
+
+    def weights(self, values: FloatArray) -> FloatArray:
+        """Weights ``(N, n_s)`` of the compared signals in all rows from those of the segments ``(K, n_rows, n_s)``."""
+        found = np.zeros((len(self.intervals.measured), len(self.columns)))
+        found[self.rows.ravel()] = values.reshape(-1, len(self.columns))
+        return found
+
+    @cached_property
     def measurements(self) -> Measurements:
         """Compared signals in all rows."""
         values = np.ascontiguousarray(self.intervals.measured[:, self.columns])

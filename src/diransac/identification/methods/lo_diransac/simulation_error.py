@@ -1,0 +1,381 @@
+"""Simulation error (output error): parameters and initial states of segments, fitted to the samples together.
+
+It neither smooths nor differentiates.  Short segments have few local minima, long ones the information: a search from
+many starts over the shortest segments is followed by fits over segments three times as long, and so on.
+
+References
+----------
+Ljung 1999, section 5.1 (output error); Ribeiro et al. 2020 (segments that grow); Dempster, Laird, Rubin 1977 (noise).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diransac.arrays import BoolArray, FloatArray
+from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
+from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments, first_states, stretches
+from diransac.identification.methods.lo_diransac.sources import Candidate
+from diransac.time_limit import check_time
+
+if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.methods.lo_diransac.smoothing import Motion
+    from diransac.identification.methods.lo_diransac.sources import Blocks
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+__all__ = ["simulation_error_candidates"]
+
+_SHORTEST, _GROWTH, _FEWEST = 8, 3, 12
+"""Rows of the shortest segments, the factor by which they grow, and the number of segments at which they do no more."""
+_N_RANDOM, _DECADES = 16, 1.0
+"""Number of random starts, and how far from known parameters they are."""
+_SCREENED, _FOLLOWED = 16, 2
+"""Segments on which all starts are scored, and the number of starts that are followed."""
+_ROWS_OF_SEARCH, _MOST_ROWS = 3_000, 50_000
+"""Rows of the fits from several starts, and of others, at most."""
+_STEPS, _CONVERGED, _NOISE_MOVES = 25, 0.1, 0.03
+"""Steps at most; change of parameters, standard errors, and relative change of the noise that end them."""
+_DAMPING, _DAMPING_BOUNDS = 1e-6, (1e-12, 1e6)
+_RIDGE, _FLOOR, _DIVERGED, _TINY = 1e-10, 1e-5, 1e6, 1e-150
+
+
+def simulation_error_candidates(
+    intervals: ShootingIntervals,
+    motion: Motion,
+    starts: FloatArray,
+    actings: Sequence[ActingInputs],
+    seed: int,
+    blocks: Blocks,
+    *,
+    outliers: bool = True,
+) -> list[tuple[Candidate, Motion]]:
+    """Estimates by simulation error over segments that grow, each with its simulated motion.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
+        From which states start that nothing measures.
+    starts : (m, n) array
+        Parameters to start from, within the bounds; further ones are random about them.
+    actings : sequence of ActingInputs
+        Of which the likeliest is taken.
+    seed : int
+    blocks : Blocks
+    outliers : bool, optional
+        Whether samples may be outliers.
+
+    Returns
+    -------
+    list of (Candidate, Motion)
+        The shortest segments first; empty where every simulation diverges, or the logs are too short.
+    """
+    starts = np.vstack([starts, _random_starts(intervals, starts, seed)])
+    tried = [_from_starts(intervals, motion, starts, acting, outliers=outliers) for acting in actings]
+    solved = [x for x in tried if x is not None]
+    if not solved:
+        return []
+    chain = [min(solved, key=lambda x: x.cost)]
+    longest = max(x.stop - x.start for x in stretches(intervals))
+    while len(chain[-1].segments) > _FEWEST and _GROWTH * chain[-1].segments.n_rows <= longest:
+        chain.append(chain[-1].grown(_GROWTH * chain[-1].segments.n_rows).descended())
+    return [(x.candidate(blocks), x.simulated(motion)) for x in chain if np.isfinite(x.cost)]
+
+
+def _random_starts(intervals: ShootingIntervals, known: FloatArray, seed: int) -> FloatArray:
+    """Parameters within a decade of known ones, log-uniform; within the bounds where both are given."""
+    bounds = intervals.layout.bounds
+    lower, upper = np.array([[x.lower, x.upper] for x in bounds]).T
+    both, found = np.isfinite(lower) & np.isfinite(upper), []
+    for k in range(_N_RANDOM):
+        rng = np.random.default_rng([abs(seed), int(seed < 0), k])
+        about = known[k % len(known)] * 10.0 ** rng.uniform(-_DECADES, _DECADES, len(bounds))
+        inside = rng.uniform(np.where(both, lower, 0.0), np.where(both, upper, 1.0))
+        found.append(np.clip(np.where(both, inside, about), lower, upper))
+    return np.array(found)
+
+
+def _segments(intervals: ShootingIntervals, acting: ActingInputs, length: int, most_rows: int) -> Segments:
+    """Segments one after another in all stretches; every so-manieth one where there are too many rows."""
+    parts = [np.arange(x.start, x.stop - length + 1, length) for x in stretches(intervals)]
+    starts = np.concatenate([np.arange(0), *parts])
+    return Segments(intervals, acting, starts[:: max(1, -(-len(starts) * length // most_rows))], length)
+
+
+def _from_starts(
+    intervals: ShootingIntervals, motion: Motion, starts: FloatArray, acting: ActingInputs, *, outliers: bool
+) -> _Solution | None:
+    """The likeliest solution over the shortest segments; None where every simulation diverges."""
+    some = _segments(intervals, acting, _SHORTEST, _ROWS_OF_SEARCH)
+    if not len(some):
+        return None
+    noise = _first_noise(some, motion.spread, outliers=outliers)
+    order = np.argsort(_scores(some, motion, starts, noise), kind="stable")[:_FOLLOWED]
+    found = [_Solution.begin(some, motion, starts[k], noise).descended() for k in order]
+    best = min(found, key=lambda x: x.cost)
+    if not np.isfinite(best.cost):
+        return None
+    every = _segments(intervals, acting, _SHORTEST, _MOST_ROWS)
+    if len(every) == len(some):
+        return best
+    return _Solution.begin(every, motion, best.parameters, best.noise).descended()
+
+
+def _first_noise(segments: Segments, spread: FloatArray, *, outliers: bool) -> Mixture:
+    """Noise before anything is known: a tenth of the spread of each signal."""
+    intervals, columns = segments.intervals, segments.columns
+    low = np.where(intervals.sampled, intervals.measured, np.inf).min(axis=0)[columns]
+    high = np.where(intervals.sampled, intervals.measured, -np.inf).max(axis=0)[columns]
+    span = np.where(high > low, high - low, 1.0)
+    sizes = np.where(spread[columns] > 0.0, spread[columns], span)
+    place = {int(c): k for k, c in enumerate(columns)}
+    whole = [(place[a], place[b], place[c], place[d]) for a, b, c, d in intervals.model.quaternions if a in place]
+    return Mixture(0.1 * sizes, np.full(len(columns), 0.1 * outliers), span, _FLOOR * sizes, whole)
+
+
+def _scores(segments: Segments, motion: Motion, starts: FloatArray, noise: Mixture) -> FloatArray:
+    """Sum ``(m,)`` over signals of the logarithm of a robust scale of the errors over a few segments."""
+    few = replace(segments, starts=segments.starts[:: max(1, len(segments) // _SCREENED)])
+    lanes = np.repeat(starts[:, None], len(few), axis=1)
+    weights = few.weights(few.known / np.square(noise.sigma))
+    states = np.repeat(_states(few, motion)[None], len(starts), axis=0)
+    errors = few.errors(lanes, few.estimated_states(lanes, states, weights))
+    scale = lower_scale(errors.reshape(len(starts), -1, errors.shape[3]), _flat(few.known))
+    return np.asarray(np.log(np.nan_to_num(scale) + noise.floor).sum(axis=1))
+
+
+def _states(segments: Segments, motion: Motion) -> FloatArray:
+    """Measured states ``(K, n_x)`` at the segments' starts, or those of a motion."""
+    every: BoolArray = np.ones_like(segments.intervals.known)
+    return first_states(segments.intervals, motion.signals, every, segments.starts)
+
+
+def _flat(values: NDArray[Scalar]) -> NDArray[Scalar]:
+    """Values ``(K, n_rows, n_s)`` as rows ``(K n_rows, n_s)``."""
+    return values.reshape(-1, values.shape[-1])
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Parameters with the initial states of all segments.
+
+    Parameters
+    ----------
+    segments : Segments
+    parameters : (n,) array
+    states : (K, n_x) array
+    noise : Mixture
+        Of the compared signals.
+    """
+
+    segments: Segments
+    parameters: FloatArray
+    states: FloatArray
+    noise: Mixture
+
+    @classmethod
+    def begin(cls, segments: Segments, motion: Motion, parameters: FloatArray, noise: Mixture) -> _Solution:
+        """The solution with states that agree best with the samples of their segments."""
+        lanes = np.repeat(parameters[None, None], len(segments), axis=1)
+        weights = segments.weights(segments.known / np.square(noise.sigma))
+        states = segments.estimated_states(lanes, _states(segments, motion)[None], weights)[0]
+        return cls(segments, parameters, states, noise)
+
+    @cached_property
+    def _lanes(self) -> tuple[FloatArray, FloatArray]:
+        """Parameters and states of the lanes of one batch."""
+        return np.repeat(self.parameters[None, None], len(self.segments), axis=1), self.states[None]
+
+    @cached_property
+    def errors(self) -> FloatArray:
+        """Simulated less measured samples ``(K n_rows, n_s)``."""
+        return _flat(self.segments.errors(*self._lanes)[0])
+
+    @cached_property
+    def _known(self) -> BoolArray:
+        return _flat(self.segments.known)
+
+    @cached_property
+    def total_cost(self) -> float:
+        """Negative log-likelihood."""
+        return float(self.noise.negative_log_likelihood(self.errors, self._known).sum())
+
+    @property
+    def cost(self) -> float:
+        """Negative log-likelihood per known sample; infinite where a simulation diverges."""
+        if np.abs(self.errors).max(initial=0.0) >= _DIVERGED:
+            return np.inf
+        return self.total_cost / max(int(self._known.sum()), 1)
+
+    @cached_property
+    def equations(self) -> _Equations:
+        """Gauss-Newton equations of each segment, weighted by the noise."""
+        shape = self.segments.known.shape
+        inlying = self.noise.inlying(self.errors, self._known).reshape(shape)
+        weights = self.segments.weights(inlying / np.square(self.noise.sigma))
+        return _Equations.of(self.segments, *self._lanes, weights)
+
+    def descended(self) -> _Solution:
+        """The solution after steps of Levenberg and Marquardt, each with an update of the noise (EM)."""
+        now, damping = self, _DAMPING
+        for _ in range(_STEPS):
+            check_time()
+            inlying = now.noise.inlying(now.errors, now._known)
+            noise = now.noise.updated(now.errors, now._known, inlying, outliers=bool(now.noise.pi.any()))
+            is_steady = bool((np.abs(np.log(noise.sigma / now.noise.sigma)) < _NOISE_MOVES).all())
+            now = replace(now, noise=noise)
+            if not now.equations.is_finite:
+                break
+            then, change, damping = now._stepped(damping)
+            if then is None:
+                break
+            now = then
+            if change < _CONVERGED and is_steady:
+                break
+        return now
+
+    def _stepped(self, damping: float) -> tuple[_Solution | None, float, float]:
+        """The solution after a step that lowers the cost, or None; its change, standard errors; the next damping."""
+        intervals = self.segments.intervals
+        while damping <= _DAMPING_BOUNDS[1]:
+            part = self.equations.reduced(damping)
+            matrix, gradient = part.with_prior(intervals, self.parameters)
+            p = _moved(intervals, self.parameters, -_solved(matrix, gradient, damping))
+            change = p - self.parameters
+            then = replace(self, parameters=p, states=self.states - part.own - part.following @ change)
+            if then.total_cost < self.total_cost:
+                sizes = np.abs(change) * np.sqrt(np.maximum(np.diag(matrix), 0.0))
+                return then, float(sizes.max()), max(0.1 * damping, _DAMPING_BOUNDS[0])
+            damping *= 10.0
+        return None, 0.0, damping
+
+    def grown(self, length: int) -> _Solution:
+        """The solution over longer segments, whose states are those of the shorter ones' simulations."""
+        longer = _segments(self.segments.intervals, self.segments.acting, length, _MOST_ROWS)
+        nearest = np.clip(np.searchsorted(self.segments.starts, longer.starts, side="right") - 1, 0, None)
+        at = np.clip(longer.starts - self.segments.starts[nearest], 0, self.segments.n_rows - 1)
+        series = self.segments.trajectories(*self._lanes)[0]
+        found = replace(self, segments=longer, states=np.nan_to_num(series[nearest, at, : self.states.shape[1]]))
+        scale = np.nan_to_num(lower_scale(found.errors.copy(), found._known), nan=1.0)
+        return replace(found, noise=replace(self.noise, sigma=np.maximum(scale, self.noise.floor)))
+
+    def candidate(self, blocks: Blocks) -> Candidate:
+        """The estimate, and what it is without each block by one Newton step."""
+        segments, intervals = self.segments, self.segments.intervals
+        block = blocks.of_row[segments.starts + segments.n_rows // 2]
+        part, without = self.equations.reduced(0.0), []
+        for k in range(blocks.n):
+            step = -_solved(*part.of(block != k).with_prior(intervals, self.parameters), 0.0)
+            without.append(_moved(intervals, self.parameters, step))
+        name = f"simulation error, {segments.n_rows * intervals.dt:.2g} s"
+        return Candidate(name, self.parameters, np.array(without), segments.acting, intervals)
+
+    def simulated(self, motion: Motion) -> Motion:
+        """The motion of the segments; the given one in rows that none covers."""
+        series, signals = self.segments.trajectories(*self._lanes)[0], motion.signals.copy()
+        finite = np.isfinite(series).all(axis=(1, 2))
+        signals[self.segments.rows[finite].ravel()] = _flat(series[finite])
+        return replace(motion, signals=signals)
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Gauss-Newton equations of K segments, their states' and all parameters'.
+
+    Parameters
+    ----------
+    H_xx, H_xp, H_pp : (K, n_x, n_x), (K, n_x, n) and (K, n, n) array
+        J' W J.
+    g_x, g_p : (K, n_x) and (K, n) array
+        J' W e.
+    """
+
+    H_xx: FloatArray
+    H_xp: FloatArray
+    H_pp: FloatArray
+    g_x: FloatArray
+    g_p: FloatArray
+
+    @classmethod
+    def of(cls, segments: Segments, parameters: FloatArray, states: FloatArray, weights: FloatArray) -> _Equations:
+        """Equations with parameters in the places of each segment's log."""
+        sums, layout = (
+            segments.gauss_newton(parameters, states, weights, parameters_too=True),
+            segments.intervals.layout,
+        )
+        H, g, n_x, n = sums.normal_matrix, sums.gradient, states.shape[2], parameters.shape[2]
+        if layout.is_shared:
+            return cls(H[:, :n_x, :n_x], H[:, :n_x, n_x:], H[:, n_x:, n_x:], g[:, :n_x], g[:, n_x:])
+        places = layout.index[segments.intervals.log_of_row[segments.starts]]
+        k = np.arange(len(H))[:, None]
+        H_xp, H_pp, g_p = np.zeros((len(H), n_x, n)), np.zeros((len(H), n, n)), np.zeros((len(H), n))
+        H_xp[k[:, :, None], np.arange(n_x)[None, :, None], places[:, None, :]] = H[:, :n_x, n_x:]
+        H_pp[k[:, :, None], places[:, :, None], places[:, None, :]] = H[:, n_x:, n_x:]
+        g_p[k, places] = g[:, n_x:]
+        return cls(H[:, :n_x, :n_x], H_xp, H_pp, g[:, :n_x], g_p)
+
+    @property
+    def is_finite(self) -> bool:
+        """False after a divergence."""
+        return all(bool(np.isfinite(x).all()) for x in (self.H_xx, self.H_xp, self.H_pp, self.g_x, self.g_p))
+
+    def reduced(self, damping: float) -> _Reduced:
+        """The equations of the parameters, without the states."""
+        d = np.sqrt(np.einsum("kii->ki", self.H_xx)) + _TINY
+        scaled = self.H_xx / d[:, :, None] / d[:, None, :] + (damping + _RIDGE) * np.eye(self.H_xx.shape[1])
+        right = np.concatenate([self.H_xp, self.g_x[:, :, None]], axis=2) / d[:, :, None]
+        solved = np.linalg.solve(scaled, right) / d[:, :, None]
+        following, own = solved[:, :, :-1], solved[:, :, -1]
+        matrix = self.H_pp - np.einsum("kxi,kxj->kij", self.H_xp, following)
+        return _Reduced(matrix, self.g_p - np.einsum("kxi,kx->ki", self.H_xp, own), following, own)
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """Schur complement of each segment's state: ``dx = -own - following dp``.
+
+    Parameters
+    ----------
+    matrix, gradient : (K, n, n) and (K, n) array
+        Each segment's part of the parameters' equations.
+    following, own : (K, n_x, n) and (K, n_x) array
+    """
+
+    matrix: FloatArray
+    gradient: FloatArray
+    following: FloatArray
+    own: FloatArray
+
+    def of(self, chosen: BoolArray) -> _Reduced:
+        """Some of the segments."""
+        return _Reduced(self.matrix[chosen], self.gradient[chosen], self.following[chosen], self.own[chosen])
+
+    def with_prior(self, intervals: ShootingIntervals, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Sums over the segments, with the priors of the parameters."""
+        precision = 1.0 / np.square(intervals.layout.prior_std)
+        away = np.where(precision > 0.0, p - intervals.layout.prior_mean, 0.0)
+        return self.matrix.sum(axis=0) + np.diag(precision), self.gradient.sum(axis=0) + precision * away
+
+
+def _solved(matrix: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
+    """Solution of damped normal equations in columns of unit size; least squares where they are singular."""
+    d = np.sqrt(np.maximum(np.diag(matrix), 0.0)) + _TINY
+    scaled = matrix / d[:, None] / d[None, :] + (damping + _RIDGE) * np.eye(len(matrix))
+    return np.asarray(np.linalg.lstsq(scaled, gradient / d, rcond=None)[0] / d)
+
+
+def _moved(intervals: ShootingIntervals, now: FloatArray, step: FloatArray) -> FloatArray:
+    """Parameters after a step within the bounds; a positive one changes by a factor of two at most."""
+    bounds = intervals.layout.bounds
+    positive = np.array([x.positive for x in bounds])
+    lower, upper = np.array([[x.lower, x.upper] for x in bounds]).T
+    then = np.clip(now + step, lower, upper)
+    return np.where(positive, np.clip(then, 0.5 * now, 2.0 * now), then)
