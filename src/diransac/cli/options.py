@@ -19,7 +19,6 @@ from diransac.cli.arguments import (
     numbers,
     pairs,
     prior_pairs,
-    start_values,
 )
 from diransac.data import preprocessing
 from diransac.data.log import Log
@@ -200,15 +199,6 @@ class Search:
         typer.Option("--prior", metavar="NAME=MEAN,SD", help="A Gaussian prior of a parameter; repeatable."),
     ] = None
 
-    start: Annotated[
-        str | None,
-        typer.Option(metavar="NAME=VALUE,...", help="Rough values from which lo-diransac starts, too: mass=0.3."),
-    ] = None
-    horizon: Annotated[
-        float | None,
-        typer.Option(metavar="S", help="Time over which the model is to predict; estimates are compared over it."),
-    ] = None
-
     time_limit: TimeLimit = None
 
     def arguments(self) -> dict[str, Any]:
@@ -219,8 +209,6 @@ class Search:
         known = {
             "fixed": fixed_parameters("--fix", self.fixed or ()),
             "priors": prior_pairs("--prior", self.priors or ()),
-            "start": start_values("--start", self.start),
-            "horizon": self.horizon,
         }
         return {"seed": self.seed, "input_hold": self.input_hold, **known}
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from diransac.cli import screen
-from diransac.cli.arguments import model_file
+from diransac.cli.arguments import model_file, start_values
 from diransac.cli.fleet_options import FleetOptions
 from diransac.cli.group import grouped
 from diransac.cli.options import (
@@ -47,6 +47,16 @@ def _identify(
     with_suggestions: Annotated[
         bool, typer.Option("--with-suggestions", help="Identify again with the terms that the model seems to lack.")
     ] = False,
+    rough: Annotated[
+        str | None,
+        typer.Option(
+            "--start", metavar="NAME=VALUE,...", help="Rough values from which lo-diransac starts, too: mass=0.3."
+        ),
+    ] = None,
+    horizon: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="Time over which the model is to predict; estimates are compared over it."),
+    ] = None,
     output: Output = None,
     report: Report = None,
     as_json: JsonFlag = False,
@@ -54,11 +64,12 @@ def _identify(
 ) -> None:
     """Identify the parameters of a model from one log, from several logs of one machine, or from each by itself."""
     (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
+    aims = {"start": start_values("--start", rough), "horizon": horizon, "with_suggestions": with_suggestions}
     read = [*files, model_file(model), search.settings]
     if each.asked():
         if output or strict:
             raise typer.BadParameter("--each keeps its results in --store; -o and --strict are of one result")
-        arguments = search.arguments() | derived | {"with_suggestions": with_suggestions}
+        arguments = search.arguments() | derived | aims
         each.run(files, robot.load(model), chosen, preparation, report, arguments, search.time_limit, as_json)
         return
     checked([output, report], read)
@@ -73,8 +84,8 @@ def _identify(
         for k, (limb, plant) in enumerate(limbs.items()):
             saved, page = drafts[2 * k : 2 * k + 2]
             with screen.bar(f"{method} {limb}".rstrip()) as progress:
-                arguments = search.arguments() | derived | {"time_limit": search.time_limit}
-                found = identify(plant, logs, chosen, with_suggestions=with_suggestions, progress=progress, **arguments)
+                arguments = search.arguments() | derived | aims | {"time_limit": search.time_limit}
+                found = identify(plant, logs, chosen, progress=progress, **arguments)
             results[limb] = found
             if output:
                 found.save(saved)
