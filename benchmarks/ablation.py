@@ -99,7 +99,6 @@ LEFT_OUT = {
     "nothing": dr.LoDiransac(),
     "random samples": dr.LoDiransac(n_samples=0),
     "local optimisation": dr.LoDiransac(max_steps=0, projection=False),
-    "further starts": dr.LoDiransac(max_starts=1),
     "outlier component of the noise": dr.LoDiransac(outliers=False),
     "unmodelled accelerations": dr.LoDiransac(model_error=False),
     "prior of a thousandth": dr.LoDiransac(prior_model_error=1e-5),

@@ -1,4 +1,4 @@
-"""Local optimisations from the best hypotheses, and what else explains a log: the likeliest explanation wins.
+"""Local optimisations from the best hypothesis, and what else explains a log: the likeliest explanation wins.
 
 An explanation is a fit with its freedom: whether the model has discrepancies, how fast unmodelled accelerations vary,
 and how inputs act after they are recorded.  Explanations are compared by their evidence, in which freedom costs, so
@@ -19,9 +19,8 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import TimeLimitError
-from diransac.identification.method import report, within
+from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
-from diransac.identification.methods.lo_diransac.mixture import BREAKDOWN
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
 from diransac.identification.methods.lo_diransac.recording_errors import (
@@ -51,7 +50,6 @@ LEAST_LAG = 0.1
 
 # Difference of two fits' evidence, nats, below which both are as likely.
 _AS_LIKELY = 5.0
-_OUTLIER = 0.5
 # Delays that are tried at a time, before they are refined to a sample.
 _DELAYS_AT_A_TIME = 12
 # Lags that are tried where one is required.
@@ -213,13 +211,13 @@ class LocalSearch:
         """The likeliest explanation so far after each stage of the search."""
         report(self.callback, "searching for a delay", 0.1)
         delay = self._likeliest_delay(intervals)
-        flexible = self._from_hypotheses(intervals, 0)
+        flexible = self._from_hypothesis(intervals, 0)
         yield flexible
         best = self._simplest(flexible, self._prior_of(intervals))
         yield best
         if delay:
             delayed = replace(intervals, delay=delay)
-            other = self._simplest(self._from_hypotheses(delayed, 1), self._prior_of(delayed))
+            other = self._simplest(self._from_hypothesis(delayed, 1), self._prior_of(delayed))
             best = self._better(best, [other])
             yield best
         best = self._with_timing(best, free_hold=free_hold)
@@ -354,10 +352,12 @@ class LocalSearch:
         others = [x for x in others if x.cost < now.cost - _AS_LIKELY and (x.exact or explains(x))]
         return min(others, key=lambda x: x.cost, default=now)
 
-    def _from_hypotheses(self, intervals: ShootingIntervals, k: int) -> Explanation:
-        """The likeliest explanation with this timing of the inputs and with unmodelled accelerations."""
-        part, undelayed = within(self.callback, 0.1 + 0.25 * k, 0.35 + 0.25 * k), self._undelayed
-        return Explanation(intervals, self.best(intervals, undelayed, part), undelayed, exact=False)
+    def _from_hypothesis(self, intervals: ShootingIntervals, k: int) -> Explanation:
+        """Local optimisation from the best hypothesis, with this timing of the inputs and unmodelled accelerations."""
+        report(self.callback, "local optimisation", 0.1 + 0.25 * k)
+        begin = start(self.settings, intervals, self.motion, self.hypotheses[0], self._undelayed)
+        refined = refine(self.settings, intervals, begin, self._undelayed)
+        return Explanation(intervals, refined, self._undelayed, exact=False)
 
     @property
     def _undelayed(self) -> Prior:
@@ -367,37 +367,6 @@ class LocalSearch:
     def _prior_of(self, intervals: ShootingIntervals) -> Prior:
         """The prior of a fit whose delay or lag is free, as far as the settings admit it."""
         return self._undelayed if self.settings.input_delay is False and not intervals.lag else self.prior
-
-    def best(self, intervals: ShootingIntervals, prior: Prior, callback: Callback | None = None) -> Refinement:
-        """Local optimisation from the best hypothesis; where it is doubtful, from others; the likeliest of these.
-
-        A fit is doubtful if most samples of an interval are outliers: either sensors failed there, or the fit did.  The
-        likeliest fit so far becomes a hypothesis itself; otherwise the next hypothesis is optimised.  The search ends
-        with a second fit that is as likely.
-
-        Parameters
-        ----------
-        intervals : ShootingIntervals
-        prior : Prior
-        callback : callable, optional
-
-        Returns
-        -------
-        Refinement
-        """
-        waiting = list(self.hypotheses[: self.settings.max_starts])
-        found: list[Refinement] = []
-        while waiting and len(found) < self.settings.max_fits:
-            share = len(found) / self.settings.max_fits
-            report(callback, "local optimisation", share, f"fit {len(found) + 1}")
-            begin = start(self.settings, intervals, self.motion, waiting.pop(0), prior)
-            found.append(refine(self.settings, intervals, begin, prior))
-            again = any(abs(found[-1].cost - x.cost) < _AS_LIKELY for x in found[:-1])
-            if again or not _is_doubtful(intervals, found[-1]):
-                break
-            if all(found[-1].cost < x.cost for x in found[:-1]):
-                waiting.insert(0, found[-1].fit.shared[: intervals.n_p])
-        return min(found, key=lambda x: x.cost)
 
     def _simplified(self, found: Explanation) -> Explanation:
         """The explanation without the freedom that is no longer likely."""
@@ -540,10 +509,3 @@ def fewest_parts(length: int) -> int:
         The smallest above one with parts that are not too short; 0 where there is none.
     """
     return next((k for k in range(2, length // _SHORTEST + 1) if length % k == 0), 0)
-
-
-def _is_doubtful(intervals: ShootingIntervals, refined: Refinement) -> bool:
-    """True if an interval has too few inlying samples for a robust scale."""
-    fit, n = refined.fit, len(intervals)
-    inlying = (fit.noise.inlying(fit.residuals, intervals.known) > _OUTLIER).reshape(n, -1).sum(axis=1)
-    return bool((inlying < BREAKDOWN * intervals.known.reshape(n, -1).sum(axis=1)).any())

@@ -155,8 +155,6 @@ class LoDiransac(LoDiransacSettings):
     substeps : int, optional
         Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
         samples or links are light.
-    max_starts, max_fits : int, optional
-        Largest number of hypotheses that are optimised, and of local optimisations.
     max_steps : int, optional
         Largest number of Gauss-Newton steps of a local optimisation; 0: the best hypothesis is the estimate.
     outliers : bool, optional

@@ -15,12 +15,12 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.simulation.compiler import order_statistics, padded_rows
 
-__all__ = ["BREAKDOWN", "Mixture", "lower_scale"]
+__all__ = ["Mixture", "lower_scale"]
 
 
 # A scale that holds while fewer than 65 % of the residuals are outliers: the 35 % quantile of |r|, and what it is of a
 # standard normal variable.
-BREAKDOWN, _OF_NORMAL = 0.35, 0.4538
+_BREAKDOWN, _OF_NORMAL = 0.35, 0.4538
 _FEWEST = 5
 _SHRINK = 0.4
 _FRACTION = (0.002, 0.95)
@@ -171,5 +171,5 @@ def lower_scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
     if not known.all():
         np.copyto(of_rows, np.inf, where=~known.swapaxes(-1, -2))
         count = np.count_nonzero(known, axis=-2)
-    found = order_statistics(sizes, (BREAKDOWN * count).astype(np.int64))
+    found = order_statistics(sizes, (_BREAKDOWN * count).astype(np.int64))
     return np.where(count >= _FEWEST, found / _OF_NORMAL, np.nan)

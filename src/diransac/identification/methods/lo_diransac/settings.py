@@ -48,8 +48,6 @@ class LoDiransacSettings:
     max_sensor_errors: int = 8
     set_points: tuple[str, ...] = ()
     substeps: int = 5
-    max_starts: int = 5
-    max_fits: int = 8
     max_steps: int = 60
     outliers: bool = True
     model_error: bool = True
