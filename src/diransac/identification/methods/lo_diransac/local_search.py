@@ -487,7 +487,10 @@ class LocalSearch:
         for p in starts[intervals.layout.admits(starts)]:
             begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
             is_left = any(x.of_inputs for x in intervals.all_errors.kinds)
-            refined = refine_exact(self.settings, intervals, begin, prior, np.inf if is_left else flexible.cost)
+            try:
+                refined = refine_exact(self.settings, intervals, begin, prior, np.inf if is_left else flexible.cost)
+            except np.linalg.LinAlgError:  # simulations by the exact model overflow from here: it is no explanation
+                continue
             exact = Explanation(intervals, refined, prior, exact=True)
             found.append(self._with_refined_errors(exact) if is_left else exact)
             if found[-1].cost < flexible.cost:

@@ -113,8 +113,8 @@ class LoDiransac(LoDiransacSettings):
         Window of the running median from which smoothing starts, s; at most 31 samples.
     smoothing_half_width : float, optional
         Usual half width of the smoothing polynomials and length of the shooting intervals, s; at most 25 samples.
-        Cross-validation chooses between it and three, nine, ... times its value, for smoothing also a third of it; signals
-        that are sampled more slowly have as many samples of their own.
+        Cross-validation chooses between it and three, nine, ... times its value, for smoothing also a third of it;
+        signals that are sampled more slowly have as many samples of their own.
     n_samples, n_nonlinear_samples : int, optional
         Number of random samples of a model that is affine in its parameters, and of others.
     largest_sample : int, optional
