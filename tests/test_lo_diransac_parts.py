@@ -11,7 +11,7 @@ from diransac.data.dataset import ParameterLayout
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 from diransac.identification.methods.lo_diransac.augmented_model import augmented_model
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
-from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, fewest_parts
+from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, LocalSearch, fewest_parts
 from diransac.identification.methods.lo_diransac.missing_terms import short_windows
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
@@ -41,6 +41,7 @@ from diransac.identification.methods.lo_diransac.smoothing import (
     stuck_rows,
     without_spikes,
 )
+from diransac.text_table import duration
 from simulated import MACHINES, flight, rollout
 
 ROTORCRAFT = dr.models.planar_rotorcraft()
@@ -584,3 +585,26 @@ def test_spikes_of_a_force_sensor_are_left_out_and_those_that_acted_are_kept():
         noted.append(any("spikes" in note for note in result.notes))
         assert result.parameters["mass"] == pytest.approx(2.0, rel=0.02)
     assert noted == [True, False]
+
+
+# ---------------------------------------------------------------------- delays
+
+
+@pytest.mark.parametrize(
+    ("dt", "range_of_settings", "samples"),
+    [
+        (0.01, (-0.03, 0.08), (-3, 8)),
+        (300.0, (-0.03, 0.08), (-2, 2)),
+        (1e-6, (-0.03, 0.08), (-100, 100)),
+        (300.0, (0.0, 0.08), (0, 2)),
+        (0.01, (0.0, 0.0), (0, 0)),
+    ],
+)
+def test_range_of_delays_is_of_some_samples_whatever_the_sampling_time(dt, range_of_settings, samples):
+    signals, inputs = flight(MACHINES["planar-rotorcraft"], 50, 0.01)
+    search = LocalSearch(dr.LoDiransac(delay_range=range_of_settings), None, np.zeros((1, 3)), None, None)
+    assert search.delays(intervals_over(signals, inputs, dt=dt)) == samples
+
+
+def test_durations_have_a_fitting_unit():
+    assert [duration(x) for x in (9.38e-3, 905.0, 2.01e-6, -0.04)] == ["9.38 ms", "905 s", "2.01 µs", "−40 ms"]
