@@ -538,3 +538,19 @@ def test_method_object_gives_what_its_name_gives():
     )
     for method, name, settings in pairs:
         assert dr.identify(MODEL, log, method) == dr.identify(MODEL, log, name, settings=settings)
+
+
+def test_failure_of_linear_algebra_is_not_blamed_on_a_motion_whose_rates_the_log_lacks():
+    class Failing(dr.LoDiransac):
+        def fit(self, *_):
+            raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    t = 0.01 * np.arange(500)
+    log = dr.Log.from_arrays(t, {"x": np.sin(3.0 * t), "f": -9.0 * np.sin(3.0 * t)})
+    parameters = {"m": dr.Parameter("kg", positive=True)}
+    model = dr.Model("mass", {"x": "m"}, {"f": "N"}, parameters, lambda q, v, a, u, p: [p.m * a.x - u.f])
+    with pytest.raises(
+        IdentificationError, match=r"fails in lo-diransac \(Eigenvalues did not converge\): the fit"
+    ) as raised:
+        dr.identify(model, log, Failing(), differentiate=True)
+    assert "excite" not in str(raised.value)

@@ -11,7 +11,7 @@ from diransac.data.dataset import ParameterLayout
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 from diransac.identification.methods.lo_diransac.augmented_model import augmented_model
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
-from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, fewest_parts
+from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, LocalSearch, fewest_parts
 from diransac.identification.methods.lo_diransac.missing_terms import short_windows
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
@@ -34,13 +34,14 @@ from diransac.identification.methods.lo_diransac.refinement import Prior, Refine
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
     Samples,
-    choose_half_width,
+    choose_half_widths,
     running_median,
     screened_inputs,
     smooth,
     stuck_rows,
     without_spikes,
 )
+from diransac.text_table import duration
 from simulated import MACHINES, flight, rollout
 
 ROTORCRAFT = dr.models.planar_rotorcraft()
@@ -64,7 +65,7 @@ def intervals_of(n_rows=200, length=25, dt=0.01):
 def smoothed(measured, known):
     """The motion of a log at 100 Hz, from 25 rows to either side."""
     samples = Samples(measured, known, running_median(measured, known, 31), np.zeros(len(measured), bool))
-    return smooth(ROTORCRAFT, [samples], 0.01, 25)[0]
+    return smooth(ROTORCRAFT, [samples], 0.01, np.full(9, 25))[0]
 
 
 # ---------------------------------------------------------------------- arrowhead
@@ -182,16 +183,53 @@ def test_smoothing_finds_velocities_and_accelerations_from_coordinates_alone():
     assert np.abs(motion.signals - truth).max() < 1e-4
 
 
-def test_half_width_is_wider_where_the_motion_is_slower():
-    t = 0.01 * np.arange(4000)
-    noise = 0.02 * np.random.default_rng(6).normal(size=(4000, 9))
+def samples_of(known: np.ndarray, wave, noise: float = 0.02) -> Samples:
+    """A wave in all signals of the rotorcraft, at 100 Hz."""
+    t = 0.01 * np.arange(len(known))
+    measured = wave(t)[:, None] + noise * np.random.default_rng(6).normal(size=known.shape)
+    measured = np.where(known, measured, 0.0)
+    return Samples(measured, known, running_median(measured, known, 31), ~known.any(axis=1))
+
+
+def test_half_width_is_wider_where_the_motion_is_slower_and_narrower_where_it_is_faster():
     known = np.zeros((4000, 9), bool)
     known[:, :3] = True
-    logs = [np.repeat(np.sin(w * t)[:, None], 9, axis=1) + noise for w in (10.0, 0.5)]
-    samples = [Samples(log, known, running_median(log, known, 31), ~known.any(axis=1)) for log in logs]
-    widths = [choose_half_width(ROTORCRAFT, [log], 0.01, 0.25) for log in samples]
-    assert widths[0] == 25
-    assert widths[1] > 25
+    logs = [samples_of(known, lambda t, w=w: np.sin(w * t)) for w in (10.0, 0.5, 40.0)]
+    (halves, slow, fast), lengths = zip(*(choose_half_widths(ROTORCRAFT, [x], 0.01, 0.25) for x in logs), strict=True)
+    assert (halves == 25).all()
+    assert (slow > 25).all()
+    assert (fast == 8).all()
+    assert lengths == (25, slow[0], 25)
+
+
+def test_half_width_of_a_slow_signal_is_in_its_own_samples():
+    known = np.zeros((4000, 9), bool)
+    known[:, 0], known[::10, 1], known[5::10, 2] = True, True, True
+    halves, length = choose_half_widths(ROTORCRAFT, [samples_of(known, lambda t: np.sin(2.0 * t))], 0.01, 0.05)
+    assert halves[:3].tolist() == [halves[0], 10 * halves[0], 10 * halves[0]]
+    assert length == halves[0]
+
+
+def test_a_slow_signal_is_smoothed_beside_a_fast_one_as_it_is_alone():
+    beside = np.zeros((2000, 9), bool)
+    beside[::10, 1] = True
+    alone = samples_of(beside, lambda t: np.sin(2.0 * t))
+    beside = beside.copy()
+    beside[:, 0] = True
+    both = samples_of(beside, lambda t: np.sin(2.0 * t))
+    halves = np.array([5, 50, 5, 5, 50, 5, 5, 50, 5])
+    alone, both = (smooth(ROTORCRAFT, [x], 0.01, halves)[0].signals for x in (replace(alone, gaps=both.gaps), both))
+    np.testing.assert_array_equal(both[:, 1::3], alone[:, 1::3])
+    t = 0.01 * np.arange(2000)
+    assert np.abs(both[50:-50, 1] - np.sin(2.0 * t[50:-50])).max() < 0.05
+
+
+def test_rows_without_samples_nearby_are_those_of_wider_windows():
+    known = np.zeros((2000, 9), bool)
+    known[:, 0], known[:900, 1], known[960:, 1] = True, True, True
+    found = smooth(ROTORCRAFT, [samples_of(known, lambda t: np.sin(2.0 * t), 0.0)], 0.01, np.full(9, 10))[0].signals
+    truth = np.sin(0.02 * np.arange(2000))
+    assert np.abs(found[:, 1] - truth).max() < 0.02
 
 
 # ---------------------------------------------------------------------- the augmented model
@@ -532,3 +570,26 @@ def test_spikes_of_a_force_sensor_are_left_out_and_those_that_acted_are_kept():
         noted.append(any("spikes" in note for note in result.notes))
         assert result.parameters["mass"] == pytest.approx(2.0, rel=0.02)
     assert noted == [True, False]
+
+
+# ---------------------------------------------------------------------- delays
+
+
+@pytest.mark.parametrize(
+    ("dt", "range_of_settings", "samples"),
+    [
+        (0.01, (-0.03, 0.08), (-3, 8)),
+        (300.0, (-0.03, 0.08), (-2, 2)),
+        (1e-6, (-0.03, 0.08), (-100, 100)),
+        (300.0, (0.0, 0.08), (0, 2)),
+        (0.01, (0.0, 0.0), (0, 0)),
+    ],
+)
+def test_range_of_delays_is_of_some_samples_whatever_the_sampling_time(dt, range_of_settings, samples):
+    signals, inputs = flight(MACHINES["planar-rotorcraft"], 50, 0.01)
+    search = LocalSearch(dr.LoDiransac(delay_range=range_of_settings), None, np.zeros((1, 3)), None, None)
+    assert search.delays(intervals_over(signals, inputs, dt=dt)) == samples
+
+
+def test_durations_have_a_fitting_unit():
+    assert [duration(x) for x in (9.38e-3, 905.0, 2.01e-6, -0.04)] == ["9.38 ms", "905 s", "2.01 µs", "−40 ms"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-__all__ = ["aligned", "listed", "number", "percent", "plural", "share", "telling_digits"]
+__all__ = ["aligned", "duration", "listed", "number", "percent", "plural", "share", "telling_digits"]
 
 _LEAST_PERCENT = 0.01
 _TIMES = 3.0
@@ -33,6 +33,12 @@ def number(x: float, digits: int = 4) -> str:
     mantissa, _, exponent = f"{x:.{digits}g}".partition("e")
     power = f"×10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if exponent else ""
     return mantissa.replace("-", "−") + power
+
+
+def duration(seconds: float) -> str:
+    """A time to three digits in a fitting unit: ``12 µs``, ``9.38 ms``, ``905 s``."""
+    unit, size = ("µs", 1e-6) if abs(seconds) < 1e-4 else ("ms", 1e-3) if abs(seconds) < 1.0 else ("s", 1.0)
+    return f"{number(seconds / size, 3)} {unit}"
 
 
 def percent(fraction: float) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.input_timing import InputTiming
 from diransac.model import Model
+from diransac.text_table import duration
 
 __all__ = ["PortableModel"]
 
@@ -103,10 +104,10 @@ class PortableModel:
         """Duties of a caller towards the inputs, a sentence each."""
         found = [f"In the identification, {_HOLDS[self.hold]}."]
         if self.input_delays:
-            delays = ", ".join(f"{n} by {1e3 * x:.3g} ms" for n, x in self.input_delays.items())
+            delays = ", ".join(f"{n} by {duration(x)}" for n, x in self.input_delays.items())
             found.append(f"Recorded inputs act late; the caller delays {delays}.")
         if self.input_lags:
-            lags = ", ".join(f"{1e3 * x:.3g} ms of {n}" for n, x in self.input_lags.items())
+            lags = ", ".join(f"{duration(x)} of {n}" for n, x in self.input_lags.items())
             found.append(f"The caller filters recorded inputs by first-order lags with the time constants {lags}.")
         if any(self.timing.gain_drifts):
             pairs = zip(self.model.inputs, self.timing.gain_drifts, strict=True)

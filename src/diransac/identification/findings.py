@@ -9,7 +9,7 @@ import numpy as np
 
 from diransac.identification.departures import departures
 from diransac.identification.estimate import TIME_LIMIT, Finding, Level
-from diransac.text_table import number, percent, plural, share
+from diransac.text_table import duration, number, percent, plural, share
 
 if TYPE_CHECKING:
     from diransac.identification.estimate import Diagnosis, LogSummary, Prediction
@@ -276,10 +276,10 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
         yield Finding("care", f"The model seems to lack a term. {suggestion.text}.")
     if found.input_delay_significant:
         sense, lag = "later" if found.input_delay > 0.0 else "earlier", result.estimate.resolution.timing.lag
-        time = number(1e3 * abs(found.input_delay), 3)
-        late, what = f"Inputs act {time} ms {sense} than recorded", "delay"
+        time = duration(abs(found.input_delay))
+        late, what = f"Inputs act {time} {sense} than recorded", "delay"
         if lag:
-            late, what = f"Inputs act after a first-order lag of the actuators of {time} ms (time constant)", "lag"
+            late, what = f"Inputs act after a first-order lag of the actuators of {time} (time constant)", "lag"
         included = f"the estimate includes this {what}, as do its evaluation and validation"
         yield Finding("care", f"{late}: {included}; other simulations of the model must include it, too.")
     yield from _unidentifiable(result, found)

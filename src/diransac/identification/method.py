@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from diransac.errors import IdentificationError
+from diransac.identification.identifiability import structural
 from diransac.identification.refusal import cause_of_refusal, motion_rows
 
 if TYPE_CHECKING:
@@ -110,18 +111,30 @@ def fit(method: Method, dataset: Dataset, seed: int, callback: Callback | None =
         with np.errstate(all="ignore"):  # what is not finite is refused, or an infinite error
             found = method.fit(dataset, seed, callback)
     except np.linalg.LinAlgError as error:
-        raise IdentificationError(_not_finite(method, dataset)) from error
+        failed = f"linear algebra fails in {method.name} ({error})"
+        raise IdentificationError(f"{dataset.source}: {failed}: {_cause_of_failure(dataset)}") from error
     if not np.isfinite(found.values).all():
-        raise IdentificationError(_not_finite(method, dataset))
+        finds = f"{method.name} finds no finite parameters"
+        raise IdentificationError(f"{dataset.source}: {finds}: {_cause_of_failure(dataset)}")
     return found
 
 
-def _not_finite(method: Method, dataset: Dataset) -> str:
+def _cause_of_failure(dataset: Dataset) -> str:
+    """Cause of numbers that are not finite: the equations, or the logs where these have every signal of them.
+
+    Rows without velocities or accelerations excite nothing, whatever the motion: the method estimates what they lack.
+    """
+    model = dataset.model
+    found = structural(model, ranges=dataset.ranges)
+    if found:
+        return "; ".join(x.sentence(x.of_equations()) for x in found)
+    needed = {*model.state, *model.accelerations}
+    if not all(needed <= set(one.present) for one in dataset.segments):
+        return "the fit diverges; check the model's constants and units, bound the parameters, or try another method"
     try:
-        cause = cause_of_refusal(dataset.model, dataset.layout, motion_rows(dataset))
+        return cause_of_refusal(model, dataset.layout, motion_rows(dataset))
     except np.linalg.LinAlgError:
-        cause = extremes(dataset.given)
-    return f"{dataset.source}: {method.name} finds no finite parameters: {cause}"
+        return extremes(dataset.given)
 
 
 @contextmanager

@@ -32,7 +32,7 @@ from diransac.identification.methods.lo_diransac.projection import (
 )
 from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs, lags_of_inputs
 from diransac.identification.methods.lo_diransac.refinement import weights_of
-from diransac.text_table import number, percent
+from diransac.text_table import duration, number, percent
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.local_search import Explanation
@@ -167,8 +167,8 @@ def _of_recordings(intervals: ShootingIntervals, fit: Fit) -> Iterator[Finding]:
     for delay in dict.fromkeys(errors.delay[errors.delay != 0.0].tolist()):
         late = signals[errors.delay == delay]
         names = f"{', '.join(late[:-1])} and {late[-1]} are" if len(late) > 1 else f"{late[0]} is"
-        time, sense = number(1e3 * abs(delay) * intervals.dt, 3), "late" if delay > 0.0 else "early"
-        text = f"{names} recorded {time} ms {sense} with respect to the other signals"
+        time, sense = duration(abs(delay) * intervals.dt), "late" if delay > 0.0 else "early"
+        text = f"{names} recorded {time} {sense} with respect to the other signals"
         yield Finding("care", f"{text}, a sensor delay that the estimate includes.")
     for name, bias in zip(signals, errors.bias, strict=True):
         if bias:
@@ -181,11 +181,11 @@ def _of_recordings(intervals: ShootingIntervals, fit: Fit) -> Iterator[Finding]:
         lags = lags_of_inputs(intervals, fit)
     for name, delay, lag, drift in zip(intervals.model.inputs, delays, lags, errors.gain_drift, strict=True):
         if abs(delay) > _SMALL_DELAY:
-            time, sense = number(1e3 * abs(delay) * intervals.dt, 3), "later" if delay > 0.0 else "earlier"
-            yield Finding("care", f"{name} acts {time} ms {sense} than recorded, a delay that the estimate includes.")
+            time, sense = duration(abs(delay) * intervals.dt), "later" if delay > 0.0 else "earlier"
+            yield Finding("care", f"{name} acts {time} {sense} than recorded, a delay that the estimate includes.")
         if lag > _SMALL_DELAY:
-            time = number(1e3 * lag * intervals.dt, 3)
-            yield Finding("care", f"{name} acts after a first-order lag of {time} ms, which the estimate includes.")
+            time = duration(lag * intervals.dt)
+            yield Finding("care", f"{name} acts after a first-order lag of {time}, which the estimate includes.")
         if drift:
             moves = f"{'rises' if drift > 0.0 else 'falls'} by {percent(abs(drift))} during the log"
             holds = "the estimate includes this drift, and its parameters are those of the beginning"

@@ -52,6 +52,8 @@ LEAST_LAG = 0.1
 _AS_LIKELY = 5.0
 # Delays that are tried at a time, before they are refined to a sample.
 _DELAYS_AT_A_TIME = 12
+# Samples that the range of delays spans to either side at least, and at most.
+_SAMPLES_OF_DELAY = 2, 100
 # Lags that are tried where one is required.
 _LAGS = 9
 # Shortest interval, samples.
@@ -399,7 +401,10 @@ class LocalSearch:
         for p in starts[intervals.layout.admits(starts)]:
             begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
             is_left = any(x.of_inputs for x in intervals.all_errors.kinds)
-            refined = refine_exact(self.settings, intervals, begin, prior)
+            try:
+                refined = refine_exact(self.settings, intervals, begin, prior)
+            except np.linalg.LinAlgError:  # simulations by the exact model overflow from here: it is no explanation
+                continue
             exact = Explanation(intervals, refined, prior, exact=True)
             found.append(self._with_refined_errors(exact) if is_left else exact)
             if found[-1].cost < flexible.cost:
@@ -461,10 +466,29 @@ class LocalSearch:
 
     def _with_likeliest_lag(self, intervals: ShootingIntervals) -> ShootingIntervals:
         """The lag, from half a sample to the latest delay, with which simulations by the best hypothesis agree best."""
-        longest, every = self.settings.delay_range[1] / intervals.dt, np.arange(len(intervals))
+        longest, every = self.delays(intervals)[1], np.arange(len(intervals))
         lags = np.geomspace(_WHOLE_SAMPLE, max(_WHOLE_SAMPLE, longest), _LAGS)
         tried = [replace(intervals, lag=float(x)) for x in lags]
         return min(tried, key=lambda x: float(robust_scores(x, self.motion, self.hypotheses[:1], every)[0]))
+
+    def delays(self, intervals: ShootingIntervals) -> tuple[int, int]:
+        """Earliest and latest delay, samples: those of the settings, but some samples at least and at most.
+
+        A controller's delay is of its own samples, which may be minutes, and microseconds are no reason for thousands.
+
+        Parameters
+        ----------
+        intervals : ShootingIntervals
+
+        Returns
+        -------
+        int, int
+            0 to a side on which the settings admit none.
+        """
+        low, high = self.settings.delay_range
+        least, most = _SAMPLES_OF_DELAY
+        early, late = (min(max(round(x / intervals.dt), least), most) if x > 0.0 else 0 for x in (-low, high))
+        return -early, late
 
     def _likeliest_delay(self, intervals: ShootingIntervals) -> int:
         """Delay in samples with which simulations by the best hypothesis agree best with the log.
@@ -473,7 +497,7 @@ class LocalSearch:
         optimum; so the number of whole samples is chosen before local optimisation.
         """
         every, scores = np.arange(len(intervals)), dict[int, float]()
-        low, high = (round(x / intervals.dt) for x in self.settings.delay_range)
+        low, high = self.delays(intervals)
 
         def score(rows: int) -> float:
             if rows not in scores:

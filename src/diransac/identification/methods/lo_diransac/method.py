@@ -55,7 +55,7 @@ from diransac.identification.methods.lo_diransac.shooting import ShootingInterva
 from diransac.identification.methods.lo_diransac.smoothing import (
     Motion,
     Samples,
-    choose_half_width,
+    choose_half_widths,
     odd_window,
     running_median,
     screened_inputs,
@@ -125,8 +125,9 @@ class LoDiransac(LoDiransacSettings):
     median_window : float, optional
         Window of the running median from which smoothing starts, s; at most 31 samples.
     smoothing_half_width : float, optional
-        Smallest half width of the smoothing polynomials and length of the shooting intervals, s; at most 25 samples.
-        Cross-validation chooses between it and three, nine, ... times its value.
+        Usual half width of the smoothing polynomials and length of the shooting intervals, s; at most 25 samples.
+        Cross-validation chooses between it and three, nine, ... times its value, for smoothing also a third of it;
+        signals that are sampled more slowly have as many samples of their own.
     n_samples, n_nonlinear_samples : int, optional
         Number of random samples of a model that is affine in its parameters, and of others.
     largest_sample : int, optional
@@ -134,7 +135,8 @@ class LoDiransac(LoDiransacSettings):
     n_screening_intervals, n_finalists : int, optional
         Number of intervals on which all hypotheses are scored; number of hypotheses that are scored on all intervals.
     delay_range : (float, float), optional
-        Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation.
+        Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation; where it is not
+        zero, 2 samples at least and 100 at most.
     input_delay, input_lag : bool, optional
         Whether inputs act after a delay, or after a first-order lag of the actuators: True, always; False, never; None,
         where that is the likelier explanation of the log.  Where the model is not exact, an actuator may have a lag of
@@ -647,21 +649,21 @@ def prepared(settings: LoDiransac, dataset: Dataset) -> tuple[ShootingIntervals,
         for one, (_, _, said) in zip(dataset.segments, screened, strict=True)
         for note in said
     ]
-    half = choose_half_width(model, samples, dt, settings.smoothing_half_width)
+    halves, length = choose_half_widths(model, samples, dt, settings.smoothing_half_width)
     n_rows, longest = sum(map(len, dataset.segments)), max(map(len, dataset.segments))
-    if n_rows < _FEWEST_INTERVALS * half or longest < half:
+    if n_rows < _FEWEST_INTERVALS * length or longest < length:
         raise LogError(
             f"{dataset.source}: {n_rows} rows are too few; lo-diransac needs at least "
-            f"{_FEWEST_INTERVALS * half}. Give a longer log"
+            f"{_FEWEST_INTERVALS * length}. Give a longer log"
         )
-    if not any(long_runs(~x.gaps, half).any() for x in samples):
+    if not any(long_runs(~x.gaps, length).any() for x in samples):
         raise LogError(
-            f"{dataset.source}: no {half} rows in a row are without a gap in the inputs or in all sensors; give a log "
-            "with longer stretches"
+            f"{dataset.source}: no {length} rows in a row are without a gap in the inputs or in all sensors; give a "
+            "log with longer stretches"
         )
-    motions = smooth(model, samples, dt, half)
+    motions = smooth(model, samples, dt, halves)
     logs = [(x.measured, x.known, u, x.gaps) for x, u in zip(samples, inputs, strict=True)]
-    intervals = ShootingIntervals.of(model, dataset.layout, logs, dt, half, settings.substeps, dataset.hold)
+    intervals = ShootingIntervals.of(model, dataset.layout, logs, dt, length, settings.substeps, dataset.hold)
     intervals = replace(intervals, threads=settings.criteria.threads or default_threads())
     rows = zip(motions, intervals.rows_of_logs, strict=True)
     signals = np.concatenate([_to_length(x.signals, r.stop - r.start) for x, r in rows])

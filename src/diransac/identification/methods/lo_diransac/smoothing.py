@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Motion",
     "Samples",
-    "choose_half_width",
+    "choose_half_widths",
     "odd_window",
     "running_median",
     "screened_inputs",
@@ -52,6 +52,8 @@ _SHRINK = 0.3
 _FLOOR = 1e-4
 _AT_REST = 0.1
 _TRIALS = 24
+# Factor between half widths that are compared, and by which a window widens that has too few samples.
+_WIDER = 3
 # Weight of a polynomial that was fitted to fewer samples than it has coefficients.
 _UNINFORMED = 1e-9
 # Samples that a window has at least, and those to either side of a knot that always suffice.
@@ -230,13 +232,15 @@ def _chains(model: Model) -> list[list[int]]:
     return [[model.signals.index(name) for name in chain] for chain in model.chains]
 
 
-def _alike(chains: Sequence[Sequence[int]], size: int) -> list[IntArray]:
-    """Columns ``(C, c)`` of chains of one length, which are fitted together; fewer together, the larger each is."""
-    together = max(1, _NUMBERS_TOGETHER // size)
-    found = []
-    for c in sorted({len(x) for x in chains}):
-        columns = np.array([x for x in chains if len(x) == c])
-        found += [columns[k : k + together] for k in range(0, len(columns), together)]
+def _alike(chains: Sequence[Sequence[int]], halves: IntArray, size: int) -> list[tuple[IntArray, int]]:
+    """Columns ``(C, c)`` of chains of one length and half width, which are fitted together, and the half width.
+
+    Fewer are fitted together, the larger each is.
+    """
+    together, found = max(1, _NUMBERS_TOGETHER // size), []
+    for c, half in sorted({(len(x), int(halves[x[0]])) for x in chains}):
+        columns = np.array([x for x in chains if (len(x), halves[x[0]]) == (c, half)])
+        found += [(columns[k : k + together], half) for k in range(0, len(columns), together)]
     return found
 
 
@@ -245,7 +249,7 @@ def _n_motion(model: Model) -> int:
     return len(model.signals) - len(model.sensors)
 
 
-def smooth(model: Model, logs: Sequence[Samples], dt: float, half: int) -> list[Motion]:
+def smooth(model: Model, logs: Sequence[Samples], dt: float, halves: IntArray) -> list[Motion]:
     """Smoothed motion of every log.
 
     Parameters
@@ -254,15 +258,15 @@ def smooth(model: Model, logs: Sequence[Samples], dt: float, half: int) -> list[
     logs : sequence of Samples
     dt : float
         Sampling time, s.
-    half : int
-        Samples that a polynomial covers to either side of its knot.
+    halves : (n_signals,) int array
+        Rows that a polynomial of each signal covers to either side of its knot; those of a chain are equal.
 
     Returns
     -------
     list of Motion
         The spread of each signal is that over all logs; its unit for one that is at rest.
     """
-    signals = [_smoothed(model, log, dt, half) for log in logs]
+    signals = [_smoothed(model, log, dt, halves) for log in logs]
     middle = _joined(
         model, [np.where(log.known.any(axis=0), log.centre, x) for log, x in zip(logs, signals, strict=True)]
     )
@@ -272,19 +276,23 @@ def smooth(model: Model, logs: Sequence[Samples], dt: float, half: int) -> list[
     return [Motion(x, spread) for x in signals]
 
 
-def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
+def _smoothed(model: Model, log: Samples, dt: float, halves: IntArray) -> FloatArray:
     """Smoothed signals ``(N, n_signals)`` of all rows of one log; those that it lacks follow from those that it has.
 
     Sensors are smoothed one by one; they are NaN in rows without a sample nearby.
     """
-    smoother = _Smoother.of(len(log.measured), dt, half)
     measured, known, centre = log.measured.copy(), log.known.copy(), log.centre.copy()
     signals = np.zeros(measured.shape)
     chains = _chains(model)
+
+    def smoothed(columns: IntArray, half: int, derivatives: int = 0) -> FloatArray:
+        some = measured[:, columns], known[:, columns], centre[:, columns]
+        return _with_wider_windows(*some, log.gaps, dt, half, derivatives)
+
     if model.kinematics is not None:
         rates = np.zeros((len(measured), model.n_q))
-        for columns in _alike(chains[: model.n_q], smoother.rows.size):
-            parts = smoother.smoothed(measured[:, columns], known[:, columns], centre[:, columns], derivatives=1)
+        for columns, half in _alike(chains[: model.n_q], halves, 4 * len(measured)):
+            parts = smoothed(columns, half, derivatives=1)
             signals[:, columns], rates[:, columns[:, 0]] = parts[:, :, :1], parts[:, :, 1]
         _project(model, signals, rates, known)
         n_x = model.n_q + len(model.velocities_of_motion)
@@ -293,18 +301,33 @@ def _smoothed(model: Model, log: Samples, dt: float, half: int) -> FloatArray:
             inferred = _velocities_of_rates(model, signals, rates, measured, known, lacking)
             measured[:, lacking], known[:, lacking], centre[:, lacking] = inferred, ~log.gaps[:, None], inferred
         chains = chains[model.n_q :]
-    for columns in _alike(chains, smoother.rows.size):
-        signals[:, columns] = smoother.smoothed(measured[:, columns], known[:, columns], centre[:, columns])
+    for columns, half in _alike(chains, halves, 4 * len(measured)):  # a row is in four windows
+        signals[:, columns] = smoothed(columns, half)
     for chain in chains:
         _integrate(signals, known, chain, dt)
     for k in range(_n_motion(model), len(model.signals)):
-        near = _near(known[:, k], half)
+        near = _near(known[:, k], halves[k])
         signals[:, [k]] = np.nan
         if near.any():
-            smoothed = smoother.smoothed(measured[:, [[k]]], known[:, [[k]]], centre[:, [[k]]])
-            signals[near, k] = smoothed[near, 0, 0]
+            signals[near, k] = smoothed(np.array([[k]]), halves[k])[near, 0, 0]
     rows, seen = np.arange(len(signals)), np.flatnonzero(~log.gaps)
     return signals if log.gaps.all() else np.column_stack([np.interp(rows, seen, x[seen]) for x in signals.T])
+
+
+def _with_wider_windows(
+    values: FloatArray, known: BoolArray, centre: FloatArray, gaps: BoolArray, dt: float, half: int, derivatives: int
+) -> FloatArray:
+    """Smoothed chains, as `_Smoother.smoothed`; rows with too few samples about them are those of wider windows."""
+    smoother = _Smoother.of(len(values), dt, half)
+    found, informed = smoother.smoothed(values, known, centre, derivatives)
+    lacking = ~(informed | gaps[:, None])
+    some = np.flatnonzero(lacking.any(axis=0) & known.any(axis=(0, 2)))
+    if len(some) and _WIDER * half < len(values):
+        wider = _with_wider_windows(
+            values[:, some], known[:, some], centre[:, some], gaps, dt, _WIDER * half, derivatives
+        )
+        found[:, some] = np.where(lacking[:, some, None], wider, found[:, some])
+    return found
 
 
 def _near(known: BoolArray, reach: int) -> BoolArray:
@@ -388,28 +411,35 @@ class _Smoother:
         blend = np.maximum(0.0, 1.0 - np.abs(offsets) / (step + 1.0))
         return cls(rows, inside, _basis(offsets / half, half * dt), blend)
 
-    def smoothed(self, values: FloatArray, known: BoolArray, centre: FloatArray, derivatives: int = 0) -> FloatArray:
-        """Signals ``(N, C, c + derivatives)`` of C chains of c signals, and further derivatives of their last."""
-        (N, _, c), n = values.shape, values.shape[2] + derivatives
+    def smoothed(
+        self, values: FloatArray, known: BoolArray, centre: FloatArray, derivatives: int
+    ) -> tuple[FloatArray, BoolArray]:
+        """Signals ``(N, C, c + derivatives)`` of C chains of c signals, and further derivatives of their last.
+
+        A mask ``(N, C)`` is that of the rows in a window with more samples than its polynomial has coefficients.
+        """
+        (N, C, c), n = values.shape, values.shape[2] + derivatives
         inside, at = self.inside, self.rows[self.inside]
         oks = _windows(known, self.rows) & inside[:, :, None]
         first, measured = _windows(values - centre, self.rows), _windows(values, self.rows)
         coefficients = _coefficients(measured, oks, first, self.basis[:c], _spread(centre))
-        blended = np.empty((*values.shape[:2], n))
+        blended, informed = np.empty((N, C, n)), np.empty((N, C), bool)
         for i, (own, ok) in enumerate(zip(coefficients, oks, strict=True)):
             fitted = np.einsum("ka,jta->ktj", own, self.basis[:n])
-            informed = ok.any(axis=2).sum(axis=1) > _DEGREE + 1
-            weight = (self.blend * np.where(informed, 1.0, _UNINFORMED)[:, None])[inside]
+            enough = ok.any(axis=2).sum(axis=1) > _DEGREE + 1
+            weight = (self.blend * np.where(enough, 1.0, _UNINFORMED)[:, None])[inside]
             total = np.bincount(at, weight, N)
+            informed[:, i] = total > _UNINFORMED * len(self.blend)
             for j in range(n):
                 blended[:, i, j] = np.bincount(at, fitted[inside, j] * weight, N) / total
-        return blended
+        return blended, informed
 
 
-def choose_half_width(model: Model, logs: Sequence[Samples], dt: float, narrowest: float) -> int:
-    """Half width whose polynomials best predict samples that they were not fitted to (cross-validation).
+def choose_half_widths(model: Model, logs: Sequence[Samples], dt: float, narrowest: float) -> tuple[IntArray, int]:
+    """Half widths of the polynomials that best predict samples that they were not fitted to (cross-validation).
 
-    Every other sample is left out and predicted; the error is a low quantile, so that outliers have no influence.
+    The smallest of each signal are so many of its own samples.  One factor times these is that of all signals: every
+    other sample is left out and predicted; the error is a low quantile, so that outliers have no influence.
 
     Parameters
     ----------
@@ -418,35 +448,46 @@ def choose_half_width(model: Model, logs: Sequence[Samples], dt: float, narrowes
     dt : float
         Sampling time, s.
     narrowest : float
-        Smallest candidate, s, at most 25 samples; each other candidate is three times as wide as the one before.
+        Usual half width, s, at most 25 samples.  Candidates are a third of it, itself, three, nine, ... times it.
 
     Returns
     -------
-    int
-        Number of samples.
+    halves : (n_signals,) int array
+        Rows; those of a chain are equal.
+    length : int
+        Rows in which signals move as little as in the half width of the fastest one; of the usual one at least.
     """
-    longest = max(len(log.measured) for log in logs)
-    n_motion = len(model.signals) - len(model.sensors)
-    apart = max(rows_per_sample(np.asarray(log.known[:, :n_motion].any(axis=1))) for log in logs)
-    first = max(_FEWEST * apart, min(round(narrowest / dt), _ENOUGH_SAMPLES * apart))
-    widths = [first * 3**k for k in range(20) if k == 0 or 8 * first * 3**k < longest]
-    losses = [_prediction_error(model, logs, dt, half, max(1, half // first) if apart == 1 else 1) for half in widths]
-    return int(widths[int(np.argmin(losses))])
+    chains, n_motion = _chains(model), _n_motion(model)
+    longest, apart = max(len(log.measured) for log in logs), np.ones(len(model.signals), int)
+    for columns in (*chains, *([k] for k in range(n_motion, len(model.signals)))):
+        apart[columns] = max(rows_per_sample(np.asarray(log.known[:, columns].any(axis=1))) for log in logs)
+    together = max(rows_per_sample(np.asarray(log.known[:, :n_motion].any(axis=1))) for log in logs)
+    usual, length = (
+        np.maximum(_FEWEST * x, np.minimum(round(narrowest / dt), _ENOUGH_SAMPLES * x)) for x in (apart, together)
+    )
+    factors = [k for k in range(20) if k == 0 or 8 * length * _WIDER**k < longest]
+    candidates = [np.maximum(usual // _WIDER, _FEWEST * apart), *(usual * _WIDER**k for k in factors)]
+    best = int(np.argmin([_prediction_error(model, logs, dt, halves, usual, apart) for halves in candidates]))
+    return candidates[best], int(length) * _WIDER ** max(best - 1, 0)
 
 
-def _prediction_error(model: Model, logs: Sequence[Samples], dt: float, half: int, stride: int) -> float:
+def _prediction_error(
+    model: Model, logs: Sequence[Samples], dt: float, halves: IntArray, usual: IntArray, apart: IntArray
+) -> float:
     """Sum over signals of the log of the left-out samples' robust scale, at knots spread over the logs."""
-    offsets = np.arange(-half, half + 1, stride)
-    rows = _trial_rows([len(log.measured) for log in logs], half, offsets)
     measured, known, centre = (
         np.concatenate([getattr(log, name) for log in logs]) if len(logs) > 1 else getattr(logs[0], name)
         for name in ("measured", "known", "centre")
     )
-    about = _joined(model, [log.centre for log in logs])
-    near = np.abs(offsets) <= half // 2
-    basis = _basis(offsets / half, half * dt)
+    about, sizes = _joined(model, [log.centre for log in logs]), [len(log.measured) for log in logs]
     loss = 0.0
-    for columns in _alike(_chains(model), rows.size):
+    for columns, half in _alike(_chains(model), halves, _TRIALS * (2 * int(usual.max()) + 1)):
+        k = columns[0, 0]
+        stride = max(1, half // usual[k]) if apart[k] == 1 else 1
+        offsets = np.arange(-half, half + 1, stride)
+        rows = _trial_rows(sizes, _TRIALS * max(1, usual[k] // half), half, offsets)
+        near = np.abs(offsets) <= half // 2
+        basis = _basis(offsets / half, half * dt)
         values, oks = _windows(measured[:, columns], rows), _windows(known[:, columns], rows)
         first = values - _windows(centre[:, columns], rows)
         spread, even, orders = _spread(about[:, columns]), _every_other(oks), basis[: columns.shape[1]]
@@ -478,11 +519,11 @@ def _joined(model: Model, logs: Sequence[FloatArray]) -> FloatArray:
     return np.concatenate([x - np.where(centred, np.median(x, axis=0), 0.0) for x in logs])
 
 
-def _trial_rows(sizes: Sequence[int], half: int, offsets: IntArray) -> IntArray:
-    """Rows (K, n_offsets) about knots that are spread over logs of so many rows, in proportion to their length."""
+def _trial_rows(sizes: Sequence[int], trials: int, half: int, offsets: IntArray) -> IntArray:
+    """Rows (K, n_offsets) about so many knots, spread over logs of so many rows in proportion to their length."""
     rows, begin = [], 0
     for N in sizes:
-        n_trials = max(1, round(_TRIALS * N / sum(sizes)))
+        n_trials = max(1, round(trials * N / sum(sizes)))
         knots = np.linspace(min(half, N // 2), max(N - 1 - half, N // 2), n_trials).astype(int)
         rows.append(begin + np.clip(knots[:, None] + offsets, 0, N - 1))
         begin += N
