@@ -39,13 +39,13 @@ class Record:
     regime, seed, method : which
     errors : by parameter, %, signed; empty without an estimate
     inside : by parameter, whether its 95 % interval holds the truth; empty without intervals
-    inside_structural : by parameter, whether that of a model that may lack a term does
-    widening : by parameter, width of the latter over that of the former
     verdict : of three; empty of baselines
     findings : sentences that a user is told
     refusal : why there is no estimate
     crashed : whether it ended in an error that is not the package's own
     seconds : of the processor
+    inside_structural : by parameter, whether the interval of a model that may lack a term holds the truth
+    widening : by parameter, width of that interval over the 95 % interval
     """
 
     regime: str
@@ -53,13 +53,13 @@ class Record:
     method: str
     errors: Mapping[str, float] = field(default_factory=dict)
     inside: Mapping[str, bool] = field(default_factory=dict)
-    inside_structural: Mapping[str, bool] = field(default_factory=dict)
-    widening: Mapping[str, float] = field(default_factory=dict)
     verdict: str = ""
     findings: tuple[str, ...] = ()
     refusal: str = ""
     crashed: bool = False
     seconds: float = 0.0
+    inside_structural: Mapping[str, bool] = field(default_factory=dict)
+    widening: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def worst(self) -> float:

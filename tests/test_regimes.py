@@ -133,7 +133,16 @@ def test_confidently_wrong_is_off_without_a_warning_or_a_cause(verdict, findings
 
 def test_the_table_has_a_row_per_regime_and_says_who_crashed(capsys, monkeypatch):
     records = [
-        Record("rotor noise 1x", 0, "lo", {"mass": 1.0, "drag": -7.0}, {"mass": True, "drag": False}, "usable"),
+        Record(
+            "rotor noise 1x",
+            0,
+            "lo",
+            {"mass": 1.0, "drag": -7.0},
+            {"mass": True, "drag": False},
+            "usable",
+            inside_structural={"mass": True, "drag": True},
+            widening={"mass": 1.5, "drag": 2.5},
+        ),
         Record("rotor noise 1x", 1, "lo", refusal="LinAlgError: no", crashed=True),
         Record("rotor noise 1x", 0, "ols", {"mass": 1.0, "drag": -2.0}),
     ]
@@ -141,7 +150,19 @@ def test_the_table_has_a_row_per_regime_and_says_who_crashed(capsys, monkeypatch
     regimes.main(["--regimes", "rotor noise 1x", "--methods", "lo,ols"])
     lines = capsys.readouterr().out.splitlines()
     row = [cell.strip() for cell in lines[2].strip("|").split("|")]
-    assert row == ["rotor noise 1x", "yes", "7 / 7", "0.50", "1/0/0", "1", "1", "0", "0, 1 crashed", "0.0", "2 / 2"]
+    assert row == [
+        "rotor noise 1x",
+        "yes",
+        "7 / 7",
+        "0.50",
+        "1.00",
+        "2.00",
+        "1/0/0",
+        *"1010",
+        "0, 1 crashed",
+        "0.0",
+        "2 / 2",
+    ]
     assert "2 runs: 1 off, 1 confidently wrong (50.0 %)" in lines[-1]
 
 

@@ -192,10 +192,10 @@ def test_binary_file_is_refused_by_name(tmp_path, content):
 @pytest.mark.parametrize(
     ("number", "says"),
     [
-        (1, "format 1, of an earlier version of diransac; this one reads 7. Identify again$"),
-        (6, "format 6, of an earlier"),
+        (1, "format 1, of an earlier version of diransac; this one reads 8. Identify again$"),
+        (7, "format 7, of an earlier"),
         (99, "format 99, of a later"),
-        ("7", "no result of diransac"),
+        ("8", "no result of diransac"),
         (None, "no result of diransac"),
     ],
 )
@@ -214,7 +214,8 @@ def test_missing_file_is_refused_by_name(tmp_path):
 
 def test_every_key_is_needed(result, tmp_path):
     data = json.loads(json.dumps(result.to_dict()))
-    derived = {"units", "standard_errors", "intervals_95", "violations", "verdict", "findings"}
+    derived = {"units", "standard_errors", "intervals_95", "structural_intervals_95", "structure", "violations"}
+    derived |= {"verdict", "findings"}
     added = {"checks"}
     for key in data.keys() - derived - added:
         path = tmp_path / "model.json"
@@ -253,6 +254,8 @@ def test_every_key_is_needed(result, tmp_path):
         (["method"], None),
         (["notes"], 5),
         (["checks"], 5),
+        (["possible_terms"], 5),
+        (["possible_terms"], [{"kind": "drag"}]),
         (["checks"], [{"level": "fatal", "text": "it burns"}]),
         (["logs", 0, "prediction"], 3),
     ],

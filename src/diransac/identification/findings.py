@@ -29,7 +29,7 @@ _UNCERTAIN = 0.5
 _WIDENED, _AMBIGUOUS = 2.0, 0.1
 """Widening of an interval by terms that a model may lack, and half of its width over the parameter, that need care."""
 _LISTED = 3
-"""Stretches that a sentence names."""
+"""Stretches that a sentence names; parameters that a term may change of which there is a finding."""
 _CONTRADICTION = 3.0
 """Distance of an estimate from the mean of its prior, in standard deviations of that, which needs care."""
 _IMPOSSIBLE = 4.0
@@ -359,7 +359,7 @@ def _uncertainty(result: Result) -> Iterator[Finding]:
 
 
 def _structure(result: Result) -> Iterator[Finding]:
-    """The parameter that is most uncertain because the model may lack a term."""
+    """The parameters that are most uncertain because the model may lack a term."""
     if not result.has_structure:
         return
     intervals, widths = result.structural_intervals(), dict[str, float]()
@@ -367,18 +367,14 @@ def _structure(result: Result) -> Iterator[Finding]:
         half, value = 0.5 * (intervals[name][1] - intervals[name][0]), abs(result.parameters[name])
         if found.widening > _WIDENED and half > _AMBIGUOUS * value and name not in result.unidentifiable:
             widths[name] = half / value if value > 0.0 else np.inf
-    if not widths:
-        return
-    name = max(widths, key=lambda n: widths[n])
-    found, others = result.structure[name], [n for n in widths if n != name]
-    low, high = (number(x, 3) for x in intervals[name])
-    also = f"; {', '.join(others)} likewise" if others else ""
-    yield Finding(
-        "care",
-        f"If the model lacks a term, {name} may be anywhere from {low} to {high}, an interval that is "
-        f"{number(found.widening, 2)} times as wide{also}: {_these(result.logs)} cannot exclude {found.term}. Record "
-        f"{found.motion}.",
-    )
+    for name in sorted(widths, key=lambda n: -widths[n])[:_LISTED]:
+        found, (low, high) = result.structure[name], (number(x, 3) for x in intervals[name])
+        yield Finding(
+            "care",
+            f"If the model lacks a term, {name} may be anywhere from {low} to {high}, an interval that is "
+            f"{number(found.widening, 2)} times as wide: {_these(result.logs)} cannot exclude {found.term}. Record "
+            f"{found.motion}.",
+        )
 
 
 def _bandwidth(result: Result) -> Iterator[Finding]:

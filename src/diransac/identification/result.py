@@ -29,7 +29,7 @@ from diransac.identification.estimate import (
 from diransac.identification.findings import Verdict, findings_of, verdict_of
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
-from diransac.identification.structure import StructuralUncertainty, largest, mixture_intervals
+from diransac.identification.structure import StructuralUncertainty, check_terms, largest, mixture_intervals
 from diransac.identification.suggestions import Suggestion
 from diransac.identification.uncertainty import student_quantile, students_draws
 from diransac.model import Model
@@ -662,6 +662,7 @@ class Result:
             raise ValueError(f"a mask of other than {n_rows} rows")
         if estimate.diagnosis is not None:
             estimate.diagnosis.check_windows()
+        check_terms(estimate.possible_terms or ())
         if not _is_covariance(estimate.covariance):
             raise ValueError("covariance: it is that of no distribution")
         _check_resolution(estimate.resolution, model.n_u)

@@ -23,9 +23,9 @@ from diransac.arrays import FloatArray
 from diransac.identification.serialization import Number, Values
 from diransac.identification.suggestions import INPUT_CHANGES, INPUT_GAIN
 
-__all__ = ["PossibleTerm", "StructuralUncertainty", "largest", "mixture_intervals"]
+__all__ = ["PossibleTerm", "StructuralUncertainty", "check_terms", "largest", "mixture_intervals"]
 
-_BISECTIONS = 60
+_BISECTIONS, _ROUNDING, _LARGEST = 60, 1e-9, 1e100
 _FAR = 9.0
 """Standard deviations beyond which a normal distribution has nothing, to rounding errors."""
 _MOTIONS = {
@@ -115,6 +115,21 @@ class StructuralUncertainty:
     weight: float
     widening: float
     motion: str
+
+
+def check_terms(terms: Sequence[PossibleTerm]) -> None:
+    """Raise ValueError: weights are no probabilities, or a coefficient or an effect is none.
+
+    Parameters
+    ----------
+    terms : sequence of PossibleTerm
+        As read from a file.
+    """
+    figures = [x for one in terms for x in (one.mean, one.variance, *one.effects.values())]
+    if not all(abs(x) < _LARGEST for x in figures) or any(x.variance < 0.0 for x in terms):
+        raise ValueError("possible_terms: a coefficient that no term has")
+    if not all(0.0 <= x.weight <= 1.0 for x in terms) or sum(x.weight for x in terms) > 1.0 + _ROUNDING:
+        raise ValueError("possible_terms: weights that are no probabilities")
 
 
 def mixture_intervals(

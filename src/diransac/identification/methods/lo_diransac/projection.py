@@ -406,6 +406,9 @@ def _combined_with_priors(intervals: ShootingIntervals, fit: Fit, found: Project
     mean = layout.prior_mean[layout.with_prior]
     p, covariance = combined(found.parameters, found.covariance, layout.with_prior, mean, variance)
     left = _over_windows(unexplained(intervals, fit, p), found.windows)
+    unit, none = np.eye(len(p)), np.zeros(len(mean))
+    shrunk = np.stack([combined(x, found.covariance, layout.with_prior, none, variance)[0] for x in unit])
+    found = replace(found, of_z=found.of_z @ shrunk, of_s=found.of_s @ shrunk)
     return replace(found, parameters=p, covariance=covariance, unexplained=left)
 
 

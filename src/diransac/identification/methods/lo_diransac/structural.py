@@ -25,7 +25,7 @@ Draper 1995 (model uncertainty); Kass, Raftery 1995 (Bayes factors); Wakefield 2
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -64,7 +64,7 @@ _DRAWS, _PER_PARAMETER, _SEED = 200, 4, 0
 _HELD, _NO_FORCE = 1e-3, 1e-9
 # Numbers of the slopes that are held at a time.
 _NUMBERS_AT_A_TIME = 10_000_000
-_LARGEST, _TINY = 600.0, 1e-300
+_HUGE, _TINY = 1e9, 1e-300
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def possible_terms(
     own = np.diag(covariance)
     own = np.where(np.isfinite(own), own, np.inf)
     added = weights * np.square(tests.effects) * (variances + np.square(means))
-    kept = np.flatnonzero((added > _KEPT * own[:, None]).any(axis=0))
+    kept = np.flatnonzero((added > _KEPT * own[:, None]).any(axis=0) & np.isfinite(added).all(axis=0))
     names = intervals.layout.names
     return tuple(
         PossibleTerm(
@@ -189,24 +189,28 @@ def candidates_tested(
     candidates, terms = candidates_of(intervals, motion, library)
     relative = _relative_forces(terms[intervals.occupied], _largest_forces(intervals, fit, motion, r, W, M))
     chosen = np.flatnonzero((relative > _NO_FORCE) & ~_replaceable(intervals, motion, candidates))
-    M = means_of_intervals(intervals, M)
-    accelerations = np.zeros((*terms.shape[:2], len(chosen)))
-    some = intervals.occupied
-    accelerations[some] = -np.linalg.solve(M[some], terms[some][:, :, chosen])
     at_a_time = max(1, _NUMBERS_AT_A_TIME // (fit.x.size + fit.d.size))
-    parts = [accelerations[:, :, k : k + at_a_time] for k in range(0, max(len(chosen), 1), at_a_time)]
-    found = [np.concatenate(x, axis=-1) for x in zip(*_tested(intervals, fit, result, parts), strict=True)]
+    parts = [chosen[k : k + at_a_time] for k in range(0, len(chosen), at_a_time)]
+    M = means_of_intervals(intervals, M)
+    found = _tested(intervals, fit, result, (_accelerations(intervals, M, terms[:, :, k]) for k in parts))
     return CandidateTests(tuple(candidates.terms[k] for k in chosen), 1.0 / relative[chosen], *found)
 
 
+def _accelerations(intervals: ShootingIntervals, M: FloatArray, terms: FloatArray) -> FloatArray:
+    """Accelerations (W, n_v, K) by unit coefficients of terms; 0 where an interval has no row that counts."""
+    found, some = np.zeros_like(terms), intervals.occupied
+    found[some] = -np.linalg.solve(M[some], terms[some])
+    return found
+
+
 def _tested(
-    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, parts: Sequence[FloatArray]
-) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Estimates, variances and effects of terms with accelerations (W, n_v, K), part by part."""
+    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, parts: Iterable[FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Estimates (K,), variances (K,) and effects (n, K) of terms with accelerations (W, n_v, K), part by part."""
     prior = fit.prior.copy()
     prior[intervals.n_p : -1] *= _HELD
     at = linearize(intervals, replace(fit, prior=prior), weights_of(intervals, fit))
-    found = list[tuple[FloatArray, FloatArray, FloatArray]]()
+    found = [(np.zeros(0), np.zeros(0), np.zeros((intervals.n_p, 0)))]
     for accelerations in parts:
         slopes = slopes_of_accelerations(intervals, fit, at, accelerations)
         tests = scores_tested(at, slopes)
@@ -219,7 +223,8 @@ def _tested(
         variances = np.where(determined, np.maximum(information, scatter) / np.square(information), np.inf)
         effects = -(np.einsum("wkp,wke->pe", result.of_z, tests.z, optimize=True) + result.of_s.T @ tests.s)
         found.append((estimates, variances, effects))
-    return found
+    estimates, variances, effects = (np.concatenate(x, axis=-1) for x in zip(*found, strict=True))
+    return estimates, variances, effects
 
 
 def _largest_forces(
@@ -271,11 +276,7 @@ def _replaceable(intervals: ShootingIntervals, motion: Sequence[FloatArray], can
         h = candidates.means((q, v, a, u, p), np.ones(n), 1)
         scale = np.sqrt(np.square(W * p[:, None, :]).sum(axis=2, keepdims=True)) + _TINY
         W, h = (x / scale for x in (W, h))
-    known = (
-        np.isfinite(W).all(axis=(1, 2))
-        & np.isfinite(h).all(axis=(1, 2))
-        & (np.abs(h) < 1.0 / _TINY**0.3).all(axis=(1, 2))
-    )
+    known = np.isfinite(W).all(axis=(1, 2)) & (np.abs(h) < _HUGE).all(axis=(1, 2))
     W, h = (x[known].reshape(-1, x.shape[2]) for x in (W, h))
     W = W / (np.linalg.norm(W, axis=0) + _TINY)
     U, sizes, _ = np.linalg.svd(W, full_matrices=False)
