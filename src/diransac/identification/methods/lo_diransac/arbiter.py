@@ -49,7 +49,7 @@ class Comparison:
     errors : (n_candidates, n_horizons) array
         Root mean square error of the predicted samples over that of the prediction that nothing changes.
     scores : (n_candidates, n_blocks) array
-        Mean loss of each block; NaN where it has no segment.
+        Mean loss of each block; NaN where it has no segment with a sample.
     best : int
         Index of the winner.
     as_good : (n_candidates,) bool array
@@ -65,6 +65,11 @@ class Comparison:
     best: int
     as_good: BoolArray
     weights: FloatArray
+
+    @property
+    def means(self) -> FloatArray:
+        """Mean loss of each candidate over the blocks."""
+        return _means(self.scores)
 
 
 def horizons_of(intervals: ShootingIntervals, horizon: float | None) -> list[int]:
@@ -82,9 +87,11 @@ def horizons_of(intervals: ShootingIntervals, horizon: float | None) -> list[int
         for lag in lags:
             apart = np.concatenate([np.abs(y[x][lag:] - y[x][:-lag]) for x in stretches(intervals)])
             changes.append(np.nanmedian(apart) if np.isfinite(apart).any() else np.nan)
-        squares = np.square(changes) - np.square(changes[0])
-        if np.nanmax(squares) > 0.0:
-            times.append(lags[int(np.nanargmax(squares >= 0.25 * np.nanmax(squares)))])
+        seen = np.isfinite(changes)
+        squares = np.square(np.array(changes)[seen])
+        squares = squares - squares[:1]
+        if squares.any():
+            times.append(lags[seen][int(np.argmax(squares >= 0.25 * squares.max()))])
     scale = float(np.median(times)) if times else 10.0
     return sorted({int(max(_FEWEST_ROWS, round(s * scale))) for s in _SCALES})
 
@@ -142,7 +149,7 @@ def compared(
     Returns
     -------
     Comparison or None
-        None where the logs are too short.
+        None where the logs are too short, or no predicted sample is known.
     """
     longest = max((x.stop - x.start for x in stretches(intervals)), default=0) // _PART
     n_before = min(n_before, longest // 2)
@@ -165,15 +172,26 @@ def compared(
             mse = np.where(ok, np.square(e), 0.0).sum(axis=1) / np.maximum(count, 1) / np.square(trivial[k])
             mse = np.where((count > 0) & columns, np.minimum(mse, _LOST), np.nan)
             own.append(np.log1p(mse))
-            squares.append(np.nanmedian(mse, axis=0))
-        losses.append(np.nanmean(np.stack(own, axis=2), axis=(1, 2)))
-        errors.append([float(np.sqrt(np.nanmean(x))) for x in squares])
-    scores = np.array([[_mean(x[block == k]) for k in range(blocks.n)] for x in losses])
-    return Comparison(tuple(n * intervals.dt for n in steps), np.array(errors), scores, *_choice(scores))
+            squares.append(_medians(mse))
+        losses.append(_means(np.concatenate(own, axis=1)))
+        errors.append(np.sqrt(_means(np.array(squares))))
+    scores = np.array([[_means(x[block == k]) for k in range(blocks.n)] for x in losses])
+    if not np.isfinite(scores).any():
+        return None
+    return Comparison(tuple(float(n * intervals.dt) for n in steps), np.array(errors), scores, *_choice(scores))
 
 
-def _mean(values: FloatArray) -> float:
-    return float(np.nanmean(values)) if np.isfinite(values).any() else np.nan
+def _means(values: FloatArray) -> FloatArray:
+    """Means of the finite numbers along the last axis; NaN where there are none."""
+    known = np.isfinite(values)
+    count = known.sum(axis=-1)
+    return np.where(count > 0, np.where(known, values, 0.0).sum(axis=-1) / np.maximum(count, 1), np.nan)
+
+
+def _medians(values: FloatArray) -> FloatArray:
+    """Medians ``(n,)`` of the finite numbers of each column; NaN where there are none."""
+    known = np.isfinite(values)
+    return np.array([np.median(x[k]) if k.any() else np.nan for x, k in zip(values.T, known.T, strict=True)])
 
 
 def _predicted(segments: Segments) -> BoolArray:
@@ -189,15 +207,16 @@ def _of_no_change(segments: Segments, inlying: BoolArray, n_before: int, steps: 
     intervals, rows = segments.intervals, segments.rows
     y = np.where(intervals.sampled & inlying, intervals.measured, np.nan)[:, segments.columns][rows]
     few = max(1, min(3, n_before))
-    with np.errstate(all="ignore"):
-        last = np.nanmedian(y[:, n_before - few : n_before], axis=1)
-        whole = np.nanstd(y.reshape(-1, y.shape[2]), axis=0)
-        found = []
-        for n in steps:
-            size = np.sqrt(np.nanmean(np.square(y[:, n_before : n_before + n] - last[:, None]), axis=(0, 1)))
-            size = np.where(np.isfinite(size) & (size > 0.0), size, whole)
-            found.append(np.where(np.isfinite(size) & (size > 0.0), size, 1.0))
-    return found
+    last = np.stack([_medians(x) for x in y[:, n_before - few : n_before]])[:, None]
+    flat = y.reshape(-1, y.shape[2])
+    whole = _sizes(flat - _medians(flat))
+    found = [_sizes((y[:, n_before : n_before + n] - last).reshape(-1, y.shape[2])) for n in steps]
+    return [np.where(size > 0.0, size, np.where(whole > 0.0, whole, 1.0)) for size in found]
+
+
+def _sizes(values: FloatArray) -> FloatArray:
+    """Root mean squares ``(n,)`` of the finite numbers of each column; NaN where there are none."""
+    return np.asarray(np.sqrt(_means(np.square(values).T)))
 
 
 def _prediction_errors(
@@ -225,7 +244,7 @@ def _choice(scores: FloatArray) -> tuple[int, BoolArray, FloatArray]:
     The winner is the first candidate that the best one does not beat by more than the noise of the comparison, nor by
     more than a fiftieth of its loss.
     """
-    means = np.nanmean(scores, axis=1)
+    means = _means(scores)
     first = int(np.nanargmin(means))
     difference, error = _differences(scores, first)
     n = np.isfinite(scores).sum(axis=1)
@@ -240,5 +259,5 @@ def _choice(scores: FloatArray) -> tuple[int, BoolArray, FloatArray]:
 def _differences(scores: FloatArray, reference: int) -> tuple[FloatArray, FloatArray]:
     """Mean difference ``(n,)`` of the losses from those of one candidate, and its standard error, by blocks."""
     apart = scores - scores[reference]
-    n = np.isfinite(apart).sum(axis=1)
-    return np.nanmean(apart, axis=1), np.nanstd(apart, axis=1) / np.sqrt(np.maximum(n - 1, 1))
+    n, mean = np.isfinite(apart).sum(axis=1), _means(apart)
+    return mean, np.sqrt(_means(np.square(apart - mean[:, None])) / np.maximum(n - 1, 1))

@@ -75,9 +75,9 @@ def is_settled(explanation: Explanation, motion: Motion) -> bool:
     share = np.where(intervals.known.any(axis=0), fit.noise.sigma / np.maximum(motion.spread, _TINY), np.inf)
     best = int(np.argmin(share))
     inlying = fit.noise.inlying(fit.residuals, intervals.known)[:, best] > _INLYING
-    e = np.where(inlying, fit.residuals[:, best], 0.0)
+    e = fit.residuals[:, best] / fit.noise.sigma[best]
     both = inlying[1:] & inlying[:-1]
-    correlation = (e[1:] * e[:-1])[both].sum() / max(np.square(e[1:][both]).sum(), _TINY)
+    correlation = (e[1:] * e[:-1])[both].mean() if both.any() else 0.0
     return bool(share[best] < _WITHIN and correlation < _WHITE)
 
 
@@ -187,7 +187,6 @@ class Contest:
         assert self.comparison is not None
         c = self.comparison
         names = self.dataset.layout.names
-        means = np.nanmean(c.scores, axis=1)
         return Competition(
             self.candidates[winner].name,
             c.horizons,
@@ -199,7 +198,7 @@ class Contest:
                     bool(ok),
                     dict(zip(names, one.parameters.tolist(), strict=True)),
                 )
-                for one, e, m, ok in zip(self.candidates, c.errors, means, c.as_good, strict=True)
+                for one, e, m, ok in zip(self.candidates, c.errors, c.means, c.as_good, strict=True)
             ),
         )
 
