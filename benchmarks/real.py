@@ -111,11 +111,9 @@ def _estimates(found: Found | dr.Result) -> Row:
     timing = resolution.timing
     row["inputs"] = vars(Inputs(resolution.hold, timing.delay, timing.lag))
     row["intervals"] = _finite(found.intervals())
-    if hasattr(found, "structural_intervals"):
-        given = found.structural_intervals
-        row["structural_intervals"] = _finite(given() if callable(given) else given)
-    if hasattr(found, "competition"):
-        row["competition"] = str(found.competition)
+    if found.estimate.possible_terms is not None:
+        row["structural_intervals"] = _finite(found.structural_intervals())
+    row["competition"] = str(found.competition)
     row["findings"] = [str(x) for x in found.findings]
     return row
 

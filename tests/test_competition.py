@@ -9,8 +9,8 @@ import pytest
 
 import diransac as dr
 from diransac.data.dataset import Dataset
-from diransac.identification.methods.lo_diransac.arbiter import compared
-from diransac.identification.methods.lo_diransac.method import prepared
+from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison
+from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments, stretches
 from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
 from diransac.identification.methods.lo_diransac.sources import (
@@ -90,8 +90,8 @@ def test_simulation_error_finds_what_smoothing_cannot_see(bound: tuple) -> None:
     actings = [ActingInputs.recorded(intervals, hold) for hold in ("zero-order", "linear")]
     far = truth() * np.array([2.0, 0.3, 0.6, 1.5])
     found = simulation_error_candidates(intervals, motion, far[None], actings, 0, blocks)
-    last = found[-1][0]
-    assert last.acting.hold == "linear"
+    assert found[0][0].acting.hold == "linear"
+    last = [x for x, _ in found if x.acting.hold == "linear"][-1]
     np.testing.assert_allclose(last.parameters, truth(), rtol=0.02)
 
 
@@ -136,10 +136,18 @@ def candidate(name: str, parameters: np.ndarray, bound: tuple, without: np.ndarr
     return Candidate(name, parameters, own, ActingInputs.recorded(intervals, "linear"), intervals)
 
 
-def comparison(candidates: list[Candidate], bound: tuple, horizon: float | None = None):
+def arbiter(bound: tuple, horizon: float | None = None) -> Arbiter:
     _, intervals, motion, blocks = bound
     every = np.ones(intervals.measured.shape, bool)
-    return compared(candidates, intervals, motion, every, motion.spread, blocks, horizon, 25)
+    acting = ActingInputs.recorded(intervals, "linear")
+    found = Arbiter.of(acting, intervals, motion, every, motion.spread, blocks, horizon)
+    assert found is not None
+    return found
+
+
+def comparison(candidates: list[Candidate], bound: tuple) -> Comparison:
+    judge = arbiter(bound)
+    return Comparison.of([judge.scores(x) for x in candidates], np.zeros(len(candidates), bool))
 
 
 def test_better_predictions_win_whatever_their_order(bound: tuple) -> None:
@@ -165,7 +173,7 @@ def test_a_block_is_predicted_without_its_own_estimate(bound: tuple) -> None:
 
 
 def test_horizon_is_the_one_that_is_asked_for(bound: tuple) -> None:
-    found = comparison([candidate("a", truth(), bound)], bound, 0.05)
+    found = arbiter(bound, 0.05)
     assert len(found.horizons) == 1
     assert found.horizons[0] == pytest.approx(0.05, abs=1.0 / RATE)
 

@@ -318,7 +318,7 @@ def test_a_time_limit_in_the_search_that_begins_with_observers_is_said(monkeypat
     def late(*_):
         raise TimeLimitError("the time limit was reached")
 
-    monkeypatch.setattr("diransac.identification.methods.lo_diransac.method.with_observed_states", late)
+    monkeypatch.setattr("diransac.identification.methods.lo_diransac.search.with_observed_states", late)
     found = dr.identify(flexible_joint(), recorded(stiff_joint_signals(31), ["motor"], 0.005), differentiate=True)
     assert found.stop_reason == TIME_LIMIT
     assert found.verdict != "usable"

@@ -515,8 +515,8 @@ def test_consensus_is_the_sum_of_log_scales_of_a_plain_simulation():
 
 def test_delays_that_are_withdrawn_have_no_effect_on_a_covariance():
     intervals, signals = intervals_of()
-    none = intervals.with_delays(np.zeros(9), np.gradient(signals, axis=0))
-    assert none.all_errors.kinds == ()
+    none = intervals.corrected({}, np.gradient(signals, axis=0))
+    assert none.errors is not None
     assert not effect_on(none, None, np.ones((8, 3, 2)), np.ones((4, 2))).any()
 
 

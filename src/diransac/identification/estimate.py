@@ -42,7 +42,7 @@ __all__ = [
     "Resolution",
 ]
 
-_LARGEST = 1e150
+_LARGEST, _PREDICTS = 1e150, 0.5
 """Bound of figures of windows; their squares are finite."""
 
 TIME_LIMIT = "time limit reached"
@@ -338,7 +338,7 @@ class Competition:
     Parameters
     ----------
     winner : str
-        Name of the estimate that is the result.
+        Name of the estimate that is the result; no two have the same.
     horizons : tuple of float
         Horizons of the predictions, s.
     competitors : tuple of Competitor
@@ -347,6 +347,11 @@ class Competition:
     winner: str
     horizons: tuple[Number, ...]
     competitors: tuple[Competitor, ...]
+
+    @property
+    def predicts(self) -> bool:
+        """True if the winner predicts much better than that nothing changes, at one horizon at least."""
+        return min(next(x for x in self.competitors if x.name == self.winner).errors) < _PREDICTS
 
     def lines(self) -> list[list[str]]:
         """Rows of a table: the best variant of each source, its errors at each horizon, and whether it is as good."""

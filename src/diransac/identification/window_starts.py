@@ -21,8 +21,9 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import LogError
-from diransac.identification.methods.lo_diransac.method import LoDiransac, prepared
+from diransac.identification.methods.lo_diransac.method import LoDiransac
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
+from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 
 if TYPE_CHECKING:

@@ -2,8 +2,8 @@
 
 Every estimate predicts the same segments, open loop.  The samples at the beginning of a segment determine its initial
 state; the samples after them are predicted, with the parameters as they are without the block.  The error of a signal
-at a horizon counts in units of that of the prediction that nothing changes, by the logarithm of one plus its square:
-a segment in which a prediction is lost counts little more than one in which it is no better than that.
+counts in units of its spread, by the logarithm of one plus its square: a segment in which a prediction is lost counts
+little more than one in which it is no better than a constant.
 
 References
 ----------
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,11 +24,12 @@ from diransac.identification.methods.lo_diransac.segments import Segments, first
 from diransac.identification.uncertainty import student_quantile
 
 if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.segments import ActingInputs
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate
 
-__all__ = ["Comparison", "compared", "horizons_of"]
+__all__ = ["Arbiter", "Comparison", "Scores", "horizons_of"]
 
 _SEGMENTS_PER_BLOCK = 20
 _SCALES = (0.125, 0.5, 2.0, 8.0)
@@ -35,41 +37,60 @@ _SCALES = (0.125, 0.5, 2.0, 8.0)
 _FEWEST_ROWS, _PART = 4, 3
 """Rows of the shortest horizon, and stretches over segments at least."""
 _LOST = 1e4
-_AS_WELL = 0.02
+_AS_WELL, _TIMING = 0.02, float(np.log(1.25))
+"""Difference of the logarithms of losses that does not count, and by how much another timing of the inputs must win: a
+controller answers disturbances, so that late inputs predict these."""
+_NEGLIGIBLE, _ROUNDING = 1e-6, 1e-12
+"""Loss in comparison with which all are equal: a thousandth of the motion."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Predictions of one candidate.
+
+    Parameters
+    ----------
+    errors : (n_horizons,) array
+        Root mean square error of the predicted samples over that of the prediction that nothing changes.
+    losses : (n_blocks,) array
+        Mean loss of each block; NaN where it has no segment with a sample.
+    """
+
+    errors: FloatArray
+    losses: FloatArray
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Predictions of each candidate.
+    """Candidates in comparison, block by block, by the logarithm of their losses: no block decides alone.
 
     Parameters
     ----------
-    horizons : tuple of float
-        s.
-    errors : (n_candidates, n_horizons) array
-        Root mean square error of the predicted samples over that of the prediction that nothing changes.
-    scores : (n_candidates, n_blocks) array
-        Mean loss of each block; NaN where it has no segment with a sample.
     best : int
-        Index of the winner.
+        Index of the winner: the first candidate that the best one does not beat by more than the noise of the
+        comparison, nor by more than a fiftieth of its loss.
+    weights : (n_candidates,) array
+        exp(-z^2 / 4) of the difference from the winner, z in standard errors; 1 for those that predict better.  The
+        difference in another log as long has twice the variance of the mean difference in this one.
     as_good : (n_candidates,) bool array
         Candidates that predict as well, within the noise of the comparison.
-    weights : (n_candidates,) array
-        Weight of each in the uncertainty of the result: exp(-z^2 / 2) of its difference from the winner, z in standard
-        errors, and 1 for those that predict better.
     """
 
-    horizons: tuple[float, ...]
-    errors: FloatArray
-    scores: FloatArray
     best: int
-    as_good: BoolArray
     weights: FloatArray
+    as_good: BoolArray
 
-    @property
-    def means(self) -> FloatArray:
-        """Mean loss of each candidate over the blocks."""
-        return _means(self.scores)
+    @classmethod
+    def of(cls, scores: Sequence[Scores], timed: BoolArray) -> Comparison:
+        """Comparison of candidates, ``timed (n,)`` those with another timing of the inputs than was recorded."""
+        logs = np.log(np.array([x.losses for x in scores]) + _NEGLIGIBLE) + _TIMING * timed[:, None]
+        first = int(np.nanargmin(_means(logs)))
+        difference, error = _differences(logs, first)
+        quantile = student_quantile(max(int(np.isfinite(logs).sum(axis=1).max()) - 1, 1), 0.975)
+        best = int(np.flatnonzero(difference <= np.minimum(quantile * error, _AS_WELL) + _ROUNDING)[0])
+        difference, error = _differences(logs, best)
+        z = np.nan_to_num(np.maximum(difference, 0.0) / (error + _ROUNDING), nan=np.inf)
+        return cls(best, np.exp(-0.25 * np.square(z)), np.asarray(z <= quantile))
 
 
 def horizons_of(intervals: ShootingIntervals, horizon: float | None) -> list[int]:
@@ -117,68 +138,115 @@ def _placed(intervals: ShootingIntervals, blocks: Blocks, n_before: int, n_after
     return np.concatenate(starts), np.concatenate(left_out)
 
 
-def compared(
-    candidates: Sequence[Candidate],
-    intervals: ShootingIntervals,
-    motion: Motion,
-    inlying: BoolArray,
-    noise: FloatArray,
-    blocks: Blocks,
-    horizon: float | None,
-    n_before: int,
-) -> Comparison | None:
-    """Comparison of candidates by prediction.
+@dataclass(frozen=True)
+class Arbiter:
+    """Segments of the logs that every candidate predicts.
 
     Parameters
     ----------
-    candidates : sequence of Candidate
-        Of those that are as good, the first is preferred.
-    intervals : ShootingIntervals
+    segments : Segments
+        Of rows before and after the beginning of a prediction; inputs as any candidate's.
+    block : (K,) int array
+        Block that the estimate which predicts a segment has no part of.
+    n_blocks : int
+    n_before : int
+        Rows that determine the initial state of a segment.
+    steps : tuple of int
+        Horizons, rows.
     motion : Motion
         From which states start that nothing measures.
     inlying : (N, n_signals) bool array
         Samples that are no outliers.
     noise : (n_signals,) array
         Standard deviation of each signal, by which samples before a prediction are weighted.
-    blocks : Blocks
-    horizon : float, optional
-        s; None: several, from the time scales of the motion.
-    n_before : int
-        Rows that determine the initial state of a segment.
-
-    Returns
-    -------
-    Comparison or None
-        None where the logs are too short, or no predicted sample is known.
     """
-    longest = max((x.stop - x.start for x in stretches(intervals)), default=0) // _PART
-    n_before = min(n_before, longest // 2)
-    steps = sorted({min(x, longest - n_before) for x in horizons_of(intervals, horizon)})
-    if n_before < 1 or steps[0] < 1:
-        return None
-    starts, block = _placed(intervals, blocks, n_before, steps[-1])
-    one = Segments(intervals, candidates[0].acting, starts, n_before + steps[-1])
-    columns = _predicted(one)
-    known = (intervals.sampled & inlying)[one.rows][:, n_before:][:, :, one.columns]
-    trivial = _of_no_change(one, inlying, n_before, steps)
-    losses, errors = [], []
-    for candidate in candidates:
-        segments = replace(one, acting=candidate.acting, intervals=candidate.intervals)
-        predicted = _prediction_errors(segments, candidate, block, motion, inlying, noise, n_before)
-        own, squares = [], []
-        for k, n in enumerate(steps):
-            e, ok = predicted[:, :n], known[:, :n]
-            count = ok.sum(axis=1)
-            mse = np.where(ok, np.square(e), 0.0).sum(axis=1) / np.maximum(count, 1) / np.square(trivial[k])
-            mse = np.where((count > 0) & columns, np.minimum(mse, _LOST), np.nan)
-            own.append(np.log1p(mse))
-            squares.append(_medians(mse))
-        losses.append(_means(np.concatenate(own, axis=1)))
-        errors.append(np.sqrt(_means(np.array(squares))))
-    scores = np.array([[_means(x[block == k]) for k in range(blocks.n)] for x in losses])
-    if not np.isfinite(scores).any():
-        return None
-    return Comparison(tuple(float(n * intervals.dt) for n in steps), np.array(errors), scores, *_choice(scores))
+
+    segments: Segments
+    block: IntArray
+    n_blocks: int
+    n_before: int
+    steps: tuple[int, ...]
+    motion: Motion
+    inlying: BoolArray
+    noise: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        acting: ActingInputs,
+        intervals: ShootingIntervals,
+        motion: Motion,
+        inlying: BoolArray,
+        noise: FloatArray,
+        blocks: Blocks,
+        horizon: float | None,
+    ) -> Arbiter | None:
+        """Segments over the blocks; None where the logs are too short, or no predicted sample is known.
+
+        ``horizon`` is in s; None: several, from the time scales of the motion.
+        """
+        longest = max((x.stop - x.start for x in stretches(intervals)), default=0) // _PART
+        n_before = min(intervals.length, longest // 2)
+        steps = sorted({min(x, longest - n_before) for x in horizons_of(intervals, horizon)})
+        if n_before < 1 or steps[0] < 1:
+            return None
+        starts, block = _placed(intervals, blocks, n_before, steps[-1])
+        segments = Segments(intervals, acting, starts, n_before + steps[-1])
+        found = cls(segments, block, blocks.n, n_before, tuple(steps), motion, inlying, noise)
+        return found if found._known.any() else None
+
+    @property
+    def horizons(self) -> tuple[float, ...]:
+        """Horizons, s."""
+        return tuple(float(n * self.segments.intervals.dt) for n in self.steps)
+
+    @cached_property
+    def _known(self) -> BoolArray:
+        """Mask ``(K, n_after, n_s)`` of the predicted samples that count."""
+        one = self.segments
+        known = (one.intervals.sampled & self.inlying)[one.rows][:, self.n_before :][:, :, one.columns]
+        return np.asarray(known & _predicted(one))
+
+    @cached_property
+    def _sizes(self) -> tuple[FloatArray, list[FloatArray]]:
+        """Spread ``(n_s,)`` of the signals, and RMS errors of the prediction that nothing changes, by horizon."""
+        one, n_before = self.segments, self.n_before
+        y = np.where(one.intervals.sampled & self.inlying, one.intervals.measured, np.nan)[:, one.columns][one.rows]
+        few = max(1, min(3, n_before))
+        last = np.stack([_medians(x) for x in y[:, n_before - few : n_before]])[:, None]
+        flat = y.reshape(-1, y.shape[2])
+        spread = _root_mean_squares(flat - _medians(flat))
+        spread = np.where(spread > 0.0, spread, 1.0)
+        changes = [(y[:, n_before : n_before + n] - last).reshape(-1, y.shape[2]) for n in self.steps]
+        return spread, [np.where(size > 0.0, size, spread) for size in map(_root_mean_squares, changes)]
+
+    def scores(self, candidate: Candidate) -> Scores:
+        """Predictions of a candidate, each block by its estimate without that block.
+
+        The loss of a signal over a horizon is ``log(1 + mse / spread^2)``.
+        """
+        spread, no_change = self._sizes
+        errors, losses, found = self._errors(candidate), list[FloatArray](), list[FloatArray]()
+        for n, size in zip(self.steps, no_change, strict=True):
+            e, known = errors[:, :n], self._known[:, :n]
+            count = known.sum(axis=1)
+            mse = np.where(known, np.square(e), 0.0).sum(axis=1) / np.maximum(count, 1)
+            mse = np.where(count > 0, mse, np.nan)
+            losses.append(np.log1p(np.minimum(mse / np.square(spread), _LOST)))
+            found.append(_medians(mse / np.square(size)))
+        loss = _means(np.concatenate(losses, axis=1))
+        of_blocks = np.array([_means(loss[self.block == k]) for k in range(self.n_blocks)])
+        return Scores(np.sqrt(_means(np.array(found))), of_blocks)
+
+    def _errors(self, candidate: Candidate) -> FloatArray:
+        """Errors ``(K, n_after, n_s)`` of the predicted rows."""
+        segments = replace(self.segments, acting=candidate.acting, intervals=candidate.intervals)
+        intervals, columns = segments.intervals, segments.columns
+        lanes = candidate.without[self.block][None]
+        weights = (intervals.sampled & self.inlying)[:, columns] / np.square(self.noise[columns])
+        states = first_states(intervals, self.motion.signals, self.inlying, segments.starts)[None]
+        states = segments.cut(self.n_before).estimated_states(lanes, states, weights)
+        return np.asarray(segments.errors(lanes, states)[0][:, self.n_before :])
 
 
 def _means(values: FloatArray) -> FloatArray:
@@ -202,58 +270,9 @@ def _predicted(segments: Segments) -> BoolArray:
     return found if found.any() else np.ones(len(names), bool)
 
 
-def _of_no_change(segments: Segments, inlying: BoolArray, n_before: int, steps: Sequence[int]) -> list[FloatArray]:
-    """Root mean square error of the prediction that nothing changes at each horizon, (n_s,) each."""
-    intervals, rows = segments.intervals, segments.rows
-    y = np.where(intervals.sampled & inlying, intervals.measured, np.nan)[:, segments.columns][rows]
-    few = max(1, min(3, n_before))
-    last = np.stack([_medians(x) for x in y[:, n_before - few : n_before]])[:, None]
-    flat = y.reshape(-1, y.shape[2])
-    whole = _sizes(flat - _medians(flat))
-    found = [_sizes((y[:, n_before : n_before + n] - last).reshape(-1, y.shape[2])) for n in steps]
-    return [np.where(size > 0.0, size, np.where(whole > 0.0, whole, 1.0)) for size in found]
-
-
-def _sizes(values: FloatArray) -> FloatArray:
+def _root_mean_squares(values: FloatArray) -> FloatArray:
     """Root mean squares ``(n,)`` of the finite numbers of each column; NaN where there are none."""
     return np.asarray(np.sqrt(_means(np.square(values).T)))
-
-
-def _prediction_errors(
-    segments: Segments,
-    candidate: Candidate,
-    block: IntArray,
-    motion: Motion,
-    inlying: BoolArray,
-    noise: FloatArray,
-    n_before: int,
-) -> FloatArray:
-    """Errors ``(K, n_after, n_s)`` of the predicted rows."""
-    intervals = segments.intervals
-    lanes = candidate.without[block][None]
-    weights = (intervals.sampled & inlying)[:, segments.columns] / np.square(noise[segments.columns])
-    states = first_states(intervals, motion.signals, inlying, segments.starts)[None]
-    before = segments.cut(n_before)
-    states = before.estimated_states(lanes, states, weights)
-    return np.asarray(segments.errors(lanes, states)[0][:, n_before:])
-
-
-def _choice(scores: FloatArray) -> tuple[int, BoolArray, FloatArray]:
-    """The winner, the mask of the candidates that predict as well, and their weights.
-
-    The winner is the first candidate that the best one does not beat by more than the noise of the comparison, nor by
-    more than a fiftieth of its loss.
-    """
-    means = _means(scores)
-    first = int(np.nanargmin(means))
-    difference, error = _differences(scores, first)
-    n = np.isfinite(scores).sum(axis=1)
-    quantile = student_quantile(max(int(n.max()) - 1, 1), 0.975)
-    near = np.minimum(quantile * error, _AS_WELL * max(means[first], 0.0))
-    best = int(np.flatnonzero(difference <= near + 1e-12)[0])
-    from_best, error_of_best = _differences(scores, best)
-    z = np.maximum(from_best, 0.0) / np.maximum(error_of_best, 1e-300)
-    return best, np.asarray(difference <= quantile * error), np.where(np.isfinite(z), np.exp(-0.5 * np.square(z)), 0.0)
 
 
 def _differences(scores: FloatArray, reference: int) -> tuple[FloatArray, FloatArray]:

@@ -7,16 +7,19 @@ fit begins with its parameters and its simulated motion, and its estimates compe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.input_timing import InputTiming
+from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.estimate import Competition, Competitor
-from diransac.identification.method import report
-from diransac.identification.methods.lo_diransac.arbiter import compared
+from diransac.identification.method import report, within
+from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison, Scores
+from diransac.identification.methods.lo_diransac.local_search import fewest_parts
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
     effect_of_intervals,
@@ -24,34 +27,32 @@ from diransac.identification.methods.lo_diransac.projection import (
     projected_candidates,
     unexplained,
 )
+from diransac.identification.methods.lo_diransac.search import Decided, Searched, likeliest, searched
 from diransac.identification.methods.lo_diransac.segments import ActingInputs
 from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
+from diransac.identification.methods.lo_diransac.smoothing import Motion
 from diransac.identification.methods.lo_diransac.sources import (
     Blocks,
     Candidate,
     jackknife,
     least_squares_candidates,
 )
+from diransac.simulation import HOLDS
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.data.input_timing import InputTiming
     from diransac.identification.method import Callback
-    from diransac.identification.methods.lo_diransac.arbiter import Comparison
     from diransac.identification.methods.lo_diransac.local_search import Explanation
-    from diransac.identification.methods.lo_diransac.method import _Searched
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-    from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["Contest", "is_settled"]
+__all__ = ["Contest", "compete", "is_settled"]
 
 # Noise over the spread of the signal, and its correlation from sample to sample, up to which an exact model is right.
 _WITHIN, _WHITE = 0.2, 0.5
-# Error of the best estimate over that of the prediction that nothing changes, where a search was refused.
-_PREDICTS = 0.5
-_INLYING, _TINY = 0.5, 1e-300
-_LEAST_NOISE = 1e-4
+_INLYING, _TINY, _LEAST_NOISE = 0.5, 1e-300, 1e-4
+# Samples of the intervals of a second search at most, as far as their number has divisors.
+_SHORT = 25
 
 
 def is_settled(explanation: Explanation, motion: Motion) -> bool:
@@ -81,6 +82,80 @@ def is_settled(explanation: Explanation, motion: Motion) -> bool:
     return bool(share[best] < _WITHIN and correlation < _WHITE)
 
 
+def compete(
+    settings: LoDiransacSettings,
+    dataset: Dataset,
+    whole: tuple[ShootingIntervals, Motion, tuple[str, ...]],
+    seed: int,
+    callback: Callback | None,
+) -> Searched:
+    """The likeliest explanation of the logs, with the estimate that predicts best.
+
+    A search that fails, or whose estimates another one beats, is followed by a second one, from that estimate.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    dataset : Dataset
+    whole : (ShootingIntervals, Motion, tuple of str)
+        As from `prepared`.
+    seed : int
+    callback : callable or None
+
+    Returns
+    -------
+    Searched
+
+    Raises
+    ------
+    IdentificationError
+        The first search fails, and no other estimate predicts much better than that nothing changes.
+    TimeLimitError
+        The time limit was reached before a search had converged.
+    """
+    refused: Exception | None = None
+    try:
+        first = likeliest(settings, dataset, seed, callback, whole)
+    except (IdentificationError, np.linalg.LinAlgError) as error:
+        first, refused = None, error
+    if first is not None and (settings.set_points or is_settled(first.likeliest, first.motion)):
+        return first
+    contest = Contest(settings, dataset, whole[0], whole[1] if first is None else first.motion, seed, callback)
+    try:
+        found = _decided(contest, first, whole[2])
+    except TimeLimitError:
+        if first is None:
+            raise
+        return replace(first, likeliest=replace(first.likeliest, complete=False))
+    if first is None and (found is None or found.decided is None or not found.decided.summary.predicts):
+        assert refused is not None
+        raise refused
+    return found or first  # type: ignore[return-value]  # one of them is there
+
+
+def _decided(contest: Contest, first: Searched | None, notes: tuple[str, ...]) -> Searched | None:
+    """The search whose estimate predicts best; None where nothing could be compared."""
+    contest.add_sources(first)
+    winner = contest.decide(first)
+    if winner is None:
+        return None
+    searches = [] if first is None else [first]
+    beaten = isinstance(contest.origins[winner], Motion) and not contest.is_as_good(first)
+    second = contest.second(winner, notes) if beaten and "second fit" in contest.settings.sources else None
+    if second is not None:
+        contest.add_fit(second, f" from {contest.candidates[winner].source}")
+        searches.insert(0, second)
+        winner = contest.decide(second)
+        assert winner is not None
+    if not searches:
+        return None
+    of_fit = next((x for x in searches if x.likeliest is contest.origins[winner]), None)
+    chosen = of_fit or searches[0]
+    result = contest.result(winner, chosen.likeliest)
+    decided = Decided(contest.summary(winner), None if of_fit else contest.candidates[winner].acting)
+    return replace(chosen, result=result, decided=decided, impossible=of_fit.impossible if of_fit else ())
+
+
 @dataclass
 class Contest:
     """Candidates of one dataset, and their comparison.
@@ -108,120 +183,193 @@ class Contest:
         self.blocks = Blocks.of(self.intervals)
         self.candidates: list[Candidate] = []
         self.origins: list[Motion | Explanation] = []
+        self.arbiter: Arbiter | None = None
+        self.scores: list[Scores] = []
         self.comparison: Comparison | None = None
 
-    def add_fit(self, explanation: Explanation, timing: InputTiming) -> None:
+    def add_fit(self, found: Searched, origin: str = "") -> None:
         """Add the estimates of a joint fit, before those that are there."""
-        found = list(_estimates_of_fit(explanation, timing, self.blocks, projection=self.settings.projection))
-        self.candidates = [*found, *self.candidates]
-        self.origins = [*[explanation] * len(found), *self.origins]
+        acting = self._acting(found)
+        some = list(
+            _estimates_of_fit(found.likeliest, acting, self.blocks, origin, projection=self.settings.projection)
+        )
+        self.candidates = [*some, *self.candidates]
+        self.origins = [*[found.likeliest] * len(some), *self.origins]
 
-    def add_sources(self, starts: Sequence[FloatArray], actings: Sequence[ActingInputs]) -> None:
-        """Add least squares of all rows and simulation error, which starts from it and from other parameters."""
-        sources = self.settings.sources
-        if "least squares" in sources:
+    def _acting(self, found: Searched) -> ActingInputs:
+        """Inputs as they act in a fit."""
+        timing = found.timing(forced=self.settings.forces_timing)
+        return ActingInputs.of_fit(found.likeliest.intervals, found.likeliest.refinement.fit, timing)
+
+    def add_sources(self, first: Searched | None) -> None:
+        """Add a fit's estimates, least squares of all rows, and simulation error, which starts from all of these."""
+        sources, dataset = self.settings.sources, self.dataset
+        holds = [dataset.input_hold] if dataset.input_hold else list(HOLDS)
+        actings = [ActingInputs.recorded(self.intervals, hold) for hold in holds]
+        if first is not None:
+            self.add_fit(first)
+            own = self._acting(first)
+            actings = [own] if self.settings.forces_timing else [*actings, own] if own.differs(actings) else actings
+        if "least squares" in sources and not self.settings.forces_timing:
             report(self.callback, "least squares", 0.88)
-            for one in least_squares_candidates(self.dataset, self.intervals, self.blocks):
+            for one in least_squares_candidates(dataset, self.intervals, self.blocks):
                 self.candidates.append(one)
                 self.origins.append(self.motion)
         if "simulation error" in sources:
             report(self.callback, "simulation error", 0.885)
-            known = [x.parameters for x in self.candidates] + list(starts)
-            known = [x for x in known if self.dataset.layout.admits(x[None])[0]]
             found = simulation_error_candidates(
-                self.intervals, self.motion, np.array(known or [np.ones(len(self.dataset.layout))]), actings, self.seed,
-                self.blocks, outliers=self.settings.outliers,
+                self.intervals, self.motion, self._starts(first), actings, self.seed, self.blocks,
+                outliers=self.settings.outliers,
             )  # fmt: skip
             for one, motion in found:
                 self.candidates.append(one)
                 self.origins.append(motion)
 
-    def decide(self, inlying: BoolArray, noise: FloatArray) -> int | None:
-        """Index of the winner; None where the logs are too short to be compared, or nothing takes part."""
+    def _starts(self, first: Searched | None) -> FloatArray:
+        """Parameters ``(m, n)`` from which simulation error starts, within the bounds."""
+        found, given = [x.parameters for x in self.candidates], _given_start(self.settings, self.dataset)
+        found += [] if given is None else [given]
+        if first is not None:
+            found += [first.result.parameters, first.likeliest.refinement.fit.shared[: self.intervals.n_p]]
+        found = [x for x in found if self.dataset.layout.admits(x[None])[0]]
+        return np.array(found or [np.ones(len(self.dataset.layout))])
+
+    def decide(self, search: Searched | None) -> int | None:
+        """Index of the winner; None where the logs are too short to be compared, or nothing takes part.
+
+        Outliers and noise are those of a search.
+        """
         if not self.candidates:
             return None
         report(self.callback, "comparing predictions", 0.89)
-        floor = _LEAST_NOISE * self.motion.spread
-        sizes = np.where(np.isfinite(noise) & (noise > 0.0), noise, self.motion.spread)
-        sizes = np.maximum(np.maximum(sizes, floor), 1e-300)
-        self.comparison = compared(
-            self.candidates, self.intervals, self.motion, inlying, sizes, self.blocks, self.settings.horizon,
-            self.intervals.length,
-        )  # fmt: skip
-        return None if self.comparison is None else self.comparison.best
+        inlying, noise = self._noise_of(search)
+        acting, horizon = self.candidates[0].acting, self.settings.horizon
+        self.arbiter = Arbiter.of(acting, self.intervals, self.motion, inlying, noise, self.blocks, horizon)
+        if self.arbiter is None:
+            return None
+        self.scores = [self.arbiter.scores(x) for x in self.candidates]
+        self.comparison = Comparison.of(self.scores, self._timed)
+        return self.comparison.best
 
     @property
-    def predicts(self) -> bool:
-        """True if the best estimate predicts much better than that nothing changes."""
-        return self.comparison is not None and bool(self.comparison.errors[self.comparison.best].min() < _PREDICTS)
+    def _timed(self) -> BoolArray:
+        """Mask of the candidates whose inputs act at another time than was recorded, unasked."""
+        forced = self.settings.forces_timing
+        return np.array([not forced and x.acting.timing != InputTiming() for x in self.candidates])
 
-    def is_as_good(self, search: _Searched | None) -> bool:
+    def _noise_of(self, search: Searched | None) -> tuple[BoolArray, FloatArray]:
+        """Samples that are no outliers ``(N, n_s)``, and the noise ``(n_s,)`` of each signal."""
+        floor = np.maximum(_LEAST_NOISE * self.motion.spread, _TINY)
+        if search is None or search.explains_nothing:
+            every: BoolArray = np.ones(self.intervals.measured.shape, bool)
+            return every, np.maximum(self.motion.spread, floor)
+        own, fit = search.likeliest.intervals, search.likeliest.refinement.fit
+        inlying = fit.noise.inlying(fit.residuals, own.known) >= _INLYING
+        noise = np.where(np.isfinite(fit.noise.sigma) & (fit.noise.sigma > 0.0), fit.noise.sigma, self.motion.spread)
+        return inlying | ~own.known, np.maximum(noise, floor)
+
+    def is_as_good(self, search: Searched | None) -> bool:
         """True if an estimate of a search's fit predicts as well as the best."""
         if search is None or self.comparison is None:
             return False
         own = np.array([x is search.likeliest for x in self.origins])
         return bool((own & self.comparison.as_good).any())
 
+    def second(self, winner: int, notes: tuple[str, ...]) -> Searched | None:
+        """A search from an estimate and its simulated motion; None where it fails."""
+        intervals, one, motion = self.intervals, self.candidates[winner], self.origins[winner]
+        assert isinstance(motion, Motion)
+        while intervals.length > _SHORT and (parts := fewest_parts(intervals.length)):
+            intervals = intervals.split(parts)
+        try:
+            return searched(
+                self.settings, replace(intervals, hold=one.acting.hold), motion, notes, self.seed, self.dataset,
+                within(self.callback, 0.88, 0.9), hypotheses=one.parameters[None],
+            )  # fmt: skip
+        except (IdentificationError, np.linalg.LinAlgError):
+            return None
+
     def result(self, winner: int, fit_of: Explanation) -> ProjectedEstimate:
-        """The winner's parameters, and a covariance that covers all that predict as well."""
+        """Mean of the winner and of those that predict as well, and a covariance that covers them.
+
+        Those whose inputs act at another time than the winner's count in the covariance alone.  Where their mean
+        predicts worse than the winner, its own parameters stay.
+        """
         assert self.comparison is not None
-        one = self.candidates[winner]
-        if one.estimate is not None:
-            found = one.estimate()
-        else:
-            intervals, fit = fit_of.intervals, fit_of.refinement.fit
-            covariance = jackknife(one.without)
-            stuck = self.dataset.layout.on_bounds(one.parameters)
-            covariance[stuck] = covariance[:, stuck] = 0.0
-            covariance[stuck, stuck] = np.inf
-            left = unexplained(intervals, fit, one.parameters)
-            n, k = len(one.parameters), fit.x.shape[1] + fit.d.shape[1]
-            of_z, of_s = np.zeros((len(intervals), k, n)), np.eye(len(fit.shared), n)
-            found = ProjectedEstimate(one.parameters, covariance, left, np.arange(len(intervals)), of_z, of_s)
-        apart, weights = np.array([x.parameters for x in self.candidates]) - found.parameters, self.comparison.weights
+        assert self.arbiter is not None
+        one, weights = self.candidates[winner], self.comparison.weights
+        alike = weights * np.array([x.acting.timing == one.acting.timing for x in self.candidates])
+        share = alike / alike.sum()
+        parameters = np.array([x.parameters for x in self.candidates])
+        mean = replace(
+            one, parameters=share @ parameters, without=np.tensordot(share, [x.without for x in self.candidates], 1)
+        )
+        better = Comparison.of([self.arbiter.scores(mean), self.scores[winner]], np.zeros(2, bool)).best == 0
+        centre = mean.parameters if better else one.parameters
+        apart = parameters - centre
         spread = (weights * apart.T) @ apart / weights.sum()
-        return replace(found, covariance=found.covariance + spread)
+        found = one.estimate() if one.estimate is not None else self._of_blocks(one, fit_of)
+        return replace(found, parameters=centre, covariance=found.covariance + spread)
+
+    def _of_blocks(self, one: Candidate, fit_of: Explanation) -> ProjectedEstimate:
+        """An estimate that no fit gave, with the covariance of the jackknife over blocks."""
+        intervals, fit = fit_of.intervals, fit_of.refinement.fit
+        covariance, stuck = jackknife(one.without), self.dataset.layout.on_bounds(one.parameters)
+        covariance[stuck] = covariance[:, stuck] = 0.0
+        covariance[stuck, stuck] = np.inf
+        left = unexplained(intervals, fit, one.parameters)
+        n, k = len(one.parameters), fit.x.shape[1] + fit.d.shape[1]
+        of_z, of_s = np.zeros((len(intervals), k, n)), np.eye(len(fit.shared), n)
+        return ProjectedEstimate(one.parameters, covariance, left, np.arange(len(intervals)), of_z, of_s)
 
     def summary(self, winner: int) -> Competition:
         """The comparison, for the result."""
         assert self.comparison is not None
-        c = self.comparison
-        names = self.dataset.layout.names
-        return Competition(
-            self.candidates[winner].name,
-            c.horizons,
-            tuple(
-                Competitor(
-                    one.name,
-                    tuple(e.tolist()),
-                    float(m),
-                    bool(ok),
-                    dict(zip(names, one.parameters.tolist(), strict=True)),
-                )
-                for one, e, m, ok in zip(self.candidates, c.errors, c.means, c.as_good, strict=True)
-            ),
-        )
+        assert self.arbiter is not None
+        names, rows = self.dataset.layout.names, zip(self.candidates, self.scores, self.comparison.as_good, strict=True)
+        competitors = tuple(
+            Competitor(
+                one.name, tuple(x.errors.tolist()), float(np.nanmean(x.losses)), bool(as_good),
+                dict(zip(names, one.parameters.tolist(), strict=True)),
+            )
+            for one, x, as_good in rows
+        )  # fmt: skip
+        return Competition(self.candidates[winner].name, self.arbiter.horizons, competitors)
+
+
+def _given_start(settings: LoDiransacSettings, dataset: Dataset) -> FloatArray | None:
+    """The user's start, means of priors and nominal values, in this order; one where there is none of these.
+
+    None where there is none of any parameter.
+    """
+    layout, start = dataset.layout, settings.start or {}
+    found = []
+    for name, bound, mean, std in zip(layout.names, layout.bounds, layout.prior_mean, layout.prior_std, strict=True):
+        plain = name.partition("[")[0]
+        nominal = mean if np.isfinite(std) else bound.value
+        found.append(start.get(plain, nominal))
+    known = [x for x in found if x is not None]
+    return np.array([1.0 if x is None else x for x in found], float) if known else None
 
 
 def _estimates_of_fit(
-    explanation: Explanation, timing: InputTiming, blocks: Blocks, *, projection: bool
+    explanation: Explanation, acting: ActingInputs, blocks: Blocks, origin: str, *, projection: bool
 ) -> Iterator[Candidate]:
     """Parameters read from a fit: by least squares on its motion over windows of each length, and its own."""
     intervals, fit = explanation.intervals, explanation.refinement.fit
-    acting = ActingInputs.of_fit(intervals, fit, timing)
     block = blocks.of_row[intervals.starts]
     if projection and not explanation.exact:
         for seconds, estimate, parameters, parts in projected_candidates(intervals, fit):
             if intervals.layout.violations(parameters) or not np.isfinite(parameters).all():
                 continue
-            name = f"least squares on the fitted motion, {seconds:.2g} s"
+            name = f"least squares on the fitted motion{origin}, {seconds:.2g} s"
             yield Candidate(
                 name, parameters, _left_out(parameters, parts, block, blocks, intervals), acting, intervals, estimate
             )
     own = fitted_parameters(intervals, fit)
     steps = effect_of_intervals(intervals, fit).steps
     without = _left_out(own.parameters, -steps, block, blocks, intervals)
-    yield Candidate("joint fit", own.parameters, without, acting, intervals, lambda: own)
+    yield Candidate(f"joint fit{origin}", own.parameters, without, acting, intervals, lambda: own)
 
 
 def _left_out(

@@ -16,90 +16,42 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.data.input_timing import InputTiming
-from diransac.data.segment import long_runs, silent_rows
-from diransac.errors import IdentificationError, LogError, ModelError, SettingsError, TimeLimitError
-from diransac.identification.estimate import (
-    TIME_LIMIT,
-    Competition,
-    Diagnosis,
-    Estimate,
-    Finding,
-    HausmanTest,
-    Resolution,
-)
+from diransac.errors import ModelError, SettingsError
+from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, HausmanTest, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
-from diransac.identification.method import report, within
+from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import compared_parts, findings_of_fit
-from diransac.identification.methods.lo_diransac.competition import Contest, is_settled
-from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
+from diransac.identification.methods.lo_diransac.competition import compete
 from diransac.identification.methods.lo_diransac.instruments import (
     Instrumented,
     check_set_points,
     instrumented_estimate,
 )
-from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch, fewest_parts
-from diransac.identification.methods.lo_diransac.projection import (
-    ProjectedEstimate,
-    discrepancy_units,
-    estimate_parameters,
-    fitted_parameters,
-    parameter_units,
-    residuals_of_motion,
-)
-from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs, lags_of_inputs
-from diransac.identification.methods.lo_diransac.refinement import make_prior
-from diransac.identification.methods.lo_diransac.segments import ActingInputs
+from diransac.identification.methods.lo_diransac.preparation import prepared
+from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate, parameter_units
+from diransac.identification.methods.lo_diransac.search import Searched, rows_of_logs
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-from diransac.identification.methods.lo_diransac.smoothing import (
-    Motion,
-    Samples,
-    choose_half_widths,
-    odd_window,
-    running_median,
-    screened_inputs,
-    smooth,
-    stuck_rows,
-)
 from diransac.identification.methods.lo_diransac.structural import possible_terms
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
     unmeasured_states,
-    with_observed_states,
-    with_unmeasured_states,
 )
-from diransac.identification.refusal import MotionRows, cause_of_refusal, check_signs
+from diransac.identification.refusal import check_signs
 from diransac.process import memory_kept, single_threaded
-from diransac.simulation import default_threads
-from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.data.segment import Segment
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.checks import Change
-    from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.missing_terms import MissingTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.refinement import Refinement
     from diransac.identification.settings import Settings
 
-__all__ = ["LoDiransac", "configured", "prepared"]
+__all__ = ["LoDiransac", "configured"]
 
-_FEWEST_INTERVALS = 4
-_OUTLIER, _TINY = 0.5, 1e-9
-# Fraction of a signal's spread from which on its noise leaves nothing to explain.
-_ALL_OF_IT = 0.8
-# Unexplained part of an acceleration from which on states that nothing measures are doubtful.
-_MUCH = 0.1
-# A significant delay: so many standard errors, and so many samples.
-_SIGNIFICANT, _SMALL_DELAY = 3.0, 0.25
-# Samples of running medians at most: spikes last for samples, however many of them there are in a second.
-_MOST_INPUTS, _MOST_SAMPLES = 15, 31
-# Samples of the intervals of a second search at most, as far as their number has divisors.
-_SHORT = 25
+_OUTLIER = 0.5
 _GAUSSIAN = 10_000
 """Degrees of freedom of an interval whose covariance is not itself an estimate from few numbers."""
 _MANY_ROWS = 200_000
@@ -245,9 +197,13 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         raise SettingsError(f'start names "{unknown[0]}", which is not to be identified; these are: {has}')
     allowed = len(dataset.model.parameters) - 1
     check_structure(dataset.model, dataset.source, allowed, ranges=dataset.ranges)
-    best = _competed(settings, dataset, seed, callback)
+    report(callback, "smoothing", 0.0)
+    whole = prepared(settings, dataset)
+    if unmeasured_states(whole[0]):
+        check_structure(dataset.model, dataset.source, allowed, measured_signals(whole[0]), dataset.ranges)
+    best = compete(settings, dataset, whole, seed, callback)
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
-    notes, refined = best.notes, likeliest.refinement
+    refined = likeliest.refinement
     report(callback, "estimating parameters", 0.9)
     instrumented = Instrumented(result, np.zeros(len(result.parameters)))
     if settings.set_points and settings.projection and not (likeliest.exact or best.impossible):
@@ -255,8 +211,9 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
             intervals, refined.fit, result, dataset, settings.set_points, settings.prior_inflation
         )
         result = instrumented.result
-    if best.impossible or dataset.layout.on_bounds(result.parameters).any():
-        check_signs(dataset.model, dataset.layout, _rows_of_logs(intervals, motion), dataset.source)
+    predicts = best.decided is None or best.decided.summary.predicts
+    if best.impossible or not predicts or dataset.layout.on_bounds(result.parameters).any():
+        check_signs(dataset.model, dataset.layout, rows_of_logs(intervals, motion), dataset.source)
     parts, lacks = compared_parts(likeliest, result, settings.prior_inflation), None
     if settings.suggestions and not likeliest.exact:
         from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
@@ -264,266 +221,16 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         lacks = missing_terms(intervals, refined.fit, result, settings.candidate_terms)
     ambiguity = _ambiguity(parts.changes, lacks, instrumented)
     checks = (
-        *_checks(settings, intervals, motion, refined),
+        *_checks(settings, best),
         *_checks_of_bounds(best),
         *_checks_of_unmeasured(best),
         *instrumented.findings,
         *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), parts),
     )
-    forced = bool(settings.input_delay or settings.input_lag)
-    found = _Found(
-        dataset, intervals, motion, refined, result, ambiguity, forced, instrumented.tests, lacks, best.contest
-    )
+    found = _Found(dataset, best, result, ambiguity, instrumented.tests, lacks)
     end = "converged" if refined.converged else "limit of steps"
     end = end if likeliest.complete else TIME_LIMIT
-    return _estimate(settings, found, best.n_hypotheses, end, notes, checks)
-
-
-@dataclass(frozen=True)
-class Decided:
-    """Outcome of a competition: its summary, and the inputs of the winner unless it is an estimate of the fit."""
-
-    summary: Competition
-    acting: ActingInputs | None
-
-
-@dataclass(frozen=True)
-class _Searched:
-    """The likeliest explanation of the logs, and the motion that its search began with.
-
-    ``impossible`` names parameters that would violate a strict bound by least squares of the whole motion; the
-    result is that of the fit then.
-    """
-
-    motion: Motion
-    notes: tuple[str, ...]
-    n_hypotheses: int
-    likeliest: Explanation
-    result: ProjectedEstimate
-    impossible: tuple[str, ...]
-    contest: Decided | None = None
-
-    @property
-    def unexplained(self) -> float:
-        """Largest RMS acceleration that the model does not explain, over the spread of its motion.
-
-        That of states which nothing measures is the spread of the fit; their motion before it was that of a hypothesis.
-        """
-        intervals, motion, hidden = self.likeliest.intervals, self.motion, unmeasured_states(self.likeliest.intervals)
-        model, first = intervals.model, intervals.model.n_q + intervals.model.n_v
-        fitted = residuals_of_motion(intervals, self.likeliest.refinement.fit, self.result.parameters)[0][2]
-        measured = np.array([name not in hidden for name in model.velocities])
-        spread = np.where(
-            measured, motion.spread[first : first + model.n_v], fitted[intervals.counted].std(axis=0) + _TINY
-        )
-        left = np.sqrt(np.square(self.result.unexplained[intervals.occupied]).mean(axis=0))
-        return float((left / spread).max())
-
-    @property
-    def is_doubtful(self) -> bool:
-        """True if much is unexplained of a motion of which nothing measures a part: either may be anything.
-
-        The unmeasured states may have begun on wrong trajectories, for which a resonance that smoothing takes for noise
-        is enough.
-        """
-        return bool(unmeasured_states(self.likeliest.intervals)) and self.unexplained > _MUCH
-
-
-def _competed(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None) -> _Searched:
-    """The likeliest explanation of the logs, with the estimate that predicts best.
-
-    A search that fails, or whose estimates another one beats, is followed by a second one, from that estimate.
-    """
-    report(callback, "smoothing", 0.0)
-    whole = prepared(settings, dataset)
-    refused: Exception | None = None
-    try:
-        first = _likeliest(settings, dataset, seed, callback, whole)
-    except (IdentificationError, np.linalg.LinAlgError) as error:
-        first, refused = None, error
-    if first is not None and (settings.set_points or is_settled(first.likeliest, first.motion)):
-        return first
-    contest = Contest(settings, dataset, *whole[:2], seed, callback)
-    try:
-        found = _decided(settings, contest, first, whole)
-    except TimeLimitError:
-        if first is None:
-            raise
-        return replace(first, likeliest=replace(first.likeliest, complete=False))
-    if first is None and (found is None or not contest.predicts):
-        assert refused is not None
-        raise refused
-    return found or first  # type: ignore[return-value]  # one of them is there
-
-
-def _decided(
-    settings: LoDiransac,
-    contest: Contest,
-    first: _Searched | None,
-    whole: tuple[ShootingIntervals, Motion, tuple[str, ...]],
-) -> _Searched | None:
-    """The search whose estimate predicts best; None where nothing could be compared."""
-    intervals, dataset = whole[0], contest.dataset
-    holds = [dataset.input_hold] if dataset.input_hold else ["zero-order", "linear"]
-    actings = [ActingInputs.recorded(intervals, hold) for hold in holds]
-    starts = [] if (given := _given_start(settings, dataset)) is None else [given]
-    forced = bool(settings.input_delay or settings.input_lag)
-    if first is not None:
-        fit, own = first.likeliest.refinement.fit, first.likeliest.intervals
-        timing = timing_of(own, first.likeliest.refinement, forced=forced)
-        contest.add_fit(first.likeliest, timing)
-        starts += [first.result.parameters, fit.shared[: own.n_p]]
-        if own.delay or own.lag or own.hold not in holds or own.errors is not None:
-            actings.append(ActingInputs.of_fit(own, fit, timing))
-    contest.add_sources(starts, actings)
-    winner = contest.decide(*_noise_of(first, whole))
-    if winner is None:
-        return None
-    origin = contest.origins[winner]
-    searches = [] if first is None else [first]
-    if isinstance(origin, Motion) and not contest.is_as_good(first):
-        second = _second(settings, contest, winner, whole) if "second fit" in settings.sources else None
-        if second is not None:
-            contest.add_fit(
-                second.likeliest, timing_of(second.likeliest.intervals, second.likeliest.refinement, forced=forced)
-            )
-            searches.insert(0, second)
-            winner = contest.decide(*_noise_of(second, whole))
-            assert winner is not None
-            origin = contest.origins[winner]
-    if not searches:
-        return None
-    of_fit = next((x for x in searches if x.likeliest is origin), None)
-    chosen = of_fit or searches[0]
-    result = contest.result(winner, chosen.likeliest)
-    decided = Decided(contest.summary(winner), None if of_fit else contest.candidates[winner].acting)
-    return replace(chosen, result=result, contest=decided, impossible=of_fit.impossible if of_fit else ())
-
-
-def _noise_of(
-    first: _Searched | None, whole: tuple[ShootingIntervals, Motion, tuple[str, ...]]
-) -> tuple[BoolArray, FloatArray]:
-    """Samples that are no outliers ``(N, n_s)``, and the noise ``(n_s,)`` of each signal."""
-    intervals, motion = whole[:2]
-    if first is None or _explains_nothing(first.likeliest.intervals, first.motion, first.likeliest.refinement):
-        every: BoolArray = np.ones(intervals.measured.shape, bool)
-        return every, motion.spread
-    own, fit = first.likeliest.intervals, first.likeliest.refinement.fit
-    inlying = fit.noise.inlying(fit.residuals, own.known) >= _OUTLIER
-    return inlying | ~own.known, fit.noise.sigma
-
-
-def _second(
-    settings: LoDiransac,
-    contest: Contest,
-    winner: int,
-    whole: tuple[ShootingIntervals, Motion, tuple[str, ...]],
-) -> _Searched | None:
-    """A search from an estimate and its simulated motion; None where it fails."""
-    (intervals, _, notes), one, motion = whole, contest.candidates[winner], contest.origins[winner]
-    assert isinstance(motion, Motion)
-    while intervals.length > _SHORT and (parts := fewest_parts(intervals.length)):
-        intervals = intervals.split(parts)
-    intervals = replace(intervals, hold=one.acting.hold)
-    try:
-        return _searched(
-            settings, intervals, motion, notes, contest.seed, contest.dataset, within(contest.callback, 0.88, 0.9),
-            hypotheses=one.parameters[None],
-        )  # fmt: skip
-    except (IdentificationError, np.linalg.LinAlgError):
-        return None
-
-
-def _given_start(settings: LoDiransac, dataset: Dataset) -> FloatArray | None:
-    """The user's start, means of priors and nominal values, in this order; one where there is none of these.
-
-    None where there is none of any parameter.
-    """
-    layout, start = dataset.layout, settings.start or {}
-    found = []
-    for name, bound, mean, std in zip(layout.names, layout.bounds, layout.prior_mean, layout.prior_std, strict=True):
-        plain = name.partition("[")[0]
-        nominal = mean if np.isfinite(std) else bound.value
-        found.append(start.get(plain, nominal))
-    known = [x for x in found if x is not None]
-    return np.array([1.0 if x is None else x for x in found], float) if known else None
-
-
-def _likeliest(
-    settings: LoDiransac,
-    dataset: Dataset,
-    seed: int,
-    callback: Callback | None,
-    whole: tuple[ShootingIntervals, Motion, tuple[str, ...]],
-) -> _Searched:
-    """The likeliest explanation of the logs.
-
-    Where states that nothing measures are not those of an exact model at once, they may have begun on wrong
-    trajectories, for which a resonance that smoothing takes for noise is enough.  A second search begins with the
-    motion of observers, and the likelier explanation counts.
-    """
-    intervals, motion, notes = whole
-    if not unmeasured_states(intervals):
-        return _searched(settings, intervals, motion, notes, seed, dataset, callback)
-    report(callback, "unmeasured states", 0.05)
-    allowed, measured = len(dataset.model.parameters) - 1, measured_signals(intervals)
-    check_structure(dataset.model, dataset.source, allowed, measured, dataset.ranges)
-    try:
-        completed = _completed(intervals, motion, dataset)
-        first = _searched(settings, intervals, completed, notes, seed, dataset, callback)
-    except (IdentificationError, np.linalg.LinAlgError):
-        observed = with_observed_states(intervals, motion)
-        if observed is None:
-            raise
-        return _searched(settings, intervals, observed, notes, seed, dataset, within(callback, 0.87, 0.9))
-    if first.likeliest.exact:
-        return first
-    try:
-        observed = with_observed_states(intervals, motion)
-        if observed is not None:
-            further = within(callback, 0.87, 0.9)
-            other = _searched(settings, intervals, observed, notes, seed, dataset, further)
-            return min(first, other, key=lambda x: x.likeliest.cost)
-    except TimeLimitError:
-        return replace(first, likeliest=replace(first.likeliest, complete=False))
-    except (IdentificationError, np.linalg.LinAlgError):
-        pass  # the first search stands
-    return first
-
-
-def _searched(
-    settings: LoDiransac,
-    intervals: ShootingIntervals,
-    motion: Motion,
-    notes: tuple[str, ...],
-    seed: int,
-    dataset: Dataset,
-    callback: Callback | None,
-    hypotheses: FloatArray | None = None,
-) -> _Searched:
-    """A search that begins with a motion, and with hypotheses or samples."""
-    report(callback, "drawing hypotheses", 0.1)
-    check_time()
-    n_spikes = 0
-    if hypotheses is None:
-        hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
-        intervals, hypotheses, n_spikes = find_spikes(settings, intervals, motion, hypotheses, seed, dataset)
-    if n_spikes:
-        notes += (f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; they are interpolated",)
-    unit = discrepancy_units(intervals, motion, hypotheses[0])
-    search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
-    likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
-    return _Searched(motion, notes, len(hypotheses), likeliest, *_parameters(settings, likeliest))
-
-
-def _parameters(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[ProjectedEstimate, tuple[str, ...]]:
-    """Parameters of an explanation: the fit's where others would violate strict bounds, with the names of these."""
-    intervals, fit = likeliest.intervals, likeliest.refinement.fit
-    if likeliest.exact or not settings.projection:
-        return fitted_parameters(intervals, fit), ()
-    result, layout = estimate_parameters(intervals, fit, settings.prior_inflation), intervals.layout
-    impossible = layout.violations(result.parameters)
-    return (fitted_parameters(intervals, fit) if impossible else result), impossible
+    return _estimate(settings, found, end, checks)
 
 
 def _ambiguity(changes: Sequence[Change], lacks: MissingTerms | None, instrumented: Instrumented) -> FloatArray:
@@ -547,41 +254,16 @@ def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:
             raise SettingsError(f'{setting} names "{unknown[0]}", which {dataset.source} lacks; it has {has}')
 
 
-def _completed(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -> Motion:
-    """The motion with its unmeasured states.  Raises IdentificationError: no simulation gives them."""
-    found = with_unmeasured_states(intervals, motion)
-    if found is None:
-        names = unmeasured_by_name(intervals)
-        raise IdentificationError(
-            f"{dataset.source}: nothing measures {names}, nor a derivative, and every simulation of {names} from the "
-            "other signals diverges; measure it, or bound the parameters of its equation"
-        )
-    return found
-
-
-def _hypotheses(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
-) -> FloatArray:
-    """Hypotheses, best first.  Raises IdentificationError: there are none, and the message names the cause."""
-    found = find_hypotheses(settings, intervals, motion, seed, dataset)
-    if len(found):
-        return found
-    cause = cause_of_refusal(dataset.model, dataset.layout, _rows_of_logs(intervals, motion))
-    raise IdentificationError(f"{dataset.source}: no sample gives parameters within their bounds: {cause}")
-
-
-def _checks(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, refined: Refinement
-) -> Iterator[Finding]:
+def _checks(settings: LoDiransacSettings, found: Searched) -> Iterator[Finding]:
     """Findings on the fit itself."""
-    if _explains_nothing(intervals, motion, refined):
+    if found.explains_nothing:
         advice = "check its terms, and the signs and units of the log"
         yield Finding("bad", f"The model explains almost nothing of this log: {advice}.")
-    if not refined.converged and settings.max_steps:
+    if not found.likeliest.refinement.converged and settings.max_steps:
         yield Finding("care", f"Local optimisation did not converge within its limit of {settings.max_steps} steps.")
 
 
-def _checks_of_bounds(found: _Searched) -> Iterator[Finding]:
+def _checks_of_bounds(found: Searched) -> Iterator[Finding]:
     """A finding where the fitted motion and the bounds contradict each other."""
     if found.impossible:
         names = ", ".join(found.impossible)
@@ -593,7 +275,7 @@ def _checks_of_bounds(found: _Searched) -> Iterator[Finding]:
         )
 
 
-def _checks_of_unmeasured(found: _Searched) -> Iterator[Finding]:
+def _checks_of_unmeasured(found: Searched) -> Iterator[Finding]:
     """A finding where a search is doubtful."""
     if found.is_doubtful:
         names, share = unmeasured_by_name(found.likeliest.intervals), 100.0 * found.unexplained
@@ -604,179 +286,43 @@ def _checks_of_unmeasured(found: _Searched) -> Iterator[Finding]:
         )
 
 
-def _rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRows]:
-    """Rows of the smoothed motion of each log."""
-    logged = [np.arange(x.start, x.stop)[intervals.is_logged[x]] for x in intervals.rows_of_logs]
-    parts = [motion.parts(intervals.model, rows) for rows in logged]
-    return [MotionRows(q, v, a, intervals.inputs[rows], y) for (q, v, a, y), rows in zip(parts, logged, strict=True)]
-
-
-def _explains_nothing(intervals: ShootingIntervals, motion: Motion, refined: Refinement) -> bool:
-    """True if the noise of every signal is as large as the signal."""
-    seen = intervals.known.any(axis=0)
-    return bool((refined.fit.noise.sigma > _ALL_OF_IT * motion.spread)[seen].all())
-
-
-# ---------------------------------------------------------------------- preparation
-
-
-def prepared(settings: LoDiransac, dataset: Dataset) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
-    """The logs in intervals of the motion's own time scale, and the motion, row by row of them.
-
-    Parameters
-    ----------
-    settings : LoDiransac
-    dataset : Dataset
-
-    Returns
-    -------
-    intervals : ShootingIntervals
-        Inputs are screened, and act as recorded.
-    motion : Motion
-    notes : tuple of str
-
-    Raises
-    ------
-    LogError
-        The logs are too short.
-    """
-    model, dt = dataset.model, dataset.dt
-    screened = [_screened(settings, one, dt) for one in dataset.segments]
-    samples, inputs = [x for x, _, _ in screened], [u for _, u, _ in screened]
-    several = len(samples) > 1
-    notes = [
-        f"{one.log.source}: {note}" if several else note
-        for one, (_, _, said) in zip(dataset.segments, screened, strict=True)
-        for note in said
-    ]
-    halves, length = choose_half_widths(model, samples, dt, settings.smoothing_half_width)
-    n_rows, longest = sum(map(len, dataset.segments)), max(map(len, dataset.segments))
-    if n_rows < _FEWEST_INTERVALS * length or longest < length:
-        raise LogError(
-            f"{dataset.source}: {n_rows} rows are too few; lo-diransac needs at least "
-            f"{_FEWEST_INTERVALS * length}. Give a longer log"
-        )
-    if not any(long_runs(~x.gaps, length).any() for x in samples):
-        raise LogError(
-            f"{dataset.source}: no {length} rows in a row are without a gap in the inputs or in all sensors; give a "
-            "log with longer stretches"
-        )
-    motions = smooth(model, samples, dt, halves)
-    logs = [(x.measured, x.known, u, x.gaps) for x, u in zip(samples, inputs, strict=True)]
-    intervals = ShootingIntervals.of(model, dataset.layout, logs, dt, length, settings.substeps, dataset.hold)
-    intervals = replace(intervals, threads=settings.criteria.threads or default_threads())
-    rows = zip(motions, intervals.rows_of_logs, strict=True)
-    signals = np.concatenate([_to_length(x.signals, r.stop - r.start) for x, r in rows])
-    return intervals, Motion(signals, motions[0].spread), tuple(notes)
-
-
-def _to_length(values: FloatArray, n_rows: int) -> FloatArray:
-    return np.pad(values, ((0, n_rows - len(values)), (0, 0)), mode="edge")
-
-
-def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Samples, FloatArray, list[str]]:
-    """Samples and inputs of one log, and findings, a sentence each."""
-    model, notes = one.model, []
-    measured = np.full((len(one), len(model.signals)), np.nan)
-    measured[:, [model.signals.index(n) for n in one.signals]] = one.measured
-    present = [one.signals.index(n) for n in one.present]
-    stuck = stuck_rows(one.measured[:, present]) if settings.stuck_rows else np.zeros(len(one), bool)
-    known = np.isfinite(measured) & ~stuck[:, None]
-    measured = np.where(known, measured, 0.0)
-    inputs, n_leaps = screened_inputs(
-        one.inputs, odd_window(settings.input_window, dt, _MOST_INPUTS), settings.input_threshold
-    )
-    if stuck.any():
-        notes.append(f"{stuck.sum()} rows repeat the row before in every signal, and were taken as missing")
-    if n_leaps:
-        notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median replaces them")
-    centre = running_median(measured, known, odd_window(settings.median_window, dt, _MOST_SAMPLES))
-    return Samples(measured, known, centre, one.gaps | silent_rows(known, dt)), inputs, notes
-
-
 # ---------------------------------------------------------------------- the estimate
 
 
 @dataclass(frozen=True)
 class _Found:
-    """Parts of an estimate; a forced delay or lag of the inputs need not be significant.
+    """Parts of an estimate.
 
     ``ambiguity (n, n)`` is a covariance besides that of the result, for what one set of parameters cannot be; ``lacks``
     is None where terms that the model lacks were not sought.
     """
 
     dataset: Dataset
-    intervals: ShootingIntervals
-    motion: Motion
-    refinement: Refinement
+    best: Searched
     result: ProjectedEstimate
     ambiguity: FloatArray
-    forced: bool
     hausman_tests: tuple[HausmanTest, ...]
     lacks: MissingTerms | None
-    contest: Decided | None
-
-    @property
-    def late(self) -> float:
-        """Delay of the inputs, lag included, samples."""
-        return _late(self.intervals, self.refinement)
 
     @property
     def is_late(self) -> bool:
         """True for a significant delay or lag that all inputs have."""
-        return _is_late(self.intervals, self.refinement) and (self.contest is None or self.contest.acting is None)
+        return self.best.is_late and (self.best.decided is None or self.best.decided.acting is None)
 
-    @property
-    def resolution(self) -> Resolution:
-        """Simulation of the estimate."""
-        acting, substeps = None if self.contest is None else self.contest.acting, self.intervals.substeps
-        if acting is not None:
-            return Resolution("rk4", substeps, acting.hold, acting.timing)
-        timing = timing_of(self.intervals, self.refinement, forced=self.forced)
-        return Resolution("rk4", substeps, self.intervals.hold, timing)
+    def resolution(self, *, forced: bool) -> Resolution:
+        """Simulation of the estimate; a forced delay or lag of the inputs need not be significant."""
+        intervals, decided = self.best.likeliest.intervals, self.best.decided
+        if decided is not None and decided.acting is not None:
+            return Resolution("rk4", intervals.substeps, decided.acting.hold, decided.acting.timing)
+        return Resolution("rk4", intervals.substeps, intervals.hold, self.best.timing(forced=forced))
 
 
-def _late(intervals: ShootingIntervals, refinement: Refinement) -> float:
-    """Delay of the inputs, lag included, samples."""
-    return float(intervals.delay + intervals.lag + refinement.fit.shared[-1])
-
-
-def _is_late(intervals: ShootingIntervals, refinement: Refinement) -> bool:
-    """True for a significant delay or lag that all inputs have."""
-    errors = intervals.all_errors
-    clear = abs(_late(intervals, refinement)) > max(_SIGNIFICANT * refinement.delay_error, _SMALL_DELAY)
-    own = errors.input_lag if intervals.lag else errors.input_delay
-    return clear and not own.any()
-
-
-def timing_of(intervals: ShootingIntervals, refinement: Refinement, *, forced: bool) -> InputTiming:
-    """Delay or lag of the inputs where it is significant, or forced, and the inputs' own errors."""
-    fit, errors = refinement.fit, intervals.all_errors
-    late, counts = _late(intervals, refinement), _is_late(intervals, refinement) or forced
-    delays, lags = np.zeros((2, intervals.model.n_u))
-    if errors.input_delay.any():
-        delays = delays_of_inputs(intervals, fit)
-    elif not intervals.lag and counts:
-        delays = delays + late
-    if errors.input_lag.any():
-        lags = lags_of_inputs(intervals, fit)
-    elif intervals.lag and counts:
-        lags = lags + max(late, LEAST_LAG)
-    return InputTiming.of(delays * intervals.dt, lags * intervals.dt, errors.gain_drift)
-
-
-def _estimate(
-    settings: LoDiransacSettings,
-    found: _Found,
-    n_hypotheses: int,
-    end: str,
-    notes: tuple[str, ...],
-    checks: tuple[Finding, ...],
-) -> Estimate:
-    dataset, intervals, result = found.dataset, found.intervals, found.result
+def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Finding, ...]) -> Estimate:
+    dataset, best, result = found.dataset, found.best, found.result
+    intervals, fit = best.likeliest.intervals, best.likeliest.refinement.fit
     names = dataset.layout.names
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
-    units = parameter_units(intervals, found.motion, result.parameters)
+    units = parameter_units(intervals, best.motion, result.parameters)
     lost = ~((spans < units) | (spans < np.abs(result.parameters)))
     measured = measured_signals(intervals) if unmeasured_states(intervals) else None
     lost, combinations = unidentifiable(
@@ -792,15 +338,15 @@ def _estimate(
         n_fitted=sum(int(np.isfinite(one.measured).any(axis=1).sum()) for one in dataset.segments),
         estimator="multiple shooting",
         iterations=settings.n_nonlinear_samples if nonlinear else settings.n_samples,
-        n_hypotheses=n_hypotheses,
+        n_hypotheses=best.n_hypotheses,
         stop_reason=end,
-        resolution=found.resolution,
-        notes=notes,
+        resolution=found.resolution(forced=settings.forces_timing),
+        notes=best.notes,
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),
         checks=checks,
         suggestions=found.lacks.suggestions if found.lacks else (),
-        competition=None if found.contest is None else found.contest.summary,
-        possible_terms=possible_terms(intervals, found.refinement.fit, result, covariance, settings.candidate_terms)
+        competition=None if best.decided is None else best.decided.summary,
+        possible_terms=possible_terms(intervals, fit, result, covariance, settings.candidate_terms)
         if settings.suggestions
         else None,
     )
@@ -808,7 +354,8 @@ def _estimate(
 
 def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ...]) -> Diagnosis:
     """Noise, faults and unmodelled forces, by name and over the rows of the given logs."""
-    dataset, intervals, fit, result = found.dataset, found.intervals, found.refinement.fit, found.result
+    dataset, best, result = found.dataset, found.best, found.result
+    intervals, fit = best.likeliest.intervals, best.likeliest.refinement.fit
     model, dt = dataset.model, intervals.dt
     columns = {name: model.signals.index(name) for name in dataset.signals}
     seen = intervals.known.any(axis=0)
@@ -838,8 +385,8 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
         unmodelled_forces=per_equation(forces[0]) if forces else {},
         smoothed_time=begins + dt * place.astype(float),
         smoothed_states=dict(zip(model.state, fit.x[shown].T.copy(), strict=True)),
-        input_delay=found.late * dt,
-        input_delay_error=found.refinement.delay_error * dt,
+        input_delay=best.late * dt,
+        input_delay_error=best.likeliest.refinement.delay_error * dt,
         input_delay_significant=found.is_late,
         unidentifiable=lost,
         combinations=combinations,

@@ -204,7 +204,7 @@ def estimate_parameters(
 def projected_candidates(
     intervals: ShootingIntervals, fit: Fit
 ) -> Iterator[tuple[float, Callable[[], ProjectedEstimate], FloatArray, FloatArray]]:
-    """Least squares on the fitted motion over windows of each length, the shortest first.
+    """Least squares on the fitted motion over windows of each length, those of `estimate_parameters` first.
 
     Parameters
     ----------
@@ -225,10 +225,11 @@ def projected_candidates(
     """
     wide = _with_wide_priors(intervals, fit)
     now, rows = wide.shared[: intervals.n_p], _Rows.of(intervals, wide)
-    for windows in _window_lengths(intervals, len(now), rows.latent.shape[1]):
+    lengths = list(_window_lengths(intervals, len(now), rows.latent.shape[1]))
+    preferred = len(_windows(intervals, now, rows)) - 1
+    for windows in (lengths[preferred], *lengths[:preferred], *lengths[preferred + 1 :]):
         p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
         seconds = intervals.duration * float(np.diff(windows, append=len(intervals)).max())
-
         yield (
             seconds,
             partial(_completed, intervals, fit, rows, windows, p, gains, stuck),

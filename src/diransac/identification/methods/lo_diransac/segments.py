@@ -7,6 +7,7 @@ determine the state, and those after it are predicted.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -46,6 +47,16 @@ class ActingInputs:
     values: FloatArray
     hold: str
     timing: InputTiming
+
+    @property
+    def sentence(self) -> str:
+        """Hold and delay in words."""
+        how = {"zero-order": "held", "linear": "linear", "smooth": "smooth"}[self.hold]
+        return f"{how} inputs" + ("" if self.timing == InputTiming() else " with their delay or lag")
+
+    def differs(self, others: Iterable[ActingInputs]) -> bool:
+        """True if no other has the same values, held alike."""
+        return not any(self.hold == x.hold and np.array_equal(self.values, x.values) for x in others)
 
     @classmethod
     def recorded(cls, intervals: ShootingIntervals, hold: str) -> ActingInputs:

@@ -94,6 +94,11 @@ class LoDiransacSettings:
         if not -np.inf < self.delay_range[0] <= 0.0 <= self.delay_range[1] < np.inf:
             raise SettingsError(f"delay_range is {self.delay_range}; give (earliest, latest) in s, with 0 between them")
 
+    @property
+    def forces_timing(self) -> bool:
+        """True if a delay or a lag of the inputs is estimated in any case."""
+        return bool(self.input_delay or self.input_lag)
+
     def regresses(self, model: Model) -> bool:
         """False: sensors are compared with simulations."""
         return False

@@ -67,7 +67,7 @@ def simulation_error_candidates(
     starts : (m, n) array
         Parameters to start from, within the bounds; further ones are random about them.
     actings : sequence of ActingInputs
-        Of which the likeliest is taken.
+        Over short segments the likeliest is taken; the others follow from the result over the longest ones.
     seed : int
     blocks : Blocks
     outliers : bool, optional
@@ -87,7 +87,9 @@ def simulation_error_candidates(
     longest = max(x.stop - x.start for x in stretches(intervals))
     while len(chain[-1].segments) > _FEWEST and _GROWTH * chain[-1].segments.n_rows <= longest:
         chain.append(chain[-1].grown(_GROWTH * chain[-1].segments.n_rows).descended())
-    return [(x.candidate(blocks), x.simulated(motion)) for x in chain if np.isfinite(x.cost)]
+    taken = chain[0].segments.acting
+    others = [chain[-1].with_inputs(x).descended() for x in actings if x is not taken]
+    return [(x.candidate(blocks), x.simulated(motion)) for x in (*chain, *others) if np.isfinite(x.cost)]
 
 
 def _random_starts(intervals: ShootingIntervals, known: FloatArray, seed: int) -> FloatArray:
@@ -267,6 +269,10 @@ class _Solution:
         scale = np.nan_to_num(lower_scale(found.errors.copy(), found._known), nan=1.0)
         return replace(found, noise=replace(self.noise, sigma=np.maximum(scale, self.noise.floor)))
 
+    def with_inputs(self, acting: ActingInputs) -> _Solution:
+        """The solution with inputs that act otherwise."""
+        return replace(self, segments=replace(self.segments, acting=acting))
+
     def candidate(self, blocks: Blocks) -> Candidate:
         """The estimate, and what it is without each block by one Newton step."""
         segments, intervals = self.segments, self.segments.intervals
@@ -275,7 +281,7 @@ class _Solution:
         for k in range(blocks.n):
             step = -_solved(*part.of(block != k).with_prior(intervals, self.parameters), 0.0)
             without.append(_moved(intervals, self.parameters, step))
-        name = f"simulation error, {segments.n_rows * intervals.dt:.2g} s"
+        name = f"simulation error, {segments.n_rows * intervals.dt:.2g} s, {segments.acting.sentence}"
         return Candidate(name, self.parameters, np.array(without), segments.acting, intervals)
 
     def simulated(self, motion: Motion) -> Motion:

@@ -82,6 +82,11 @@ class Candidate:
     intervals: ShootingIntervals
     estimate: Callable[[], ProjectedEstimate] | None = None
 
+    @property
+    def source(self) -> str:
+        """The name without the variant."""
+        return self.name.partition(",")[0]
+
 
 def jackknife(without: FloatArray) -> FloatArray:
     """Covariance ``(n, n)`` from estimates without each block, increased by Student's t for their number."""
@@ -113,6 +118,7 @@ def least_squares_candidates(dataset: Dataset, intervals: ShootingIntervals, blo
 
     model = dataset.model.with_sensors(())
     acting, whole = ActingInputs.recorded(intervals, dataset.hold), _filtered(dataset, model)
+    usual = len(whole) - len(_BANDWIDTHS) + _BANDWIDTHS.index(1.0) if len(whole) >= len(_BANDWIDTHS) else 0
     for k, (label, logs) in enumerate(whole):
         try:
             own = replace(Dataset.of(model, logs), layout=dataset.layout)
@@ -120,7 +126,7 @@ def least_squares_candidates(dataset: Dataset, intervals: ShootingIntervals, blo
             continue
         block = _blocks_of_rows(own, dataset, intervals, blocks)
         kinds = [_ordinary] if model.is_affine else []
-        kinds += [_nonlinear] if k == len(whole) // 2 else []
+        kinds += [_nonlinear] if k == usual else []
         for kind in kinds:
             check_time()
             try:

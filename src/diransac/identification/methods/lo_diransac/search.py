@@ -1,0 +1,241 @@
+"""Search of the likeliest explanation of the logs, from random samples or from an estimate with its motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.data.input_timing import InputTiming
+from diransac.errors import IdentificationError, TimeLimitError
+from diransac.identification.method import report, within
+from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
+from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
+from diransac.identification.methods.lo_diransac.projection import (
+    ProjectedEstimate,
+    discrepancy_units,
+    estimate_parameters,
+    fitted_parameters,
+    residuals_of_motion,
+)
+from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs, lags_of_inputs
+from diransac.identification.methods.lo_diransac.refinement import make_prior
+from diransac.identification.methods.lo_diransac.unmeasured import (
+    unmeasured_by_name,
+    unmeasured_states,
+    with_observed_states,
+    with_unmeasured_states,
+)
+from diransac.identification.refusal import MotionRows, cause_of_refusal
+from diransac.time_limit import check_time
+
+if TYPE_CHECKING:
+    from diransac.data.dataset import Dataset
+    from diransac.identification.estimate import Competition
+    from diransac.identification.method import Callback
+    from diransac.identification.methods.lo_diransac.local_search import Explanation
+    from diransac.identification.methods.lo_diransac.segments import ActingInputs
+    from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.methods.lo_diransac.smoothing import Motion
+
+__all__ = ["Decided", "Searched", "likeliest", "rows_of_logs", "searched"]
+
+_ALL_OF_IT = 0.8
+"""Fraction of a signal's spread from which on its noise leaves nothing to explain."""
+_MUCH = 0.1
+"""Unexplained part of an acceleration from which on states that nothing measures are doubtful."""
+_SIGNIFICANT, _SMALL_DELAY = 3.0, 0.25
+"""A significant delay: so many standard errors, and so many samples."""
+_TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class Decided:
+    """Outcome of a competition: its summary, and the inputs of the winner unless it is an estimate of the fit."""
+
+    summary: Competition
+    acting: ActingInputs | None
+
+
+@dataclass(frozen=True)
+class Searched:
+    """The likeliest explanation of the logs, and the motion that its search began with.
+
+    ``decided`` is the outcome of a competition; None where there was none.  ``impossible`` names parameters that would
+    violate a strict bound by least squares of the whole motion; the result is that of the fit then.
+    """
+
+    motion: Motion
+    notes: tuple[str, ...]
+    n_hypotheses: int
+    likeliest: Explanation
+    result: ProjectedEstimate
+    impossible: tuple[str, ...]
+    decided: Decided | None = None
+
+    @property
+    def late(self) -> float:
+        """Delay of the inputs, lag included, samples."""
+        intervals = self.likeliest.intervals
+        return float(intervals.delay + intervals.lag + self.likeliest.refinement.fit.shared[-1])
+
+    @property
+    def is_late(self) -> bool:
+        """True for a significant delay or lag that all inputs have."""
+        intervals, error = self.likeliest.intervals, self.likeliest.refinement.delay_error
+        clear = abs(self.late) > max(_SIGNIFICANT * error, _SMALL_DELAY)
+        own = intervals.all_errors.input_lag if intervals.lag else intervals.all_errors.input_delay
+        return bool(clear and not own.any())
+
+    def timing(self, *, forced: bool) -> InputTiming:
+        """Delay or lag of the inputs where it is significant, or forced, and the inputs' own errors."""
+        intervals, fit, counts = self.likeliest.intervals, self.likeliest.refinement.fit, self.is_late or forced
+        errors, (delays, lags) = intervals.all_errors, np.zeros((2, intervals.model.n_u))
+        if errors.input_delay.any():
+            delays = delays_of_inputs(intervals, fit)
+        elif not intervals.lag and counts:
+            delays = delays + self.late
+        if errors.input_lag.any():
+            lags = lags_of_inputs(intervals, fit)
+        elif intervals.lag and counts:
+            lags = lags + max(self.late, LEAST_LAG)
+        return InputTiming.of(delays * intervals.dt, lags * intervals.dt, errors.gain_drift)
+
+    @property
+    def explains_nothing(self) -> bool:
+        """True if the noise of every signal is as large as the signal."""
+        seen = self.likeliest.intervals.known.any(axis=0)
+        return bool((self.likeliest.refinement.fit.noise.sigma > _ALL_OF_IT * self.motion.spread)[seen].all())
+
+    @property
+    def unexplained(self) -> float:
+        """Largest RMS acceleration that the model does not explain, over the spread of its motion.
+
+        That of states which nothing measures is the spread of the fit; their motion before it was that of a hypothesis.
+        """
+        intervals, motion, hidden = self.likeliest.intervals, self.motion, unmeasured_states(self.likeliest.intervals)
+        model, first = intervals.model, intervals.model.n_q + intervals.model.n_v
+        fitted = residuals_of_motion(intervals, self.likeliest.refinement.fit, self.result.parameters)[0][2]
+        measured = np.array([name not in hidden for name in model.velocities])
+        spread = np.where(
+            measured, motion.spread[first : first + model.n_v], fitted[intervals.counted].std(axis=0) + _TINY
+        )
+        left = np.sqrt(np.square(self.result.unexplained[intervals.occupied]).mean(axis=0))
+        return float((left / spread).max())
+
+    @property
+    def is_doubtful(self) -> bool:
+        """True if much is unexplained of a motion of which nothing measures a part: either may be anything.
+
+        The unmeasured states may have begun on wrong trajectories, for which a resonance that smoothing takes for noise
+        is enough.
+        """
+        return bool(unmeasured_states(self.likeliest.intervals)) and self.unexplained > _MUCH
+
+
+def likeliest(
+    settings: LoDiransacSettings,
+    dataset: Dataset,
+    seed: int,
+    callback: Callback | None,
+    whole: tuple[ShootingIntervals, Motion, tuple[str, ...]],
+) -> Searched:
+    """The likeliest explanation of the logs.
+
+    Where states that nothing measures are not those of an exact model at once, they may have begun on wrong
+    trajectories, for which a resonance that smoothing takes for noise is enough.  A second search begins with the
+    motion of observers, and the likelier explanation counts.
+    """
+    intervals, motion, notes = whole
+    if not unmeasured_states(intervals):
+        return searched(settings, intervals, motion, notes, seed, dataset, callback)
+    report(callback, "unmeasured states", 0.05)
+    try:
+        completed = _completed(intervals, motion, dataset)
+        first = searched(settings, intervals, completed, notes, seed, dataset, callback)
+    except (IdentificationError, np.linalg.LinAlgError):
+        observed = with_observed_states(intervals, motion)
+        if observed is None:
+            raise
+        return searched(settings, intervals, observed, notes, seed, dataset, within(callback, 0.87, 0.9))
+    if first.likeliest.exact:
+        return first
+    try:
+        observed = with_observed_states(intervals, motion)
+        if observed is not None:
+            further = within(callback, 0.87, 0.9)
+            other = searched(settings, intervals, observed, notes, seed, dataset, further)
+            return min(first, other, key=lambda x: x.likeliest.cost)
+    except TimeLimitError:
+        return replace(first, likeliest=replace(first.likeliest, complete=False))
+    except (IdentificationError, np.linalg.LinAlgError):
+        pass  # the first search stands
+    return first
+
+
+def searched(
+    settings: LoDiransacSettings,
+    intervals: ShootingIntervals,
+    motion: Motion,
+    notes: tuple[str, ...],
+    seed: int,
+    dataset: Dataset,
+    callback: Callback | None,
+    hypotheses: FloatArray | None = None,
+) -> Searched:
+    """A search that begins with a motion, and with hypotheses or samples."""
+    report(callback, "drawing hypotheses", 0.1)
+    check_time()
+    n_spikes = 0
+    if hypotheses is None:
+        hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
+        intervals, hypotheses, n_spikes = find_spikes(settings, intervals, motion, hypotheses, seed, dataset)
+    if n_spikes:
+        notes += (f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; they are interpolated",)
+    unit = discrepancy_units(intervals, motion, hypotheses[0])
+    search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
+    likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
+    return Searched(motion, notes, len(hypotheses), likeliest, *_parameters(settings, likeliest))
+
+
+def _parameters(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[ProjectedEstimate, tuple[str, ...]]:
+    """Parameters of an explanation: the fit's where others would violate strict bounds, with the names of these."""
+    intervals, fit = likeliest.intervals, likeliest.refinement.fit
+    if likeliest.exact or not settings.projection:
+        return fitted_parameters(intervals, fit), ()
+    result, layout = estimate_parameters(intervals, fit, settings.prior_inflation), intervals.layout
+    impossible = layout.violations(result.parameters)
+    return (fitted_parameters(intervals, fit) if impossible else result), impossible
+
+
+def _completed(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -> Motion:
+    """The motion with its unmeasured states.  Raises IdentificationError: no simulation gives them."""
+    found = with_unmeasured_states(intervals, motion)
+    if found is None:
+        names = unmeasured_by_name(intervals)
+        raise IdentificationError(
+            f"{dataset.source}: nothing measures {names}, nor a derivative, and every simulation of {names} from the "
+            "other signals diverges; measure it, or bound the parameters of its equation"
+        )
+    return found
+
+
+def _hypotheses(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
+) -> FloatArray:
+    """Hypotheses, best first.  Raises IdentificationError: there are none, and the message names the cause."""
+    found = find_hypotheses(settings, intervals, motion, seed, dataset)
+    if len(found):
+        return found
+    cause = cause_of_refusal(dataset.model, dataset.layout, rows_of_logs(intervals, motion))
+    raise IdentificationError(f"{dataset.source}: no sample gives parameters within their bounds: {cause}")
+
+
+def rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRows]:
+    """Rows of the smoothed motion of each log."""
+    logged = [np.arange(x.start, x.stop)[intervals.is_logged[x]] for x in intervals.rows_of_logs]
+    parts = [motion.parts(intervals.model, rows) for rows in logged]
+    return [MotionRows(q, v, a, intervals.inputs[rows], y) for (q, v, a, y), rows in zip(parts, logged, strict=True)]
