@@ -56,12 +56,17 @@ def test_equations_are_those_of_the_machine(name):
 
 
 def assert_within_intervals(name, result, within):
-    """The errors are below a limit, and below four standard errors."""
+    """The errors are below a limit, and below four standard errors.
+
+    But for what dry friction, which switches within a step, leaves to an integrator: derivatives of a simulation do not
+    contain that it switches earlier or later.
+    """
     truth = MACHINES[name].truth
+    switches = 1e-3 if "dry" in " ".join(truth) else 0.0
     for parameter, value in result.parameters.items():
         error = abs(value - truth[parameter])
         assert error <= within * truth[parameter], parameter
-        assert error <= 4.0 * result.standard_errors[parameter], parameter
+        assert error <= max(4.0 * result.standard_errors[parameter], switches * truth[parameter]), parameter
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     fitted_parameters,
     projected_candidates,
     unexplained,
+    with_parameters,
 )
 from diransac.identification.methods.lo_diransac.search import Decided, Searched, likeliest, searched
 from diransac.identification.methods.lo_diransac.segments import ActingInputs
@@ -293,7 +294,7 @@ class Contest:
         """Mean of the winner and of those that predict as well, and a covariance that covers them.
 
         Those whose inputs act at another time than the winner's count in the covariance alone.  Where their mean
-        predicts worse than the winner, its own parameters stay.
+        predicts clearly worse than the winner, its own parameters stay.
         """
         assert self.comparison is not None
         assert self.arbiter is not None
@@ -304,12 +305,13 @@ class Contest:
         mean = replace(
             one, parameters=share @ parameters, without=np.tensordot(share, [x.without for x in self.candidates], 1)
         )
-        better = Comparison.of([self.arbiter.scores(mean), self.scores[winner]], np.zeros(2, bool)).best == 0
-        centre = mean.parameters if better else one.parameters
+        alone = Comparison.of([self.scores[winner], self.arbiter.scores(mean)], np.zeros(2, bool))
+        centre = mean.parameters if alone.as_good[1] else one.parameters
         apart = parameters - centre
         spread = (weights * apart.T) @ apart / weights.sum()
         found = one.estimate() if one.estimate is not None else self._of_blocks(one, fit_of)
-        return replace(found, parameters=centre, covariance=found.covariance + spread)
+        found = replace(found, covariance=found.covariance + spread)
+        return with_parameters(fit_of.intervals, fit_of.refinement.fit, found, centre)
 
     def _of_blocks(self, one: Candidate, fit_of: Explanation) -> ProjectedEstimate:
         """An estimate that no fit gave, with the covariance of the jackknife over blocks."""

@@ -81,6 +81,7 @@ __all__ = [
     "projected_parameters",
     "residuals_of_motion",
     "unexplained",
+    "with_parameters",
 ]
 
 
@@ -406,11 +407,30 @@ def _combined_with_priors(intervals: ShootingIntervals, fit: Fit, found: Project
     variance = np.square(layout.prior_std[layout.with_prior]) / (1.0 - _WIDER**-2)
     mean = layout.prior_mean[layout.with_prior]
     p, covariance = combined(found.parameters, found.covariance, layout.with_prior, mean, variance)
-    left = _over_windows(unexplained(intervals, fit, p), found.windows)
     unit, none = np.eye(len(p)), np.zeros(len(mean))
     shrunk = np.stack([combined(x, found.covariance, layout.with_prior, none, variance)[0] for x in unit])
     found = replace(found, of_z=found.of_z @ shrunk, of_s=found.of_s @ shrunk)
-    return replace(found, parameters=p, covariance=covariance, unexplained=left)
+    return with_parameters(intervals, fit, replace(found, covariance=covariance), p)
+
+
+def with_parameters(
+    intervals: ShootingIntervals, fit: Fit, found: ProjectedEstimate, parameters: FloatArray
+) -> ProjectedEstimate:
+    """The estimate with other parameters, and what these leave unexplained of the fitted motion.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    found : ProjectedEstimate
+    parameters : (n,) array
+
+    Returns
+    -------
+    ProjectedEstimate
+    """
+    left = _over_windows(unexplained(intervals, fit, parameters), found.windows)
+    return replace(found, parameters=parameters, unexplained=left)
 
 
 def inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fit:

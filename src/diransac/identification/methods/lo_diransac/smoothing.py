@@ -49,7 +49,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 _DEGREE, _STEPS = 4, 12
 _SHRINK = 0.3
-_FLOOR = 1e-4
+_FLOOR, _VISIBLE = 1e-4, 1e-2
 _AT_REST = 0.1
 _TRIALS = 24
 # Factor between half widths that are compared, and by which a window widens that has too few samples.
@@ -467,20 +467,24 @@ def choose_half_widths(model: Model, logs: Sequence[Samples], dt: float, narrowe
     )
     factors = [k for k in range(20) if k == 0 or 8 * length * _WIDER**k < longest]
     candidates = [np.maximum(usual // _WIDER, _FEWEST * apart), *(usual * _WIDER**k for k in factors)]
-    best = int(np.argmin([_prediction_error(model, logs, dt, halves, usual, apart) for halves in candidates]))
+    errors = np.array([_prediction_errors(model, logs, dt, halves, usual, apart) for halves in candidates])
+    best = 1 + int(np.argmin(np.log(errors[1:]).sum(axis=1)))
+    # Narrower windows have noisier derivatives: they are taken where the others miss a visible part of the motion.
+    visible = np.log(np.maximum(errors, _VISIBLE)).sum(axis=1)
+    best = 0 if visible[0] < visible[best] else best
     return candidates[best], int(length) * _WIDER ** max(best - 1, 0)
 
 
-def _prediction_error(
+def _prediction_errors(
     model: Model, logs: Sequence[Samples], dt: float, halves: IntArray, usual: IntArray, apart: IntArray
-) -> float:
-    """Sum over signals of the log of the left-out samples' robust scale, at knots spread over the logs."""
+) -> FloatArray:
+    """Robust scale of the left-out samples of each signal, over its spread, at knots spread over the logs."""
     measured, known, centre = (
         np.concatenate([getattr(log, name) for log in logs]) if len(logs) > 1 else getattr(logs[0], name)
         for name in ("measured", "known", "centre")
     )
     about, sizes = _joined(model, [log.centre for log in logs]), [len(log.measured) for log in logs]
-    loss = 0.0
+    found = list[FloatArray]()
     for columns, half in _alike(_chains(model), halves, _TRIALS * (2 * int(usual.max()) + 1)):
         k = columns[0, 0]
         stride = max(1, half // usual[k]) if apart[k] == 1 else 1
@@ -495,8 +499,8 @@ def _prediction_error(
         fitted = np.einsum("Cka,jta->Cktj", coefficients, orders)
         scale = _scale(values - fitted, oks & near[:, None] & ~even)
         seen = oks.any(axis=(1, 2))
-        loss += float(np.log(np.maximum(scale, _FLOOR * spread + 1e-12))[seen].sum())
-    return loss
+        found.append((np.maximum(scale, _FLOOR * spread + 1e-12) / (spread + 1e-12))[seen])
+    return np.concatenate(found)
 
 
 def _windows(values: NDArray[Scalar], rows: IntArray) -> NDArray[Scalar]:
