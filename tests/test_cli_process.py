@@ -63,9 +63,10 @@ def test_debug_shows_what_a_model_file_prints_on_stderr(tmp_path: Path):
 
 def test_commands_import_no_more_than_they_need(tmp_path: Path):
     """Large libraries take longer to import than a log to be identified, and parts of the package as long."""
-    t = np.arange(300) * 0.01
-    log = dr.Log.from_arrays(t, {"x": np.sin(t), "x_dot": np.cos(t), "x_ddot": -np.sin(t), "thrust": np.cos(3.0 * t)})
-    log.write(tmp_path / "log.csv")
+    t, model = np.arange(300) * 0.01, dr.models.underwater_vehicle()
+    inputs = dr.Log.from_arrays(t, {**dict.fromkeys(model.signals, 0.0 * t), "thrust": 90.0 * np.cos(3.0 * t)})
+    plant = dr.Plant(model, dict(zip(model.parameters, (120.0, 20.0, 35.0, 3.0), strict=True)))
+    dr.simulate(plant, inputs, initial_state={"x": 0.0, "x_dot": 0.0}).write(tmp_path / "log.csv")
     code = """
 import sys
 from diransac.cli import main

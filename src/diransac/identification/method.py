@@ -113,7 +113,8 @@ def fit(method: Method, dataset: Dataset, seed: int, callback: Callback | None =
     except np.linalg.LinAlgError as error:
         failed = f"linear algebra fails in {method.name} ({error})"
         raise IdentificationError(f"{dataset.source}: {failed}: {_cause_of_failure(dataset)}") from error
-    if not np.isfinite(found.values).all():
+    forces = [] if found.diagnosis is None else list(found.diagnosis.unmodelled_accelerations.values())
+    if not all(np.isfinite(x).all() for x in (found.values, *forces)):
         finds = f"{method.name} finds no finite parameters"
         raise IdentificationError(f"{dataset.source}: {finds}: {_cause_of_failure(dataset)}")
     return found

@@ -71,7 +71,8 @@ class Comparison:
         comparison, nor by more than a fiftieth of its loss.
     weights : (n_candidates,) array
         exp(-z^2 / 4) of the difference from the winner, z in standard errors; 1 for those that predict better.  The
-        difference in another log as long has twice the variance of the mean difference in this one.
+        difference in another log as long has twice the variance of the mean difference in this one.  That of a winner
+        whose loss is negligible is the only one.
     as_good : (n_candidates,) bool array
         Candidates that predict as well, within the noise of the comparison.
     """
@@ -90,7 +91,9 @@ class Comparison:
         best = int(np.flatnonzero(difference <= np.minimum(quantile * error, _AS_WELL) + _ROUNDING)[0])
         difference, error = _differences(logs, best)
         z = np.nan_to_num(np.maximum(difference, 0.0) / (error + _ROUNDING), nan=np.inf)
-        return cls(best, np.exp(-0.25 * np.square(z)), np.asarray(z <= quantile))
+        alone = _means(scores[best].losses) < _NEGLIGIBLE
+        weights = np.where(alone & (np.arange(len(z)) != best), 0.0, np.exp(-0.25 * np.square(z)))
+        return cls(best, weights, np.asarray(z <= quantile))
 
 
 def horizons_of(intervals: ShootingIntervals, horizon: float | None) -> list[int]:

@@ -1,4 +1,4 @@
-"""Findings of a fit on itself: errors of sensors, parameters that change, methods that disagree.
+"""Findings of a fit on itself: errors of sensors, and parameters that change.
 
 Parts of the logs are compared without another fit.  Where the model is not exact, parameters are projected again from a
 part of the intervals, and the others are predicted with them.  Where it is exact, each interval has a contribution to
@@ -19,7 +19,6 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.estimate import Finding
-from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
 from diransac.identification.methods.lo_diransac.normal_equations import variances_of_intervals
 from diransac.identification.methods.lo_diransac.projection import (
     batch_sums,
@@ -38,8 +37,8 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
+    from diransac.identification.methods.lo_diransac.segments import ActingInputs
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-    from diransac.identification.methods.lo_diransac.smoothing import Motion
 
 __all__ = ["Change", "Parts", "compared_parts", "findings_of_fit"]
 
@@ -59,8 +58,6 @@ _STRETCHES, _BY_CHANCE, _NEGLIGIBLE, _ROUNDING = 10, 3.72, 2e-4, 1e-9
 # Residual of an equation over that of the worst, at least.
 _SMALLEST = 1e-6
 _TINY = 1e-300
-# Log residual of each signal that is as small.
-_AS_WELL = 0.03
 # Intervals of half the logs from which parameters and their scatter are estimated, at least.
 _FEWEST_INTERVALS = 9
 
@@ -135,29 +132,28 @@ class Parts:
     deviation: Deviation | None = None
 
 
-def findings_of_fit(found: Explanation, motion: Motion, result: ProjectedEstimate, parts: Parts) -> Iterator[Finding]:
+def findings_of_fit(found: Explanation, parts: Parts, acting: ActingInputs | None) -> Iterator[Finding]:
     """Findings for and against an estimate.
 
     Parameters
     ----------
     found : Explanation
-    motion : Motion
-        Smoothed motion over the rows of the intervals.
-    result : ProjectedEstimate
     parts : Parts
         Result of `compared_parts`.
+    acting : ActingInputs or None
+        Inputs of an estimate that is none of the fit, and to which errors of recordings that the fit has do not apply.
 
     Returns
     -------
     iterator of Finding
     """
-    if found.intervals.hold != "zero-order" and not found.intervals.lag:
-        how = {"linear": "linearly", "smooth": "smoothly"}[found.intervals.hold]
+    hold = found.intervals.hold if acting is None else acting.hold
+    if hold != "zero-order" and not (found.intervals.lag and acting is None):
+        how = {"linear": "linearly", "smooth": "smoothly"}[hold]
         yield Finding("note", f"Inputs that vary {how} between samples explain this log better than held ones.")
-    yield from _of_recordings(found.intervals, found.refinement.fit)
+    if acting is None:
+        yield from _of_recordings(found.intervals, found.refinement.fit)
     yield from _of_parts(found.intervals.layout.names, parts)
-    if not found.exact:
-        yield from _of_plain_least_squares(found.intervals, motion, result)
 
 
 def _of_recordings(intervals: ShootingIntervals, fit: Fit) -> Iterator[Finding]:
@@ -357,31 +353,3 @@ def _scales(residuals: FloatArray) -> FloatArray:
     """Size ``(n_v,)`` of the residuals of each equation."""
     scale = np.sqrt(np.square(residuals).mean(axis=0))
     return np.asarray(np.maximum(scale, _SMALLEST * scale.max() + _TINY))
-
-
-def _of_plain_least_squares(
-    intervals: ShootingIntervals, motion: Motion, result: ProjectedEstimate
-) -> Iterator[Finding]:
-    """Parameters of plain least squares of the smoothed motion that lie far outside their intervals.
-
-    They are no alarm where simulations with them agree less with the log.
-    """
-    if intervals.model.nonlinear_parameters:
-        return
-    weak = weak_form(intervals, motion)
-    everything: BoolArray = np.ones((1, *weak.b.shape), bool)
-    plain = weak.solve_sized(everything)[0]
-    both, seen = np.array([plain, result.parameters]), intervals.known.any(axis=0)
-    worse, own = robust_scores(intervals, motion, both, np.arange(len(intervals)))
-    if not worse < own + _AS_WELL * seen.sum():
-        return
-    _, variance = _change(weak.W, weak.W @ plain - weak.b)
-    error = np.sqrt(variance + np.diag(result.covariance))
-    solved: BoolArray = np.asarray(weak.W.any(axis=(0, 1)))
-    for name, a, b, s, ok in zip(intervals.layout.names, plain, result.parameters, error, solved, strict=True):
-        apart, size = abs(a - b), abs(b)
-        if ok and np.isfinite(s) and apart > _CLEAR * s and apart > _SERIOUS * size:
-            text = (
-                f"Plain least squares explains the log as well, with {name} = {number(a, 3)} far outside the interval"
-            )
-            yield Finding("care", f"{text}: noise of the smoothed motion, or a term that the model lacks.")

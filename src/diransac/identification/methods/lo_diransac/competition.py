@@ -121,6 +121,8 @@ def compete(
         first, refused = None, error
     if first is not None and (settings.set_points or is_settled(first.likeliest, first.motion)):
         return first
+    if first is not None and not first.likeliest.complete:
+        return first
     contest = Contest(settings, dataset, whole[0], whole[1] if first is None else first.motion, seed, callback)
     try:
         found = _decided(contest, first, whole[2])

@@ -18,7 +18,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
@@ -257,8 +256,10 @@ def _solved(G: FloatArray, h: FloatArray) -> FloatArray:
 def _connected(W: FloatArray) -> BoolArray:
     """Mask ``(n_p, n_groups)`` of the parameters that some equations ``(n, r, n_p)`` connect; others are alone."""
     used = W.any(axis=0).astype(int)
-    labels = connected_components(used.T @ used, directed=False)[1]
-    return np.asarray(labels[:, None] == np.unique(labels))
+    joined = (used.T @ used > 0) | np.eye(used.shape[1], dtype=bool)
+    for _ in range(used.shape[1].bit_length()):
+        joined = joined.astype(int) @ joined > 0
+    return np.asarray(np.unique(joined, axis=0).T)
 
 
 def random_sets(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -225,7 +225,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         *_checks_of_bounds(best),
         *_checks_of_unmeasured(best),
         *instrumented.findings,
-        *findings_of_fit(likeliest, motion, replace(result, covariance=result.covariance + ambiguity), parts),
+        *findings_of_fit(likeliest, parts, best.decided.acting if best.decided else None),
     )
     found = _Found(dataset, best, result, ambiguity, instrumented.tests, lacks)
     end = "converged" if refined.converged else "limit of steps"

@@ -467,24 +467,24 @@ def choose_half_widths(model: Model, logs: Sequence[Samples], dt: float, narrowe
     )
     factors = [k for k in range(20) if k == 0 or 8 * length * _WIDER**k < longest]
     candidates = [np.maximum(usual // _WIDER, _FEWEST * apart), *(usual * _WIDER**k for k in factors)]
-    errors = np.array([_prediction_errors(model, logs, dt, halves, usual, apart) for halves in candidates])
-    best = 1 + int(np.argmin(np.log(errors[1:]).sum(axis=1)))
+    tried = [_prediction_errors(model, logs, dt, halves, usual, apart) for halves in candidates]
+    best = 1 + int(np.argmin([np.log(errors).sum() for errors, _ in tried[1:]]))
     # Narrower windows have noisier derivatives: they are taken where the others miss a visible part of the motion.
-    visible = np.log(np.maximum(errors, _VISIBLE)).sum(axis=1)
+    visible = [float(np.log(np.maximum(first, _VISIBLE)).sum()) for _, first in tried]
     best = 0 if visible[0] < visible[best] else best
     return candidates[best], int(length) * _WIDER ** max(best - 1, 0)
 
 
 def _prediction_errors(
     model: Model, logs: Sequence[Samples], dt: float, halves: IntArray, usual: IntArray, apart: IntArray
-) -> FloatArray:
-    """Robust scale of the left-out samples of each signal, over its spread, at knots spread over the logs."""
+) -> tuple[FloatArray, FloatArray]:
+    """Robust scale of the left-out samples over a signal's spread: of each signal, and of the first of each chain."""
     measured, known, centre = (
         np.concatenate([getattr(log, name) for log in logs]) if len(logs) > 1 else getattr(logs[0], name)
         for name in ("measured", "known", "centre")
     )
     about, sizes = _joined(model, [log.centre for log in logs]), [len(log.measured) for log in logs]
-    found = list[FloatArray]()
+    found, first_of_chains = list[FloatArray](), list[float]()
     for columns, half in _alike(_chains(model), halves, _TRIALS * (2 * int(usual.max()) + 1)):
         k = columns[0, 0]
         stride = max(1, half // usual[k]) if apart[k] == 1 else 1
@@ -498,9 +498,11 @@ def _prediction_errors(
         coefficients = _coefficients(values, oks & even, first, orders, spread)
         fitted = np.einsum("Cka,jta->Cktj", coefficients, orders)
         scale = _scale(values - fitted, oks & near[:, None] & ~even)
-        seen = oks.any(axis=(1, 2))
-        found.append((np.maximum(scale, _FLOOR * spread + 1e-12) / (spread + 1e-12))[seen])
-    return np.concatenate(found)
+        seen: BoolArray = np.asarray(oks.any(axis=(1, 2)))
+        errors = np.maximum(scale, _FLOOR * spread + 1e-12) / (spread + 1e-12)
+        found.append(errors[seen])
+        first_of_chains += [float(own[ok][0]) for own, ok in zip(errors, seen, strict=True) if ok.any()]
+    return np.concatenate(found), np.array(first_of_chains)
 
 
 def _windows(values: NDArray[Scalar], rows: IntArray) -> NDArray[Scalar]:
