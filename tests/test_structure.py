@@ -227,7 +227,7 @@ def test_structure_survives_json(lacking):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("weight", 1.5), ("weight", -0.1), ("variance", -1.0), ("mean", "NaN"), ("variance", "Infinity")],
+    [("weight", 1.5), ("weight", -0.1), ("variance", -1.0), ("effects", {"damping": "NaN"}), ("variance", "Infinity")],
 )
 def test_terms_of_no_distribution_are_refused(lacking, field, value):
     data = json.loads(json.dumps(lacking[0].to_dict()))

@@ -288,14 +288,19 @@ class Result:
             The method has not tested any terms.
         """
         terms, intervals = self._tested_terms(), self.intervals(level)
-        effects = np.array([[x.effects.get(n, 0.0) for n in self.layout.names] for x in terms])
-        effects = effects.reshape(-1, len(self.layout)) @ self._of_parameters.T
-        means, variances = (np.array([getattr(x, n) for x in terms])[:, None] for n in ("mean", "variance"))
+        effects, shifts = (
+            np.array([[values.get(n, 0.0) for n in self.layout.names] for values in of_terms]).reshape(
+                -1, len(self.layout)
+            )
+            @ self._of_parameters.T
+            for of_terms in ([x.effects for x in terms], [x.shifts for x in terms])
+        )
+        variances = np.array([x.variance for x in terms])[:, None]
         found = mixture_intervals(
             np.array(list(self.parameters.values())),
             np.array(list(self.standard_errors.values())),
             np.array([x.weight for x in terms]),
-            effects * means,
+            shifts,
             np.square(effects) * variances,
             level,
             student_quantile(self.degrees_of_freedom, 0.5 + level / 2.0),

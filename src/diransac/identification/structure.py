@@ -68,19 +68,21 @@ class PossibleTerm:
         The term for readers, such as ``sign(x_dot)``; may be empty.
     weight : float
         Probability of the term, by its evidence and its prior.
-    mean, variance : float
+    variance : float
         Of its coefficient, if the model lacks the term.
     effects : mapping of str to float
         Change of each parameter per unit of the coefficient.
+    shifts : mapping of str to float
+        Parameters if the model lacks the term, less those of the estimate.
     """
 
     kind: str
     place: str
     formula: str
     weight: Number
-    mean: Number
     variance: Number
     effects: Values
+    shifts: Values
 
     def __str__(self) -> str:
         formula = f", {self.formula}" if self.formula and self.kind != INPUT_GAIN else ""
@@ -125,7 +127,7 @@ def check_terms(terms: Sequence[PossibleTerm]) -> None:
     terms : sequence of PossibleTerm
         As read from a file.
     """
-    figures = [x for one in terms for x in (one.mean, one.variance, *one.effects.values())]
+    figures = [x for one in terms for x in (one.variance, *one.effects.values(), *one.shifts.values())]
     if not all(abs(x) < _LARGEST for x in figures) or any(x.variance < 0.0 for x in terms):
         raise ValueError("possible_terms: a coefficient that no term has")
     if not all(0.0 <= x.weight <= 1.0 for x in terms) or sum(x.weight for x in terms) > 1.0 + _ROUNDING:
@@ -207,8 +209,8 @@ def largest(terms: Sequence[PossibleTerm], shares: Mapping[str, float]) -> Possi
     """
 
     def spread(x: PossibleTerm) -> float:
-        effect = sum(share * x.effects.get(name, 0.0) for name, share in shares.items())
-        return float(x.weight * effect**2 * (x.variance + x.mean**2))
+        effect, shift = (sum(share * y.get(n, 0.0) for n, share in shares.items()) for y in (x.effects, x.shifts))
+        return float(x.weight * (effect**2 * x.variance + shift**2))
 
     found = max(terms, key=spread, default=None)
     return found if found is not None and spread(found) > 0.0 else None

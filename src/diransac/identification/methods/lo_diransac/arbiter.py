@@ -52,7 +52,7 @@ class Scores:
     ----------
     errors : (n_horizons,) array
         Root mean square error of the predicted samples over that of the prediction that nothing changes.
-    losses : (n_blocks,) array
+    losses : (n_horizons, n_blocks) array
         Mean loss of each block; NaN where it has no segment with a sample.
     """
 
@@ -83,15 +83,22 @@ class Comparison:
 
     @classmethod
     def of(cls, scores: Sequence[Scores], timed: BoolArray) -> Comparison:
-        """Comparison of candidates, ``timed (n,)`` those with another timing of the inputs than was recorded."""
-        logs = np.log(np.array([x.losses for x in scores]) + _NEGLIGIBLE) + _TIMING * timed[:, None]
+        """Comparison of candidates, ``timed (n,)`` those with another timing of the inputs than was recorded.
+
+        Horizons over which no candidate predicts better than that nothing changes do not count: there, an unstable
+        machine is lost, and estimates that respond less to their inputs have the smaller errors.
+        """
+        told = np.nanmin([x.errors for x in scores], axis=0) < 1.0
+        told = told if told.any() else np.ones_like(told)
+        losses = _means(np.array([x.losses[told] for x in scores]).swapaxes(1, 2))
+        logs = np.log(losses + _NEGLIGIBLE) + _TIMING * timed[:, None]
         first = int(np.nanargmin(_means(logs)))
         difference, error = _differences(logs, first)
         quantile = student_quantile(max(int(np.isfinite(logs).sum(axis=1).max()) - 1, 1), 0.975)
         best = int(np.flatnonzero(difference <= np.minimum(quantile * error, _AS_WELL) + _ROUNDING)[0])
         difference, error = _differences(logs, best)
         z = np.nan_to_num(np.maximum(difference, 0.0) / (error + _ROUNDING), nan=np.inf)
-        alone = _means(scores[best].losses) < _NEGLIGIBLE
+        alone = _means(losses[best]) < _NEGLIGIBLE
         weights = np.where(alone & (np.arange(len(z)) != best), 0.0, np.exp(-0.25 * np.square(z)))
         return cls(best, weights, np.asarray(z <= quantile))
 
@@ -121,11 +128,7 @@ def horizons_of(intervals: ShootingIntervals, horizon: float | None) -> list[int
 
 
 def _placed(intervals: ShootingIntervals, blocks: Blocks, n_before: int, n_after: int) -> tuple[IntArray, IntArray]:
-    """First rows of segments within a stretch, spread over the blocks, and the block that each has no part in.
-
-    That is the block of the middle of the predicted rows: long predictions are of others in part, but few parameters
-    are determined by many rows.
-    """
+    """First rows of segments within a stretch, spread over the blocks, and the block of the middle of each."""
     n_rows, starts, left_out = n_before + n_after, [], []
     for part in stretches(intervals):
         own = blocks.of_row[part]
@@ -150,8 +153,9 @@ class Arbiter:
     segments : Segments
         Of rows before and after the beginning of a prediction; inputs as any candidate's.
     block : (K,) int array
-        Block that the estimate which predicts a segment has no part of.
-    n_blocks : int
+        Block of the middle of the predicted rows.
+    left_out : (K, n_blocks) bool array
+        Blocks of which a segment has rows, without which estimates predict it.
     n_before : int
         Rows that determine the initial state of a segment.
     steps : tuple of int
@@ -166,7 +170,7 @@ class Arbiter:
 
     segments: Segments
     block: IntArray
-    n_blocks: int
+    left_out: BoolArray
     n_before: int
     steps: tuple[int, ...]
     motion: Motion
@@ -195,7 +199,8 @@ class Arbiter:
             return None
         starts, block = _placed(intervals, blocks, n_before, steps[-1])
         segments = Segments(intervals, acting, starts, n_before + steps[-1])
-        found = cls(segments, block, blocks.n, n_before, tuple(steps), motion, inlying, noise)
+        left_out = np.array([(blocks.of_row[segments.rows] == k).any(axis=1) for k in range(blocks.n)]).T
+        found = cls(segments, block, left_out, n_before, tuple(steps), motion, inlying, noise)
         return found if found._known.any() else None
 
     @property
@@ -224,7 +229,7 @@ class Arbiter:
         return spread, [np.where(size > 0.0, size, spread) for size in map(_root_mean_squares, changes)]
 
     def scores(self, candidate: Candidate) -> Scores:
-        """Predictions of a candidate, each block by its estimate without that block.
+        """Predictions of a candidate, each segment by its estimate without the blocks of the segment.
 
         The loss of a signal over a horizon is ``log(1 + mse / spread^2)``.
         """
@@ -237,15 +242,16 @@ class Arbiter:
             mse = np.where(count > 0, mse, np.nan)
             losses.append(np.log1p(np.minimum(mse / np.square(spread), _LOST)))
             found.append(_medians(mse / np.square(size)))
-        loss = _means(np.concatenate(losses, axis=1))
-        of_blocks = np.array([_means(loss[self.block == k]) for k in range(self.n_blocks)])
+        by_horizon = _means(np.array(losses))
+        blocks = range(self.left_out.shape[1])
+        of_blocks = np.array([_means(by_horizon[:, self.block == k]) for k in blocks]).T
         return Scores(np.sqrt(_means(np.array(found))), of_blocks)
 
     def _errors(self, candidate: Candidate) -> FloatArray:
         """Errors ``(K, n_after, n_s)`` of the predicted rows."""
         segments = replace(self.segments, acting=candidate.acting, intervals=candidate.intervals)
         intervals, columns = segments.intervals, segments.columns
-        lanes = candidate.without[self.block][None]
+        lanes = candidate.without_blocks(self.left_out)[None]
         weights = (intervals.sampled & self.inlying)[:, columns] / np.square(self.noise[columns])
         states = first_states(intervals, self.motion.signals, self.inlying, segments.starts)[None]
         states = segments.cut(self.n_before).estimated_states(lanes, states, weights)

@@ -324,7 +324,8 @@ class Contest:
         left = unexplained(intervals, fit, one.parameters)
         n, k = len(one.parameters), fit.x.shape[1] + fit.d.shape[1]
         of_z, of_s = np.zeros((len(intervals), k, n)), np.eye(len(fit.shared), n)
-        return ProjectedEstimate(one.parameters, covariance, left, np.arange(len(intervals)), of_z, of_s)
+        of_fit = fit.shared[:n]
+        return ProjectedEstimate(one.parameters, covariance, left, np.arange(len(intervals)), of_z, of_s, of_fit)
 
     def summary(self, winner: int) -> Competition:
         """The comparison, for the result."""
@@ -368,22 +369,15 @@ def _estimates_of_fit(
                 continue
             name = f"least squares on the fitted motion{origin}, {seconds:.2g} s"
             yield Candidate(
-                name, parameters, _left_out(parameters, parts, block, blocks, intervals), acting, intervals, estimate
+                name, parameters, _left_out(parameters, parts, block, blocks.n), acting, intervals, estimate
             )
     own = fitted_parameters(intervals, fit)
     steps = effect_of_intervals(intervals, fit).steps
-    without = _left_out(own.parameters, -steps, block, blocks, intervals)
+    without = _left_out(own.parameters, -steps, block, blocks.n)
     yield Candidate(f"joint fit{origin}", own.parameters, without, acting, intervals, lambda: own)
 
 
-def _left_out(
-    parameters: FloatArray, parts: FloatArray, block: IntArray, blocks: Blocks, intervals: ShootingIntervals
-) -> FloatArray:
-    """Parameters without each block, to first order, from the contribution of each interval to their error."""
-    K = blocks.n
+def _left_out(parameters: FloatArray, parts: FloatArray, block: IntArray, K: int) -> FloatArray:
+    """Parameters without each of K blocks, to first order, from the contribution of each interval to their error."""
     sums = np.array([parts[block == k].sum(axis=0) for k in range(K)])
-    found = parameters + K / (K - 1.0) * sums
-    for j, bound in enumerate(intervals.layout.bounds):
-        least = max(bound.lower, 0.5 * parameters[j]) if bound.positive else bound.lower
-        found[:, j] = np.clip(found[:, j], least, bound.upper)
-    return found
+    return np.asarray(parameters + K / (K - 1.0) * sums)

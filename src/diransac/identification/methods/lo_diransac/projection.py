@@ -116,7 +116,9 @@ class ProjectedEstimate:
     windows : (n_windows,) int array
         First intervals of the windows over which the equations were averaged.
     of_z, of_s : (W, k, n) and (n_s, n) array
-        Derivatives of the parameters with respect to the unknowns of the fit.
+        Derivatives of the parameters that were read from a fit with respect to its unknowns.
+    of_fit : (n,) array
+        Those parameters, of which the estimate may be a mean with others, or to which it was preferred.
     """
 
     parameters: FloatArray
@@ -125,6 +127,7 @@ class ProjectedEstimate:
     windows: IntArray
     of_z: FloatArray
     of_s: FloatArray
+    of_fit: FloatArray
 
 
 @dataclass(frozen=True)
@@ -352,7 +355,7 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     p = fit.shared[: intervals.n_p]
     covariance = effect.covariance * np.outer(more, more) + effect_on(intervals, fit, effect.z, effect.s)
     left, windows = unexplained(intervals, fit, p), np.arange(len(intervals))
-    return ProjectedEstimate(p, covariance, left, windows, np.zeros_like(effect.z), np.eye(*effect.s.shape))
+    return ProjectedEstimate(p, covariance, left, windows, np.zeros_like(effect.z), np.eye(*effect.s.shape), p)
 
 
 @dataclass(frozen=True)
@@ -409,8 +412,8 @@ def _combined_with_priors(intervals: ShootingIntervals, fit: Fit, found: Project
     p, covariance = combined(found.parameters, found.covariance, layout.with_prior, mean, variance)
     unit, none = np.eye(len(p)), np.zeros(len(mean))
     shrunk = np.stack([combined(x, found.covariance, layout.with_prior, none, variance)[0] for x in unit])
-    found = replace(found, of_z=found.of_z @ shrunk, of_s=found.of_s @ shrunk)
-    return with_parameters(intervals, fit, replace(found, covariance=covariance), p)
+    found = replace(found, of_z=found.of_z @ shrunk, of_s=found.of_s @ shrunk, of_fit=p, covariance=covariance)
+    return with_parameters(intervals, fit, found, p)
 
 
 def with_parameters(
@@ -531,7 +534,7 @@ def _solution(
     covariance[stuck] = covariance[:, stuck] = 0.0
     covariance[stuck, stuck] = np.inf
     left = _over_windows(unexplained(intervals, fit, p), windows)
-    return ProjectedEstimate(p, covariance, left, windows, *(x * ~stuck for x in slopes))
+    return ProjectedEstimate(p, covariance, left, windows, slopes[0] * ~stuck, slopes[1] * ~stuck, p)
 
 
 def _slopes(

@@ -33,8 +33,8 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 __all__ = ["simulation_error_candidates"]
 
-_SHORTEST, _GROWTH, _FEWEST = 8, 3, 12
-"""Rows of the shortest segments, the factor by which they grow, and the number of segments at which they do no more."""
+_SHORTEST, _GROWTH = 8, 3
+"""Rows of the shortest segments, and the factor by which they grow, as long as they are more than the blocks."""
 _N_RANDOM, _DECADES = 16, 1.0
 """Number of random starts, and how far from known parameters they are."""
 _SCREENED, _FOLLOWED = 16, 2
@@ -85,7 +85,7 @@ def simulation_error_candidates(
         return []
     chain = [min(solved, key=lambda x: x.cost)]
     longest = max(x.stop - x.start for x in stretches(intervals))
-    while len(chain[-1].segments) > _FEWEST and _GROWTH * chain[-1].segments.n_rows <= longest:
+    while len(chain[-1].segments) > _GROWTH * blocks.n and _GROWTH * chain[-1].segments.n_rows <= longest:
         chain.append(chain[-1].grown(_GROWTH * chain[-1].segments.n_rows).descended())
     taken = chain[0].segments.acting
     others = [chain[-1].with_inputs(x).descended() for x in actings if x is not taken]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import IdentificationError, LogError, SettingsError
 from diransac.identification.estimators import regression
 from diransac.identification.methods.lo_diransac.segments import ActingInputs
@@ -26,6 +26,8 @@ __all__ = ["Blocks", "Candidate", "jackknife", "least_squares_candidates"]
 
 N_BLOCKS = 10
 """Number of blocks, of which each is left out in turn."""
+_KEPT = 0.5
+"""Part of a positive parameter that is left at least, where blocks are left out."""
 _BANDWIDTHS = (0.5, 1.0, 2.0, 4.0)
 """Of filtered least squares, over the bandwidth that the package chooses for a log."""
 _MOST_ROWS = 3000
@@ -81,6 +83,14 @@ class Candidate:
     acting: ActingInputs
     intervals: ShootingIntervals
     estimate: Callable[[], ProjectedEstimate] | None = None
+
+    def without_blocks(self, left_out: BoolArray) -> FloatArray:
+        """Parameters ``(K, n)`` without K sets ``(K, n_blocks)`` of blocks, to first order."""
+        found = self.parameters + left_out @ (self.without - self.parameters)
+        for j, bound in enumerate(self.intervals.layout.bounds):
+            least = max(bound.lower, _KEPT * self.parameters[j]) if bound.positive else bound.lower
+            found[:, j] = np.clip(found[:, j], least, bound.upper)
+        return np.asarray(found)
 
     @property
     def source(self) -> str:

@@ -117,7 +117,9 @@ def possible_terms(
     weights, means, variances = weighted(tests)
     own = np.diag(covariance)
     own = np.where(np.isfinite(own), own, np.inf)
-    added = weights * np.square(tests.effects) * (variances + np.square(means))
+    # With the term, least squares, simulation error and the fit would agree: what the fit has then is the estimate's.
+    shifts = tests.effects * means + (result.of_fit - result.parameters)[:, None]
+    added = weights * (np.square(tests.effects) * variances + np.square(shifts))
     kept = np.flatnonzero((added > _KEPT * own[:, None]).any(axis=0) & np.isfinite(added).all(axis=0))
     names = intervals.layout.names
     return tuple(
@@ -126,9 +128,9 @@ def possible_terms(
             term.place,
             term.formula,
             float(weights[k]),
-            float(means[k]),
             float(variances[k]),
             dict(zip(names, tests.effects[:, k].tolist(), strict=True)),
+            dict(zip(names, shifts[:, k].tolist(), strict=True)),
         )
         for k in kept[np.argsort(-weights[kept], kind="stable")]
     )
