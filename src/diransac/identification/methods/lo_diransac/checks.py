@@ -247,9 +247,9 @@ def _changing(
     changed = np.abs(apart) > _clear(apart, held_out)
     if changed.any():
         # Noise that the prior takes for unmodelled forces, or the reverse, is no change of the machine.
-        wide = inflated_prior(intervals, fit, prior_inflation)
-        _, apart_again = _of_halves(*_equations(intervals, wide, result), first)
-        changed &= apart_again * np.sign(apart) > _LIKELY
+        wide = _equations(intervals, inflated_prior(intervals, fit, prior_inflation), result)
+        if all(np.isfinite(x).all() for x in wide):
+            changed &= _of_halves(*wide, first)[1] * np.sign(apart) > _LIKELY
     halves = result.parameters + moved
     both = [Change(int(k), *halves[:, k].tolist()) for k in np.flatnonzero(changed)]
     return Parts([x for x in both if x.apart > _DIFFERENT], held_out)

@@ -120,7 +120,6 @@ def instrumented_estimate(
     plain: ProjectedEstimate,
     dataset: Dataset,
     names: Sequence[str],
-    prior_inflation: float,
 ) -> Instrumented:
     """Estimate with set-points as instruments where Hausman's test rejects the plain one.
 
@@ -134,8 +133,6 @@ def instrumented_estimate(
     dataset : Dataset
     names : sequence of str
         Set-points, as `check_set_points` admits them.
-    prior_inflation : float
-        As of `estimate_parameters`.
 
     Returns
     -------
@@ -151,7 +148,7 @@ def instrumented_estimate(
     replaced: BoolArray = np.asarray(contrast.together[rejected].any(axis=0))
     result = plain
     if rejected.any():
-        found = estimate_parameters(intervals, fit, prior_inflation, Instruments(means, replaced))
+        found = estimate_parameters(intervals, fit, Instruments(means, replaced))
         stopped = intervals.layout.on_bounds(found.parameters)[replaced].any()
         result = plain if stopped or intervals.layout.violations(found.parameters) else found
     if result is plain:

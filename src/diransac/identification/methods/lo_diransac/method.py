@@ -126,7 +126,7 @@ class LoDiransac(LoDiransacSettings):
         Whether discrepancies in the column space of the regressor are attributed to the parameters; otherwise these are
         those of the fit.
     prior_inflation : float, optional
-        Factor of the prior on model error whose effect on the parameters is added to their covariance.
+        Factor of the prior on model error under which a change of a parameter during a log must be seen, too.
     suggestions : bool, optional
         Whether terms are searched that would explain the unmodelled forces, and terms that the model may lack are
         weighted for `Result.structural_intervals`.
@@ -207,9 +207,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     report(callback, "estimating parameters", 0.9)
     instrumented = Instrumented(result, np.zeros(len(result.parameters)))
     if settings.set_points and settings.projection and not (likeliest.exact or best.impossible):
-        instrumented = instrumented_estimate(
-            intervals, refined.fit, result, dataset, settings.set_points, settings.prior_inflation
-        )
+        instrumented = instrumented_estimate(intervals, refined.fit, result, dataset, settings.set_points)
         result = instrumented.result
     predicts = best.decided is None or best.decided.summary.predicts
     if best.impossible or not predicts or dataset.layout.on_bounds(result.parameters).any():

@@ -180,7 +180,7 @@ class Contrast:
 
 
 def estimate_parameters(
-    intervals: ShootingIntervals, fit: Fit, prior_inflation: float, instruments: Instruments | None = None
+    intervals: ShootingIntervals, fit: Fit, instruments: Instruments | None = None
 ) -> ProjectedEstimate:
     """Parameters that solve the equations on the fitted motion by least squares, and their covariance.
 
@@ -189,8 +189,6 @@ def estimate_parameters(
     intervals : ShootingIntervals
     fit : Fit
         Most probable motion.
-    prior_inflation : float
-        Factor of the prior on model error whose effect on the parameters is added to their covariance.
     instruments : Instruments, optional
 
     Returns
@@ -199,9 +197,7 @@ def estimate_parameters(
         Within the inclusive bounds; parameters on them have an infinite variance.
     """
     wide = _with_wide_priors(intervals, fit)
-    found, inflated = _of_windows(intervals, wide, instruments), inflated_prior(intervals, wide, prior_inflation)
-    change = projected_parameters(intervals, inflated, instruments) - found.parameters
-    found = replace(found, covariance=found.covariance + np.outer(change, change))
+    found = _of_windows(intervals, wide, instruments)
     return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
 
 

@@ -206,7 +206,7 @@ def _parameters(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[P
     intervals, fit = likeliest.intervals, likeliest.refinement.fit
     if likeliest.exact or not settings.projection:
         return fitted_parameters(intervals, fit), ()
-    result, layout = estimate_parameters(intervals, fit, settings.prior_inflation), intervals.layout
+    result, layout = estimate_parameters(intervals, fit), intervals.layout
     impossible = layout.violations(result.parameters)
     return (fitted_parameters(intervals, fit) if impossible else result), impossible
 

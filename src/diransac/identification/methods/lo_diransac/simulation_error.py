@@ -41,6 +41,8 @@ _SCREENED, _FOLLOWED = 16, 2
 """Segments on which all starts are scored, and the number of starts that are followed."""
 _ROWS_OF_SEARCH, _MOST_ROWS = 3_000, 50_000
 """Rows of the fits from several starts, and of others, at most."""
+_OUTLYING = 6.0
+"""Robust standard deviations from which on a sample is far from the smoothed motion."""
 _STEPS, _CONVERGED, _NOISE_MOVES = 25, 0.1, 0.03
 """Steps at most; change of parameters, standard errors, and relative change of the noise that end them."""
 _DAMPING, _DAMPING_BOUNDS = 1e-6, (1e-12, 1e6)
@@ -155,9 +157,11 @@ def _scores(segments: Segments, motion: Motion, starts: FloatArray, noise: Mixtu
 
 
 def _states(segments: Segments, motion: Motion) -> FloatArray:
-    """Measured states ``(K, n_x)`` at the segments' starts, or those of a motion."""
-    every: BoolArray = np.ones_like(segments.intervals.known)
-    return first_states(segments.intervals, motion.signals, every, segments.starts)
+    """Measured states ``(K, n_x)`` at the segments' starts, or those of a motion where a sample is far from it."""
+    intervals = segments.intervals
+    apart = np.where(intervals.known, np.nan_to_num(intervals.measured - motion.signals), 0.0)
+    far: BoolArray = np.abs(apart) > _OUTLYING * lower_scale(apart.copy(), intervals.known)
+    return first_states(intervals, motion.signals, ~far, segments.starts)
 
 
 def _flat(values: NDArray[Scalar]) -> NDArray[Scalar]:
