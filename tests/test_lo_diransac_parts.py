@@ -443,7 +443,7 @@ def test_noise_that_unmodelled_accelerations_follow_does_not_attenuate_parameter
     accelerations = means_of_intervals(intervals, W)[:, 2, 1]
     moments = means_of_intervals(intervals, 0.177 * intervals.inputs)[:, 1]
     assert accelerations @ moments / (accelerations @ accelerations) < 0.85 * TRUTH[1]
-    found = estimate_parameters(intervals, fit, 10.0)
+    found = estimate_parameters(intervals, fit)
     assert len(found.windows) < 0.3 * len(intervals)
     assert found.parameters == pytest.approx(TRUTH, rel=0.05)
     assert (np.abs(found.parameters - TRUTH) < 4.0 * np.sqrt(np.diag(found.covariance))).all()
@@ -452,7 +452,7 @@ def test_noise_that_unmodelled_accelerations_follow_does_not_attenuate_parameter
 
 def test_every_interval_counts_where_unmodelled_accelerations_are_small():
     intervals, fit = noisy_motion(1000, 1e-4)
-    assert len(estimate_parameters(intervals, fit, 10.0).windows) == len(intervals)
+    assert len(estimate_parameters(intervals, fit).windows) == len(intervals)
 
 
 def test_terms_are_sought_in_windows_of_four_intervals_at_most():
