@@ -9,7 +9,7 @@ import pytest
 
 import diransac as dr
 from diransac.data.dataset import Dataset
-from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison
+from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison, Scores
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments, stretches
 from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
@@ -172,6 +172,46 @@ def test_a_block_is_predicted_without_its_own_estimate(bound: tuple) -> None:
     assert comparison([cheating, candidate("honest", truth() * 1.01, bound)], bound).best == 1
 
 
+def scores(losses: list[list[float]], errors: list[float]) -> Scores:
+    """Losses by horizon and block."""
+    return Scores(np.array(errors), np.array(losses))
+
+
+def test_another_timing_must_reduce_the_loss_by_a_fifth() -> None:
+    recorded, late = scores([[1e-2, 1.1e-2, 0.9e-2]], [0.1]), scores([[0.9e-2, 1.0e-2, 0.8e-2]], [0.1])
+    assert Comparison.of([recorded, late], np.array([False, False])).best == 1
+    assert Comparison.of([recorded, late], np.array([False, True])).best == 0
+    much = scores([[0.5e-2, 0.6e-2, 0.4e-2]], [0.1])
+    assert Comparison.of([recorded, much], np.array([False, True])).best == 1
+
+
+def test_horizons_that_nothing_predicts_do_not_count() -> None:
+    right = scores([[1e-2, 1.1e-2, 0.9e-2], [0.8, 0.9, 1.0]], [0.1, 3.0])
+    dull = scores([[2e-2, 2.1e-2, 1.9e-2], [0.2, 0.3, 0.1]], [0.2, 1.2])
+    assert Comparison.of([dull, right], np.zeros(2, bool)).best == 1
+
+
+def test_weights_are_those_of_a_difference_in_another_log() -> None:
+    base = np.array([1e-2, 1.2e-2, 0.8e-2, 1.1e-2])
+    factors = np.exp([0.2, 0.4, 0.0, 0.2])
+    other = scores([(base * factors).tolist()], [0.1])
+    z = 0.2 / (np.std([0.2, 0.4, 0.0, 0.2]) / np.sqrt(3.0))
+    found = Comparison.of([scores([base.tolist()], [0.1]), other], np.zeros(2, bool))
+    np.testing.assert_allclose(found.weights, [1.0, np.exp(-0.25 * z**2)], rtol=1e-2)
+
+
+def test_a_segment_is_predicted_without_all_blocks_that_it_touches(bound: tuple) -> None:
+    judge = arbiter(bound)
+    rows = judge.segments.rows
+    touched = [np.unique(bound[3].of_row[x]) for x in rows]
+    assert max(len(x) for x in touched) > 1
+    assert all(np.flatnonzero(own).tolist() == x.tolist() for own, x in zip(judge.left_out, touched, strict=True))
+    apart = np.arange(1.0, bound[3].n + 1.0)[:, None] * 1e-3 * truth()
+    one = candidate("one", truth(), bound, truth() + apart)
+    expected = truth() + np.array([apart[x].sum(axis=0) for x in touched])
+    np.testing.assert_allclose(one.without_blocks(judge.left_out), expected, rtol=1e-12)
+
+
 def test_horizon_is_the_one_that_is_asked_for(bound: tuple) -> None:
     found = arbiter(bound, 0.05)
     assert len(found.horizons) == 1
@@ -213,6 +253,14 @@ def test_the_result_predicts_as_well_as_every_competitor(lacking: dr.Result) -> 
 def test_an_answer_where_smoothing_sees_nothing(lacking: dr.Result) -> None:
     assert lacking.parameters["m"] == pytest.approx(TRUTH["m"], rel=0.03)
     assert lacking.estimate.resolution.hold == "linear"
+
+
+def test_the_answer_is_a_mean_of_those_that_predict_as_well(lacking: dr.Result) -> None:
+    good = [x.parameters for x in lacking.competition.competitors if x.as_good]
+    assert len(good) > 1
+    for name, value in lacking.parameters.items():
+        values = [x[name] for x in good]
+        assert min(values) - 0.05 * abs(value) <= value <= max(values) + 0.05 * abs(value)
 
 
 def test_the_competition_is_printed_and_stored(lacking: dr.Result, tmp_path) -> None:

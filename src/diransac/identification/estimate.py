@@ -338,7 +338,8 @@ class Competition:
     Parameters
     ----------
     winner : str
-        Name of the estimate that is the result; no two have the same.
+        Name of the estimate that predicts best; no two have the same.  The result is its mean with those that predict
+        as well.
     horizons : tuple of float
         Horizons of the predictions, s.
     competitors : tuple of Competitor
@@ -367,7 +368,9 @@ class Competition:
         best = self._best_of_sources()
         own = next(x for x in best if x.name == self.winner)
         others = ", ".join(f"{x.name} {x.errors[middle]:.2g}" for x in best if x is not own)
-        text = f"held-out prediction over {self.horizons[middle]:.2g} s chose: {self.winner}"
+        n = sum(x.as_good for x in self.competitors if x.name != self.winner)
+        also = f" and {n} that predict as well" if n else ""
+        text = f"held-out prediction over {self.horizons[middle]:.2g} s chose: {self.winner}{also}"
         error = f"error {own.errors[middle]:.2g} of that of no change"
         return f"{text}, {error}" + (f"; {others}" if others else "")
 
