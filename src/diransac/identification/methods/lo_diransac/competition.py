@@ -156,7 +156,7 @@ def _decided(contest: Contest, first: Searched | None, notes: tuple[str, ...]) -
     if not searches:
         return None
     of_fit = next((x for x in searches if x.likeliest is contest.origins[winner]), None)
-    chosen = of_fit or searches[0]
+    chosen = of_fit or min(searches, key=contest.loss_of)
     result = contest.result(winner, chosen.likeliest)
     decided = Decided(contest.summary(winner), None if of_fit else contest.candidates[winner].acting)
     return replace(chosen, result=result, decided=decided, impossible=of_fit.impossible if of_fit else ())
@@ -289,6 +289,11 @@ class Contest:
             return False
         own = np.array([x is search.likeliest for x in self.origins])
         return bool((own & self.comparison.as_good).any())
+
+    def loss_of(self, search: Searched) -> float:
+        """Least loss of the estimates of a search's fit."""
+        own = [np.nanmean(x.losses) for x, y in zip(self.scores, self.origins, strict=True) if y is search.likeliest]
+        return float(min(own, default=np.inf))
 
     def second(self, winner: int, notes: tuple[str, ...]) -> Searched | None:
         """A search from an estimate and its simulated motion; None where it fails."""
