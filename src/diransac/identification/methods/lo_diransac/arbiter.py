@@ -75,11 +75,14 @@ class Comparison:
         whose loss is negligible is the only one.
     as_good : (n_candidates,) bool array
         Candidates that predict as well, within the noise of the comparison.
+    losses : (n_candidates,) array
+        Mean losses over the blocks and the horizons that count.
     """
 
     best: int
     weights: FloatArray
     as_good: BoolArray
+    losses: FloatArray
 
     @classmethod
     def of(cls, scores: Sequence[Scores], timed: BoolArray) -> Comparison:
@@ -100,7 +103,7 @@ class Comparison:
         z = np.nan_to_num(np.maximum(difference, 0.0) / (error + _ROUNDING), nan=np.inf)
         alone = _means(losses[best]) < _NEGLIGIBLE
         weights = np.where(alone & (np.arange(len(z)) != best), 0.0, np.exp(-0.25 * np.square(z)))
-        return cls(best, weights, np.asarray(z <= quantile))
+        return cls(best, weights, np.asarray(z <= quantile), _means(losses))
 
 
 def horizons_of(intervals: ShootingIntervals, horizon: float | None) -> list[int]:

@@ -292,7 +292,8 @@ class Contest:
 
     def loss_of(self, search: Searched) -> float:
         """Least loss of the estimates of a search's fit."""
-        own = [np.nanmean(x.losses) for x, y in zip(self.scores, self.origins, strict=True) if y is search.likeliest]
+        assert self.comparison is not None
+        own = [x for x, y in zip(self.comparison.losses, self.origins, strict=True) if y is search.likeliest]
         return float(min(own, default=np.inf))
 
     def second(self, winner: int, notes: tuple[str, ...]) -> Searched | None:
@@ -348,13 +349,14 @@ class Contest:
         """The comparison, for the result."""
         assert self.comparison is not None
         assert self.arbiter is not None
-        names, rows = self.dataset.layout.names, zip(self.candidates, self.scores, self.comparison.as_good, strict=True)
+        names, c = self.dataset.layout.names, self.comparison
+        rows = zip(self.candidates, self.scores, c.losses, c.as_good, strict=True)
         competitors = tuple(
             Competitor(
-                one.name, tuple(x.errors.tolist()), float(np.nanmean(x.losses)), bool(as_good),
+                one.name, tuple(x.errors.tolist()), float(loss), bool(as_good),
                 dict(zip(names, one.parameters.tolist(), strict=True)),
             )
-            for one, x, as_good in rows
+            for one, x, loss, as_good in rows
         )  # fmt: skip
         return Competition(self.candidates[winner].name, self.arbiter.horizons, competitors)
 

@@ -127,6 +127,13 @@ class LoDiransac(LoDiransacSettings):
         those of the fit.
     prior_inflation : float, optional
         Factor of the prior on model error under which a change of a parameter during a log must be seen, too.
+    sources : sequence of str, optional
+        Sources of estimates besides the joint fit: "least squares", "simulation error", and "second fit", a joint fit
+        from the best of these where it predicts better.
+    start : mapping of str to float, optional
+        Values of parameters, each in its unit, from which simulation error starts, too.
+    horizon : float, optional
+        Horizon of the predictions that decide between estimates, s; None: several, from the time scales of the motion.
     suggestions : bool, optional
         Whether terms are searched that would explain the unmodelled forces, and terms that the model may lack are
         weighted for `Result.structural_intervals`.

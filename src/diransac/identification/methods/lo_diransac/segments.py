@@ -42,17 +42,20 @@ class ActingInputs:
         From row to row, one of `HOLDS`.
     timing : InputTiming
         Of the recorded inputs.
+    fitted : bool, optional
+        Whether a fit has changed them, by their timing or by what it left out of them.
     """
 
     values: FloatArray
     hold: str
     timing: InputTiming
+    fitted: bool = False
 
     @property
     def sentence(self) -> str:
-        """Hold and delay in words."""
+        """Hold in words, and whether they are those of a fit."""
         how = {"zero-order": "held", "linear": "linear", "smooth": "smooth"}[self.hold]
-        return f"{how} inputs" + ("" if self.timing == InputTiming() else " with their delay or lag")
+        return f"{how} inputs" + (" as in the fit" if self.fitted else "")
 
     def differs(self, others: Iterable[ActingInputs]) -> bool:
         """True if no other has the same values, held alike."""
@@ -67,7 +70,7 @@ class ActingInputs:
     def of_fit(cls, intervals: ShootingIntervals, fit: Fit, timing: InputTiming) -> ActingInputs:
         """Inputs with the timing of a fit, significant or not, which is named by ``timing``."""
         values = intervals.inputs + fit.shared[-1] * intervals.moving_inputs[:, intervals.model.n_u :]
-        return cls(values, intervals.hold, timing)
+        return cls(values, intervals.hold, timing, fitted=True)
 
 
 @dataclass(frozen=True)
