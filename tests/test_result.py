@@ -192,8 +192,8 @@ def test_binary_file_is_refused_by_name(tmp_path, content):
 @pytest.mark.parametrize(
     ("number", "says"),
     [
-        (1, "format 1, of an earlier version of diransac; this one reads 8. Identify again$"),
-        (7, "format 7, of an earlier"),
+        (1, "format 1, of an earlier version of diransac; this one reads 9. Identify again$"),
+        (8, "format 8, of an earlier"),
         (99, "format 99, of a later"),
         ("8", "no result of diransac"),
         (None, "no result of diransac"),

@@ -367,6 +367,35 @@ def test_two_logs_that_disagree_are_both_named(method):
     assert all("mass" in x.remark for x in result.logs)
 
 
+def rubbing(k: int, mass: float) -> dr.Log:
+    """A slider with dry friction that `SLIDER` lacks, pushed by gusts that it does not know."""
+    rng, dt, n = np.random.default_rng([11, k]), 0.02, 900
+    force = np.cumsum(rng.normal(size=n))
+    force = 6.0 * (force - force.mean()) / np.abs(force).max() + 3.0 * np.sin(0.05 * np.arange(n))
+    s, v, gust, found = 0.0, 0.0, 0.0, []
+    for i in range(n):
+        found.append((s, v))
+        gust += 0.5 * rng.normal() - 0.2 * gust
+        for _ in range(10):
+            v += 0.1 * dt * (force[i] - 0.5 * v - 0.8 * np.tanh(50.0 * v) + 0.3 * gust) / mass
+            s += 0.1 * dt * v
+    s, v = np.array(found).T + rng.normal(size=(2, n)) * [[0.001], [0.005]]
+    columns = {"s": s, "s_dot": v, "force": force}
+    return dr.Log.from_arrays(dt * np.arange(n), columns, source=f"slide {k}")
+
+
+def test_logs_of_a_machine_that_the_model_does_not_describe_agree_unless_one_has_another_mass():
+    """Each log's own estimate is by simulation error then, not by an identification of its own."""
+    alike, other = (
+        dr.identify(SLIDER, [rubbing(k, x) for k, x in enumerate(masses)], differentiate=True)
+        for masses in ((2.0, 2.0, 2.0), (2.0, 4.0, 2.0))
+    )
+    assert len(other.estimate.of_logs) == 3
+    assert [x.remark for x in alike.logs] == [""] * 3
+    assert [bool(x.remark) for x in other.logs] == [False, True, False]
+    assert "mass" in other.logs[1].remark
+
+
 def test_logs_that_agree_are_named_once_in_a_thousand_at_most():
     """Forty sets of three clean logs under white noise in the input: none is named by chance."""
     named = 0

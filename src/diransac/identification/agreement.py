@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.errors import DiransacError, TimeLimitError
+from diransac.identification.estimate import LogEstimate
 from diransac.identification.method import fit, within
 from diransac.identification.uncertainty import student_quantile
 from diransac.time_limit import check_time
@@ -34,16 +35,17 @@ _ROUNDING = 1e-12
 
 
 def disagreements(
-    method: Method, dataset: Dataset, seed: int, callback: Callback | None = None
+    method: Method, estimate: Estimate, dataset: Dataset, seed: int, callback: Callback | None = None
 ) -> tuple[list[str], list[str]]:
     """A sentence for each log whose own estimate disagrees with those of the others; empty where it agrees.
 
     The second list has a sentence on every log that cannot be compared, because alone it gives no estimate.
 
-    Each log is identified alone.  A shared parameter of log ``i`` is compared with the precision-weighted mean of the
-    other logs: ``|p_i - p| > t sqrt(B (C_i + C))``, with Student's ``t`` at the level shared among all comparisons and
-    the Birge ratio ``B >= 1`` of the others' scatter to their intervals.  The worst log is set aside and the others are
-    compared again, so that one deviating log does not make the rest disagree.  Input delays are compared likewise.
+    Each log's own estimate is `Estimate.of_logs`, where the method has it; otherwise the log is identified alone.  A
+    shared parameter of log ``i`` is compared with the precision-weighted mean of the other logs: ``|p_i - p| > t sqrt(B
+    (C_i + C))``, with Student's ``t`` at the level shared among all comparisons and the Birge ratio ``B >= 1`` of the
+    others' scatter to their intervals.  The worst log is set aside and the others are compared again, so that one
+    deviating log does not make the rest disagree.  Input delays are compared likewise.
 
     References
     ----------
@@ -52,16 +54,20 @@ def disagreements(
     """
     n, remarks, notes = len(dataset.segments), [""] * len(dataset.segments), list[str]()
     shared = [name for name, x in dataset.model.parameters.items() if not x.per_log]
-    found = {}
+    found: dict[int, LogEstimate] = {}
     for i in range(n):
-        try:
-            estimate = _alone(method, dataset, i, seed, within(callback, i / n, (i + 1) / n, f"log {i + 1} alone: "))
-        except TimeLimitError:
-            return remarks, ["the time limit was reached before the logs were compared with each other"]
-        if not isinstance(estimate, str) and any(np.isfinite(_marginal(estimate, name)[1]) for name in shared):
-            found[i] = estimate
+        own: LogEstimate | str
+        if estimate.of_logs:
+            own = estimate.of_logs[i]
         else:
-            reason = estimate if isinstance(estimate, str) else "its parameters are not identifiable from it alone"
+            try:
+                own = _alone(method, dataset, i, seed, within(callback, i / n, (i + 1) / n, f"log {i + 1} alone: "))
+            except TimeLimitError:
+                return remarks, ["the time limit was reached before the logs were compared with each other"]
+        if not isinstance(own, str) and any(np.isfinite(own.standard_errors[name]) for name in shared):
+            found[i] = own
+        else:
+            reason = own if isinstance(own, str) else "alone it tells too little of the parameters"
             notes.append(f"{dataset.given[i].source} could not be compared with the other logs: {reason}")
     level = _LEVEL / max(1, 2 * len(shared) * n)
     while len(found) > 1:
@@ -76,7 +82,7 @@ def disagreements(
     return remarks, notes
 
 
-def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callback | None) -> Estimate | str:
+def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callback | None) -> LogEstimate | str:
     """The estimate of one log, or the reason why that log alone gives none.
 
     Raises TimeLimitError: the time limit was reached.
@@ -84,21 +90,24 @@ def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callba
     try:
         found = fit(method, dataset.subset([i]), seed, callback)
         check_time()
-        return found
     except TimeLimitError:
         raise
     except (DiransacError, np.linalg.LinAlgError) as error:
         return str(error)
+    errors = dict(zip(found.parameters, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
+    delay, spread = 0.0, np.inf
+    if found.diagnosis is not None:
+        delay, spread = found.diagnosis.input_delay, found.diagnosis.input_delay_error
+    return LogEstimate(found.parameters, errors, delay, spread, found.degrees_of_freedom)
 
 
 def _worst(
-    found: Mapping[int, Estimate], i: int, parameters: Sequence[str], level: float, dt: float
+    found: Mapping[int, LogEstimate], i: int, parameters: Sequence[str], level: float, dt: float
 ) -> tuple[float, str]:
     """Largest difference of log ``i`` from the others over what is allowed, and a sentence on it."""
     worst, sentence = 0.0, ""
     t = student_quantile(min(x.degrees_of_freedom for x in found.values()), 1.0 - level)
-    delays = [_DELAY] if all(x.diagnosis is not None for x in found.values()) else []
-    for name in (*parameters, *delays):
+    for name in (*parameters, _DELAY):
         own, variance = _marginal(found[i], name)
         others = [_marginal(x, name) for j, x in found.items() if j != i]
         others = [(p, v) for p, v in others if np.isfinite(v)]
@@ -119,13 +128,11 @@ def _worst(
     return worst, sentence
 
 
-def _marginal(estimate: Estimate, name: str) -> tuple[float, float]:
+def _marginal(found: LogEstimate, name: str) -> tuple[float, float]:
     """A parameter, or the delay of the inputs, and its variance."""
     if name == _DELAY:
-        assert estimate.diagnosis is not None
-        return estimate.diagnosis.input_delay, estimate.diagnosis.input_delay_error**2
-    k = list(estimate.parameters).index(name)
-    return estimate.parameters[name], float(estimate.covariance[k, k])
+        return found.input_delay, found.input_delay_error**2
+    return found.parameters[name], found.standard_errors[name] ** 2
 
 
 def _combined(values: Sequence[tuple[float, float]]) -> tuple[float, float, float]:

@@ -36,6 +36,7 @@ __all__ = [
     "Finding",
     "HausmanTest",
     "Level",
+    "LogEstimate",
     "LogSummary",
     "Outcome",
     "Prediction",
@@ -382,6 +383,27 @@ class Competition:
         return list(best.values())
 
 
+@dataclass(frozen=True)
+class LogEstimate:
+    """Estimate from one of several logs alone.
+
+    Parameters
+    ----------
+    parameters, standard_errors : mapping of str to float
+        Each parameter, in its unit; its standard error is infinite where the log does not tell it.
+    input_delay, input_delay_error : float, optional
+        Delay of the inputs, s, and its standard error; infinite where it is not estimated.
+    degrees_of_freedom : int, optional
+        Of the standard errors.
+    """
+
+    parameters: Values
+    standard_errors: Values
+    input_delay: Number = 0.0
+    input_delay_error: Number = np.inf
+    degrees_of_freedom: int = 10_000
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Parameters of a model, their covariance, and the search that found them.
@@ -422,6 +444,9 @@ class Estimate:
         Comparison with other estimates; None where the exact model predicts the logs within their noise.
     possible_terms : tuple of PossibleTerm, optional
         Terms that the model may lack, with their weights; None: they were not tested.
+    of_logs : tuple of LogEstimate, optional
+        Estimates from each of several logs alone; empty where they are not compared with each other, or a fit of each
+        log is fast.
     """
 
     parameters: Values
@@ -441,6 +466,7 @@ class Estimate:
     suggestions: tuple[Suggestion, ...] = ()
     competition: Competition | None = None
     possible_terms: tuple[PossibleTerm, ...] | None = None
+    of_logs: tuple[LogEstimate, ...] = ()
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, np.float64).reshape(len(self.parameters), len(self.parameters))

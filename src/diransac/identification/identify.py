@@ -95,8 +95,7 @@ def identify(
         Time over which the model is to predict, s: lo-diransac compares estimates by predictions of this length.  None:
         several, from the time scales of the motion.
     compare_logs : bool, optional
-        Whether each of several logs is also identified alone, so that logs that disagree with the others are named;
-        that takes about as long again.
+        Whether each of several logs is also identified alone, so that logs that disagree with the others are named.
     with_suggestions : bool, optional
         Whether to identify again with the terms that the first identification suggests (`Result.suggestions`), and to
         return that result, whose model has them as further parameters; for lo-diransac.
@@ -295,7 +294,9 @@ class _Task:
         evaluation = evaluate(estimate, dataset, scoring, criteria)
         remarks, incomparable = [""] * len(logs), list[str]()
         if self.compares:
-            remarks, incomparable = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
+            remarks, incomparable = disagreements(
+                self.method, estimate, dataset, self.seed, within(progress, fitted, 1.0)
+            )
         report(progress, "done", 1.0)
         return Result(
             model=known.model,

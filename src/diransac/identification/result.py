@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MARKS", "Result"]
 
-_FORMAT = 8
+_FORMAT = 9
 _LATEST = 1e9
 """Bound of delays and lags, s, and of the drift of gains."""
 _BY_LOG = ("parameters", "covariance")

@@ -1,135 +1,27 @@
-"""Findings of a fit on itself: errors of sensors, and parameters that change.
-
-Parts of the logs are compared without another fit.  Where the model is not exact, parameters are projected again from a
-part of the intervals, and the others are predicted with them.  Where it is exact, each interval has a contribution to
-the parameters and an information, so that those of a part follow from sums: Cochran's test of homogeneity.
-
-References
-----------
-Chow 1960 (parameters of parts of a sample); Cochran 1954 (homogeneity of estimates).
-"""
+"""Findings of a fit on itself: errors of sensors and of inputs, and parameters that change."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.estimate import Finding
-from diransac.identification.methods.lo_diransac.normal_equations import variances_of_intervals
-from diransac.identification.methods.lo_diransac.projection import (
-    batch_sums,
-    effect_of_intervals,
-    inflated_prior,
-    least_squares_gains,
-    means_of_intervals,
-    means_of_windows,
-    residuals_of_motion,
-)
 from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs, lags_of_inputs
-from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.text_table import duration, number, percent
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
+    from diransac.identification.methods.lo_diransac.parts import Parts
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["Change", "Parts", "compared_parts", "findings_of_fit"]
+__all__ = ["findings_of_fit"]
 
-# A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious,
-# if held-out parts of the logs are predicted worse for it.
-_CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
 # Delay of an input that is worth a sentence, samples.
 _SMALL_DELAY = 0.1
-# Parts of the logs that are predicted by the rest; mean square of what the model leaves of them, over what it is for
-# parameters that do not change, from which on it is no chance; standard errors by which the parameter that changed most
-# differs then, and probability that any of the others differs as much by chance.
-_HELD_OUT, _WORSE, _LIKELY, _UNLIKELY = 5, 1.25, 2.0, 0.05
-# Parts whose parameters an exact model must have in common; normal deviation of a difference that is no chance, of a
-# probability of 1e-4; part of a parameter that is negligible; information about a direction of the parameters, over the
-# largest, that is rounding.
-_STRETCHES, _BY_CHANCE, _NEGLIGIBLE, _ROUNDING = 10, 3.72, 2e-4, 1e-9
-# Residual of an equation over that of the worst, at least.
-_SMALLEST = 1e-6
-_TINY = 1e-300
-# Intervals of half the logs from which parameters and their scatter are estimated, at least.
-_FEWEST_INTERVALS = 9
-
-
-@dataclass(frozen=True)
-class Change:
-    """A parameter that differs between the halves of the logs: a payload, a battery, a machine that wears.
-
-    Parameters
-    ----------
-    index : int
-        Of the parameter.
-    first, second : float
-        Its value in each half, its unit.
-    """
-
-    index: int
-    first: float
-    second: float
-
-    @property
-    def apart(self) -> float:
-        """Difference over the mean of both."""
-        return abs(self.first - self.second) / max(0.5 * (abs(self.first) + abs(self.second)), _TINY)
-
-    @property
-    def variance(self) -> float:
-        """Variance over the log of a parameter that changes uniformly, with these means over its halves."""
-        return (self.first - self.second) ** 2 / 3.0
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """The part of the logs that agrees least with the others, where the model is exact.
-
-    Parameters
-    ----------
-    begin, end : float
-        The part, over the duration of each log.
-    scatter : float
-        Scatter of the parameters of all parts, over that by noise (RMS).
-    index : int
-        Parameter that changes most, over its value, if this part is left out.
-    change : float
-        That change.
-    """
-
-    begin: float
-    end: float
-    scatter: float
-    index: int
-    change: float
-
-
-@dataclass(frozen=True)
-class Parts:
-    """Parameters that are estimated again from parts of the logs.
-
-    Parameters
-    ----------
-    changes : sequence of Change, optional
-        Parameters that clearly differ between the halves; none where the model is exact.
-    held_out : float, optional
-        Mean square of what the model leaves of fifths of the logs whose parameters are those of the rest, over that of
-        the fit, and over what this is on average for parameters that do not change.
-    deviation : Deviation, optional
-        Of the part that deviates most from an exact model, if parts differ by more than noise explains.
-    """
-
-    changes: Sequence[Change] = ()
-    held_out: float = 1.0
-    deviation: Deviation | None = None
 
 
 def findings_of_fit(found: Explanation, parts: Parts, acting: ActingInputs | None) -> Iterator[Finding]:
@@ -194,9 +86,9 @@ def _of_parts(names: Sequence[str], parts: Parts) -> Iterator[Finding]:
         first, second = number(change.first, 3), number(change.second, 3)
         text = f"{names[change.index]} changes during the log, from {first} in its first half to {second} in its second"
         advice = "a payload, a drifting gain or another regime; identify stretches of the log one by one"
-        is_serious = change.apart > _SERIOUS and parts.held_out > _WORSE
+        is_serious = change.is_large and parts.fail_elsewhere
         yield Finding("bad" if is_serious else "care", f"{text}: {advice}.")
-    if parts.held_out > _WORSE:
+    if parts.fail_elsewhere:
         more = percent(np.sqrt(parts.held_out) - 1.0)
         text = f"Fifths of the log that are held out have {more} more unmodelled force (RMS) than in the fit of all"
         yield Finding("care" if parts.changes else "note", f"{text}: what is estimated from one part fails in another.")
@@ -208,148 +100,3 @@ def _of_parts(names: Sequence[str], parts: Parts) -> Iterator[Finding]:
         )
         effect = f"without that part {names[found.index]} changes by {percent(found.change)}"
         yield Finding("care", f"{text}: {effect}. Intervals are too narrow, or the model lacks an effect.")
-
-
-def compared_parts(found: Explanation, result: ProjectedEstimate, prior_inflation: float) -> Parts:
-    """Parameters of parts of the logs, compared with each other.
-
-    Parameters
-    ----------
-    found : Explanation
-    result : ProjectedEstimate
-    prior_inflation : float
-        Factor of the prior on model error under which parameters must differ, too.
-
-    Returns
-    -------
-    Parts
-    """
-    intervals, fit = found.intervals, found.refinement.fit
-    place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
-    share = place / np.bincount(intervals.log_of)[intervals.log_of]
-    if found.exact:
-        return _deviating(intervals, fit, result, share)
-    return _changing(intervals, fit, result, share, prior_inflation)
-
-
-def _changing(
-    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray, prior_inflation: float
-) -> Parts:
-    """Halves and held-out fifths of the logs, where the model is not exact."""
-    share = share[result.windows]
-    first = share < 0.5
-    if min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
-        return Parts()
-    equations = _equations(intervals, fit, result)
-    held_out = _held_out(*equations, (_HELD_OUT * share).astype(int))
-    moved, apart = _of_halves(*equations, first)
-    apart[np.isinf(np.diag(result.covariance))] = 0.0
-    changed = np.abs(apart) > _clear(apart, held_out)
-    if changed.any():
-        # Noise that the prior takes for unmodelled forces, or the reverse, is no change of the machine.
-        wide = _equations(intervals, inflated_prior(intervals, fit, prior_inflation), result)
-        if all(np.isfinite(x).all() for x in wide):
-            changed &= _of_halves(*wide, first)[1] * np.sign(apart) > _LIKELY
-    halves = result.parameters + moved
-    both = [Change(int(k), *halves[:, k].tolist()) for k in np.flatnonzero(changed)]
-    return Parts([x for x in both if x.apart > _DIFFERENT], held_out)
-
-
-def _clear(apart: FloatArray, held_out: float) -> FloatArray:
-    """Standard errors ``(n,)`` beyond which a difference of parameters, so many standard errors, is no chance."""
-    if held_out <= _WORSE:
-        return np.full(len(apart), _CLEAR)
-    from statistics import NormalDist
-
-    of_any = NormalDist().inv_cdf(1.0 - 0.5 * _UNLIKELY / len(apart))
-    return np.where(np.abs(apart) == np.abs(apart).max(), _LIKELY, min(of_any, _CLEAR))
-
-
-def _equations(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate) -> tuple[FloatArray, FloatArray]:
-    """Regressors (W, n_v, n) and residuals (W, n_v) of the fitted motion, in the mean over each window."""
-    _, rows, regressors, _ = residuals_of_motion(intervals, fit, result.parameters)
-    W = means_of_intervals(intervals, regressors * intervals.counted[:, None, None])
-    residuals = means_of_intervals(intervals, rows * intervals.counted[:, None])
-    return means_of_windows(W, result.windows), means_of_windows(residuals, result.windows)
-
-
-def _of_halves(W: FloatArray, residuals: FloatArray, first: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Changes (2, n) of the parameters in the first and the second half; their difference (n,), in standard errors."""
-    moved, variances = zip(*(_change(W[half], residuals[half]) for half in (first, ~first)), strict=True)
-    return np.array(moved), (moved[1] - moved[0]) / np.sqrt(np.maximum(np.sum(variances, axis=0), _TINY))
-
-
-def _held_out(W: FloatArray, residuals: FloatArray, part: IntArray) -> float:
-    """Mean square of the residuals of each part with the parameters of the others, over that with those of all.
-
-    Of n parameters that do not change, fitted to N residuals, that of all is ``1 - n/N`` times that of the noise, and
-    that of a part ``1 + n/N'``, with N' residuals of the others.  The ratio of these two counts as 1.
-    """
-    scale = _scales(residuals)
-    fitted = residuals + W @ _change(W, residuals)[0]
-    left = np.zeros_like(residuals)
-    for k in np.unique(part):
-        held = part == k
-        left[held] = residuals[held] + W[held] @ _change(W[~held], residuals[~held])[0]
-    taken = _n_estimated(W) / residuals.size
-    usual = (1.0 + taken * _HELD_OUT / (_HELD_OUT - 1.0)) / max(1.0 - taken, _TINY)
-    return float(np.square(left / scale).sum() / max(np.square(fitted / scale).sum() * usual, _TINY))
-
-
-def _deviating(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
-    """Tenths of the logs, where the model is exact; no deviation if all agree, or if its effect is negligible.
-
-    The measurements of part k change the parameters by ``u_k``, of variance ``V_k`` if the model is exact and the noise
-    white.  ``sum u_k V_k^-1 u_k`` then has a chi-squared distribution.
-    """
-    n, part = len(result.parameters), (_STRETCHES * share).astype(int)
-    effect = effect_of_intervals(intervals, fit)
-    variances = variances_of_intervals(intervals, fit, weights_of(intervals, fit), effect.z, effect.s)
-    unit = np.sqrt(np.diag(effect.covariance)) + _TINY
-    if not (np.isfinite(variances).all() and np.isfinite(effect.steps).all()):  # LAPACK would raise
-        return Parts()
-    u = np.array([effect.steps[part == k].sum(axis=0) for k in range(_STRETCHES)]) / unit
-    V = np.array([variances[part == k].sum(axis=0) for k in range(_STRETCHES)]) / np.outer(unit, unit)
-    sizes, axes = np.linalg.eigh(V)
-    informed = sizes > _ROUNDING * sizes[:, -1:]
-    along = np.einsum("kij,ki->kj", axes, u)
-    distances = np.divide(np.square(along), sizes, out=np.zeros_like(sizes), where=informed).sum(axis=1)
-    freedom = int(informed.sum()) - n
-    if freedom < 1 or not _is_no_chance(float(distances.sum()), freedom):
-        return Parts()
-    k, scatter = int(np.argmax(distances)), float(np.sqrt(distances.sum() / freedom))
-    R = effect.covariance / np.outer(unit, unit)
-    without = R @ np.linalg.lstsq(R - V[k], -u[k], rcond=None)[0]
-    changes = np.abs(without) * unit / np.maximum(np.abs(result.parameters), _TINY)
-    worst, edges = int(np.argmax(changes)), (k / _STRETCHES, (k + 1) / _STRETCHES)
-    most = Deviation(*edges, scatter, worst, float(changes[worst]))
-    return Parts(deviation=most if most.change > _NEGLIGIBLE else None)
-
-
-def _is_no_chance(distance: float, freedom: int) -> bool:
-    """True if chi squared is hardly ever as large, by its cube root, which is nearly normal (Wilson, Hilferty 1931)."""
-    spread = 2.0 / (9.0 * freedom)
-    return bool(np.cbrt(distance / freedom) - (1.0 - spread) > _BY_CHANCE * np.sqrt(spread))
-
-
-def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Change ``(n,)`` of parameters by least squares of some rows, and its variance by batches of them.
-
-    What is left of N residuals is too small by what n parameters have taken of them, ``1 - n/N`` on average.
-    """
-    gains = least_squares_gains(W, 1.0 / _scales(residuals))
-    change = -np.einsum("pwi,wi->p", gains, residuals)
-    left = residuals + W @ change
-    sums = batch_sums(np.einsum("pwi,wi->wp", gains, left))
-    return change, np.square(sums).sum(axis=0) / max(1.0 - _n_estimated(W) / residuals.size, _TINY)
-
-
-def _n_estimated(W: FloatArray) -> int:
-    """Number of parameters that have a part in the regressors."""
-    return int(W.any(axis=(0, 1)).sum())
-
-
-def _scales(residuals: FloatArray) -> FloatArray:
-    """Size ``(n_v,)`` of the residuals of each equation."""
-    scale = np.sqrt(np.square(residuals).mean(axis=0))
-    return np.asarray(np.maximum(scale, _SMALLEST * scale.max() + _TINY))

@@ -16,7 +16,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.input_timing import InputTiming
 from diransac.errors import IdentificationError, TimeLimitError
-from diransac.identification.estimate import Competition, Competitor
+from diransac.identification.estimate import Competition, Competitor, LogEstimate
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison, Scores
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
@@ -31,7 +31,7 @@ from diransac.identification.methods.lo_diransac.projection import (
 )
 from diransac.identification.methods.lo_diransac.search import Decided, Searched, likeliest, searched
 from diransac.identification.methods.lo_diransac.segments import ActingInputs
-from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
+from diransac.identification.methods.lo_diransac.simulation_error import estimates_of_logs, simulation_error_candidates
 from diransac.identification.methods.lo_diransac.smoothing import Motion
 from diransac.identification.methods.lo_diransac.sources import (
     Blocks,
@@ -158,7 +158,8 @@ def _decided(contest: Contest, first: Searched | None, notes: tuple[str, ...]) -
     of_fit = next((x for x in searches if x.likeliest is contest.origins[winner]), None)
     chosen = of_fit or min(searches, key=contest.loss_of)
     result = contest.result(winner, chosen.likeliest)
-    decided = Decided(contest.summary(winner), None if of_fit else contest.candidates[winner].acting)
+    acting = None if of_fit else contest.candidates[winner].acting
+    decided = Decided(contest.summary(winner), acting, contest.of_logs(winner, result.parameters))
     return replace(chosen, result=result, decided=decided, impossible=of_fit.impossible if of_fit else ())
 
 
@@ -295,6 +296,16 @@ class Contest:
         assert self.comparison is not None
         own = [x for x, y in zip(self.comparison.losses, self.origins, strict=True) if y is search.likeliest]
         return float(min(own, default=np.inf))
+
+    def of_logs(self, winner: int, parameters: FloatArray) -> tuple[LogEstimate, ...]:
+        """Estimates of each of several logs alone, over the horizon at which the winner predicts best."""
+        if len(self.dataset.segments) < 2:
+            return ()
+        assert self.arbiter is not None
+        report(self.callback, "comparing logs", 0.895)
+        n_rows = self.arbiter.steps[int(np.argmin(self.scores[winner].errors))]
+        one = replace(self.candidates[winner], parameters=parameters)
+        return estimates_of_logs(one, self.motion, n_rows, outliers=self.settings.outliers)
 
     def second(self, winner: int, notes: tuple[str, ...]) -> Searched | None:
         """A search from an estimate and its simulated motion; None where it fails."""

@@ -20,13 +20,14 @@ from diransac.errors import ModelError, SettingsError
 from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, HausmanTest, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report
-from diransac.identification.methods.lo_diransac.checks import compared_parts, findings_of_fit
+from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
 from diransac.identification.methods.lo_diransac.instruments import (
     Instrumented,
     check_set_points,
     instrumented_estimate,
 )
+from diransac.identification.methods.lo_diransac.parts import compared_parts
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate, parameter_units
 from diransac.identification.methods.lo_diransac.search import Searched, rows_of_logs
@@ -44,9 +45,9 @@ from diransac.process import memory_kept, single_threaded
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
     from diransac.identification.method import Callback
-    from diransac.identification.methods.lo_diransac.checks import Change
     from diransac.identification.methods.lo_diransac.missing_terms import MissingTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.methods.lo_diransac.parts import Change
     from diransac.identification.settings import Settings
 
 __all__ = ["LoDiransac", "configured"]
@@ -354,6 +355,7 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
         possible_terms=possible_terms(intervals, fit, result, covariance, settings.candidate_terms)
         if settings.suggestions
         else None,
+        of_logs=best.decided.of_logs if best.decided else (),
     )
 
 

@@ -33,7 +33,7 @@ from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.identification.estimate import Competition
+    from diransac.identification.estimate import Competition, LogEstimate
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
@@ -54,10 +54,15 @@ _TINY = 1e-9
 
 @dataclass(frozen=True)
 class Decided:
-    """Outcome of a competition: its summary, and the inputs of the winner unless it is an estimate of the fit."""
+    """Outcome of a competition.
+
+    Its summary, the inputs of the winner unless it is an estimate of the fit, and the estimates of each of several logs
+    alone.
+    """
 
     summary: Competition
     acting: ActingInputs | None
+    of_logs: tuple[LogEstimate, ...]
 
 
 @dataclass(frozen=True)

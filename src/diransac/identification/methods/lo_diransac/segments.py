@@ -61,6 +61,12 @@ class ActingInputs:
         """True if no other has the same values, held alike."""
         return not any(self.hold == x.hold and np.array_equal(self.values, x.values) for x in others)
 
+    def shifted(self, intervals: ShootingIntervals, rows: int) -> ActingInputs:
+        """Inputs that act some rows later, or earlier; those at the ends of a log are held."""
+        every = np.arange(len(self.values))
+        at = [np.clip(every[x] - rows, x.start, x.stop - 1) for x in intervals.rows_of_logs]
+        return replace(self, values=self.values[np.concatenate(at)])
+
     @classmethod
     def recorded(cls, intervals: ShootingIntervals, hold: str) -> ActingInputs:
         """Inputs that act as they were recorded."""

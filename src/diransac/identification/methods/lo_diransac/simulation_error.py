@@ -19,19 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diransac.arrays import BoolArray, FloatArray
+from diransac.identification.estimate import LogEstimate
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments, first_states, stretches
-from diransac.identification.methods.lo_diransac.sources import Candidate
+from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate, jackknife
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
-    from diransac.identification.methods.lo_diransac.sources import Blocks
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-__all__ = ["simulation_error_candidates"]
+__all__ = ["estimates_of_logs", "simulation_error_candidates"]
 
 _SHORTEST, _GROWTH = 8, 3
 """Rows of the shortest segments, and the factor by which they grow, as long as they are more than the blocks."""
@@ -43,6 +43,8 @@ _ROWS_OF_SEARCH, _MOST_ROWS = 3_000, 50_000
 """Rows of the fits from several starts, and of others, at most."""
 _OUTLYING = 6.0
 """Robust standard deviations from which on a sample is far from the smoothed motion."""
+_WHOLE_ROW = 1.0 / 12.0
+"""Variance of a number that is rounded to a whole one."""
 _STEPS, _CONVERGED, _NOISE_MOVES = 25, 0.1, 0.03
 """Steps at most; change of parameters, standard errors, and relative change of the noise that end them."""
 _DAMPING, _DAMPING_BOUNDS = 1e-6, (1e-12, 1e6)
@@ -92,6 +94,42 @@ def simulation_error_candidates(
     taken = chain[0].segments.acting
     others = [chain[-1].with_inputs(x).descended() for x in actings if x is not taken]
     return [(x.candidate(blocks), x.simulated(motion)) for x in (*chain, *others) if np.isfinite(x.cost)]
+
+
+def estimates_of_logs(one: Candidate, motion: Motion, n_rows: int, *, outliers: bool = True) -> tuple[LogEstimate, ...]:
+    """Estimates of each log alone, by simulation error from an estimate of all of them.
+
+    Parameters
+    ----------
+    one : Candidate
+    motion : Motion
+        From which states start that nothing measures.
+    n_rows : int
+        Rows of a segment; fewer where a log would have less than two segments per block.
+    outliers : bool, optional
+        Whether samples may be outliers.
+
+    Returns
+    -------
+    tuple of LogEstimate
+        With infinite standard errors where a log has fewer segments than blocks.
+    """
+    intervals, found = one.intervals, []
+    blocks, names, n = Blocks.of(intervals, each=True), intervals.layout.names, len(one.parameters)
+    for i, rows in enumerate(intervals.rows_of_logs):
+        length = max(_SHORTEST, min(n_rows, (rows.stop - rows.start) // (2 * blocks.n)))
+        every = _segments(intervals, one.acting, length, _MOST_ROWS)
+        own = replace(every, starts=every.starts[intervals.log_of_row[every.starts] == i])
+        parameters, errors, late, late_error = one.parameters, np.full(n, np.inf), 0, np.inf
+        if len(own) >= blocks.n:
+            noise = _first_noise(own, motion.spread, outliers=outliers)
+            fitted = _Solution.begin(own, motion, one.parameters, noise).descended()
+            if np.isfinite(fitted.cost):
+                fitted, late, late_error = fitted.with_own_timing(blocks)
+                parameters, errors = fitted.parameters, fitted.standard_errors(blocks)
+        values, spans = (dict(zip(names, x.tolist(), strict=True)) for x in (parameters, errors))
+        found.append(LogEstimate(values, spans, late * intervals.dt, late_error * intervals.dt))
+    return tuple(found)
 
 
 def _random_starts(intervals: ShootingIntervals, known: FloatArray, seed: int) -> FloatArray:
@@ -287,6 +325,39 @@ class _Solution:
             without.append(_moved(intervals, self.parameters, step))
         name = f"simulation error, {segments.n_rows * intervals.dt:.2g} s, {segments.acting.sentence}"
         return Candidate(name, self.parameters, np.array(without), segments.acting, intervals)
+
+    def standard_errors(self, blocks: Blocks) -> FloatArray:
+        """Standard errors ``(n,)`` of the parameters, by the jackknife over blocks; those by white noise at least."""
+        matrix, _ = self.equations.reduced(0.0).with_prior(self.segments.intervals, self.parameters)
+        d = np.sqrt(np.maximum(np.diag(matrix), 0.0)) + _TINY
+        white = np.diag(np.linalg.inv(matrix / np.outer(d, d) + _RIDGE * np.eye(len(d)))) / np.square(d)
+        return np.asarray(np.sqrt(np.maximum(np.diag(jackknife(self.candidate(blocks).without)), white)))
+
+    def with_own_timing(self, blocks: Blocks) -> tuple[_Solution, int, float]:
+        """The solution with inputs that act earlier or later by the likeliest number of rows; that number, its error.
+
+        A pattern search: steps double while they help.  The error is that of the vertex of a parabola, by the jackknife
+        over blocks, and of rounding.
+        """
+        tried, given, at, step = {0: self}, self.segments.acting, 0, 1
+        while step:
+            for x in (at - step, at + step):
+                if x not in tried and abs(x) < self.segments.n_rows:
+                    tried[x] = self.with_inputs(given.shifted(self.segments.intervals, x)).descended()
+            best = min(tried, key=lambda x: tried[x].total_cost)
+            at, step = best, (2 * step if best != at else step // 2)
+        if not {at - 1, at + 1} <= tried.keys():
+            return tried[at], at, np.inf
+        before, now, after = (tried[at + x].costs_without(blocks) for x in (-1, 0, 1))
+        vertex = 0.5 * (before - after) / np.maximum(before - 2.0 * now + after, _TINY)
+        return tried[at], at, float(np.sqrt(_WHOLE_ROW + jackknife(np.clip(vertex, -1.0, 1.0)[:, None])[0, 0]))
+
+    def costs_without(self, blocks: Blocks) -> FloatArray:
+        """Negative log-likelihood of the samples without each block."""
+        cost = self.noise.negative_log_likelihood(self.errors, self._known)
+        each = cost.reshape(len(self.segments), -1).sum(axis=1)
+        block = blocks.of_row[self.segments.starts + self.segments.n_rows // 2]
+        return np.array([each[block != k].sum() for k in range(blocks.n)])
 
     def simulated(self, motion: Motion) -> Motion:
         """The motion of the segments; the given one in rows that none covers."""

@@ -49,10 +49,10 @@ class Blocks:
     n: int
 
     @classmethod
-    def of(cls, intervals: ShootingIntervals) -> Blocks:
-        """Blocks of the rows that count, as one log; of every log, where logs have parameters of their own."""
+    def of(cls, intervals: ShootingIntervals, *, each: bool = False) -> Blocks:
+        """Blocks of the rows that count, as one log; of each log if asked, or where logs have own parameters."""
         found = np.zeros(len(intervals.is_logged), int)
-        parts = intervals.rows_of_logs if not intervals.layout.is_shared else [slice(None)]
+        parts = intervals.rows_of_logs if each or not intervals.layout.is_shared else [slice(None)]
         for rows in parts:
             counted = np.cumsum(intervals.counted[rows]) - 1
             found[rows] = np.clip(N_BLOCKS * counted // max(counted[-1] + 1, 1), 0, N_BLOCKS - 1)
