@@ -21,7 +21,7 @@ TEXTS = {
     "c1": "m\x9b2J\x85\x90evil\x9c",
     "line separator": "m\u2028import evil\u2029",
     "bidirectional": "m\u202e\u2066evil\u2069",
-    "surrogate": "m\ud800",
+    "surrogate": "m\udc9b",
     "no character": "m\uffff\U000e0001",
     "byte order mark": "\ufeffm",
     "quotes": "m\"'`",

@@ -96,8 +96,8 @@ def literal(text: str) -> str:
 
     Examples
     --------
-    >>> print(literal('5" \\ ' + chr(0x9B)))
-    "5\" \\ \u009b"
+    >>> literal('5"' + chr(0x9B)) == r'"5\"\u009b"'
+    True
     """
     quoted = text.replace("\\", r"\\").replace('"', r"\"")
     return f'"{quoted if quoted.isprintable() else _escaped(quoted, _in_literals)}"'
