@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import sys
 from collections.abc import Sequence
+from contextlib import chdir, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +30,7 @@ __all__ = [
     "Range",
     "check_ending",
     "draw_heading",
+    "empty_figure",
     "extent",
     "flight_panels",
     "header_height",
@@ -66,6 +69,22 @@ _PATH_WIDTH, _PATH_ROWS, _WIDE, _PATH_HEIGHT = 3.75, 3, 2.2, 2.3
 _STEPS = (1, 2, 5, 10)
 
 
+def empty_figure(height: float) -> Figure:
+    """Figure without panels.
+
+    Matplotlib, which is imported here first, would take settings from ``matplotlibrc`` in the working directory.
+
+    Parameters
+    ----------
+    height : inches
+    """
+    beside = Path("matplotlibrc").exists() and "matplotlib" not in sys.modules
+    with chdir(Path(__file__).parent) if beside else nullcontext():
+        from matplotlib.figure import Figure
+
+    return Figure(figsize=(WIDTH, height), facecolor=PAPER)
+
+
 def flight_panels(
     states: Sequence[str], inputs: Sequence[str], box: tuple[Range, Range] | None, header: float
 ) -> tuple[Figure, dict[str, Axes], Axes | None]:
@@ -76,14 +95,12 @@ def flight_panels(
     box : ranges of the path in x and z; None for no path
     header : free height at the top, inches
     """
-    from matplotlib.figure import Figure
-
     columns = _halves(states)
     n_rows, n_input_rows = max(map(len, columns)), -(-len(inputs) // 2)
     wide = box is not None and extent(box[0]) > _WIDE * extent(box[1])
     top = header + (_PATH_HEIGHT + _TIMES if wide else 0.0)
     below = top + n_rows * _ROW + _TIMES
-    figure = Figure(figsize=(WIDTH, below + n_input_rows * _ROW + _TIMES + _GAP), facecolor=PAPER)
+    figure = empty_figure(below + n_input_rows * _ROW + _TIMES + _GAP)
 
     path = None
     if box is not None:

@@ -22,6 +22,7 @@ from diransac.plots.figure import (
     WIDTH,
     check_ending,
     draw_heading,
+    empty_figure,
     header_height,
     name_panel,
     panel,
@@ -110,15 +111,13 @@ def plot_study(store: str | Path, path: str | Path | None = None, *, title: str 
 
 
 def _drawn(summary: Summary, title: str) -> Figure:
-    from matplotlib.figure import Figure
-
     looks = _looks(summary)
     entries = list(looks.items())
     header = header_height(entries, title)
     heights = [_block_height(summary, flights) for flights in summary.flights.values()]
     words = _caption(summary)
     caption = _LINE * len(words) + 0.14
-    figure = Figure(figsize=(WIDTH, header + sum(heights) + caption), facecolor=PAPER)
+    figure = empty_figure(header + sum(heights) + caption)
     top = header
     for (shape, flights), height in zip(summary.flights.items(), heights, strict=True):
         _draw_block(figure, summary, shape, flights, top)
