@@ -24,6 +24,7 @@ from diransac.errors import ModelError
 from diransac.export import PortableModel, write_model
 from diransac.model.robots.calibration import calibrated
 from diransac.plain_text import cell, identifier, literal
+from diransac.plots.figure import draw_heading, empty_figure, name_panel, panel, svg, write
 from diransac.study import identify_each, load
 from diransac.study.fleet import export_fleet
 from diransac.study.reading import export
@@ -188,6 +189,25 @@ def test_a_description_has_the_elements_and_names_that_it_had_with_other_numbers
     assert [x.tag for x in before] == [x.tag for x in after]
     changed = [(x.attrib, y.attrib) for x, y in zip(before, after, strict=True) if x.attrib != y.attrib]
     assert [(x | {"damping": "0.25"}) == y for x, y in changed] == [True]
+
+
+# Figures --------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("ending", ["svg", "pdf", "png"])
+def test_texts_of_a_figure_are_no_formulas_and_leave_a_file_that_reads_back(tmp_path, ending):
+    figure = empty_figure(9.0)
+    draw_heading(figure, [(text[:100], {}) for text in TEXTS.values() if text], TEXTS["mathematics"])
+    axes = panel(figure, 0.0, 6.0, 9.0, 3.0)
+    name_panel(axes, TEXTS["mathematics"], TEXTS["c1"])
+    axes.plot([1.0, 1e6], [1e-9, 2e-9])
+    for _ in range(2):
+        write(figure, tmp_path / f"a.{ending}")
+    assert (tmp_path / f"a.{ending}").stat().st_size > 1000
+    if ending == "svg":
+        text = svg(figure)
+        assert text.isprintable() or all(line.isprintable() for line in text.split("\n"))
+        shown = "".join(ElementTree.fromstring(text).itertext())
+        assert shown.count(TEXTS["mathematics"]) == 3
+        assert r"m\u009b2J" in shown
 
 
 # CSV ------------------------------------------------------------------------------------------------------------------

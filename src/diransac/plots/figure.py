@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Sequence
-from contextlib import chdir, nullcontext
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import chdir, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from diransac.atomic import write_with
 from diransac.errors import SettingsError
+from diransac.plain_text import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -229,17 +231,29 @@ def check_ending(path: Path) -> str:
     return ending
 
 
+@contextmanager
+def _literal_texts(figure: Figure, **settings: Any) -> Iterator[None]:
+    """Context in which a figure is saved: names are no formulas, have no control characters, and may lack a glyph."""
+    from matplotlib import rc_context
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+        text.set_text(printable(text.get_text()))
+    with rc_context({**_SALT, "text.parse_math": False, **settings}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font", category=UserWarning)
+        yield
+
+
 def write(figure: Figure, path: Path) -> None:
     """Write the figure in the format of the file's ending, completely or not at all.
 
     Raises SettingsError: the ending is unknown, or the file cannot be written.
     """
-    from matplotlib import rc_context
-
     ending = check_ending(path)
 
     def save(temporary: Path) -> None:
-        with rc_context(_SALT):
+        with _literal_texts(figure):
             figure.savefig(temporary, format=ending[1:], dpi=_DOTS_PER_INCH, metadata=_METADATA[ending])
 
     try:
@@ -250,10 +264,8 @@ def write(figure: Figure, path: Path) -> None:
 
 def svg(figure: Figure) -> str:
     """Figure as an ``<svg>`` element with selectable text, for embedding in a page."""
-    from matplotlib import rc_context
-
     memory = io.StringIO()
-    with rc_context({**_SALT, "svg.fonttype": "none"}):
+    with _literal_texts(figure, **{"svg.fonttype": "none"}):
         figure.savefig(memory, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = memory.getvalue()
     return text[text.index("<svg") :]

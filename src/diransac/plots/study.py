@@ -12,6 +12,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
+from diransac.plain_text import printable
 from diransac.plots.figure import (
     COLOURS,
     INK,
@@ -235,7 +236,7 @@ def _name_levels(axes: Axes, summary: Summary) -> None:
     margin = 0.6 * (float(np.diff(positions).min()) if len(positions) > 1 else 1.0)
     axes.set_xlim(positions[0] - margin, positions[-1] + margin)
     if len(positions) <= _COLUMNS * 2:
-        axes.set_xticks(positions, level_labels(summary))
+        axes.set_xticks(positions, [printable(label) for label in level_labels(summary)])
     else:
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
 
