@@ -1,32 +1,40 @@
 """Files of each kind that diransac reads, mutations of them, and the rule that every command keeps over them.
 
-The rule: the exit code is 0, 1 or 2; stderr has at most three lines; no unexpected exception, no warning; the file that
-was read stays as it is; nothing is left behind but an output that was asked for and is complete; no process is started,
-no library or pickle loaded, no connection opened, and no file written elsewhere; memory and time are bounded.
+The rule: the exit code is 0, 1 or 2; stderr has at most three lines; no unexpected exception, no warning, no control
+character; the file that was read stays as it is; nothing is left behind but an output that was asked for, is complete
+and reads back, and as code is what diransac writes alone; no process is started, no library or pickle loaded, no
+connection opened, and no file written elsewhere; memory and time are bounded.
 """
 
+import ast
 import copy
+import csv
 import itertools
 import json
 import math
 import os
+import re
 import resource
 import signal
 import sqlite3
 import sys
 import tempfile
 import threading
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 from typing import Any
+from xml.etree import ElementTree
 
+import pytest
 from typer.testing import CliRunner
 
 from diransac.cli.commands import app
 from diransac.model.model import _checksum
+from hostile import NAMES, TEXTS
 
 MOST_LINES, MOST_SECONDS, MOST_MEMORY = 3, 60, 2**30
 """Lines on stderr, s, and bytes by which the largest size of the process may grow in one command."""
@@ -160,7 +168,9 @@ def outcome(folder: Path, words: Sequence[str], outputs: Sequence[str] = ()) -> 
     grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - largest)
     assert grown < MOST_MEMORY, f"{words}: {grown / 2**20:.0f} MiB more"
     assert threading.active_count() < 64
+    check_printed(words, done.stdout, done.stderr)
     for name in made:
+        check_reads_back(folder / name)
         (folder / name).unlink()
     return done.exit_code
 
@@ -528,7 +538,7 @@ class Kind:
     def place(self, folder: Path, data: bytes) -> None:
         """Write a file of the kind, and those beside it."""
         for name, content in {**self.beside, self.name: data}.items():
-            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)
 
     def check(self, folder: Path, rng: Random) -> int:
@@ -542,3 +552,78 @@ class Kind:
         for data, one in itertools.product(self.data, self.commands):
             self.place(folder, data)
             yield one, outcome(folder, one.words, one.outputs)
+
+
+# Names ----------------------------------------------------------------------------------------------------------------
+def changed_names(data: bytes, rng: Random) -> bytes:
+    """A result in which one to four names, units or other texts are crafted ones, with a checksum that fits."""
+    result = json.loads(data)
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        model = result["model"]
+        group = rng.choice(("coordinates", "inputs", "parameters"))
+        if rng.random() < 0.4:
+            result = _renamed(result, rng.choice(list(model[group])), rng.choice(NAMES))
+            continue
+        *way, key = rng.choice([way for way in places(result) if isinstance(_at(result, way), str)])
+        if "operations" not in way:
+            _at(result, way)[key] = rng.choice(list(TEXTS.values()))
+    return as_json(signed(result)).encode()
+
+
+def _renamed(result: Any, old: str, new: str) -> Any:
+    """A result with another name of a signal, and of its derivatives, wherever it stands alone."""
+    quoted, given = json.dumps(old)[1:-1], json.dumps(new)[1:-1]
+    text = re.sub(rf'"{re.escape(quoted)}(|_dot|_ddot)"', lambda found: f'"{given}{found[1]}"', json.dumps(result))
+    return json.loads(text)
+
+
+def check_printed(words: Sequence[str], *texts: str) -> None:
+    """Raises AssertionError: a command has printed a control character."""
+    for line in (line for text in texts for line in text.split("\n")):
+        assert line.isprintable(), f"{words}: {line!r}"
+
+
+def check_reads_back(path: Path) -> None:
+    """Raises AssertionError, SyntaxError and the like: an output cannot be read, or holds code of others."""
+    if path.suffix not in _READERS:
+        return
+    text = path.read_text(encoding="utf-8")
+    check_printed((path.name,), text)
+    _READERS[path.suffix](text)
+
+
+def _check_python(text: str) -> None:
+    kinds = [type(one).__name__ for one in ast.parse(text).body]
+    assert kinds == ["Expr", "Import", "Assign", "Assign", "Assign", "FunctionDef", "FunctionDef"], kinds
+
+
+def _check_c(text: str) -> None:
+    """What is left of C without comments, after lines are joined, has the words of a model alone."""
+    joined = re.sub(r"(\\|\?\?/)\n", "", text)
+    code = re.sub(r"/\*.*?\*/", " ", joined, flags=re.DOTALL)
+    assert '"' not in code
+    assert "__" not in code
+    assert re.findall(r"#.*", code) == ["#include <math.h>"]
+    assert re.findall(r"^\w[\w ]*?(\w+)\(", code, re.MULTILINE) == re.findall(r"^void (\w+)\(", code, re.MULTILINE)
+    assert len(re.findall(r"^void \w+\(", code, re.MULTILINE)) == 3
+
+
+def _check_yaml(text: str) -> None:
+    yaml = pytest.importorskip("yaml", reason="EXPORTED YAML NOT READ: PyYAML is missing")
+    assert {"model", "states", "parameters"} <= yaml.safe_load(text).keys()
+
+
+def _check_csv(text: str) -> None:
+    header, *rows = csv.reader((line for line in text.splitlines() if not line.startswith("#")), strict=True)
+    assert {len(row) for row in rows} <= {len(header)}
+
+
+_READERS: dict[str, Callable[[str], object]] = {
+    ".py": _check_python,
+    ".c": _check_c,
+    ".yaml": _check_yaml,
+    ".csv": _check_csv,
+    ".toml": tomllib.loads,
+    ".svg": ElementTree.fromstring,
+}
+"""Check of the text of an output by its ending."""

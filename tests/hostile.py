@@ -1,4 +1,4 @@
-"""Texts that end comments and strings, control terminals, or are words of a language: what a crafted file may hold."""
+"""Texts that end comments and strings, control terminals, or are words of a language; files that lie beside a log."""
 
 import diransac as dr
 
@@ -46,6 +46,35 @@ NAMES = (
     "µ", "\U0001d6fc", "l" * 5000,
 )  # fmt: skip
 """Names that a model may have, and that the files of its exports use themselves, or languages do."""
+
+# Files that lie in a working directory: modules, libraries, settings, and a description of which MuJoCo warns.
+MODULES = (
+    "numpy", "scipy", "casadi", "polars", "mujoco", "matplotlib", "h5py", "dask", "distributed", "llvmlite", "sqlite3",
+    "pickle", "struct", "socket", "logging", "sitecustomize", "usercustomize",
+)  # fmt: skip
+LIBRARIES = (
+    "libcasadi_nlpsol_ipopt.so", "libcasadi_nlpsol_fatrop.so", "libipopt.so.3", "libhsl.so", "libcoinhsl.so",
+    "libllvmlite.so", "libmujoco.so", "libgomp.so.1", "plugin/libh5.so", "mujoco_plugin/libplugin.so",
+)  # fmt: skip
+SETTINGS = {
+    "ipopt.opt": "output_file ran-ipopt\nprint_level 5\nlinear_solver ma27\nhsllib ./libhsl.so\n",
+    "fatrop.opt": "print_level 5\n",
+    "matplotlibrc": "figure.dpi: 7\nbackend: module://pickle\ntext.usetex: True\n",
+    "dask.yaml": "planted: true\n",
+    "distributed.yaml": "planted: true\n",
+    ".dask/dask.yaml": "planted: true\n",
+    ".config/dask/dask.yaml": "planted: true\n",
+    ".sqliterc": ".system touch ran-sqlite\n",
+    "diransac.toml": "[identify]\nmethod = 'planted'\n",
+    ".numba_config.yaml": "disable_jit: 1\n",
+    "polars.toml": "verbose = 1\n",
+    "pyvenv.cfg": "home = .\n",
+}
+URDF = """<robot name="r"><link name="w"/><link name="b"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="e" type="revolute">
+<parent link="w"/><child link="b"/><axis xyz="0 1 0"/><limit lower="0" upper="0" effort="1" velocity="1"/></joint>
+</robot>
+"""
 
 
 def named(text: str = "m", names: tuple[str, ...] = ("x", "push", "mass", "drag")) -> dr.Model:
