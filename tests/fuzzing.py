@@ -564,9 +564,10 @@ def changed_names(data: bytes, rng: Random) -> bytes:
         if rng.random() < 0.4:
             result = _renamed(result, rng.choice(list(model[group])), rng.choice(NAMES))
             continue
-        *way, key = rng.choice([way for way in places(result) if isinstance(_at(result, way), str)])
-        if "operations" not in way:
-            _at(result, way)[key] = rng.choice(list(TEXTS.values()))
+        texts = [way for way in places(result) if isinstance(_at(result, way), str) and "operations" not in way]
+        of_model = [way for way in texts if way[0] == "model"]
+        *way, key = rng.choice(of_model if rng.random() < 0.8 else texts)
+        _at(result, way)[key] = rng.choice(list(TEXTS.values()))
     return as_json(signed(result)).encode()
 
 

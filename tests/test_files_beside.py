@@ -5,6 +5,7 @@ A folder holds a crafted file for every library; one process, started as the con
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -142,6 +143,16 @@ def test_mujoco_writes_no_log_and_prints_no_warning(worked):
     assert found["mujoco"] == ["damping_e"]
     assert "MUJOCO_LOG.TXT" not in new
     assert printed == []
+
+
+def test_the_page_names_every_library_that_is_checked_here():
+    page = (Path(__file__).parents[1] / "docs" / "trust.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([^|]+) \|.*\|$", page.partition("## Files beside a log")[2], re.MULTILINE)
+    named = {name.split()[0].strip("`") for row in rows[1:] for name in row.split(", ")}
+    assert named == {
+        "IPOPT", "Matplotlib", "MuJoCo", "Python", "CasADi", "HDF5", "Dask", "NumPy", "SciPy", "Polars",
+        "llvmlite", "FATROP", "SQLite", "diransac",
+    }  # fmt: skip
 
 
 def test_dask_reads_no_settings(worked):

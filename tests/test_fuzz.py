@@ -270,7 +270,7 @@ def ros2(part: str, folder: Path) -> Kind:
 SEARCH = "--model underwater-vehicle --method i-diransac --time-limit 1"
 KINDS = {
     "results": (40, lambda folder: result(changed_result, folder)),
-    "names": (40, names),
+    "names": (20, names),
     "files beside": (8, files_beside),
     "equations": (20, lambda folder: result(changed_graph, folder)),
     "stores": (30, study_store),

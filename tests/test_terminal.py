@@ -92,18 +92,19 @@ def test_errors_print_no_control_characters_and_at_most_three_lines(folder, word
 
 
 @pytest.mark.parametrize("words", [[], ["--debug"]], ids=["internal error", "traceback"])
-def test_unexpected_errors_print_no_control_characters(tmp_path, words):
+def test_unexpected_errors_and_warnings_print_no_control_characters(tmp_path, words):
     script = tmp_path / "broken.py"
     script.write_text(
-        "import sys\nfrom diransac import cli\nimport diransac.cli.commands as commands\n"
-        "def app():\n    raise RuntimeError('a\\x1b[2J\\x9bm\\ud800')\n"
+        "import sys, warnings\nfrom diransac import cli\nimport diransac.cli.commands as commands\n"
+        "text = 'a\\x1b[2J\\x9bm\\ud800'\n"
+        "def app():\n    warnings.warn(text)\n    raise RuntimeError(text)\n"
         "commands.app = app\ncli.main()\n"
     )
     done = subprocess.run([sys.executable, script, *words], capture_output=True, check=False)
     assert done.returncode == 1
     text = done.stderr.decode()
     assert is_plain(text)
-    assert r"a\u001b[2J\u009bm\ud800" in text
+    assert text.count(r"a\u001b[2J\u009bm\ud800") == 2
 
 
 @pytest.mark.parametrize("terminal", [True, False], ids=["terminal", "pipe"])

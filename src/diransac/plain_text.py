@@ -31,7 +31,7 @@ _RESERVED = {
         "return short signed sizeof static static_assert static_cast struct switch template this thread_local throw "
         "true try typedef typeid typename union unsigned using virtual void volatile wchar_t while xor xor_eq",
     ),
-    *(word.lower() for word in (*keyword.kwlist, *keyword.softkwlist)),
+    *map(str.lower, keyword.kwlist),
 }
 """Words of C, C++, Python and CasADi, in lower case."""
 

@@ -3,8 +3,10 @@
 import gc
 import os
 import sys
+import warnings
 from contextlib import suppress
 from types import TracebackType
+from typing import TextIO
 
 from diransac.plain_text import printable
 
@@ -20,6 +22,7 @@ _ALLOCATIONS = 10_000
 def main() -> None:
     """Run the command line of this process, and end the process with its exit code."""
     sys.excepthook = _show_traceback if "--debug" in sys.argv else _report_internal_error
+    warnings.showwarning = _show_warning
     gc.set_threshold(_ALLOCATIONS)
     from diransac.cli.commands import app
     from diransac.user_files import leave_stdout
@@ -56,6 +59,18 @@ def _show_traceback(kind: type[BaseException], error: BaseException, where: Trac
     import traceback
 
     _print("".join(traceback.format_exception(kind, error, where)).rstrip())
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,  # noqa: ARG001  as Python calls it
+    line: str | None = None,
+) -> None:
+    """Print a warning of a library."""
+    _print(warnings.formatwarning(message, category, filename, lineno, line).rstrip())
 
 
 def _print(text: str) -> None:
