@@ -6,9 +6,7 @@ and reads back, and as code is what diransac writes alone; no process is started
 connection opened, and no file written elsewhere; memory and time are bounded.
 """
 
-import ast
 import copy
-import csv
 import itertools
 import json
 import math
@@ -20,21 +18,19 @@ import sqlite3
 import sys
 import tempfile
 import threading
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 from typing import Any
-from xml.etree import ElementTree
 
-import pytest
 from typer.testing import CliRunner
 
 from diransac.cli.commands import app
 from diransac.model.model import _checksum
 from hostile import NAMES, TEXTS
+from read_back import check_printed, check_reads_back
 
 MOST_LINES, MOST_SECONDS, MOST_MEMORY = 3, 60, 2**30
 """Lines on stderr, s, and bytes by which the largest size of the process may grow in one command."""
@@ -576,55 +572,3 @@ def _renamed(result: Any, old: str, new: str) -> Any:
     quoted, given = json.dumps(old)[1:-1], json.dumps(new)[1:-1]
     text = re.sub(rf'"{re.escape(quoted)}(|_dot|_ddot)"', lambda found: f'"{given}{found[1]}"', json.dumps(result))
     return json.loads(text)
-
-
-def check_printed(words: Sequence[str], *texts: str) -> None:
-    """Raises AssertionError: a command has printed a control character."""
-    for line in (line for text in texts for line in text.split("\n")):
-        assert line.isprintable(), f"{words}: {line!r}"
-
-
-def check_reads_back(path: Path) -> None:
-    """Raises AssertionError, SyntaxError and the like: an output cannot be read, or holds code of others."""
-    if path.suffix not in _READERS:
-        return
-    text = path.read_text(encoding="utf-8")
-    check_printed((path.name,), text)
-    _READERS[path.suffix](text)
-
-
-def _check_python(text: str) -> None:
-    kinds = [type(one).__name__ for one in ast.parse(text).body]
-    assert kinds == ["Expr", "Import", "Assign", "Assign", "Assign", "FunctionDef", "FunctionDef"], kinds
-
-
-def _check_c(text: str) -> None:
-    """What is left of C without comments, after lines are joined, has the words of a model alone."""
-    joined = re.sub(r"(\\|\?\?/)\n", "", text)
-    code = re.sub(r"/\*.*?\*/", " ", joined, flags=re.DOTALL)
-    assert '"' not in code
-    assert "__" not in code
-    assert re.findall(r"#.*", code) == ["#include <math.h>"]
-    assert re.findall(r"^\w[\w ]*?(\w+)\(", code, re.MULTILINE) == re.findall(r"^void (\w+)\(", code, re.MULTILINE)
-    assert len(re.findall(r"^void \w+\(", code, re.MULTILINE)) == 3
-
-
-def _check_yaml(text: str) -> None:
-    yaml = pytest.importorskip("yaml", reason="EXPORTED YAML NOT READ: PyYAML is missing")
-    assert {"model", "states", "parameters"} <= yaml.safe_load(text).keys()
-
-
-def _check_csv(text: str) -> None:
-    header, *rows = csv.reader((line for line in text.splitlines() if not line.startswith("#")), strict=True)
-    assert {len(row) for row in rows} <= {len(header)}
-
-
-_READERS: dict[str, Callable[[str], object]] = {
-    ".py": _check_python,
-    ".c": _check_c,
-    ".yaml": _check_yaml,
-    ".csv": _check_csv,
-    ".toml": tomllib.loads,
-    ".svg": ElementTree.fromstring,
-}
-"""Check of the text of an output by its ending."""
