@@ -1,8 +1,9 @@
 """Files of each kind that diransac reads, mutations of them, and the rule that every command keeps over them.
 
-The rule: the exit code is 0, 1 or 2; stderr has at most three lines; no unexpected exception, no warning; the file that
-was read stays as it is; nothing is left behind but an output that was asked for and is complete; no process is started,
-no library or pickle loaded, no connection opened, and no file written elsewhere; memory and time are bounded.
+The rule: the exit code is 0, 1 or 2; stderr has at most three lines; no unexpected exception, no warning, no control
+character; the file that was read stays as it is; nothing is left behind but an output that was asked for, is complete
+and reads back, and as code is what diransac writes alone; no process is started, no library or pickle loaded, no
+connection opened, and no file written elsewhere; memory and time are bounded.
 """
 
 import copy
@@ -10,6 +11,7 @@ import itertools
 import json
 import math
 import os
+import re
 import resource
 import signal
 import sqlite3
@@ -27,6 +29,8 @@ from typer.testing import CliRunner
 
 from diransac.cli.commands import app
 from diransac.model.model import _checksum
+from hostile import NAMES, TEXTS
+from read_back import check_printed, check_reads_back
 
 MOST_LINES, MOST_SECONDS, MOST_MEMORY = 3, 60, 2**30
 """Lines on stderr, s, and bytes by which the largest size of the process may grow in one command."""
@@ -160,7 +164,9 @@ def outcome(folder: Path, words: Sequence[str], outputs: Sequence[str] = ()) -> 
     grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - largest)
     assert grown < MOST_MEMORY, f"{words}: {grown / 2**20:.0f} MiB more"
     assert threading.active_count() < 64
+    check_printed(words, done.stdout, done.stderr)
     for name in made:
+        check_reads_back(folder / name)
         (folder / name).unlink()
     return done.exit_code
 
@@ -528,7 +534,7 @@ class Kind:
     def place(self, folder: Path, data: bytes) -> None:
         """Write a file of the kind, and those beside it."""
         for name, content in {**self.beside, self.name: data}.items():
-            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)
 
     def check(self, folder: Path, rng: Random) -> int:
@@ -542,3 +548,27 @@ class Kind:
         for data, one in itertools.product(self.data, self.commands):
             self.place(folder, data)
             yield one, outcome(folder, one.words, one.outputs)
+
+
+# Names ----------------------------------------------------------------------------------------------------------------
+def changed_names(data: bytes, rng: Random) -> bytes:
+    """A result in which one to four names, units or other texts are crafted ones, with a checksum that fits."""
+    result = json.loads(data)
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        model = result["model"]
+        group = rng.choice(("coordinates", "inputs", "parameters"))
+        if rng.random() < 0.4:
+            result = _renamed(result, rng.choice(list(model[group])), rng.choice(NAMES))
+            continue
+        texts = [way for way in places(result) if isinstance(_at(result, way), str) and "operations" not in way]
+        of_model = [way for way in texts if way[0] == "model"]
+        *way, key = rng.choice(of_model if rng.random() < 0.8 else texts)
+        _at(result, way)[key] = rng.choice(list(TEXTS.values()))
+    return as_json(signed(result)).encode()
+
+
+def _renamed(result: Any, old: str, new: str) -> Any:
+    """A result with another name of a signal, and of its derivatives, wherever it stands alone."""
+    quoted, given = json.dumps(old)[1:-1], json.dumps(new)[1:-1]
+    text = re.sub(rf'"{re.escape(quoted)}(|_dot|_ddot)"', lambda found: f'"{given}{found[1]}"', json.dumps(result))
+    return json.loads(text)

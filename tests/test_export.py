@@ -194,11 +194,12 @@ def test_equations_without_a_form_in_a_language_leave_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_parameter_that_hides_an_argument_is_refused(tmp_path):
-    model = dr.Model("m", {"x": "m"}, {"u": "N"}, {"state": dr.Parameter("kg", positive=True)}, lambda q, v, a, u, p: [
-        p.state * a.x - u.u
+@pytest.mark.parametrize("name", ["state", "inputs", "derivative"])
+def test_a_parameter_that_hides_an_argument_or_the_result_is_refused(tmp_path, name):
+    model = dr.Model("m", {"x": "m"}, {"u": "N"}, {name: dr.Parameter("kg", positive=True)}, lambda q, v, a, u, p: [
+        p[name] * a.x - u.u
     ])  # fmt: skip
-    with pytest.raises(ModelError, match="named state or inputs"):
+    with pytest.raises(ModelError, match=f"a parameter is named {name}, as"):
         write_model(portable(model), tmp_path / "dynamics.casadi", "casadi")
 
 

@@ -30,11 +30,14 @@ from fuzzing import (
     changed_bytes,
     changed_graph,
     changed_lines,
+    changed_names,
     changed_result,
     changed_store,
     changed_table,
     command,
 )
+from hostile import SETTINGS as BESIDE
+from hostile import URDF
 from recordings import flight, write_bag, write_mcap
 from studies import TINY, TINY_TOML
 
@@ -186,6 +189,36 @@ def result(changed, _: Path) -> Kind:
     return Kind("model.json", results(), changed, commands, {"swim.csv": table()})
 
 
+def names(_: Path) -> Kind:
+    """Results with crafted names, in everything that is written of them."""
+    commands = (
+        *(
+            command(f"export model.json -o out.{ending}", f"out.{ending}", 3)
+            for ending in ("c", "py", "yaml", "casadi")
+        ),
+        command("validate model.json swim.csv --horizon 1 --json"),
+        command("validate model.json swim.csv --report out.html", "out.html"),
+        command("predict model.json swim.csv -o out.csv", "out.csv"),
+        command("predict model.json swim.csv -o out.csv --plot out.svg", "out.csv out.svg"),
+        command("map swim.csv --model underwater-vehicle -o out.toml", "out.toml"),
+    )
+    return Kind("model.json", results(), changed_names, commands, {"swim.csv": table()})
+
+
+def files_beside(_: Path) -> Kind:
+    """Options of IPOPT in the working directory, beside files of other libraries."""
+    pytest.importorskip("mujoco", reason="NOT CHECKED: mujoco is missing")
+    others = {name: text.encode() for name, text in BESIDE.items() if name != "ipopt.opt"}
+    commands = (
+        command("simulate star --plant extended-rotorcraft -o out.csv", "out.csv"),
+        command("models arm.urdf --unknown damping", share=2),
+        command("predict model.json swim.csv -o out.csv --plot out.svg", "out.csv out.svg", share=2),
+        command(f"identify swim.csv {MODEL}", share=2),
+    )
+    beside = {**others, "arm.urdf": URDF.encode(), "model.json": results()[0], "swim.csv": table()}
+    return Kind("ipopt.opt", (BESIDE["ipopt.opt"].encode(),), changed_lines, commands, beside)
+
+
 def study_store(folder: Path) -> Kind:
     commands = (
         command("study status a.db", share=20),
@@ -237,6 +270,8 @@ def ros2(part: str, folder: Path) -> Kind:
 SEARCH = "--model underwater-vehicle --method i-diransac --time-limit 1"
 KINDS = {
     "results": (40, lambda folder: result(changed_result, folder)),
+    "names": (20, names),
+    "files beside": (8, files_beside),
     "equations": (20, lambda folder: result(changed_graph, folder)),
     "stores": (30, study_store),
     "fleets": (15, fleet_store),

@@ -1,4 +1,6 @@
-"""Settings that belong to the whole process, for the time of some work: threads of linear algebra, kept memory."""
+"""Settings that belong to the whole process, for the time of some work: threads of linear algebra, kept memory, the
+module path of processes that it starts.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from threadpoolctl import threadpool_limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-__all__ = ["memory_kept", "single_threaded"]
+__all__ = ["memory_kept", "module_path_safe", "single_threaded"]
 
 
 class _Setting:
@@ -80,6 +82,21 @@ def _freed_memory_kept() -> Callable[[], object]:
     return undo
 
 
+def _working_directory_off_module_path() -> Callable[[], object]:
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+
+    def undo() -> None:
+        if before is None:
+            del os.environ[_SAFE_PATH]
+        else:
+            os.environ[_SAFE_PATH] = before
+
+    return undo
+
+
+_SAFE_PATH = "PYTHONSAFEPATH"
+
 single_threaded = _Setting(_one_blas_thread)
 """``with single_threaded():`` BLAS has one thread, also while other threads of the process enter and leave."""
 
@@ -89,4 +106,11 @@ memory_kept = _Setting(_freed_memory_kept)
 glibc gives arrays of more than 32 MB back at once. The next one then waits for the system to clear new pages: a fit of
 a million rows, of which every temporary array is as large, would spend a quarter of its time there. Nothing changes
 with another allocator, or where the environment has options for this one.
+"""
+
+module_path_safe = _Setting(_working_directory_off_module_path)
+"""``with module_path_safe():`` Python processes start without the working directory on their module path.
+
+``python -c``, with which pools of processes begin and libraries test others, has it there: a file ``struct.py`` in the
+working directory would run in place of Python's own.
 """

@@ -3,8 +3,12 @@
 import gc
 import os
 import sys
+import warnings
 from contextlib import suppress
 from types import TracebackType
+from typing import TextIO
+
+from diransac.plain_text import printable
 
 __all__ = ["INTERRUPTED", "main"]
 
@@ -17,8 +21,8 @@ _ALLOCATIONS = 10_000
 
 def main() -> None:
     """Run the command line of this process, and end the process with its exit code."""
-    if "--debug" not in sys.argv:
-        sys.excepthook = _report_internal_error
+    sys.excepthook = _show_traceback if "--debug" in sys.argv else _report_internal_error
+    warnings.showwarning = _show_warning
     gc.set_threshold(_ALLOCATIONS)
     from diransac.cli.commands import app
     from diransac.user_files import leave_stdout
@@ -45,6 +49,30 @@ def _end_now() -> None:
 def _report_internal_error(kind: type[BaseException], error: BaseException, _: TracebackType | None) -> None:
     """Print one line for an unexpected error."""
     if issubclass(kind, KeyboardInterrupt):
-        print("interrupted", file=sys.stderr)  # noqa: T201  before there is a command line to print with
+        _print("interrupted")
         sys.exit(INTERRUPTED)
-    print(f"internal error: {kind.__name__}: {error}; --debug shows where. Please report it", file=sys.stderr)  # noqa: T201
+    _print(f"internal error: {kind.__name__}: {error}; --debug shows where. Please report it")
+
+
+def _show_traceback(kind: type[BaseException], error: BaseException, where: TracebackType | None) -> None:
+    """Print all of an error."""
+    import traceback
+
+    _print("".join(traceback.format_exception(kind, error, where)).rstrip())
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,  # noqa: ARG001  as Python calls it
+    line: str | None = None,
+) -> None:
+    """Print a warning of a library."""
+    _print(warnings.formatwarning(message, category, filename, lineno, line).rstrip())
+
+
+def _print(text: str) -> None:
+    """Print on stderr, also before there is a command line to print with."""
+    print(printable(text), file=sys.stderr)  # noqa: T201

@@ -116,7 +116,7 @@ class Group(TyperGroup):
         except (KeyboardInterrupt, typer.Abort):
             code = INTERRUPTED
         if code == INTERRUPTED:
-            typer.echo("interrupted", err=True)
+            screen.note("interrupted")
         sys.exit(code or 0)
 
 
@@ -178,8 +178,8 @@ def _message(error: DiransacError | OSError) -> str:
 
 def _say(message: str, code: int) -> int:
     """Print a message of a few lines on stderr; the exit code."""
-    lines = [line for line in message.splitlines() if line.strip()]
-    typer.echo("\n".join([f"error: {lines[0]}" if lines else "error", *lines[1:MAX_LINES]]), err=True)
+    lines = [line for line in message.split("\n") if line.strip()]
+    screen.note("\n".join([f"error: {lines[0]}" if lines else "error", *lines[1:MAX_LINES]]))
     return code
 
 

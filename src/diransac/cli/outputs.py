@@ -8,10 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-import typer
-
 from diransac.atomic import draft
-from diransac.cli.screen import stdout_taken
+from diransac.cli.screen import copy, stdout_taken
 from diransac.errors import DiransacError, ResultError
 
 __all__ = ["PAGE", "RESULT", "STDOUT", "check_ending", "checked", "staged"]
@@ -93,7 +91,7 @@ def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -
             yield drafts
         for written, target in zip(drafts, targets, strict=True):
             if target == STDOUT:
-                _print(written)
+                copy(written.read_bytes())
             elif target is not None:
                 if target.exists():
                     written.chmod(target.stat().st_mode)
@@ -113,11 +111,6 @@ def _naming(outputs: Mapping[Path, Path | None]) -> Iterator[None]:
         if message == str(error):
             raise
         raise type(error)(message) from error
-
-
-def _print(written: Path) -> None:
-    """Copy a file to stdout."""
-    typer.echo(written.read_bytes(), nl=False)
 
 
 def _made(target: Path, folders: ExitStack) -> Path:

@@ -1,4 +1,4 @@
-"""Printed output: results on stdout, progress on stderr."""
+"""Printed output: results on stdout, progress and errors on stderr; all of it without control characters."""
 
 from __future__ import annotations
 
@@ -10,22 +10,28 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO
 
 import typer
 
 from diransac.identification.method import Callback, Progress
+from diransac.plain_text import printable
 
 __all__ = [
     "Lines",
     "bar",
     "command",
+    "copy",
     "end",
     "is_quiet",
+    "is_terminal",
+    "note",
+    "progress_bar",
     "say",
     "set_command",
     "set_verbosity",
     "show",
+    "shows_bars",
     "stdout_taken",
 ]
 
@@ -64,7 +70,7 @@ def show(shown: Showable, as_json: bool) -> None:
         return
     if _STATE["taken"]:
         raise typer.BadParameter("-o - and --json both write to stdout; give one")
-    typer.echo(json.dumps(_finite(shown.to_dict()), indent=1, ensure_ascii=False, allow_nan=False))
+    typer.echo(printable(json.dumps(_finite(shown.to_dict()), indent=1, ensure_ascii=False, allow_nan=False)))
 
 
 def say(text: str) -> None:
@@ -75,7 +81,38 @@ def say(text: str) -> None:
     text : str
     """
     if not is_quiet():
-        typer.echo(text, err=bool(_STATE["taken"]))
+        typer.echo(printable(text), err=bool(_STATE["taken"]))
+
+
+def note(text: str) -> None:
+    """Print text on stderr.
+
+    Parameters
+    ----------
+    text : str
+    """
+    typer.echo(printable(text), err=True)
+
+
+def copy(content: bytes) -> None:
+    """Write an output to stdout as it is; to a terminal as printable text.
+
+    Parameters
+    ----------
+    content : bytes
+    """
+    typer.echo(printable(content.decode(errors="replace")) if is_terminal(sys.stdout) else content, nl=False)
+
+
+def is_terminal(stream: TextIO | None) -> bool:
+    """True for a stream that a terminal shows.
+
+    Parameters
+    ----------
+    stream : text stream, optional
+        None: a process without it.
+    """
+    return stream is not None and stream.isatty()
 
 
 def set_command(words: Sequence[str]) -> None:
@@ -164,27 +201,46 @@ def bar(label: str) -> Iterator[Callback]:
     if _STATE["verbosity"] > 0:
         yield Stages(label).show
         return
-    if sys.stderr is None or not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
+    if not shows_bars():
         lines = Lines(label)
         yield lambda found: lines.show(found.stage, found.fraction)
         return
     from rich import progress
-    from rich.console import Console
 
-    columns = (
-        progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
-        progress.TaskProgressColumn(),
-        progress.TimeRemainingColumn(),
-    )
-    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        task = shown.add_task(label, total=1.0)
+    with progress_bar(progress.TaskProgressColumn()) as shown:
+        task = shown.add_task(printable(label), total=1.0)
 
         def update(found: Progress) -> None:
-            note = f" ({found.note})" if found.note else ""
-            shown.update(task, completed=found.fraction, description=f"{label}: {found.stage}{note}")
+            about = f" ({found.note})" if found.note else ""
+            shown.update(task, completed=found.fraction, description=printable(f"{label}: {found.stage}{about}"))
 
         yield update
+
+
+def shows_bars() -> bool:
+    """True where stderr is a terminal, or ``FORCE_COLOR`` says so."""
+    return is_terminal(sys.stderr) or (sys.stderr is not None and bool(os.environ.get("FORCE_COLOR")))
+
+
+def progress_bar(*columns: Any, **options: Any) -> Any:
+    """Bar of Rich on stderr, a context: a description, which is no markup, the bar, columns, and the time left.
+
+    Parameters
+    ----------
+    *columns : rich.progress.ProgressColumn
+    **options
+        Of `rich.progress.Progress`.
+
+    Returns
+    -------
+    rich.progress.Progress
+    """
+    from rich import progress
+    from rich.console import Console
+
+    first = progress.TextColumn("{task.description}", markup=False), progress.BarColumn()
+    last = progress.TimeRemainingColumn()
+    return progress.Progress(*first, *columns, last, console=Console(stderr=True), transient=True, **options)
 
 
 class Stages:
@@ -209,7 +265,7 @@ class Stages:
         if found.stage != self._last:
             self._last = found.stage
             elapsed = time.monotonic() - self._begin
-            typer.echo(f"{self._label}: {elapsed:7.2f} s  {found.fraction:4.0%}  {found.stage}", err=True)
+            note(f"{self._label}: {elapsed:7.2f} s  {found.fraction:4.0%}  {found.stage}")
 
 
 class Lines:
@@ -240,4 +296,4 @@ class Lines:
             return
         self._next = elapsed + _LINE_EVERY
         left = f", about {elapsed * (1.0 / fraction - 1.0):.0f} s left" if fraction > 0.0 else ""
-        typer.echo(f"{self._label}: {stage}, {fraction:.0%} after {elapsed:.0f} s{left}", err=True)
+        note(f"{self._label}: {stage}, {fraction:.0%} after {elapsed:.0f} s{left}")

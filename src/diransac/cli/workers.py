@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from diransac.cli import screen
+from diransac.plain_text import printable
 
 __all__ = ["Cluster", "Jobs", "running"]
 
@@ -77,7 +77,7 @@ def _kept(store: Path) -> Iterator[Progress]:
     finally:
         done, asked = counts
         if done < asked and isinstance(sys.exception(), KeyboardInterrupt | None):
-            typer.echo(f"{done} of {asked} rows are kept in {store}; the same command runs the rest", err=True)
+            screen.note(f"{done} of {asked} rows are kept in {store}; the same command runs the rest")
 
 
 @contextmanager
@@ -89,23 +89,15 @@ def _bar(label: str) -> Iterator[Progress]:
     if screen.is_quiet():
         yield lambda _done, _asked: None
         return
-    if sys.stderr is None or not (sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
+    if not screen.shows_bars():
         yield _lines(label)
         return
     from rich import progress
-    from rich.console import Console
 
-    columns = (
-        progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        progress.TextColumn("rows, {task.fields[rate]}"),
-        progress.TimeRemainingColumn(),
-    )
+    columns = progress.MofNCompleteColumn(), progress.TextColumn("rows, {task.fields[rate]}")
     # The rate is an average since the start, so that it is known from the first rows on.
-    options: dict[str, Any] = {"console": Console(stderr=True), "transient": True, "speed_estimate_period": math.inf}
-    with progress.Progress(*columns, **options) as shown:
-        task = shown.add_task(label, total=None, rate="starting")
+    with screen.progress_bar(*columns, speed_estimate_period=math.inf) as shown:
+        task = shown.add_task(printable(label), total=None, rate="starting")
 
         def update(done: int, asked: int) -> None:
             if shown.tasks[0].total is None:  # rows of an earlier run do not count for the rate

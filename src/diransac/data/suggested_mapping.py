@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ from diransac.data.mapping import BUILT_IN, LogMapping, MappedSignals, load_mapp
 from diransac.data.readers.recording import shortened
 from diransac.data.units import conversion
 from diransac.errors import LogError
+from diransac.plain_text import comment, literal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -91,7 +91,8 @@ class Coverage:
 
     def toml(self) -> str:
         """The mapping as a commented file."""
-        start = f'# A first guess for the model "{self.model}" from {self.source}, by the names of its fields.\n'
+        about = comment(f'A first guess for the model "{self.model}" from {self.source}, by the names of its fields.')
+        start = f"# {about}\n"
         start += "# Check topics, units, signs and frames: value = sign * scale * field + offset.\n"
         start += self.clock
         start += '# resample = "median" # or a rate in Hz; without it the rows are those of the fastest topic\n'
@@ -103,13 +104,14 @@ class Coverage:
             listed = f"; the nearest names are {', '.join(near)}" if near else ""
             unit = self.units.get(name, "?")
             parts.append(
-                f"# No field was found for {name} [{unit}]{listed}.\n"
-                f'# [[signals]]\n# name = {json.dumps(name)}\n# topic = ""\n# field = ""\n# unit = {json.dumps(unit)}\n'
+                f"# {comment(f'No field was found for {name} [{unit}]{listed}.')}\n"
+                f'# [[signals]]\n# name = {literal(name)}\n# topic = ""\n# field = ""\n# unit = {literal(unit)}\n'
             )
         parts += self._event()
         if self.missing:
             rest = {topic: shortened(labels) for topic, labels in self.unused.items()}
-            parts.append("".join(f"# Other fields{_of(t)}: {_some(labels)}\n" for t, labels in rest.items() if labels))
+            others = (f"Other fields{_of(t)}: {_some(labels)}" for t, labels in rest.items() if labels)
+            parts.append("".join(f"# {comment(line)}\n" for line in others))
         return "\n".join(part for part in parts if part)
 
     def _event(self) -> list[str]:
@@ -117,11 +119,11 @@ class Coverage:
         for topic, labels in self.unused.items():
             for label in labels:
                 if _STATES & set(_WORD.findall(label.lower())):
-                    place = f"# topic = {json.dumps(topic)}\n" if topic else ""
+                    place = f"# topic = {literal(topic)}\n" if topic else ""
                     return [
                         "# Stretches that count, by a field of the log; with while, all others are left out.\n"
                         f'# while = ["running"] # above [[signals]]\n# [[events]]\n# name = "running"\n{place}'
-                        f"# where = {{ field = {json.dumps(label)}, equals = 1 }}\n"
+                        f"# where = {{ field = {literal(label)}, equals = 1 }}\n"
                     ]
         return []
 
@@ -191,7 +193,7 @@ def _clock(fields: Mapping[str, Sequence[str]]) -> str:
     if likely is None:
         return '# time = { column = "t_ms", scale = 0.001 } # where it is not the column t, in seconds\n'
     factor = 0.001 if likely.lower().endswith(("_ms", "millis")) else 1.0
-    return f"time = {{ column = {json.dumps(likely)}, scale = {factor:g} }} # to seconds\n"
+    return f"time = {{ column = {literal(likely)}, scale = {factor:g} }} # to seconds\n"
 
 
 def _needed(model: Model) -> list[str]:
@@ -268,30 +270,37 @@ def _origin(entry: MappedSignals, name: str) -> str:
     return (f"{entry.topic}.{label}" if entry.topic else label) + frame
 
 
+def _value(value: object) -> str:
+    """A text, a number or a list of them in TOML."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    return literal(value) if isinstance(value, str) else repr(value)
+
+
 def _toml(entry: MappedSignals, units: Mapping[str, str]) -> str:
     """One entry as TOML."""
     several = len(entry.names) > 1
     pick = list if several else next
-    lines = ["[[signals]]", f"name = {json.dumps(pick(iter(entry.names)))}"]
-    lines += [f"topic = {json.dumps(entry.topic)}"] if entry.topic else []
-    lines.append(f"field = {json.dumps(pick(iter(entry.fields)))}")
+    lines = ["[[signals]]", f"name = {_value(pick(iter(entry.names)))}"]
+    lines += [f"topic = {literal(entry.topic)}"] if entry.topic else []
+    lines.append(f"field = {_value(pick(iter(entry.fields)))}")
     for key, numbers, neutral in (("scale", entry.factors, 1.0), ("offset", entry.offsets, 0.0)):
         if any(x != neutral for x in numbers):
-            lines.append(f"{key} = {json.dumps(numbers[0] if len(set(numbers)) == 1 else list(numbers))}")
+            lines.append(f"{key} = {_value(numbers[0] if len(set(numbers)) == 1 else list(numbers))}")
     if entry.frame is not None:
         lines += ['order = "wxyz"'] if len(entry.names) == 4 else []
-        lines.append(f"frame = {json.dumps(entry.frame)}")
+        lines.append(f"frame = {literal(entry.frame)}")
     if entry.where:
         limits = [
             {"field": x.field, **{k: v for k, v in (("above", x.above), ("below", x.below)) if abs(v) != float("inf")}}
             for x in entry.where
         ]
-        inner = ", ".join("{ " + ", ".join(f"{k} = {json.dumps(v)}" for k, v in x.items()) + " }" for x in limits)
+        inner = ", ".join("{ " + ", ".join(f"{k} = {_value(v)}" for k, v in x.items()) + " }" for x in limits)
         lines.append(f"where = [{inner}]")
     known = entry.known_units()
     if known:
-        lines.append(f"unit = {json.dumps(next(iter(known.values())))}")
+        lines.append(f"unit = {literal(next(iter(known.values())))}")
     else:
         unit = units.get(entry.names[0], "?")
-        lines.append(f"unit = {json.dumps(unit)} # what the model has; is it that of the log?")
+        lines.append(f"unit = {literal(unit)} # what the model has; is it that of the log?")
     return "\n".join(lines) + "\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from diransac.atomic import write_text, write_with
 from diransac.errors import ModelError, SettingsError
 from diransac.export.portable import PortableModel
 from diransac.export.statements import PYTHON, C, statements
+from diransac.plain_text import comment, literal
 
 __all__ = ["FORMATS", "format_of", "write_model"]
 
@@ -92,7 +92,7 @@ def c_source(model: PortableModel) -> str:
     name, n_x, n_u, n_p = model.identifier, len(model.model.state), model.model.n_u, model.model.n_p
     state, inputs = f"const double x[{n_x}]", f"const double u[{max(1, n_u)}]"
     definitions, results = statements(model.model.dynamics, ("x", "u", "p"), C)
-    values = [f"    {C.number(value)}, /* {parameter} */" for parameter, value in model.parameters.items()]
+    values = [f"    {C.number(value)}, /* {comment(parameter)} */" for parameter, value in model.parameters.items()]
     unused = [] if n_u and any("u[" in line for line in (*definitions, *results)) else ["    (void)u;"]
     body = [
         *_comment(model.description()),
@@ -128,8 +128,7 @@ def c_source(model: PortableModel) -> str:
 
 def _comment(lines: Iterator[str]) -> list[str]:
     """A block comment."""
-    safe = (line.replace("*/", "* /") for line in lines)
-    return ["/*", *(f" * {line}".rstrip() for line in safe), " */"]
+    return ["/*", *(f" * {comment(line)}".rstrip() for line in lines), " */"]
 
 
 def _step_in_c(model: PortableModel) -> Iterator[str]:
@@ -209,10 +208,10 @@ def python_source(model: PortableModel) -> str:
     quaternions = [list(four) for four in model.model.quaternions]
     plain = "    return state + dt / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)"
     return _PYTHON.format(
-        description="\n".join(model.description()).replace("\\", "\\\\").replace('"""', "'''"),
-        states=json.dumps(model.model.state),
-        inputs=json.dumps(list(model.model.inputs)),
-        parameters="\n".join(f"    {json.dumps(n)}: {PYTHON.number(x)}," for n, x in model.parameters.items()),
+        description="\n".join(map(comment, model.description())),
+        states=_flow(list(model.model.state)),
+        inputs=_flow(list(model.model.inputs)),
+        parameters="\n".join(f"    {literal(n)}: {PYTHON.number(x)}," for n, x in model.parameters.items()),
         n_x=len(model.model.state),
         n_u=model.model.n_u,
         definitions="".join(f"    {line}\n" for line in definitions),
@@ -227,23 +226,27 @@ def python_source(model: PortableModel) -> str:
 def casadi_function(model: PortableModel) -> ca.Function:
     """Function ``(state, inputs, NAME=estimate, ...) -> derivative``, an argument for each parameter."""
     x, u = ca.SX.sym("x", len(model.model.state)), ca.SX.sym("u", model.model.n_u)
-    arguments = ["state", "inputs", *model.parameters]
-    if len(set(arguments)) < len(arguments):
+    taken = [name for name in ("state", "inputs", "derivative") if name in model.parameters]
+    if taken:
         raise ModelError(
-            "a parameter is named state or inputs, as another argument of the CasADi function is; rename it"
+            f"a parameter is named {taken[0]}, as an argument or the result of the CasADi function is; rename it"
         )
     p = [ca.SX.sym(name) for name in model.parameters]
     return ca.Function(
         model.identifier,
         [x, u, *p],
         [model.model.dynamics(x, u, ca.vertcat(*p))[0]],
-        arguments,
+        ["state", "inputs", *model.parameters],
         ["derivative"],
         {"default_in": [0.0, 0.0, *model.parameters.values()]},
     )
 
 
 # ---------------------------------------------------------------------- YAML
+
+
+_LONGEST_KEY = 1000
+"""Characters of a key that needs no mark; YAML has 1024."""
 
 
 def yaml_document(model: PortableModel) -> str:
@@ -263,7 +266,7 @@ def yaml_document(model: PortableModel) -> str:
         "covariance": dict(zip(values, model.covariance.tolist(), strict=True)),
         "samples": {name: draws.tolist() for name, draws in model.samples.items()},
     }
-    return "\n".join([*(f"# {line}".rstrip() for line in model.remarks), *_yaml(document, ""), ""])
+    return "\n".join([*(f"# {comment(line)}".rstrip() for line in model.remarks), *_yaml(document, ""), ""])
 
 
 def _estimate(model: PortableModel, name: str) -> dict[str, Any]:
@@ -289,11 +292,13 @@ def _estimate(model: PortableModel, name: str) -> dict[str, Any]:
 def _yaml(mapping: dict[str, Any], indent: str) -> Iterator[str]:
     """Lines of a mapping in block style; lists in flow style."""
     for key, value in mapping.items():
+        name = literal(key)
+        begin = f"{name}:" if len(name) <= _LONGEST_KEY else f"? {name}\n{indent}:"
         if isinstance(value, dict) and value:
-            yield f"{indent}{_scalar(key)}:"
+            yield f"{indent}{begin}"
             yield from _yaml(value, indent + "  ")
         else:
-            yield f"{indent}{_scalar(key)}: {_flow(value)}"
+            yield f"{indent}{begin} {_flow(value)}"
 
 
 def _flow(value: Any) -> str:
@@ -303,14 +308,14 @@ def _flow(value: Any) -> str:
 
 
 def _scalar(value: Any) -> str:
-    """JSON's text of a text or number; YAML's where JSON has none."""
+    """YAML's text of a text or number."""
     if isinstance(value, float):
         if not np.isfinite(value):
             return ".nan" if np.isnan(value) else f"{'-' if value < 0 else ''}.inf"
         mantissa, exponent, power = repr(value).partition("e")
         point = "" if "." in mantissa or not exponent else ".0"  # without it, YAML 1.1 reads 1e-05 as text
         return f"{mantissa}{point}{exponent}{power}"
-    return json.dumps(value, ensure_ascii=False)
+    return literal(value) if isinstance(value, str) else str(value).lower()
 
 
 _TEXTS: dict[str, Callable[[PortableModel], str]] = {

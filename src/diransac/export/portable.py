@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -13,6 +12,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.input_timing import InputTiming
 from diransac.model import Model
+from diransac.plain_text import identifier
 from diransac.text_table import duration
 
 __all__ = ["PortableModel"]
@@ -76,9 +76,8 @@ class PortableModel:
 
     @property
     def identifier(self) -> str:
-        """Name of the model as an identifier of C and Python."""
-        name = re.sub(r"[^A-Za-z0-9]+", "_", self.name or self.model.name).strip("_")
-        return name if name and not name[0].isdigit() else f"model_{name}".rstrip("_")
+        """Name of the model as an identifier of C and CasADi."""
+        return identifier(self.name or self.model.name)
 
     @property
     def version(self) -> str:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
-from diransac.plots.figure import INK, MUTED, PAPER, WIDTH, check_ending, draw_heading, header_height, write
+from diransac.plots.figure import INK, MUTED, WIDTH, check_ending, draw_heading, empty_figure, header_height, write
 from diransac.plots.rows import LogAxis, MarkRow, as_marks, draw_rows, name_rows, names_width, row_height
 from diransac.plots.study import axis_label, level_labels, method_looks, n_trials, title_of
 from diransac.study.database import damage
@@ -119,8 +119,6 @@ def _row(name: str, errors: FloatArray, hidden: npt.NDArray[np.bool_], *, quiet:
 
 
 def _drawn(summary: Summary, title: str) -> Figure:
-    from matplotlib.figure import Figure
-
     methods, rows = methods_and_errors(summary)
     every = as_marks(method_looks(summary.methods))
     looks = {label: every[label] for label in methods}
@@ -129,7 +127,7 @@ def _drawn(summary: Summary, title: str) -> Figure:
     caption = _caption(summary, scale)
     header, height = header_height(entries, title), row_height(len(methods)) * len(rows)
     full = header + _ABOVE + height + _BELOW + _LINE * len(caption) + 0.08
-    figure = Figure(figsize=(WIDTH, full), facecolor=PAPER)
+    figure = empty_figure(full)
     draw_heading(figure, entries, title)
     heading = axis_label(summary)
     what, left = "Error of the worst parameter, %", names_width([row.name for row in rows], heading)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import chdir, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from diransac.atomic import write_with
 from diransac.errors import SettingsError
+from diransac.plain_text import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,6 +32,7 @@ __all__ = [
     "Range",
     "check_ending",
     "draw_heading",
+    "empty_figure",
     "extent",
     "flight_panels",
     "header_height",
@@ -66,6 +71,22 @@ _PATH_WIDTH, _PATH_ROWS, _WIDE, _PATH_HEIGHT = 3.75, 3, 2.2, 2.3
 _STEPS = (1, 2, 5, 10)
 
 
+def empty_figure(height: float) -> Figure:
+    """Figure without panels.
+
+    Matplotlib, which is imported here first, would take settings from ``matplotlibrc`` in the working directory.
+
+    Parameters
+    ----------
+    height : inches
+    """
+    beside = Path("matplotlibrc").exists() and "matplotlib" not in sys.modules
+    with chdir(Path(__file__).parent) if beside else nullcontext():
+        from matplotlib.figure import Figure
+
+    return Figure(figsize=(WIDTH, height), facecolor=PAPER)
+
+
 def flight_panels(
     states: Sequence[str], inputs: Sequence[str], box: tuple[Range, Range] | None, header: float
 ) -> tuple[Figure, dict[str, Axes], Axes | None]:
@@ -76,14 +97,12 @@ def flight_panels(
     box : ranges of the path in x and z; None for no path
     header : free height at the top, inches
     """
-    from matplotlib.figure import Figure
-
     columns = _halves(states)
     n_rows, n_input_rows = max(map(len, columns)), -(-len(inputs) // 2)
     wide = box is not None and extent(box[0]) > _WIDE * extent(box[1])
     top = header + (_PATH_HEIGHT + _TIMES if wide else 0.0)
     below = top + n_rows * _ROW + _TIMES
-    figure = Figure(figsize=(WIDTH, below + n_input_rows * _ROW + _TIMES + _GAP), facecolor=PAPER)
+    figure = empty_figure(below + n_input_rows * _ROW + _TIMES + _GAP)
 
     path = None
     if box is not None:
@@ -212,17 +231,29 @@ def check_ending(path: Path) -> str:
     return ending
 
 
+@contextmanager
+def _literal_texts(figure: Figure, **settings: Any) -> Iterator[None]:
+    """Context in which a figure is saved: names are no formulas, have no control characters, and may lack a glyph."""
+    from matplotlib import rc_context
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+        text.set_text(printable(text.get_text()))
+    with rc_context({**_SALT, "text.parse_math": False, **settings}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font", category=UserWarning)
+        yield
+
+
 def write(figure: Figure, path: Path) -> None:
     """Write the figure in the format of the file's ending, completely or not at all.
 
     Raises SettingsError: the ending is unknown, or the file cannot be written.
     """
-    from matplotlib import rc_context
-
     ending = check_ending(path)
 
     def save(temporary: Path) -> None:
-        with rc_context(_SALT):
+        with _literal_texts(figure):
             figure.savefig(temporary, format=ending[1:], dpi=_DOTS_PER_INCH, metadata=_METADATA[ending])
 
     try:
@@ -233,10 +264,8 @@ def write(figure: Figure, path: Path) -> None:
 
 def svg(figure: Figure) -> str:
     """Figure as an ``<svg>`` element with selectable text, for embedding in a page."""
-    from matplotlib import rc_context
-
     memory = io.StringIO()
-    with rc_context({**_SALT, "svg.fonttype": "none"}):
+    with _literal_texts(figure, **{"svg.fonttype": "none"}):
         figure.savefig(memory, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = memory.getvalue()
     return text[text.index("<svg") :]

@@ -10,12 +10,12 @@ import numpy as np
 from diransac.plots.figure import (
     COLOURS,
     INK,
-    PAPER,
     REFERENCE,
     WIDTH,
     LegendEntry,
     check_ending,
     draw_heading,
+    empty_figure,
     header_height,
     name_panel,
     panel,
@@ -59,8 +59,6 @@ def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: 
     SettingsError
         The file cannot be written.
     """
-    from matplotlib.figure import Figure
-
     if path is not None:
         check_ending(Path(path))
     colours = _colours(summary)
@@ -68,7 +66,7 @@ def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: 
     entries: list[LegendEntry] = [("fleet", {"color": REFERENCE, "marker": ".", "linestyle": ""})]
     entries += [(vehicle, {"color": colour, "marker": "."}) for vehicle, colour in colours.items()]
     header = header_height(entries, text)
-    figure = Figure(figsize=(WIDTH, header + _ROW * len(summary.parameters) + 0.35), facecolor=PAPER)
+    figure = empty_figure(header + _ROW * len(summary.parameters) + 0.35)
     draw_heading(figure, entries, text)
     for k, parameter in enumerate(summary.parameters):
         last, top = k == len(summary.parameters) - 1, header + k * _ROW

@@ -13,7 +13,6 @@ from diransac.errors import SettingsError
 from diransac.plots.figure import (
     INK,
     MUTED,
-    PAPER,
     REFERENCE,
     RULE,
     SOFT,
@@ -21,6 +20,7 @@ from diransac.plots.figure import (
     Range,
     check_ending,
     draw_heading,
+    empty_figure,
     extent,
     header_height,
     write,
@@ -123,8 +123,6 @@ def _at(found: Mapping[tuple[str, int, str], Path2], level: str, methods: Sequen
 
 # Panels --------------------------------------------------------------------------------------------------------------
 def _drawn(summary: Summary, level: str, flown: _Paths, planned: _Paths, title: str) -> Figure:
-    from matplotlib.figure import Figure
-
     looks = method_looks(summary.methods)
     entries = [("flown with the true parameters", looks[TRUE])] if TRUE in looks else []
     if any(some for by_method in planned.values() for some in by_method.values()):
@@ -134,7 +132,7 @@ def _drawn(summary: Summary, level: str, flown: _Paths, planned: _Paths, title: 
     heights = {shape: width * extent(box[1]) / extent(box[0]) for shape, box in boxes.items()}
     header = header_height(entries, title)
     full = header + sum(_NAME + height + _BELOW for height in heights.values()) + _CAPTION
-    figure = Figure(figsize=(WIDTH, full), facecolor=PAPER)
+    figure = empty_figure(full)
     top = header
     for shape, by_method in flown.items():
         _write(figure, 0.1, top + 0.03, shape, fontsize=9.5, color=INK)

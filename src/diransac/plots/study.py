@@ -12,6 +12,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
+from diransac.plain_text import printable
 from diransac.plots.figure import (
     COLOURS,
     INK,
@@ -22,6 +23,7 @@ from diransac.plots.figure import (
     WIDTH,
     check_ending,
     draw_heading,
+    empty_figure,
     header_height,
     name_panel,
     panel,
@@ -110,15 +112,13 @@ def plot_study(store: str | Path, path: str | Path | None = None, *, title: str 
 
 
 def _drawn(summary: Summary, title: str) -> Figure:
-    from matplotlib.figure import Figure
-
     looks = _looks(summary)
     entries = list(looks.items())
     header = header_height(entries, title)
     heights = [_block_height(summary, flights) for flights in summary.flights.values()]
     words = _caption(summary)
     caption = _LINE * len(words) + 0.14
-    figure = Figure(figsize=(WIDTH, header + sum(heights) + caption), facecolor=PAPER)
+    figure = empty_figure(header + sum(heights) + caption)
     top = header
     for (shape, flights), height in zip(summary.flights.items(), heights, strict=True):
         _draw_block(figure, summary, shape, flights, top)
@@ -236,7 +236,7 @@ def _name_levels(axes: Axes, summary: Summary) -> None:
     margin = 0.6 * (float(np.diff(positions).min()) if len(positions) > 1 else 1.0)
     axes.set_xlim(positions[0] - margin, positions[-1] + margin)
     if len(positions) <= _COLUMNS * 2:
-        axes.set_xticks(positions, level_labels(summary))
+        axes.set_xticks(positions, [printable(label) for label in level_labels(summary)])
     else:
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
 

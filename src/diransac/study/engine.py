@@ -29,6 +29,7 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, Protocol
 
 from diransac.errors import SettingsError, StudyError
+from diransac.process import module_path_safe
 from diransac.simulation import default_threads
 from diransac.time_limit import time_left
 
@@ -217,7 +218,7 @@ class Processes:
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """Future of a task in a process; a pool with a dead process is replaced, as it takes no more tasks."""
-        with _interrupts_held():
+        with _interrupts_held(), module_path_safe():
             try:
                 return self._pool.submit(function, *arguments)
             except BrokenExecutor:
@@ -234,7 +235,8 @@ class Processes:
 
     def _new_pool(self) -> ProcessPoolExecutor:
         self._begun = _Begun()
-        return ProcessPoolExecutor(self._jobs, self._begun, initializer=_begin)
+        with module_path_safe():  # the pool's first lock starts a process that tracks it
+            return ProcessPoolExecutor(self._jobs, self._begun, initializer=_begin)
 
 
 class _Begun(SpawnContext):

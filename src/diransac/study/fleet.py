@@ -40,6 +40,7 @@ from diransac.identification.result import Result
 from diransac.identification.settings import EXECUTION, Settings
 from diransac.model import Model
 from diransac.plain_data import json_data
+from diransac.plain_text import cell
 from diransac.process import single_threaded
 from diransac.study.database import (
     AGAIN,
@@ -586,7 +587,7 @@ def export_fleet(store: str | Path, path: str | Path) -> None:
     def write(temporary: Path) -> None:
         with temporary.open("w", newline="", encoding="utf-8") as file:
             table = csv.writer(file)
-            table.writerow(["log", "vehicle", "time", *(name.rstrip(AGAIN) for name in names[1:])])
-            table.writerows(rows)
+            table.writerow(["log", "vehicle", "time", *(cell(name.rstrip(AGAIN)) for name in names[1:])])
+            table.writerows([cell(x) if isinstance(x, str) else x for x in row] for row in rows)
 
     write_with(path, write)

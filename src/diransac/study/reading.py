@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from diransac.errors import SettingsError, StudyError
 from diransac.plain_data import json_data
+from diransac.plain_text import cell
 from diransac.study.database import damage, quoted, word
 from diransac.study.specification import planned_path
 from diransac.study.store import Store, whole
@@ -167,7 +168,11 @@ def export(store: str | Path, path: str | Path, kind: str) -> None:
         )  # without rows it has no stages, which Parquet cannot hold
         rows.write_parquet(memory)
     elif kind == "csv":
-        frame.with_columns(pl.col("seconds").struct.json_encode()).write_csv(memory)
+        memory.write(
+            pl.DataFrame([list(map(cell, frame.columns))], orient="row").write_csv(include_header=False).encode()
+        )
+        texts = pl.col(pl.String).map_elements(cell, pl.String)
+        frame.with_columns(texts, pl.col("seconds").struct.json_encode()).write_csv(memory, include_header=False)
     else:
         raise SettingsError(f'there is no kind "{kind}"; there are parquet, csv')
     try:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from diransac.cli import screen
 from diransac.cli.group import Group
 
 __all__ = ["app"]
@@ -35,7 +36,7 @@ def _diransac(
     if version:
         from importlib.metadata import version as version_of
 
-        typer.echo(f"diransac {version_of('diransac')}")
+        screen.copy(f"diransac {version_of('diransac')}\n".encode())
         raise typer.Exit
     if context.invoked_subcommand is None:
         context.fail(f"Give a command: {', '.join(sorted(context.command.list_commands(context)))}.")  # type: ignore[attr-defined]

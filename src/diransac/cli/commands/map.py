@@ -41,7 +41,7 @@ def _map(
         fields, elements = read_fields(file)
         found = suggest_mapping(fields, elements, robot.load(model), f'log "{file}"')
         if output is None and not as_json:
-            typer.echo(found.toml(), nl=False)
+            screen.copy(found.toml().encode())
             return
         if output is not None:
             written.write_text(found.toml(), encoding="utf-8")

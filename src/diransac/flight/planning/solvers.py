@@ -355,6 +355,7 @@ def _sorted(entries: tuple[IntArray, IntArray], shape: tuple[int, int]) -> tuple
 
 def _ipopt_options(_layout: Layout, iterations: int, strategy: Strategy) -> dict[str, Any]:
     options = {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, **_interior(iterations, strategy)}
+    options["option_file_name"] = ""  # else ipopt.opt of the working directory is read, which may load a library
     if strategy == "full steps":
         options |= {"accept_every_trial_step": "yes", "mu_init": 1e-3}
     return {"ipopt": options}

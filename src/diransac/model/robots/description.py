@@ -7,7 +7,9 @@ here.
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -17,8 +19,12 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
+from diransac.process import module_path_safe
 
 __all__ = ["Body", "Coupling", "Description", "Joint", "mujoco_module", "parsed", "read_description"]
+
+_ALONE = threading.Lock()
+"""Held while warnings are dropped, which all threads share."""
 
 _ROUNDING = 1e-15
 """Entries of rotations that differ from 0, 1 or -1 by less are these: rounding of quarter turns' quaternions."""
@@ -148,7 +154,8 @@ def mujoco_module() -> ModuleType:
         It is not installed.
     """
     try:
-        import mujoco
+        with module_path_safe():  # glfw, which it imports, starts a process
+            import mujoco
     except ImportError as error:
         raise ModelError(
             "descriptions of robots are read by MuJoCo, which is not installed: pip install 'diransac[robots]'"
@@ -204,9 +211,22 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
         that exerts forces, or a surrounding fluid.
     """
     try:
-        return _description(path, base)
+        with _warnings_dropped(mujoco_module()):
+            return _description(path, base)
     except UnicodeDecodeError as error:  # a name in another encoding, or none
         raise _unreadable(path, error) from error
+
+
+@contextmanager
+def _warnings_dropped(mujoco: ModuleType) -> Iterator[None]:
+    """Context of one thread at a time in which MuJoCo neither prints warnings nor appends them to MUJOCO_LOG.TXT."""
+    with _ALONE:
+        before = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(lambda _: None)
+        try:
+            yield
+        finally:
+            mujoco.set_mju_user_warning(before)
 
 
 def _description(path: str | Path, base: str | None) -> Description:
