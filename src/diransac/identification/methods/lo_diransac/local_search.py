@@ -402,7 +402,7 @@ class LocalSearch:
             begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
             is_left = any(x.of_inputs for x in intervals.all_errors.kinds)
             try:
-                refined = refine_exact(self.settings, intervals, begin, prior)
+                refined = refine_exact(self.settings, intervals, begin, prior, flexible.cost)
             except np.linalg.LinAlgError:  # simulations by the exact model overflow from here: it is no explanation
                 continue
             exact = Explanation(intervals, refined, prior, exact=True)

@@ -19,6 +19,7 @@ MacKay 1992 (evidence updates); Chung et al. 2013 (scales that are kept off zero
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -70,6 +71,8 @@ _MAX_TRIALS, _MAX_SWEEPS = 8, 12
 # Part of what is left of the excess of its cost when a step is corrected for the curvature of the rollouts, at most.
 _CORRECTED = 0.3
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
+# Steps of which the best says how much a fit may gain in each of those that are left.
+_RECENT = 6
 
 
 @dataclass(frozen=True)
@@ -275,7 +278,9 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
     return Refinement(fit, *_evidence(intervals, fit, at), steps, converged)
 
 
-def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
+def refine_exact(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, rival: float = np.inf
+) -> Refinement:
     """Fit of the model as it is, without unmodelled accelerations and input gain and bias discrepancies.
 
     Parameters
@@ -285,6 +290,8 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     fit : Fit
         Initial fit, as from `refine`.
     prior : Prior
+    rival : float, optional
+        Cost of a fit to which this one is an alternative: it ends where it cannot become as likely.
 
     Returns
     -------
@@ -295,15 +302,21 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     TimeLimitError
         The time limit was reached.
     """
-    found = _refined_exactly(settings, intervals, fit, prior)
+    found = _refined_exactly(settings, intervals, fit, prior, rival)
     again = with_lost_intervals_restarted(intervals, found.fit) if found.converged else None
     if again is None:
         return found
-    return min(found, _refined_exactly(settings, intervals, again, prior), key=lambda x: x.cost)
+    return min(found, _refined_exactly(settings, intervals, again, prior, rival), key=lambda x: x.cost)
 
 
-def _refined_exactly(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
-    """As `refine_exact`, from one start."""
+def _refined_exactly(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, rival: float
+) -> Refinement:
+    """As `refine_exact`, from one start.
+
+    It is given up where as many steps as are left, each as good as the best of the last few, and a nat more in every
+    sample would leave it behind its rival.
+    """
     n_p, least = intervals.n_p, _EXACT * prior.tau
     shared, sizes = fit.shared.copy(), fit.prior.copy()
     shared[n_p:-1], sizes[n_p:-1] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:-1]
@@ -312,11 +325,12 @@ def _refined_exactly(settings: LoDiransacSettings, intervals: ShootingIntervals,
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
     damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
-    at = _linearized(intervals, fit)
-    while steps < settings.max_steps and not converged:
+    at, losses = _linearized(intervals, fit), list[float]()
+    while steps < settings.max_steps and not converged and not _is_lost(intervals, losses, settings, rival):
         check_time()
         steps += 1
         moved, solved, damping = _step(intervals, fit, at, damping)
+        losses.append(float(moved.noise.negative_log_likelihood(moved.residuals, intervals.known).sum()))
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
         noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
         sizes = fit.prior.copy()
@@ -328,6 +342,15 @@ def _refined_exactly(settings: LoDiransacSettings, intervals: ShootingIntervals,
         converged = bool((tau == fit.tau).all()) and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
         fit, at = updated, _linearized(intervals, updated)
     return Refinement(fit, *_evidence(intervals, fit, at), steps, converged)
+
+
+def _is_lost(intervals: ShootingIntervals, losses: Sequence[float], settings: LoDiransacSettings, rival: float) -> bool:
+    """True if the losses after each step so far leave a fit behind its rival for good."""
+    if len(losses) <= _RECENT:
+        return False
+    best = max(-np.diff(losses[-_RECENT:]).min(), 0.0)
+    left = settings.max_steps - len(losses)
+    return bool(losses[-1] - rival > intervals.known.sum() + left * best)
 
 
 def _linearized(intervals: ShootingIntervals, fit: Fit) -> NormalEquations:
