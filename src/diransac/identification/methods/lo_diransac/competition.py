@@ -30,7 +30,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     with_parameters,
 )
 from diransac.identification.methods.lo_diransac.search import Decided, Searched, likeliest, searched
-from diransac.identification.methods.lo_diransac.segments import ActingInputs
+from diransac.identification.methods.lo_diransac.segments import ActingInputs, inlying_samples
 from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
 from diransac.identification.methods.lo_diransac.smoothing import Motion
 from diransac.identification.methods.lo_diransac.sources import (
@@ -276,8 +276,7 @@ class Contest:
         """Samples that are no outliers ``(N, n_s)``, and the noise ``(n_s,)`` of each signal."""
         floor = np.maximum(_LEAST_NOISE * self.motion.spread, _TINY)
         if search is None or search.explains_nothing:
-            every: BoolArray = np.ones(self.intervals.measured.shape, bool)
-            return every, np.maximum(self.motion.spread, floor)
+            return inlying_samples(self.intervals, self.motion), np.maximum(self.motion.spread, floor)
         own, fit = search.likeliest.intervals, search.likeliest.refinement.fit
         inlying = fit.noise.inlying(fit.residuals, own.known) >= _INLYING
         noise = np.where(np.isfinite(fit.noise.sigma) & (fit.noise.sigma > 0.0), fit.noise.sigma, self.motion.spread)

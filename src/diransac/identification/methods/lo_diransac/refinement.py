@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.model import Model
 
-__all__ = ["Prior", "Refinement", "make_prior", "refine", "refine_exact", "start", "weights_of"]
+__all__ = ["Prior", "Refinement", "diverges", "make_prior", "refine", "refine_exact", "start", "weights_of"]
 
 
 # Where tau starts, in spreads of the accelerations; the largest change of any scale in a step.
@@ -70,6 +70,8 @@ _MAX_TRIALS, _MAX_SWEEPS = 8, 12
 # Part of what is left of the excess of its cost when a step is corrected for the curvature of the rollouts, at most.
 _CORRECTED = 0.3
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
+# Size of a state, whatever its unit, from which on squares of its derivatives overflow.
+_HUGE = 1e50
 
 
 @dataclass(frozen=True)
@@ -196,12 +198,12 @@ def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
 
     Where outliers are in the majority for longer than an interval, its state follows from its neighbours alone.
     """
-    n, losses = len(intervals), _losses(intervals, fit.noise, fit.residuals, np.arange(len(intervals)))
+    n, losses = len(intervals), _losses(intervals, fit.noise, fit.residuals, fit.ends, np.arange(len(intervals)))
     # States that changed since those of their neighbours were last propagated from them: others give what they gave.
     forward, backward = np.ones(n, bool), np.ones(n, bool)
     for _ in range(_MAX_SWEEPS):
-        after = 1 + np.flatnonzero(intervals.linked & forward[:-1])
-        fit, losses, forward = _better(intervals, fit, losses, after, np.nan_to_num(fit.ends[after - 1]))
+        after = 1 + np.flatnonzero(intervals.linked & forward[:-1] & _ends_well(fit.ends)[:-1])
+        fit, losses, forward = _better(intervals, fit, losses, after, fit.ends[after - 1])
         backward |= forward
         before = np.flatnonzero(intervals.linked & (backward[:-1] | backward[1:]))
         if len(before):
@@ -226,7 +228,7 @@ def _better(
     x, residuals, ends = fit.x.copy(), fit.residuals.copy(), fit.ends.copy()
     x[chosen] = states
     simulated, ended = intervals.simulated(fit.shared, x, fit.d, chosen)
-    found = _losses(intervals, fit.noise, simulated, chosen)
+    found = _losses(intervals, fit.noise, simulated, ended, chosen)
     better = found < losses[chosen]
     x[chosen[~better]] = fit.x[chosen[~better]]
     changed[chosen[better]] = True
@@ -237,10 +239,23 @@ def _better(
     return replace(fit, x=x, residuals=residuals, ends=ends), losses, changed
 
 
-def _losses(intervals: ShootingIntervals, noise: Mixture, residuals: FloatArray, chosen: IntArray) -> FloatArray:
-    """Negative log-likelihood ``(n,)`` of the samples of chosen intervals, from their residuals."""
+def _losses(
+    intervals: ShootingIntervals, noise: Mixture, residuals: FloatArray, ends: FloatArray, chosen: IntArray
+) -> FloatArray:
+    """Negative log-likelihood ``(n,)`` of the samples of chosen intervals; infinite where a rollout diverges."""
     known = intervals.known if len(chosen) == len(intervals) else intervals.known[intervals.rows_of(chosen)]
-    return np.asarray(noise.negative_log_likelihood(residuals, known).reshape(len(chosen), -1).sum(axis=1))
+    found = noise.negative_log_likelihood(residuals, known).reshape(len(chosen), -1).sum(axis=1)
+    return np.where(_ends_well(ends), found, np.inf)
+
+
+def _ends_well(ends: FloatArray) -> BoolArray:
+    """Mask ``(n,)`` of the rollouts that have not diverged, by the states in which they end."""
+    return np.asarray((np.abs(ends) < _HUGE).all(axis=1))
+
+
+def diverges(fit: Fit) -> bool:
+    """True if a rollout diverges, so that the fit has no normal equations."""
+    return not _ends_well(fit.ends).all()
 
 
 def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:

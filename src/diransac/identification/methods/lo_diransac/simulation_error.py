@@ -1,7 +1,10 @@
 """Simulation error (output error): parameters and initial states of segments, fitted to the samples together.
 
 It neither smooths nor differentiates.  Short segments have few local minima, long ones the information: a search from
-many starts over the shortest segments is followed by fits over segments three times as long, and so on.
+many starts over the shortest segments is followed by fits over segments three times as long, up to a block.
+
+Initial states have a Gaussian prior, the measured or smoothed state within the spread of the motion: few samples of a
+segment may not determine them.  Samples are a mixture with outliers, and so are those of a segment that diverges.
 
 References
 ----------
@@ -20,7 +23,13 @@ from numpy.typing import NDArray
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
-from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments, first_states, stretches
+from diransac.identification.methods.lo_diransac.segments import (
+    ActingInputs,
+    Segments,
+    inlying_samples,
+    prior_states,
+    stretches,
+)
 from diransac.identification.methods.lo_diransac.sources import Candidate
 from diransac.time_limit import check_time
 
@@ -34,19 +43,17 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 __all__ = ["simulation_error_candidates"]
 
 _SHORTEST, _GROWTH = 8, 3
-"""Rows of the shortest segments, and the factor by which they grow, as long as they are more than the blocks."""
+"""Rows of the shortest segments at least, and the factor by which they grow, up to the length of a block."""
 _N_RANDOM, _DECADES = 16, 1.0
 """Number of random starts, and how far from known parameters they are."""
 _SCREENED, _FOLLOWED = 16, 2
 """Segments on which all starts are scored, and the number of starts that are followed."""
 _ROWS_OF_SEARCH, _MOST_ROWS = 3_000, 50_000
 """Rows of the fits from several starts, and of others, at most."""
-_OUTLYING = 6.0
-"""Robust standard deviations from which on a sample is far from the smoothed motion."""
 _STEPS, _CONVERGED, _NOISE_MOVES = 25, 0.1, 0.03
 """Steps at most; change of parameters, standard errors, and relative change of the noise that end them."""
 _DAMPING, _DAMPING_BOUNDS = 1e-6, (1e-12, 1e6)
-_RIDGE, _FLOOR, _DIVERGED, _TINY = 1e-10, 1e-5, 1e6, 1e-150
+_RIDGE, _FLOOR, _TINY = 1e-10, 1e-5, 1e-150
 
 
 def simulation_error_candidates(
@@ -81,17 +88,25 @@ def simulation_error_candidates(
         The shortest segments first; empty where every simulation diverges, or the logs are too short.
     """
     starts = np.vstack([starts, _random_starts(intervals, starts, seed)])
-    tried = [_from_starts(intervals, motion, starts, acting, outliers=outliers) for acting in actings]
+    shortest, *longer = _lengths(intervals, blocks)
+    tried = [_from_starts(intervals, motion, starts, acting, shortest, outliers=outliers) for acting in actings]
     solved = [x for x in tried if x is not None]
     if not solved:
         return []
     chain = [min(solved, key=lambda x: x.cost)]
-    longest = max(x.stop - x.start for x in stretches(intervals))
-    while len(chain[-1].segments) > _GROWTH * blocks.n and _GROWTH * chain[-1].segments.n_rows <= longest:
-        chain.append(chain[-1].grown(_GROWTH * chain[-1].segments.n_rows).descended())
+    for length in longer:
+        chain.append(chain[-1].grown(length).descended())
     taken = chain[0].segments.acting
     others = [chain[-1].with_inputs(x).descended() for x in actings if x is not taken]
-    return [(x.candidate(blocks), x.simulated(motion)) for x in (*chain, *others) if np.isfinite(x.cost)]
+    return [(x.candidate(blocks), x.simulated) for x in (*chain, *others)]
+
+
+def _lengths(intervals: ShootingIntervals, blocks: Blocks) -> list[int]:
+    """Rows of the segments: those of a block, a third of them, and so on, the shortest first."""
+    block = np.median(np.diff(np.flatnonzero(np.diff(blocks.of_row))))
+    longest = int(min(block, max(x.stop - x.start for x in stretches(intervals))))
+    n = max(0, int(np.log(longest / _SHORTEST) / np.log(_GROWTH)))
+    return [max(_SHORTEST, longest // _GROWTH**k) for k in range(n, -1, -1)]
 
 
 def _random_starts(intervals: ShootingIntervals, known: FloatArray, seed: int) -> FloatArray:
@@ -115,19 +130,23 @@ def _segments(intervals: ShootingIntervals, acting: ActingInputs, length: int, m
 
 
 def _from_starts(
-    intervals: ShootingIntervals, motion: Motion, starts: FloatArray, acting: ActingInputs, *, outliers: bool
+    intervals: ShootingIntervals,
+    motion: Motion,
+    starts: FloatArray,
+    acting: ActingInputs,
+    length: int,
+    *,
+    outliers: bool,
 ) -> _Solution | None:
-    """The likeliest solution over the shortest segments; None where every simulation diverges."""
-    some = _segments(intervals, acting, _SHORTEST, _ROWS_OF_SEARCH)
+    """The likeliest solution over the shortest segments; None where the logs are too short."""
+    some = _segments(intervals, acting, length, _ROWS_OF_SEARCH)
     if not len(some):
         return None
     noise = _first_noise(some, motion.spread, outliers=outliers)
     order = np.argsort(_scores(some, motion, starts, noise), kind="stable")[:_FOLLOWED]
     found = [_Solution.begin(some, motion, starts[k], noise).descended() for k in order]
     best = min(found, key=lambda x: x.cost)
-    if not np.isfinite(best.cost):
-        return None
-    every = _segments(intervals, acting, _SHORTEST, _MOST_ROWS)
+    every = _segments(intervals, acting, length, _MOST_ROWS)
     if len(every) == len(some):
         return best
     return _Solution.begin(every, motion, best.parameters, best.noise).descended()
@@ -149,19 +168,18 @@ def _scores(segments: Segments, motion: Motion, starts: FloatArray, noise: Mixtu
     """Sum ``(m,)`` over signals of the logarithm of a robust scale of the errors over a few segments."""
     few = replace(segments, starts=segments.starts[:: max(1, len(segments) // _SCREENED)])
     lanes = np.repeat(starts[:, None], len(few), axis=1)
-    weights = few.weights(few.known / np.square(noise.sigma))
-    states = np.repeat(_states(few, motion)[None], len(starts), axis=0)
-    errors = few.errors(lanes, few.estimated_states(lanes, states, weights))
+    errors = few.errors(lanes, _first_states(few, motion, lanes, noise))
     scale = lower_scale(errors.reshape(len(starts), -1, errors.shape[3]), _flat(few.known))
     return np.asarray(np.log(np.nan_to_num(scale) + noise.floor).sum(axis=1))
 
 
-def _states(segments: Segments, motion: Motion) -> FloatArray:
-    """Measured states ``(K, n_x)`` at the segments' starts, or those of a motion where a sample is far from it."""
-    intervals = segments.intervals
-    apart = np.where(intervals.known, np.nan_to_num(intervals.measured - motion.signals), 0.0)
-    far: BoolArray = np.abs(apart) > _OUTLYING * lower_scale(apart.copy(), intervals.known)
-    return first_states(intervals, motion.signals, ~far, segments.starts)
+def _first_states(segments: Segments, motion: Motion, lanes: FloatArray, noise: Mixture) -> FloatArray:
+    """Initial states ``(m, K, n_x)`` for parameters ``(m, K, n)``, without samples far from a smoothed motion."""
+    inlying = inlying_samples(segments.intervals, motion)
+    weights = segments.known & inlying[segments.rows][:, :, segments.columns]
+    states, spread = prior_states(segments.intervals, motion, inlying, segments.starts)
+    states = np.repeat(states[None], len(lanes), axis=0)
+    return segments.estimated_states(lanes, states, spread, segments.weights(weights / np.square(noise.sigma)))
 
 
 def _flat(values: NDArray[Scalar]) -> NDArray[Scalar]:
@@ -176,6 +194,8 @@ class _Solution:
     Parameters
     ----------
     segments : Segments
+    motion : Motion
+        About which initial states are before they are known.
     parameters : (n,) array
     states : (K, n_x) array
     noise : Mixture
@@ -183,6 +203,7 @@ class _Solution:
     """
 
     segments: Segments
+    motion: Motion
     parameters: FloatArray
     states: FloatArray
     noise: Mixture
@@ -191,9 +212,13 @@ class _Solution:
     def begin(cls, segments: Segments, motion: Motion, parameters: FloatArray, noise: Mixture) -> _Solution:
         """The solution with states that agree best with the samples of their segments."""
         lanes = np.repeat(parameters[None, None], len(segments), axis=1)
-        weights = segments.weights(segments.known / np.square(noise.sigma))
-        states = segments.estimated_states(lanes, _states(segments, motion)[None], weights)[0]
-        return cls(segments, parameters, states, noise)
+        return cls(segments, motion, parameters, _first_states(segments, motion, lanes, noise)[0], noise)
+
+    @cached_property
+    def _prior(self) -> tuple[FloatArray, FloatArray]:
+        """Means and standard deviations of the initial states."""
+        intervals = self.segments.intervals
+        return prior_states(intervals, self.motion, inlying_samples(intervals, self.motion), self.segments.starts)
 
     @cached_property
     def _lanes(self) -> tuple[FloatArray, FloatArray]:
@@ -211,23 +236,25 @@ class _Solution:
 
     @cached_property
     def total_cost(self) -> float:
-        """Negative log-likelihood."""
-        return float(self.noise.negative_log_likelihood(self.errors, self._known).sum())
+        """Negative logarithm of the probability of samples and states."""
+        mean, spread = self._prior
+        of_states = 0.5 * np.square((self.states - mean) / spread).sum()
+        return float(self.noise.negative_log_likelihood(self.errors, self._known).sum() + of_states)
 
     @property
     def cost(self) -> float:
-        """Negative log-likelihood per known sample; infinite where a simulation diverges."""
-        if np.abs(self.errors).max(initial=0.0) >= _DIVERGED:
-            return np.inf
+        """Negative logarithm of the probability per known sample."""
         return self.total_cost / max(int(self._known.sum()), 1)
 
     @cached_property
     def equations(self) -> _Equations:
-        """Gauss-Newton equations of each segment, weighted by the noise."""
+        """Gauss-Newton equations of each segment, weighted by the noise, with the prior of its state."""
         shape = self.segments.known.shape
         inlying = self.noise.inlying(self.errors, self._known).reshape(shape)
         weights = self.segments.weights(inlying / np.square(self.noise.sigma))
-        return _Equations.of(self.segments, *self._lanes, weights)
+        found, (mean, spread) = _Equations.of(self.segments, *self._lanes, weights), self._prior
+        away = (self.states - mean) / np.square(spread)
+        return replace(found, H_xx=found.H_xx + np.diag(spread**-2.0), g_x=found.g_x + away)
 
     def descended(self) -> _Solution:
         """The solution after steps of Levenberg and Marquardt, each with an update of the noise (EM)."""
@@ -238,8 +265,6 @@ class _Solution:
             noise = now.noise.updated(now.errors, now._known, inlying, outliers=bool(now.noise.pi.any()))
             is_steady = bool((np.abs(np.log(noise.sigma / now.noise.sigma)) < _NOISE_MOVES).all())
             now = replace(now, noise=noise)
-            if not now.equations.is_finite:
-                break
             then, change, damping = now._stepped(damping)
             if then is None:
                 break
@@ -288,12 +313,13 @@ class _Solution:
         name = f"simulation error, {segments.n_rows * intervals.dt:.2g} s, {segments.acting.sentence}"
         return Candidate(name, self.parameters, np.array(without), segments.acting, intervals)
 
-    def simulated(self, motion: Motion) -> Motion:
-        """The motion of the segments; the given one in rows that none covers."""
-        series, signals = self.segments.trajectories(*self._lanes)[0], motion.signals.copy()
+    @property
+    def simulated(self) -> Motion:
+        """The motion of the segments; the smoothed one in rows that none covers."""
+        series, signals = self.segments.trajectories(*self._lanes)[0], self.motion.signals.copy()
         finite = np.isfinite(series).all(axis=(1, 2))
         signals[self.segments.rows[finite].ravel()] = _flat(series[finite])
-        return replace(motion, signals=signals)
+        return replace(self.motion, signals=signals)
 
 
 @dataclass(frozen=True)
@@ -316,12 +342,12 @@ class _Equations:
 
     @classmethod
     def of(cls, segments: Segments, parameters: FloatArray, states: FloatArray, weights: FloatArray) -> _Equations:
-        """Equations with parameters in the places of each segment's log."""
-        sums, layout = (
-            segments.gauss_newton(parameters, states, weights, parameters_too=True),
-            segments.intervals.layout,
-        )
-        H, g, n_x, n = sums.normal_matrix, sums.gradient, states.shape[2], parameters.shape[2]
+        """Equations with parameters in the places of each segment's log; those of segments that diverge are zero."""
+        sums = segments.gauss_newton(parameters, states, weights, parameters_too=True)
+        layout, n_x, n = segments.intervals.layout, states.shape[2], parameters.shape[2]
+        finite: BoolArray = np.isfinite(sums.normal_matrix).all(axis=(1, 2)) & np.isfinite(sums.gradient).all(axis=1)
+        H = np.where(finite[:, None, None], sums.normal_matrix, 0.0)
+        g = np.where(finite[:, None], sums.gradient, 0.0)
         if layout.is_shared:
             return cls(H[:, :n_x, :n_x], H[:, :n_x, n_x:], H[:, n_x:, n_x:], g[:, :n_x], g[:, n_x:])
         places = layout.index[segments.intervals.log_of_row[segments.starts]]
@@ -331,11 +357,6 @@ class _Equations:
         H_pp[k[:, :, None], places[:, :, None], places[:, None, :]] = H[:, n_x:, n_x:]
         g_p[k, places] = g[:, n_x:]
         return cls(H[:, :n_x, :n_x], H_xp, H_pp, g[:, :n_x], g_p)
-
-    @property
-    def is_finite(self) -> bool:
-        """False after a divergence."""
-        return all(bool(np.isfinite(x).all()) for x in (self.H_xx, self.H_xp, self.H_pp, self.g_x, self.g_p))
 
     def reduced(self, damping: float) -> _Reduced:
         """The equations of the parameters, without the states."""
