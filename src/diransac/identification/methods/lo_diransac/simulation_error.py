@@ -97,7 +97,8 @@ def simulation_error_candidates(
     for length in longer:
         chain.append(chain[-1].grown(length).descended())
     taken = chain[0].segments.acting
-    others = [chain[-1].with_inputs(x).descended() for x in actings if x is not taken]
+    last = chain[-1]
+    others = [replace(last, segments=replace(last.segments, acting=x)).descended() for x in actings if x is not taken]
     return [(x.candidate(blocks), x.simulated) for x in (*chain, *others)]
 
 
@@ -145,11 +146,7 @@ def _from_starts(
     noise = _first_noise(some, motion.spread, outliers=outliers)
     order = np.argsort(_scores(some, motion, starts, noise), kind="stable")[:_FOLLOWED]
     found = [_Solution.begin(some, motion, starts[k], noise).descended() for k in order]
-    best = min(found, key=lambda x: x.cost)
-    every = _segments(intervals, acting, length, _MOST_ROWS)
-    if len(every) == len(some):
-        return best
-    return _Solution.begin(every, motion, best.parameters, best.noise).descended()
+    return min(found, key=lambda x: x.cost)
 
 
 def _first_noise(segments: Segments, spread: FloatArray, *, outliers: bool) -> Mixture:
@@ -247,14 +244,25 @@ class _Solution:
         return self.total_cost / max(int(self._known.sum()), 1)
 
     @cached_property
-    def equations(self) -> _Equations:
-        """Gauss-Newton equations of each segment, weighted by the noise, with the prior of its state."""
-        shape = self.segments.known.shape
-        inlying = self.noise.inlying(self.errors, self._known).reshape(shape)
-        weights = self.segments.weights(inlying / np.square(self.noise.sigma))
-        found, (mean, spread) = _Equations.of(self.segments, *self._lanes, weights), self._prior
-        away = (self.states - mean) / np.square(spread)
-        return replace(found, H_xx=found.H_xx + np.diag(spread**-2.0), g_x=found.g_x + away)
+    def _equations(self) -> tuple[FloatArray, FloatArray]:
+        """Gauss-Newton matrix and gradient of each segment's state and of all parameters; zero after a divergence."""
+        segments, (mean, spread), (K, n_x) = self.segments, self._prior, self.states.shape
+        inlying = self.noise.inlying(self.errors, self._known).reshape(segments.known.shape)
+        weights = segments.weights(inlying / np.square(self.noise.sigma))
+        sums = segments.gauss_newton(*self._lanes, weights, parameters_too=True)
+        own = segments.intervals.layout.index[segments.intervals.log_of_row[segments.starts]]
+        at = np.hstack([np.tile(np.arange(n_x), (K, 1)), n_x + own])
+        H, g = np.zeros((K, *2 * (n_x + len(self.parameters),))), np.zeros((K, n_x + len(self.parameters)))
+        k = np.flatnonzero(np.isfinite(sums.normal_matrix).all(axis=(1, 2)) & np.isfinite(sums.gradient).all(axis=1))
+        H[k[:, None, None], at[k][:, :, None], at[k][:, None, :]] = sums.normal_matrix[k]
+        g[k[:, None], at[k]] = sums.gradient[k]
+        H[:, :n_x, :n_x] += np.diag(spread**-2.0)
+        g[:, :n_x] += (self.states - mean) / np.square(spread)
+        return H, g
+
+    def _reduced(self, damping: float) -> _Reduced:
+        """The equations of the parameters."""
+        return _Reduced.of(*self._equations, self.states.shape[1], damping)
 
     def descended(self) -> _Solution:
         """The solution after steps of Levenberg and Marquardt, each with an update of the noise (EM)."""
@@ -277,8 +285,8 @@ class _Solution:
         """The solution after a step that lowers the cost, or None; its change, standard errors; the next damping."""
         intervals = self.segments.intervals
         while damping <= _DAMPING_BOUNDS[1]:
-            part = self.equations.reduced(damping)
-            matrix, gradient = part.with_prior(intervals, self.parameters)
+            part = self._reduced(damping)
+            matrix, gradient = part.sums(intervals, self.parameters, np.ones(len(self.segments), bool))
             p = _moved(intervals, self.parameters, -_solved(matrix, gradient, damping))
             change = p - self.parameters
             then = replace(self, parameters=p, states=self.states - part.own - part.following @ change)
@@ -289,26 +297,19 @@ class _Solution:
         return None, 0.0, damping
 
     def grown(self, length: int) -> _Solution:
-        """The solution over longer segments, whose states are those of the shorter ones' simulations."""
+        """The solution over longer segments."""
         longer = _segments(self.segments.intervals, self.segments.acting, length, _MOST_ROWS)
-        nearest = np.clip(np.searchsorted(self.segments.starts, longer.starts, side="right") - 1, 0, None)
-        at = np.clip(longer.starts - self.segments.starts[nearest], 0, self.segments.n_rows - 1)
-        series = self.segments.trajectories(*self._lanes)[0]
-        found = replace(self, segments=longer, states=np.nan_to_num(series[nearest, at, : self.states.shape[1]]))
+        found = _Solution.begin(longer, self.motion, self.parameters, self.noise)
         scale = np.nan_to_num(lower_scale(found.errors.copy(), found._known), nan=1.0)
         return replace(found, noise=replace(self.noise, sigma=np.maximum(scale, self.noise.floor)))
-
-    def with_inputs(self, acting: ActingInputs) -> _Solution:
-        """The solution with inputs that act otherwise."""
-        return replace(self, segments=replace(self.segments, acting=acting))
 
     def candidate(self, blocks: Blocks) -> Candidate:
         """The estimate, and what it is without each block by one Newton step."""
         segments, intervals = self.segments, self.segments.intervals
         block = blocks.of_row[segments.starts + segments.n_rows // 2]
-        part, without = self.equations.reduced(0.0), []
+        part, without = self._reduced(0.0), []
         for k in range(blocks.n):
-            step = -_solved(*part.of(block != k).with_prior(intervals, self.parameters), 0.0)
+            step = -_solved(*part.sums(intervals, self.parameters, block != k), 0.0)
             without.append(_moved(intervals, self.parameters, step))
         name = f"simulation error, {segments.n_rows * intervals.dt:.2g} s, {segments.acting.sentence}"
         return Candidate(name, self.parameters, np.array(without), segments.acting, intervals)
@@ -323,55 +324,8 @@ class _Solution:
 
 
 @dataclass(frozen=True)
-class _Equations:
-    """Gauss-Newton equations of K segments, their states' and all parameters'.
-
-    Parameters
-    ----------
-    H_xx, H_xp, H_pp : (K, n_x, n_x), (K, n_x, n) and (K, n, n) array
-        J' W J.
-    g_x, g_p : (K, n_x) and (K, n) array
-        J' W e.
-    """
-
-    H_xx: FloatArray
-    H_xp: FloatArray
-    H_pp: FloatArray
-    g_x: FloatArray
-    g_p: FloatArray
-
-    @classmethod
-    def of(cls, segments: Segments, parameters: FloatArray, states: FloatArray, weights: FloatArray) -> _Equations:
-        """Equations with parameters in the places of each segment's log; those of segments that diverge are zero."""
-        sums = segments.gauss_newton(parameters, states, weights, parameters_too=True)
-        layout, n_x, n = segments.intervals.layout, states.shape[2], parameters.shape[2]
-        finite: BoolArray = np.isfinite(sums.normal_matrix).all(axis=(1, 2)) & np.isfinite(sums.gradient).all(axis=1)
-        H = np.where(finite[:, None, None], sums.normal_matrix, 0.0)
-        g = np.where(finite[:, None], sums.gradient, 0.0)
-        if layout.is_shared:
-            return cls(H[:, :n_x, :n_x], H[:, :n_x, n_x:], H[:, n_x:, n_x:], g[:, :n_x], g[:, n_x:])
-        places = layout.index[segments.intervals.log_of_row[segments.starts]]
-        k = np.arange(len(H))[:, None]
-        H_xp, H_pp, g_p = np.zeros((len(H), n_x, n)), np.zeros((len(H), n, n)), np.zeros((len(H), n))
-        H_xp[k[:, :, None], np.arange(n_x)[None, :, None], places[:, None, :]] = H[:, :n_x, n_x:]
-        H_pp[k[:, :, None], places[:, :, None], places[:, None, :]] = H[:, n_x:, n_x:]
-        g_p[k, places] = g[:, n_x:]
-        return cls(H[:, :n_x, :n_x], H_xp, H_pp, g[:, :n_x], g_p)
-
-    def reduced(self, damping: float) -> _Reduced:
-        """The equations of the parameters, without the states."""
-        d = np.sqrt(np.einsum("kii->ki", self.H_xx)) + _TINY
-        scaled = self.H_xx / d[:, :, None] / d[:, None, :] + (damping + _RIDGE) * np.eye(self.H_xx.shape[1])
-        right = np.concatenate([self.H_xp, self.g_x[:, :, None]], axis=2) / d[:, :, None]
-        solved = np.linalg.solve(scaled, right) / d[:, :, None]
-        following, own = solved[:, :, :-1], solved[:, :, -1]
-        matrix = self.H_pp - np.einsum("kxi,kxj->kij", self.H_xp, following)
-        return _Reduced(matrix, self.g_p - np.einsum("kxi,kx->ki", self.H_xp, own), following, own)
-
-
-@dataclass(frozen=True)
 class _Reduced:
-    """Schur complement of each segment's state: ``dx = -own - following dp``.
+    """Gauss-Newton equations of the parameters, without each segment's state: ``dx = -own - following dp``.
 
     Parameters
     ----------
@@ -385,15 +339,22 @@ class _Reduced:
     following: FloatArray
     own: FloatArray
 
-    def of(self, chosen: BoolArray) -> _Reduced:
-        """Some of the segments."""
-        return _Reduced(self.matrix[chosen], self.gradient[chosen], self.following[chosen], self.own[chosen])
+    @classmethod
+    def of(cls, H: FloatArray, g: FloatArray, n_x: int, damping: float) -> _Reduced:
+        """Schur complements of the first n_x unknowns in equations ``(K, n_x + n, n_x + n)`` and ``(K, n_x + n)``."""
+        d = np.sqrt(np.einsum("kii->ki", H[:, :n_x, :n_x])) + _TINY
+        scaled = H[:, :n_x, :n_x] / d[:, :, None] / d[:, None, :] + (damping + _RIDGE) * np.eye(n_x)
+        right = np.concatenate([H[:, :n_x, n_x:], g[:, :n_x, None]], axis=2) / d[:, :, None]
+        solved = np.linalg.solve(scaled, right) / d[:, :, None]
+        left = np.concatenate([H[:, n_x:, n_x:], g[:, n_x:, None]], axis=2) - H[:, n_x:, :n_x] @ solved
+        return cls(left[:, :, :-1], left[:, :, -1], solved[:, :, :-1], solved[:, :, -1])
 
-    def with_prior(self, intervals: ShootingIntervals, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Sums over the segments, with the priors of the parameters."""
+    def sums(self, intervals: ShootingIntervals, p: FloatArray, chosen: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Matrix and gradient of chosen segments together, with the priors of the parameters."""
         precision = 1.0 / np.square(intervals.layout.prior_std)
         away = np.where(precision > 0.0, p - intervals.layout.prior_mean, 0.0)
-        return self.matrix.sum(axis=0) + np.diag(precision), self.gradient.sum(axis=0) + precision * away
+        matrix, gradient = self.matrix[chosen].sum(axis=0), self.gradient[chosen].sum(axis=0)
+        return matrix + np.diag(precision), gradient + precision * away
 
 
 def _solved(matrix: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
