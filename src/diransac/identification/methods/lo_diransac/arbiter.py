@@ -257,7 +257,8 @@ class Arbiter:
         lanes = candidate.without_blocks(self.left_out)[None]
         weights = (intervals.sampled & self.inlying)[:, columns] / np.square(self.noise[columns])
         states, spread = prior_states(intervals, self.motion, self.inlying, segments.starts)
-        states = segments.cut(self.n_before).estimated_states(lanes, states[None], spread, weights)
+        before = replace(segments, n_rows=self.n_before)
+        states = before.estimated_states(lanes, states[None], spread, weights)
         return np.asarray(segments.errors(lanes, states)[0][:, self.n_before :])
 
 

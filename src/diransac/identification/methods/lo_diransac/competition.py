@@ -1,9 +1,9 @@
 """Competition of estimates: sources propose them, and the arbiter compares their predictions.
 
-Where the exact model of a fit predicts a log within its noise, there is no competition.  Elsewhere the estimates of the joint
-fit compete with least squares of all rows and with simulation error.  If one of these predicts better, or as well and
-contradicts the fit, a second joint fit begins with its parameters and its simulated motion, and its estimates compete,
-too: the fit may have been at a local optimum.
+Where the exact model of a fit predicts a log within its noise, there is no competition.  Elsewhere the estimates of the
+joint fit compete with least squares of all rows and with simulation error.  If one of these predicts better, or as well
+and contradicts the fit, which may be at a local optimum, a second joint fit begins with its parameters and its motion,
+and its estimates compete, too.
 """
 
 from __future__ import annotations

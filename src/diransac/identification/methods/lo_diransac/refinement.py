@@ -35,6 +35,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
     linearize,
     with_residuals,
 )
+from diransac.identification.methods.lo_diransac.segments import DIVERGED
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -70,8 +71,6 @@ _MAX_TRIALS, _MAX_SWEEPS = 8, 12
 # Part of what is left of the excess of its cost when a step is corrected for the curvature of the rollouts, at most.
 _CORRECTED = 0.3
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
-# Size of a state, whatever its unit, from which on squares of its derivatives overflow.
-_HUGE = 1e50
 
 
 @dataclass(frozen=True)
@@ -250,7 +249,7 @@ def _losses(
 
 def _ends_well(ends: FloatArray) -> BoolArray:
     """Mask ``(n,)`` of the rollouts that have not diverged, by the states in which they end."""
-    return np.asarray((np.abs(ends) < _HUGE).all(axis=1))
+    return np.asarray((np.abs(ends) < DIVERGED).all(axis=1))
 
 
 def diverges(fit: Fit) -> bool:

@@ -8,7 +8,7 @@ determine the state, and those after it are predicted.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.simulation import GaussNewtonBatch, Simulator
 
-__all__ = ["ActingInputs", "Segments", "inlying_samples", "prior_states", "stretches"]
+__all__ = ["DIVERGED", "ActingInputs", "Segments", "inlying_samples", "prior_states", "stretches"]
 
-_DIVERGED = 1e100
-"""Error after a divergence, whatever the unit; its square does not overflow."""
+DIVERGED = 1e50
+"""Error after a divergence, and state from which on squares of its derivatives overflow, whatever their units."""
 _STATE_STEPS = 15
 _OUTLYING = 6.0
 """Robust standard deviations from which on a sample is far from the smoothed motion."""
@@ -164,7 +164,7 @@ class Segments:
         found = self._simulator.errors(
             self.batch(parameters, states), self.measurements, threads=self.intervals.threads
         )
-        found = np.nan_to_num(found, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
+        found = np.nan_to_num(found, nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED)
         return found.reshape(*states.shape[:2], self.n_rows, -1)
 
     def trajectories(self, parameters: FloatArray, states: FloatArray) -> FloatArray:
@@ -216,10 +216,6 @@ class Segments:
         flat = states.reshape(-1, states.shape[2])
         found, _ = least_squares(_States(self, parameters, flat, spread, weights), flat, _STATE_STEPS)
         return found.reshape(states.shape)
-
-    def cut(self, n_rows: int) -> Segments:
-        """The beginnings of the segments."""
-        return replace(self, n_rows=n_rows)
 
 
 @dataclass(frozen=True)

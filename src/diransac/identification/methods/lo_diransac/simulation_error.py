@@ -16,10 +16,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
@@ -37,8 +36,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.methods.lo_diransac.sources import Blocks
-
-Scalar = TypeVar("Scalar", bound=np.generic)
 
 __all__ = ["simulation_error_candidates"]
 
@@ -166,7 +163,8 @@ def _scores(segments: Segments, motion: Motion, starts: FloatArray, noise: Mixtu
     few = replace(segments, starts=segments.starts[:: max(1, len(segments) // _SCREENED)])
     lanes = np.repeat(starts[:, None], len(few), axis=1)
     errors = few.errors(lanes, _first_states(few, motion, lanes, noise))
-    scale = lower_scale(errors.reshape(len(starts), -1, errors.shape[3]), _flat(few.known))
+    known = few.known.reshape(-1, errors.shape[3])
+    scale = lower_scale(errors.reshape(len(starts), *known.shape), known)
     return np.asarray(np.log(np.nan_to_num(scale) + noise.floor).sum(axis=1))
 
 
@@ -177,11 +175,6 @@ def _first_states(segments: Segments, motion: Motion, lanes: FloatArray, noise: 
     states, spread = prior_states(segments.intervals, motion, inlying, segments.starts)
     states = np.repeat(states[None], len(lanes), axis=0)
     return segments.estimated_states(lanes, states, spread, segments.weights(weights / np.square(noise.sigma)))
-
-
-def _flat(values: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Values ``(K, n_rows, n_s)`` as rows ``(K n_rows, n_s)``."""
-    return values.reshape(-1, values.shape[-1])
 
 
 @dataclass(frozen=True)
@@ -225,23 +218,18 @@ class _Solution:
     @cached_property
     def errors(self) -> FloatArray:
         """Simulated less measured samples ``(K n_rows, n_s)``."""
-        return _flat(self.segments.errors(*self._lanes)[0])
+        return np.asarray(self.segments.errors(*self._lanes)[0].reshape(-1, len(self.segments.columns)))
 
     @cached_property
     def _known(self) -> BoolArray:
-        return _flat(self.segments.known)
+        return self.segments.known.reshape(self.errors.shape)
 
     @cached_property
-    def total_cost(self) -> float:
+    def cost(self) -> float:
         """Negative logarithm of the probability of samples and states."""
         mean, spread = self._prior
         of_states = 0.5 * np.square((self.states - mean) / spread).sum()
         return float(self.noise.negative_log_likelihood(self.errors, self._known).sum() + of_states)
-
-    @property
-    def cost(self) -> float:
-        """Negative logarithm of the probability per known sample."""
-        return self.total_cost / max(int(self._known.sum()), 1)
 
     @cached_property
     def _equations(self) -> tuple[FloatArray, FloatArray]:
@@ -290,7 +278,7 @@ class _Solution:
             p = _moved(intervals, self.parameters, -_solved(matrix, gradient, damping))
             change = p - self.parameters
             then = replace(self, parameters=p, states=self.states - part.own - part.following @ change)
-            if then.total_cost < self.total_cost:
+            if then.cost < self.cost:
                 sizes = np.abs(change) * np.sqrt(np.maximum(np.diag(matrix), 0.0))
                 return then, float(sizes.max()), max(0.1 * damping, _DAMPING_BOUNDS[0])
             damping *= 10.0
@@ -319,7 +307,7 @@ class _Solution:
         """The motion of the segments; the smoothed one in rows that none covers."""
         series, signals = self.segments.trajectories(*self._lanes)[0], self.motion.signals.copy()
         finite = np.isfinite(series).all(axis=(1, 2))
-        signals[self.segments.rows[finite].ravel()] = _flat(series[finite])
+        signals[self.segments.rows[finite]] = series[finite]
         return replace(self.motion, signals=signals)
 
 
