@@ -82,27 +82,25 @@ def simulation_error_candidates(
     Returns
     -------
     list of (Candidate, Motion)
-        The shortest segments first; empty where every simulation diverges, or the logs are too short.
+        The shortest segments first; empty where the logs are too short.
     """
-    starts = np.vstack([starts, _random_starts(intervals, starts, seed)])
-    shortest, *longer = _lengths(intervals, blocks)
-    tried = [_from_starts(intervals, motion, starts, acting, shortest, outliers=outliers) for acting in actings]
+    starts, lengths = np.vstack([starts, _random_starts(intervals, starts, seed)]), _lengths(intervals, blocks)
+    tried = [_from_starts(intervals, motion, starts, acting, lengths[0], outliers=outliers) for acting in actings]
     solved = [x for x in tried if x is not None]
     if not solved:
         return []
     chain = [min(solved, key=lambda x: x.cost)]
-    for length in longer:
+    for length in lengths:
         chain.append(chain[-1].grown(length).descended())
-    taken = chain[0].segments.acting
-    last = chain[-1]
+    last, taken = chain[-1], chain[-1].segments.acting
     others = [replace(last, segments=replace(last.segments, acting=x)).descended() for x in actings if x is not taken]
-    return [(x.candidate(blocks), x.simulated) for x in (*chain, *others)]
+    return [(x.candidate(blocks), x.simulated) for x in (*chain[1:], *others)]
 
 
 def _lengths(intervals: ShootingIntervals, blocks: Blocks) -> list[int]:
     """Rows of the segments: those of a block, a third of them, and so on, the shortest first."""
-    block = np.median(np.diff(np.flatnonzero(np.diff(blocks.of_row))))
-    longest = int(min(block, max(x.stop - x.start for x in stretches(intervals))))
+    block = int(intervals.counted.sum()) // (1 + np.count_nonzero(np.diff(blocks.of_row)))
+    longest = min(max(block, 1), int(np.max([x.stop - x.start for x in stretches(intervals)], initial=1)))
     n = max(0, int(np.log(longest / _SHORTEST) / np.log(_GROWTH)))
     return [max(_SHORTEST, longest // _GROWTH**k) for k in range(n, -1, -1)]
 
@@ -136,7 +134,7 @@ def _from_starts(
     *,
     outliers: bool,
 ) -> _Solution | None:
-    """The likeliest solution over the shortest segments; None where the logs are too short."""
+    """The likeliest solution over some of the shortest segments; None where the logs are too short."""
     some = _segments(intervals, acting, length, _ROWS_OF_SEARCH)
     if not len(some):
         return None
@@ -162,19 +160,25 @@ def _scores(segments: Segments, motion: Motion, starts: FloatArray, noise: Mixtu
     """Sum ``(m,)`` over signals of the logarithm of a robust scale of the errors over a few segments."""
     few = replace(segments, starts=segments.starts[:: max(1, len(segments) // _SCREENED)])
     lanes = np.repeat(starts[:, None], len(few), axis=1)
-    errors = few.errors(lanes, _first_states(few, motion, lanes, noise))
+    errors = few.errors(lanes, _first_states(few, motion, lanes, noise)[0])
     known = few.known.reshape(-1, errors.shape[3])
     scale = lower_scale(errors.reshape(len(starts), *known.shape), known)
     return np.asarray(np.log(np.nan_to_num(scale) + noise.floor).sum(axis=1))
 
 
-def _first_states(segments: Segments, motion: Motion, lanes: FloatArray, noise: Mixture) -> FloatArray:
-    """Initial states ``(m, K, n_x)`` for parameters ``(m, K, n)``, without samples far from a smoothed motion."""
+def _first_states(
+    segments: Segments, motion: Motion, lanes: FloatArray, noise: Mixture
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Initial states ``(m, K, n_x)`` for parameters ``(m, K, n)``, means ``(K, n_x)`` and deviations of their prior.
+
+    Samples far from the smoothed motion do not count.
+    """
     inlying = inlying_samples(segments.intervals, motion)
-    weights = segments.known & inlying[segments.rows][:, :, segments.columns]
-    states, spread = prior_states(segments.intervals, motion, inlying, segments.starts)
-    states = np.repeat(states[None], len(lanes), axis=0)
-    return segments.estimated_states(lanes, states, spread, segments.weights(weights / np.square(noise.sigma)))
+    mean, spread = prior_states(segments.intervals, motion, inlying, segments.starts)
+    states = np.repeat(mean[None], len(lanes), axis=0)
+    counted = segments.known & inlying[segments.rows][:, :, segments.columns]
+    weights = segments.weights(counted / np.square(noise.sigma))
+    return segments.estimated_states(lanes, states, spread, weights), mean, spread
 
 
 @dataclass(frozen=True)
@@ -185,30 +189,28 @@ class _Solution:
     ----------
     segments : Segments
     motion : Motion
-        About which initial states are before they are known.
+        Smoothed.
     parameters : (n,) array
-    states : (K, n_x) array
     noise : Mixture
         Of the compared signals.
+    states, mean, spread : (K, n_x), (K, n_x) and (n_x,) array
+        Initial states, and means and standard deviations of their prior.
     """
 
     segments: Segments
     motion: Motion
     parameters: FloatArray
-    states: FloatArray
     noise: Mixture
+    states: FloatArray
+    mean: FloatArray
+    spread: FloatArray
 
     @classmethod
     def begin(cls, segments: Segments, motion: Motion, parameters: FloatArray, noise: Mixture) -> _Solution:
         """The solution with states that agree best with the samples of their segments."""
         lanes = np.repeat(parameters[None, None], len(segments), axis=1)
-        return cls(segments, motion, parameters, _first_states(segments, motion, lanes, noise)[0], noise)
-
-    @cached_property
-    def _prior(self) -> tuple[FloatArray, FloatArray]:
-        """Means and standard deviations of the initial states."""
-        intervals = self.segments.intervals
-        return prior_states(intervals, self.motion, inlying_samples(intervals, self.motion), self.segments.starts)
+        states, mean, spread = _first_states(segments, motion, lanes, noise)
+        return cls(segments, motion, parameters, noise, states[0], mean, spread)
 
     @cached_property
     def _lanes(self) -> tuple[FloatArray, FloatArray]:
@@ -227,14 +229,13 @@ class _Solution:
     @cached_property
     def cost(self) -> float:
         """Negative logarithm of the probability of samples and states."""
-        mean, spread = self._prior
-        of_states = 0.5 * np.square((self.states - mean) / spread).sum()
+        of_states = 0.5 * np.square((self.states - self.mean) / self.spread).sum()
         return float(self.noise.negative_log_likelihood(self.errors, self._known).sum() + of_states)
 
     @cached_property
     def _equations(self) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton matrix and gradient of each segment's state and of all parameters; zero after a divergence."""
-        segments, (mean, spread), (K, n_x) = self.segments, self._prior, self.states.shape
+        segments, (K, n_x) = self.segments, self.states.shape
         inlying = self.noise.inlying(self.errors, self._known).reshape(segments.known.shape)
         weights = segments.weights(inlying / np.square(self.noise.sigma))
         sums = segments.gauss_newton(*self._lanes, weights, parameters_too=True)
@@ -244,8 +245,8 @@ class _Solution:
         k = np.flatnonzero(np.isfinite(sums.normal_matrix).all(axis=(1, 2)) & np.isfinite(sums.gradient).all(axis=1))
         H[k[:, None, None], at[k][:, :, None], at[k][:, None, :]] = sums.normal_matrix[k]
         g[k[:, None], at[k]] = sums.gradient[k]
-        H[:, :n_x, :n_x] += np.diag(spread**-2.0)
-        g[:, :n_x] += (self.states - mean) / np.square(spread)
+        H[:, :n_x, :n_x] += np.diag(self.spread**-2.0)
+        g[:, :n_x] += (self.states - self.mean) / np.square(self.spread)
         return H, g
 
     def _reduced(self, damping: float) -> _Reduced:
@@ -285,7 +286,7 @@ class _Solution:
         return None, 0.0, damping
 
     def grown(self, length: int) -> _Solution:
-        """The solution over longer segments."""
+        """The solution over all segments of a length, of which states and noise are their own."""
         longer = _segments(self.segments.intervals, self.segments.acting, length, _MOST_ROWS)
         found = _Solution.begin(longer, self.motion, self.parameters, self.noise)
         scale = np.nan_to_num(lower_scale(found.errors.copy(), found._known), nan=1.0)
