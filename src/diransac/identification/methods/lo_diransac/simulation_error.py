@@ -100,7 +100,7 @@ def simulation_error_candidates(
 def _lengths(intervals: ShootingIntervals, blocks: Blocks) -> list[int]:
     """Rows of the segments: those of a block, a third of them, and so on, the shortest first."""
     block = int(intervals.counted.sum()) // (1 + np.count_nonzero(np.diff(blocks.of_row)))
-    longest = min(max(block, 1), int(np.max([x.stop - x.start for x in stretches(intervals)], initial=1)))
+    longest = int(np.clip(block, 1, max((int(x.stop - x.start) for x in stretches(intervals)), default=1)))
     n = max(0, int(np.log(longest / _SHORTEST) / np.log(_GROWTH)))
     return [max(_SHORTEST, longest // _GROWTH**k) for k in range(n, -1, -1)]
 
