@@ -20,7 +20,6 @@ from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.estimate import Competition, Competitor
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison, Scores
-from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import fewest_parts
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
@@ -56,8 +55,6 @@ _WITHIN, _WHITE = 0.2, 0.5
 _INLYING, _TINY, _LEAST_NOISE = 0.5, 1e-300, 1e-4
 # Half width of an interval of 95 %, standard errors.
 _INTERVAL = 1.96
-# Random samples from which simulation error starts.
-_FROM_SAMPLES = 4
 # Samples of the intervals of a second search at most, as far as their number has divisors.
 _SHORT = 25
 
@@ -240,19 +237,10 @@ class Contest:
         """Parameters ``(m, n)`` from which simulation error starts, within the bounds."""
         found, given = [x.parameters for x in self.candidates], _given_start(self.settings, self.dataset)
         found += [] if given is None else [given]
-        found += [*self._hypotheses()] if first is None else [
-            first.result.parameters, first.likeliest.refinement.fit.shared[: self.intervals.n_p]
-        ]  # fmt: skip
+        if first is not None:
+            found += [first.result.parameters, first.likeliest.refinement.fit.shared[: self.intervals.n_p]]
         found = [x for x in found if self.dataset.layout.admits(x[None])[0]]
         return np.array(found or [np.ones(len(self.dataset.layout))])
-
-    def _hypotheses(self) -> FloatArray:
-        """The best of random samples, where no fit began with them."""
-        try:
-            found = find_hypotheses(self.settings, self.intervals, self.motion, self.seed, self.dataset)
-        except (IdentificationError, np.linalg.LinAlgError):
-            return np.zeros((0, len(self.dataset.layout)))
-        return found[:_FROM_SAMPLES]
 
     def decide(self, search: Searched | None) -> int | None:
         """Index of the winner; None where the logs are too short to be compared, or nothing takes part.

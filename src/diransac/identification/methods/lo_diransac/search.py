@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import dropwhile
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -197,15 +198,13 @@ def searched(
     if n_spikes:
         notes += (f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; they are interpolated",)
     prior = make_prior(settings, intervals, motion, discrepancy_units(intervals, motion, hypotheses[0]))
-    run = (k for k, p in enumerate(hypotheses) if not diverges(start(settings, intervals, motion, p, prior)))
-    first = next(run, None)
-    if first is None:
+    able = list(dropwhile(lambda p: diverges(start(settings, intervals, motion, p, prior)), hypotheses))
+    if not able:
         raise IdentificationError(
             f"{dataset.source}: simulations of {intervals.length} rows from smoothed states diverge, with each of "
-            f"{len(hypotheses)} samples of the parameters; check the model's constants, and the signs, units and "
-            "offsets of the signals, or bound the parameters"
+            f"{len(hypotheses)} samples of the parameters; check the model's constants, signs and units, or bound them"
         )
-    search = LocalSearch(settings, motion, hypotheses[first:], prior, callback)
+    search = LocalSearch(settings, motion, np.array(able), prior, callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
     return Searched(motion, notes, len(hypotheses), likeliest, *_parameters(settings, likeliest))
 

@@ -150,8 +150,7 @@ def _first_noise(segments: Segments, spread: FloatArray, *, outliers: bool) -> M
     low = np.where(intervals.sampled, intervals.measured, np.inf).min(axis=0)[columns]
     high = np.where(intervals.sampled, intervals.measured, -np.inf).max(axis=0)[columns]
     span = np.where(high > low, high - low, 1.0)
-    sizes = np.where(spread[columns] > 0.0, spread[columns], span)
-    place = {int(c): k for k, c in enumerate(columns)}
+    sizes, place = spread[columns], {int(c): k for k, c in enumerate(columns)}
     whole = [(place[a], place[b], place[c], place[d]) for a, b, c, d in intervals.model.quaternions if a in place]
     return Mixture(0.1 * sizes, np.full(len(columns), 0.1 * outliers), span, _FLOOR * sizes, whole)
 
@@ -249,9 +248,17 @@ class _Solution:
         g[:, :n_x] += (self.states - self.mean) / np.square(self.spread)
         return H, g
 
-    def _reduced(self, damping: float) -> _Reduced:
-        """The equations of the parameters."""
-        return _Reduced.of(*self._equations, self.states.shape[1], damping)
+    def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray]:
+        """Equations ``(K, n, n + 1)`` of the parameters, the gradient last, without the states.
+
+        After a step dp of the parameters, these change by ``-following (dp, 1)``, with ``following (K, n_x, n + 1)``.
+        """
+        (H, g), n_x = self._equations, self.states.shape[1]
+        d = np.sqrt(np.einsum("kii->ki", H[:, :n_x, :n_x])) + _TINY
+        scaled = H[:, :n_x, :n_x] / d[:, :, None] / d[:, None, :] + (damping + _RIDGE) * np.eye(n_x)
+        right = np.concatenate([H[:, :, n_x:], g[:, :, None]], axis=2)
+        following = np.linalg.solve(scaled, right[:, :n_x] / d[:, :, None]) / d[:, :, None]
+        return right[:, n_x:] - H[:, n_x:, :n_x] @ following, following
 
     def descended(self) -> _Solution:
         """The solution after steps of Levenberg and Marquardt, each with an update of the noise (EM)."""
@@ -274,11 +281,11 @@ class _Solution:
         """The solution after a step that lowers the cost, or None; its change, standard errors; the next damping."""
         intervals = self.segments.intervals
         while damping <= _DAMPING_BOUNDS[1]:
-            part = self._reduced(damping)
-            matrix, gradient = part.sums(intervals, self.parameters, np.ones(len(self.segments), bool))
+            parts, following = self._reduced(damping)
+            matrix, gradient = _with_priors(intervals, self.parameters, parts)
             p = _moved(intervals, self.parameters, -_solved(matrix, gradient, damping))
             change = p - self.parameters
-            then = replace(self, parameters=p, states=self.states - part.own - part.following @ change)
+            then = replace(self, parameters=p, states=self.states - following @ np.append(change, 1.0))
             if then.cost < self.cost:
                 sizes = np.abs(change) * np.sqrt(np.maximum(np.diag(matrix), 0.0))
                 return then, float(sizes.max()), max(0.1 * damping, _DAMPING_BOUNDS[0])
@@ -296,9 +303,9 @@ class _Solution:
         """The estimate, and what it is without each block by one Newton step."""
         segments, intervals = self.segments, self.segments.intervals
         block = blocks.of_row[segments.starts + segments.n_rows // 2]
-        part, without = self._reduced(0.0), []
+        parts, without = self._reduced(0.0)[0], []
         for k in range(blocks.n):
-            step = -_solved(*part.sums(intervals, self.parameters, block != k), 0.0)
+            step = -_solved(*_with_priors(intervals, self.parameters, parts[block != k]), 0.0)
             without.append(_moved(intervals, self.parameters, step))
         name = f"simulation error, {segments.n_rows * intervals.dt:.2g} s, {segments.acting.sentence}"
         return Candidate(name, self.parameters, np.array(without), segments.acting, intervals)
@@ -312,38 +319,11 @@ class _Solution:
         return replace(self.motion, signals=signals)
 
 
-@dataclass(frozen=True)
-class _Reduced:
-    """Gauss-Newton equations of the parameters, without each segment's state: ``dx = -own - following dp``.
-
-    Parameters
-    ----------
-    matrix, gradient : (K, n, n) and (K, n) array
-        Each segment's part of the parameters' equations.
-    following, own : (K, n_x, n) and (K, n_x) array
-    """
-
-    matrix: FloatArray
-    gradient: FloatArray
-    following: FloatArray
-    own: FloatArray
-
-    @classmethod
-    def of(cls, H: FloatArray, g: FloatArray, n_x: int, damping: float) -> _Reduced:
-        """Schur complements of the first n_x unknowns in equations ``(K, n_x + n, n_x + n)`` and ``(K, n_x + n)``."""
-        d = np.sqrt(np.einsum("kii->ki", H[:, :n_x, :n_x])) + _TINY
-        scaled = H[:, :n_x, :n_x] / d[:, :, None] / d[:, None, :] + (damping + _RIDGE) * np.eye(n_x)
-        right = np.concatenate([H[:, :n_x, n_x:], g[:, :n_x, None]], axis=2) / d[:, :, None]
-        solved = np.linalg.solve(scaled, right) / d[:, :, None]
-        left = np.concatenate([H[:, n_x:, n_x:], g[:, n_x:, None]], axis=2) - H[:, n_x:, :n_x] @ solved
-        return cls(left[:, :, :-1], left[:, :, -1], solved[:, :, :-1], solved[:, :, -1])
-
-    def sums(self, intervals: ShootingIntervals, p: FloatArray, chosen: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Matrix and gradient of chosen segments together, with the priors of the parameters."""
-        precision = 1.0 / np.square(intervals.layout.prior_std)
-        away = np.where(precision > 0.0, p - intervals.layout.prior_mean, 0.0)
-        matrix, gradient = self.matrix[chosen].sum(axis=0), self.gradient[chosen].sum(axis=0)
-        return matrix + np.diag(precision), gradient + precision * away
+def _with_priors(intervals: ShootingIntervals, p: FloatArray, parts: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Matrix and gradient of the parameters, of segments' parts ``(K, n, n + 1)`` and of priors."""
+    precision, total = 1.0 / np.square(intervals.layout.prior_std), parts.sum(axis=0)
+    away = np.where(precision > 0.0, p - intervals.layout.prior_mean, 0.0)
+    return total[:, :-1] + np.diag(precision), total[:, -1] + precision * away
 
 
 def _solved(matrix: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
