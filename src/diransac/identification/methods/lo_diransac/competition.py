@@ -133,9 +133,11 @@ def compete(
         if first is None:
             raise
         return replace(first, likeliest=replace(first.likeliest, complete=False))
-    if first is None and (found is None or found.decided is None or not found.decided.summary.predicts):
-        assert refused is not None
-        raise refused
+    if first is None and (found is None or (found.decided is not None and not found.decided.summary.predicts)):
+        if isinstance(refused, IdentificationError):
+            raise refused
+        failed = f"the joint fit fails numerically ({refused}), and no other estimate predicts the log"
+        raise IdentificationError(f"{dataset.source}: {failed}; check the model's constants, signs and units")
     return found or first  # type: ignore[return-value]  # one of them is there
 
 
