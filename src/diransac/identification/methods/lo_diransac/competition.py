@@ -133,7 +133,7 @@ def compete(
         if first is None:
             raise
         return replace(first, likeliest=replace(first.likeliest, complete=False))
-    if first is None and (found is None or (found.decided is not None and not found.decided.summary.predicts)):
+    if first is None and (found is None or found.decided is None or not found.decided.summary.predicts):
         if isinstance(refused, IdentificationError):
             raise refused
         failed = f"the joint fit fails numerically ({refused}), and no other estimate predicts the log"
@@ -150,7 +150,7 @@ def _decided(contest: Contest, first: Searched | None, notes: tuple[str, ...]) -
     searches = [] if first is None else [first]
     other = contest.challenger(first) if "second fit" in contest.settings.sources else None
     second = contest.second(other, notes) if other is not None else None
-    if second is not None and is_settled(second.likeliest, second.motion):
+    if first is not None and second is not None and is_settled(second.likeliest, second.motion):
         return second
     if second is not None and other is not None:
         contest.add_fit(second, f" from {contest.candidates[other].source}")
