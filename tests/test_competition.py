@@ -115,7 +115,8 @@ def test_states_are_those_of_the_simulation(bound: tuple) -> None:
     measured = intervals.measured.copy()
     measured[segments.rows, 0] = exact
     same = Segments(replace(intervals, measured=measured), segments.acting, segments.starts, 30)
-    found = same.estimated_states(lanes, np.zeros_like(states), np.ones((len(measured), 1)))
+    free = np.full(2, np.inf)
+    found = same.estimated_states(lanes, np.zeros_like(states), free, np.ones((len(measured), 1)))
     np.testing.assert_allclose(found, states, rtol=1e-6, atol=1e-9)
 
 
@@ -125,6 +126,53 @@ def test_no_stretch_passes_a_gap(bound: tuple) -> None:
     gaps[500:510] = True
     parts = stretches(replace(intervals, gaps=gaps))
     assert [(x.start, x.stop) for x in parts] == [(0, 500), (510, int(intervals.is_logged.sum()))]
+
+
+def explosive() -> dr.Model:
+    """A state that grows beyond all bounds from 1.6 on."""
+    return dr.Model(
+        name="explosive",
+        coordinates={},
+        first_order={"x": "1"},
+        inputs={"u": "1"},
+        parameters={"k": dr.Parameter("1/s", positive=True), "c": dr.Parameter("1/s", positive=True)},
+        equations=lambda q, v, a, u, p: [a.x + p.k * v.x - p.c * v.x**3 - u.u],
+    )
+
+
+def settling(outliers: slice, scale: float = 1.0) -> dr.Log:
+    """The state near zero, with outliers from which simulations explode."""
+    rng, dt, n = np.random.default_rng(0), 0.02, 800
+    u = np.repeat(rng.uniform(-1.0, 1.0, n // 20), 20)
+    x = np.zeros(n)
+    for i in range(n - 1):
+        now = x[i]
+        for _ in range(20):
+            now += dt / 20 * (u[i] - 2.0 * now + 0.8 * now**3)
+        x[i + 1] = now
+    x += 1e-3 * rng.standard_normal(n)
+    x[outliers] += 40.0 + rng.standard_normal(len(x[outliers]))
+    return dr.Log.from_arrays(np.arange(n) * dt, {"x": scale * x, "u": u})
+
+
+@pytest.mark.parametrize("outliers", [slice(400, 425), slice(0, 800, 160)])
+def test_outliers_where_segments_begin_do_not_lose_simulation_error(outliers: slice) -> None:
+    dataset = Dataset.of(explosive(), settling(outliers), pointwise=False)
+    intervals, motion, _ = prepared(dr.LoDiransac(), dataset)
+    actings = [ActingInputs.recorded(intervals, "zero-order")]
+    found = simulation_error_candidates(intervals, motion, np.ones((1, 2)), actings, 0, Blocks.of(intervals))
+    assert found
+    np.testing.assert_allclose(found[-1][0].parameters, [2.0, 0.8], rtol=0.1)
+
+
+def test_an_interval_that_diverges_does_not_lose_the_fit() -> None:
+    found = dr.identify(explosive(), settling(slice(400, 425)), differentiate=True).parameters
+    assert found["k"] == pytest.approx(2.0, rel=0.05)
+
+
+def test_a_wrong_unit_is_no_failure_of_linear_algebra() -> None:
+    found = dr.identify(explosive(), settling(slice(400, 425), 1e3), differentiate=True)
+    assert found.verdict == "do not rely on this"
 
 
 # ---------------------------------------------------------------------- the arbiter

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.segments import Segments, first_states, stretches
+from diransac.identification.methods.lo_diransac.segments import Segments, prior_states, stretches
 from diransac.identification.uncertainty import student_quantile
 
 if TYPE_CHECKING:
@@ -256,8 +256,9 @@ class Arbiter:
         intervals, columns = segments.intervals, segments.columns
         lanes = candidate.without_blocks(self.left_out)[None]
         weights = (intervals.sampled & self.inlying)[:, columns] / np.square(self.noise[columns])
-        states = first_states(intervals, self.motion.signals, self.inlying, segments.starts)[None]
-        states = segments.cut(self.n_before).estimated_states(lanes, states, weights)
+        states, spread = prior_states(intervals, self.motion, self.inlying, segments.starts)
+        before = replace(segments, n_rows=self.n_before)
+        states = before.estimated_states(lanes, states[None], spread, weights)
         return np.asarray(segments.errors(lanes, states)[0][:, self.n_before :])
 
 

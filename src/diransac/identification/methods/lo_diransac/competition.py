@@ -1,8 +1,9 @@
 """Competition of estimates: sources propose them, and the arbiter compares their predictions.
 
-Where the exact model predicts a log within its noise, there is no competition.  Elsewhere the estimates of the joint
-fit compete with least squares of all rows and with simulation error.  If one of these predicts better, a second joint
-fit begins with its parameters and its simulated motion, and its estimates compete, too.
+Where the exact model of a fit predicts a log within its noise, there is no competition.  Elsewhere the estimates of the
+joint fit compete with least squares of all rows and with simulation error.  If one of these predicts better, or as well
+and contradicts the fit, which may be at a local optimum, a second joint fit begins with its parameters and its motion,
+and its estimates compete, too.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.estimate import Competition, Competitor, LogEstimate
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison, Scores
-from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import fewest_parts
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
@@ -30,7 +30,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     with_parameters,
 )
 from diransac.identification.methods.lo_diransac.search import Decided, Searched, likeliest, searched
-from diransac.identification.methods.lo_diransac.segments import ActingInputs
+from diransac.identification.methods.lo_diransac.segments import ActingInputs, inlying_samples
 from diransac.identification.methods.lo_diransac.simulation_error import estimates_of_logs, simulation_error_candidates
 from diransac.identification.methods.lo_diransac.smoothing import Motion
 from diransac.identification.methods.lo_diransac.sources import (
@@ -53,8 +53,8 @@ __all__ = ["Contest", "compete", "is_settled"]
 # Noise over the spread of the signal, and its correlation from sample to sample, up to which an exact model is right.
 _WITHIN, _WHITE = 0.2, 0.5
 _INLYING, _TINY, _LEAST_NOISE = 0.5, 1e-300, 1e-4
-# Random samples from which simulation error starts.
-_FROM_SAMPLES = 4
+# Half width of an interval of 95 %, standard errors.
+_INTERVAL = 1.96
 # Samples of the intervals of a second search at most, as far as their number has divisors.
 _SHORT = 25
 
@@ -134,8 +134,10 @@ def compete(
             raise
         return replace(first, likeliest=replace(first.likeliest, complete=False))
     if first is None and (found is None or found.decided is None or not found.decided.summary.predicts):
-        assert refused is not None
-        raise refused
+        if isinstance(refused, IdentificationError):
+            raise refused
+        failed = f"the joint fit fails numerically ({refused}), and no other estimate predicts the log"
+        raise IdentificationError(f"{dataset.source}: {failed}; check the model's constants, signs and units")
     return found or first  # type: ignore[return-value]  # one of them is there
 
 
@@ -146,12 +148,14 @@ def _decided(contest: Contest, first: Searched | None, notes: tuple[str, ...]) -
     if winner is None:
         return None
     searches = [] if first is None else [first]
-    beaten = isinstance(contest.origins[winner], Motion) and not contest.is_as_good(first)
-    second = contest.second(winner, notes) if beaten and "second fit" in contest.settings.sources else None
-    if second is not None:
-        contest.add_fit(second, f" from {contest.candidates[winner].source}")
-        searches.insert(0, second)
-        winner = contest.decide(second)
+    other = contest.challenger(first) if "second fit" in contest.settings.sources else None
+    second = contest.second(other, notes) if other is not None else None
+    if first is not None and second is not None and is_settled(second.likeliest, second.motion):
+        return second
+    if second is not None and other is not None:
+        contest.add_fit(second, f" from {contest.candidates[other].source}")
+        searches.append(second)
+        winner = contest.decide(min(searches, key=lambda x: x.likeliest.cost))
         assert winner is not None
     if not searches:
         return None
@@ -195,13 +199,13 @@ class Contest:
         self.comparison: Comparison | None = None
 
     def add_fit(self, found: Searched, origin: str = "") -> None:
-        """Add the estimates of a joint fit, before those that are there."""
+        """Add the estimates of a joint fit, before those that are there, but after those of a likelier one."""
         acting = self._acting(found)
         some = list(
             _estimates_of_fit(found.likeliest, acting, self.blocks, origin, projection=self.settings.projection)
         )
-        self.candidates = [*some, *self.candidates]
-        self.origins = [*[found.likeliest] * len(some), *self.origins]
+        k = sum(not isinstance(x, Motion) and x.cost < found.likeliest.cost for x in self.origins)
+        self.candidates[k:k], self.origins[k:k] = some, [found.likeliest] * len(some)
 
     def _acting(self, found: Searched) -> ActingInputs:
         """Inputs as they act in a fit."""
@@ -236,19 +240,10 @@ class Contest:
         """Parameters ``(m, n)`` from which simulation error starts, within the bounds."""
         found, given = [x.parameters for x in self.candidates], _given_start(self.settings, self.dataset)
         found += [] if given is None else [given]
-        found += [*self._hypotheses()] if first is None else [
-            first.result.parameters, first.likeliest.refinement.fit.shared[: self.intervals.n_p]
-        ]  # fmt: skip
+        if first is not None:
+            found += [first.result.parameters, first.likeliest.refinement.fit.shared[: self.intervals.n_p]]
         found = [x for x in found if self.dataset.layout.admits(x[None])[0]]
         return np.array(found or [np.ones(len(self.dataset.layout))])
-
-    def _hypotheses(self) -> FloatArray:
-        """The best of random samples, where no fit began with them."""
-        try:
-            found = find_hypotheses(self.settings, self.intervals, self.motion, self.seed, self.dataset)
-        except (IdentificationError, np.linalg.LinAlgError):
-            return np.zeros((0, len(self.dataset.layout)))
-        return found[:_FROM_SAMPLES]
 
     def decide(self, search: Searched | None) -> int | None:
         """Index of the winner; None where the logs are too short to be compared, or nothing takes part.
@@ -277,19 +272,27 @@ class Contest:
         """Samples that are no outliers ``(N, n_s)``, and the noise ``(n_s,)`` of each signal."""
         floor = np.maximum(_LEAST_NOISE * self.motion.spread, _TINY)
         if search is None or search.explains_nothing:
-            every: BoolArray = np.ones(self.intervals.measured.shape, bool)
-            return every, np.maximum(self.motion.spread, floor)
+            return inlying_samples(self.intervals, self.motion), np.maximum(self.motion.spread, floor)
         own, fit = search.likeliest.intervals, search.likeliest.refinement.fit
         inlying = fit.noise.inlying(fit.residuals, own.known) >= _INLYING
         noise = np.where(np.isfinite(fit.noise.sigma) & (fit.noise.sigma > 0.0), fit.noise.sigma, self.motion.spread)
         return inlying | ~own.known, np.maximum(noise, floor)
 
-    def is_as_good(self, search: Searched | None) -> bool:
-        """True if an estimate of a search's fit predicts as well as the best."""
-        if search is None or self.comparison is None:
-            return False
-        own = np.array([x is search.likeliest for x in self.origins])
-        return bool((own & self.comparison.as_good).any())
+    def challenger(self, search: Searched | None) -> int | None:
+        """Index of the best estimate that no fit gave, where it beats a fit, or contradicts one that predicts as well.
+
+        Two estimates contradict each other if their intervals of a parameter are disjoint.
+        """
+        assert self.comparison is not None
+        as_good, fitted = self.comparison.as_good, np.array([not isinstance(x, Motion) for x in self.origins])
+        found = int(np.argmin(np.where(as_good & ~fitted, self.comparison.losses, np.inf)))
+        if fitted[found] or not as_good[found]:
+            return None
+        if search is None or not (as_good & fitted).any():
+            return found
+        one, variances = self.candidates[found], np.diag(search.result.covariance)
+        spans = _INTERVAL * (np.sqrt(np.diag(jackknife(one.without))) + np.sqrt(variances))
+        return found if (np.abs(one.parameters - search.result.parameters) > spans).any() else None
 
     def loss_of(self, search: Searched) -> float:
         """Least loss of the estimates of a search's fit."""

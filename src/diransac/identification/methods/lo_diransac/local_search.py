@@ -206,6 +206,9 @@ class LocalSearch:
             if best is None:
                 raise
             return replace(best, complete=False)
+        except np.linalg.LinAlgError:  # of another explanation, which is none then
+            if best is None:
+                raise
         assert best is not None
         return best
 

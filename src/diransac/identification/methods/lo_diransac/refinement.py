@@ -36,6 +36,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
     linearize,
     with_residuals,
 )
+from diransac.identification.methods.lo_diransac.segments import DIVERGED
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.model import Model
 
-__all__ = ["Prior", "Refinement", "make_prior", "refine", "refine_exact", "start", "weights_of"]
+__all__ = ["Prior", "Refinement", "diverges", "make_prior", "refine", "refine_exact", "start", "weights_of"]
 
 
 # Where tau starts, in spreads of the accelerations; the largest change of any scale in a step.
@@ -199,12 +200,12 @@ def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
 
     Where outliers are in the majority for longer than an interval, its state follows from its neighbours alone.
     """
-    n, losses = len(intervals), _losses(intervals, fit.noise, fit.residuals, np.arange(len(intervals)))
+    n, losses = len(intervals), _losses(intervals, fit.noise, fit.residuals, fit.ends, np.arange(len(intervals)))
     # States that changed since those of their neighbours were last propagated from them: others give what they gave.
     forward, backward = np.ones(n, bool), np.ones(n, bool)
     for _ in range(_MAX_SWEEPS):
-        after = 1 + np.flatnonzero(intervals.linked & forward[:-1])
-        fit, losses, forward = _better(intervals, fit, losses, after, np.nan_to_num(fit.ends[after - 1]))
+        after = 1 + np.flatnonzero(intervals.linked & forward[:-1] & _ends_well(fit.ends)[:-1])
+        fit, losses, forward = _better(intervals, fit, losses, after, fit.ends[after - 1])
         backward |= forward
         before = np.flatnonzero(intervals.linked & (backward[:-1] | backward[1:]))
         if len(before):
@@ -229,7 +230,7 @@ def _better(
     x, residuals, ends = fit.x.copy(), fit.residuals.copy(), fit.ends.copy()
     x[chosen] = states
     simulated, ended = intervals.simulated(fit.shared, x, fit.d, chosen)
-    found = _losses(intervals, fit.noise, simulated, chosen)
+    found = _losses(intervals, fit.noise, simulated, ended, chosen)
     better = found < losses[chosen]
     x[chosen[~better]] = fit.x[chosen[~better]]
     changed[chosen[better]] = True
@@ -240,10 +241,23 @@ def _better(
     return replace(fit, x=x, residuals=residuals, ends=ends), losses, changed
 
 
-def _losses(intervals: ShootingIntervals, noise: Mixture, residuals: FloatArray, chosen: IntArray) -> FloatArray:
-    """Negative log-likelihood ``(n,)`` of the samples of chosen intervals, from their residuals."""
+def _losses(
+    intervals: ShootingIntervals, noise: Mixture, residuals: FloatArray, ends: FloatArray, chosen: IntArray
+) -> FloatArray:
+    """Negative log-likelihood ``(n,)`` of the samples of chosen intervals; infinite where a rollout diverges."""
     known = intervals.known if len(chosen) == len(intervals) else intervals.known[intervals.rows_of(chosen)]
-    return np.asarray(noise.negative_log_likelihood(residuals, known).reshape(len(chosen), -1).sum(axis=1))
+    found = noise.negative_log_likelihood(residuals, known).reshape(len(chosen), -1).sum(axis=1)
+    return np.where(_ends_well(ends), found, np.inf)
+
+
+def _ends_well(ends: FloatArray) -> BoolArray:
+    """Mask ``(n,)`` of the rollouts that have not diverged, by the states in which they end."""
+    return np.asarray((np.abs(ends) < DIVERGED).all(axis=1))
+
+
+def diverges(fit: Fit) -> bool:
+    """True if a rollout diverges, so that the fit has no normal equations."""
+    return not _ends_well(fit.ends).all()
 
 
 def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import dropwhile
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +22,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     residuals_of_motion,
 )
 from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs, lags_of_inputs
-from diransac.identification.methods.lo_diransac.refinement import make_prior
+from diransac.identification.methods.lo_diransac.refinement import diverges, make_prior, start
 from diransac.identification.methods.lo_diransac.unmeasured import (
     unmeasured_by_name,
     unmeasured_states,
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["Decided", "Searched", "likeliest", "rows_of_logs", "searched"]
 
 _ALL_OF_IT = 0.8
-"""Fraction of a signal's spread from which on its noise leaves nothing to explain."""
+"""Fraction of a signal's spread from which on its noise leaves nothing to explain, and of its samples for outliers."""
 _MUCH = 0.1
 """Unexplained part of an acceleration from which on states that nothing measures are doubtful."""
 _SIGNIFICANT, _SMALL_DELAY = 3.0, 0.25
@@ -111,9 +112,10 @@ class Searched:
 
     @property
     def explains_nothing(self) -> bool:
-        """True if the noise of every signal is as large as the signal."""
-        seen = self.likeliest.intervals.known.any(axis=0)
-        return bool((self.likeliest.refinement.fit.noise.sigma > _ALL_OF_IT * self.motion.spread)[seen].all())
+        """True if the noise of every signal is as large as the signal, or nearly all of its samples are outliers."""
+        seen, noise = self.likeliest.intervals.known.any(axis=0), self.likeliest.refinement.fit.noise
+        nothing = (noise.sigma > _ALL_OF_IT * self.motion.spread) | (noise.pi > _ALL_OF_IT)
+        return bool(nothing[seen].all())
 
     @property
     def unexplained(self) -> float:
@@ -200,8 +202,14 @@ def searched(
         intervals, hypotheses, n_spikes = find_spikes(settings, intervals, motion, hypotheses, seed, dataset)
     if n_spikes:
         notes += (f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; they are interpolated",)
-    unit = discrepancy_units(intervals, motion, hypotheses[0])
-    search = LocalSearch(settings, motion, hypotheses, make_prior(settings, intervals, motion, unit), callback)
+    prior = make_prior(settings, intervals, motion, discrepancy_units(intervals, motion, hypotheses[0]))
+    able = list(dropwhile(lambda p: diverges(start(settings, intervals, motion, p, prior)), hypotheses))
+    if not able:
+        raise IdentificationError(
+            f"{dataset.source}: simulations of {intervals.length} rows from smoothed states diverge, with each of "
+            f"{len(hypotheses)} samples of the parameters; check the model's constants, signs and units, or bound them"
+        )
+    search = LocalSearch(settings, motion, np.array(able), prior, callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
     return Searched(motion, notes, len(hypotheses), likeliest, *_parameters(settings, likeliest))
 

@@ -16,18 +16,23 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.input_timing import InputTiming
+from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.multistart import least_squares
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.simulation import GaussNewtonBatch, Simulator
 
-__all__ = ["ActingInputs", "Segments", "first_states", "stretches"]
+__all__ = ["DIVERGED", "ActingInputs", "Segments", "inlying_samples", "prior_states", "stretches"]
 
-_DIVERGED = 1e6
+DIVERGED = 1e50
+"""Error after a divergence, and state from which on squares of its derivatives overflow, whatever their units."""
 _STATE_STEPS = 15
+_OUTLYING = 6.0
+"""Robust standard deviations from which on a sample is far from the smoothed motion."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +170,7 @@ class Segments:
         found = self._simulator.errors(
             self.batch(parameters, states), self.measurements, threads=self.intervals.threads
         )
-        found = np.nan_to_num(found, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
+        found = np.nan_to_num(found, nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED)
         return found.reshape(*states.shape[:2], self.n_rows, -1)
 
     def trajectories(self, parameters: FloatArray, states: FloatArray) -> FloatArray:
@@ -197,14 +202,16 @@ class Segments:
             batch, self.measurements, weights, unknowns=unknowns, threads=self.intervals.threads
         )
 
-    def estimated_states(self, parameters: FloatArray, states: FloatArray, weights: FloatArray) -> FloatArray:
-        """Initial states ``(m, K, n_x)`` by weighted least squares of each segment's samples.
+    def estimated_states(
+        self, parameters: FloatArray, states: FloatArray, spread: FloatArray, weights: FloatArray
+    ) -> FloatArray:
+        """Initial states ``(m, K, n_x)`` by weighted least squares of each segment's samples, and of the states' prior.
 
         Parameters
         ----------
         parameters : (m, K, n) array
-        states : (m, K, n_x) array
-            To start from.
+        states, spread : (m, K, n_x) and (n_x,) array
+            Means of the prior, from which the search starts, and its standard deviations.
         weights : (N, n_s) array
             Of the compared signals in all rows.
 
@@ -212,21 +219,19 @@ class Segments:
         -------
         (m, K, n_x) array
         """
-        problem = _States(self, parameters, weights)
-        found, _ = least_squares(problem, states.reshape(-1, states.shape[2]), _STATE_STEPS)
+        flat = states.reshape(-1, states.shape[2])
+        found, _ = least_squares(_States(self, parameters, flat, spread, weights), flat, _STATE_STEPS)
         return found.reshape(states.shape)
-
-    def cut(self, n_rows: int) -> Segments:
-        """The beginnings of the segments."""
-        return replace(self, n_rows=n_rows)
 
 
 @dataclass(frozen=True)
 class _States:
-    """Initial states of segments with given parameters."""
+    """Initial states of segments with given parameters, with a Gaussian prior: few samples may not determine them."""
 
     segments: Segments
     parameters: FloatArray
+    mean: FloatArray
+    spread: FloatArray
     weights: FloatArray
 
     def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
@@ -235,7 +240,9 @@ class _States:
     def linearized(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         states = z.reshape(*self.parameters.shape[:2], -1)
         found = self.segments.gauss_newton(self.parameters, states, self.weights, parameters_too=False)
-        return found.cost, found.gradient, found.normal_matrix
+        away = (z - self.mean) / self.spread
+        cost, matrix = found.cost + np.square(away).sum(axis=1), found.normal_matrix + np.diag(self.spread**-2.0)
+        return cost, found.gradient + away / self.spread, matrix
 
 
 def stretches(intervals: ShootingIntervals) -> list[slice]:
@@ -257,22 +264,44 @@ def stretches(intervals: ShootingIntervals) -> list[slice]:
     return [slice(a, b + 1) for a, b in zip(np.flatnonzero(begins), np.flatnonzero(ends), strict=True)]
 
 
-def first_states(intervals: ShootingIntervals, signals: FloatArray, inlying: BoolArray, rows: IntArray) -> FloatArray:
-    """States ``(K, n_x)`` to start from: measured where a sample is no outlier, else those of a motion, else zero.
+def inlying_samples(intervals: ShootingIntervals, motion: Motion) -> BoolArray:
+    """Mask ``(N, n_signals)`` of the samples that are not far from a smoothed motion, in units of what it leaves.
 
     Parameters
     ----------
     intervals : ShootingIntervals
-    signals : (N, n_signals) array
-        A motion.
+    motion : Motion
+
+    Returns
+    -------
+    (N, n_signals) bool array
+        True where nothing is measured.
+    """
+    apart = np.where(intervals.known, np.nan_to_num(intervals.measured - motion.signals), 0.0)
+    return np.asarray(~(np.abs(apart) > _OUTLYING * lower_scale(apart.copy(), intervals.known)))
+
+
+def prior_states(
+    intervals: ShootingIntervals, motion: Motion, inlying: BoolArray, rows: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Means ``(K, n_x)`` and standard deviations ``(n_x,)`` of states before their segments are known.
+
+    The means are measured where a sample is no outlier, else those of a motion, else zero; the deviations are the
+    spread of the motion, infinite for states of which it tells nothing.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
     inlying : (N, n_signals) bool array
         Samples that are no outliers.
     rows : (K,) int array
 
     Returns
     -------
-    (K, n_x) array
+    (K, n_x) array, (n_x,) array
     """
     n_x = intervals.model.n_q + intervals.model.n_v
-    known = (intervals.known & inlying)[rows, :n_x]
-    return np.where(known, intervals.measured[rows, :n_x], np.nan_to_num(signals[rows, :n_x]))
+    smooth, known = motion.signals[:, :n_x], (intervals.known & inlying)[rows, :n_x]
+    means = np.where(known, intervals.measured[rows, :n_x], np.nan_to_num(smooth[rows]))
+    return means, np.where(np.ptp(smooth, axis=0) > 0.0, motion.spread[:n_x], np.inf)

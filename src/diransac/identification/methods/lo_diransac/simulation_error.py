@@ -1,7 +1,10 @@
 """Simulation error (output error): parameters and initial states of segments, fitted to the samples together.
 
 It neither smooths nor differentiates.  Short segments have few local minima, long ones the information: a search from
-many starts over the shortest segments is followed by fits over segments three times as long, and so on.
+many starts over the shortest segments is followed by fits over segments three times as long, up to a block.
+
+Initial states have a Gaussian prior, the measured or smoothed state within the spread of the motion: few samples of a
+segment may not determine them.  Samples are a mixture with outliers, and so are those of a segment that diverges.
 
 References
 ----------
@@ -13,15 +16,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.estimate import LogEstimate
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
-from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments, first_states, stretches
+from diransac.identification.methods.lo_diransac.segments import (
+    ActingInputs,
+    Segments,
+    inlying_samples,
+    prior_states,
+    stretches,
+)
 from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate, jackknife
 from diransac.time_limit import check_time
 
@@ -29,26 +37,22 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-Scalar = TypeVar("Scalar", bound=np.generic)
-
 __all__ = ["estimates_of_logs", "simulation_error_candidates"]
 
 _SHORTEST, _GROWTH = 8, 3
-"""Rows of the shortest segments, and the factor by which they grow, as long as they are more than the blocks."""
+"""Rows of the shortest segments at least, and the factor by which they grow, up to the length of a block."""
 _N_RANDOM, _DECADES = 16, 1.0
 """Number of random starts, and how far from known parameters they are."""
 _SCREENED, _FOLLOWED = 16, 2
 """Segments on which all starts are scored, and the number of starts that are followed."""
 _ROWS_OF_SEARCH, _MOST_ROWS = 3_000, 50_000
 """Rows of the fits from several starts, and of others, at most."""
-_OUTLYING = 6.0
-"""Robust standard deviations from which on a sample is far from the smoothed motion."""
 _WHOLE_ROW = 1.0 / 12.0
 """Variance of a number that is rounded to a whole one."""
 _STEPS, _CONVERGED, _NOISE_MOVES = 25, 0.1, 0.03
 """Steps at most; change of parameters, standard errors, and relative change of the noise that end them."""
 _DAMPING, _DAMPING_BOUNDS = 1e-6, (1e-12, 1e6)
-_RIDGE, _FLOOR, _DIVERGED, _TINY = 1e-10, 1e-5, 1e6, 1e-150
+_RIDGE, _FLOOR, _TINY = 1e-10, 1e-5, 1e-150
 
 
 def simulation_error_candidates(
@@ -80,20 +84,27 @@ def simulation_error_candidates(
     Returns
     -------
     list of (Candidate, Motion)
-        The shortest segments first; empty where every simulation diverges, or the logs are too short.
+        The shortest segments first; empty where the logs are too short.
     """
-    starts = np.vstack([starts, _random_starts(intervals, starts, seed)])
-    tried = [_from_starts(intervals, motion, starts, acting, outliers=outliers) for acting in actings]
+    starts, lengths = np.vstack([starts, _random_starts(intervals, starts, seed)]), _lengths(intervals, blocks)
+    tried = [_from_starts(intervals, motion, starts, acting, lengths[0], outliers=outliers) for acting in actings]
     solved = [x for x in tried if x is not None]
     if not solved:
         return []
     chain = [min(solved, key=lambda x: x.cost)]
-    longest = max(x.stop - x.start for x in stretches(intervals))
-    while len(chain[-1].segments) > _GROWTH * blocks.n and _GROWTH * chain[-1].segments.n_rows <= longest:
-        chain.append(chain[-1].grown(_GROWTH * chain[-1].segments.n_rows).descended())
-    taken = chain[0].segments.acting
-    others = [chain[-1].with_inputs(x).descended() for x in actings if x is not taken]
-    return [(x.candidate(blocks), x.simulated(motion)) for x in (*chain, *others) if np.isfinite(x.cost)]
+    for length in lengths:
+        chain.append(chain[-1].grown(length).descended())
+    last, taken = chain[-1], chain[-1].segments.acting
+    others = [replace(last, segments=replace(last.segments, acting=x)).descended() for x in actings if x is not taken]
+    return [(x.candidate(blocks), x.simulated) for x in (*chain[1:], *others)]
+
+
+def _lengths(intervals: ShootingIntervals, blocks: Blocks) -> list[int]:
+    """Rows of the segments: those of a block, a third of them, and so on, the shortest first."""
+    block = int(intervals.counted.sum()) // (1 + np.count_nonzero(np.diff(blocks.of_row)))
+    longest = int(np.clip(block, 1, max((int(x.stop - x.start) for x in stretches(intervals)), default=1)))
+    n = max(0, int(np.log(longest / _SHORTEST) / np.log(_GROWTH)))
+    return [max(_SHORTEST, longest // _GROWTH**k) for k in range(n, -1, -1)]
 
 
 def estimates_of_logs(one: Candidate, motion: Motion, n_rows: int, *, outliers: bool = True) -> tuple[LogEstimate, ...]:
@@ -124,9 +135,8 @@ def estimates_of_logs(one: Candidate, motion: Motion, n_rows: int, *, outliers: 
         if len(own) >= blocks.n:
             noise = _first_noise(own, motion.spread, outliers=outliers)
             fitted = _Solution.begin(own, motion, one.parameters, noise).descended()
-            if np.isfinite(fitted.cost):
-                fitted, late, late_error = fitted.with_own_timing(blocks)
-                parameters, errors = fitted.parameters, fitted.standard_errors(blocks)
+            fitted, late, late_error = fitted.with_own_timing(blocks)
+            parameters, errors = fitted.parameters, fitted.standard_errors(blocks)
         values, spans = (dict(zip(names, x.tolist(), strict=True)) for x in (parameters, errors))
         found.append(LogEstimate(values, spans, late * intervals.dt, late_error * intervals.dt))
     return tuple(found)
@@ -153,22 +163,22 @@ def _segments(intervals: ShootingIntervals, acting: ActingInputs, length: int, m
 
 
 def _from_starts(
-    intervals: ShootingIntervals, motion: Motion, starts: FloatArray, acting: ActingInputs, *, outliers: bool
+    intervals: ShootingIntervals,
+    motion: Motion,
+    starts: FloatArray,
+    acting: ActingInputs,
+    length: int,
+    *,
+    outliers: bool,
 ) -> _Solution | None:
-    """The likeliest solution over the shortest segments; None where every simulation diverges."""
-    some = _segments(intervals, acting, _SHORTEST, _ROWS_OF_SEARCH)
+    """The likeliest solution over some of the shortest segments; None where the logs are too short."""
+    some = _segments(intervals, acting, length, _ROWS_OF_SEARCH)
     if not len(some):
         return None
     noise = _first_noise(some, motion.spread, outliers=outliers)
     order = np.argsort(_scores(some, motion, starts, noise), kind="stable")[:_FOLLOWED]
     found = [_Solution.begin(some, motion, starts[k], noise).descended() for k in order]
-    best = min(found, key=lambda x: x.cost)
-    if not np.isfinite(best.cost):
-        return None
-    every = _segments(intervals, acting, _SHORTEST, _MOST_ROWS)
-    if len(every) == len(some):
-        return best
-    return _Solution.begin(every, motion, best.parameters, best.noise).descended()
+    return min(found, key=lambda x: x.cost)
 
 
 def _first_noise(segments: Segments, spread: FloatArray, *, outliers: bool) -> Mixture:
@@ -177,8 +187,7 @@ def _first_noise(segments: Segments, spread: FloatArray, *, outliers: bool) -> M
     low = np.where(intervals.sampled, intervals.measured, np.inf).min(axis=0)[columns]
     high = np.where(intervals.sampled, intervals.measured, -np.inf).max(axis=0)[columns]
     span = np.where(high > low, high - low, 1.0)
-    sizes = np.where(spread[columns] > 0.0, spread[columns], span)
-    place = {int(c): k for k, c in enumerate(columns)}
+    sizes, place = spread[columns], {int(c): k for k, c in enumerate(columns)}
     whole = [(place[a], place[b], place[c], place[d]) for a, b, c, d in intervals.model.quaternions if a in place]
     return Mixture(0.1 * sizes, np.full(len(columns), 0.1 * outliers), span, _FLOOR * sizes, whole)
 
@@ -187,24 +196,25 @@ def _scores(segments: Segments, motion: Motion, starts: FloatArray, noise: Mixtu
     """Sum ``(m,)`` over signals of the logarithm of a robust scale of the errors over a few segments."""
     few = replace(segments, starts=segments.starts[:: max(1, len(segments) // _SCREENED)])
     lanes = np.repeat(starts[:, None], len(few), axis=1)
-    weights = few.weights(few.known / np.square(noise.sigma))
-    states = np.repeat(_states(few, motion)[None], len(starts), axis=0)
-    errors = few.errors(lanes, few.estimated_states(lanes, states, weights))
-    scale = lower_scale(errors.reshape(len(starts), -1, errors.shape[3]), _flat(few.known))
+    errors = few.errors(lanes, _first_states(few, motion, lanes, noise)[0])
+    known = few.known.reshape(-1, errors.shape[3])
+    scale = lower_scale(errors.reshape(len(starts), *known.shape), known)
     return np.asarray(np.log(np.nan_to_num(scale) + noise.floor).sum(axis=1))
 
 
-def _states(segments: Segments, motion: Motion) -> FloatArray:
-    """Measured states ``(K, n_x)`` at the segments' starts, or those of a motion where a sample is far from it."""
-    intervals = segments.intervals
-    apart = np.where(intervals.known, np.nan_to_num(intervals.measured - motion.signals), 0.0)
-    far: BoolArray = np.abs(apart) > _OUTLYING * lower_scale(apart.copy(), intervals.known)
-    return first_states(intervals, motion.signals, ~far, segments.starts)
+def _first_states(
+    segments: Segments, motion: Motion, lanes: FloatArray, noise: Mixture
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Initial states ``(m, K, n_x)`` for parameters ``(m, K, n)``, means ``(K, n_x)`` and deviations of their prior.
 
-
-def _flat(values: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Values ``(K, n_rows, n_s)`` as rows ``(K n_rows, n_s)``."""
-    return values.reshape(-1, values.shape[-1])
+    Samples far from the smoothed motion do not count.
+    """
+    inlying = inlying_samples(segments.intervals, motion)
+    mean, spread = prior_states(segments.intervals, motion, inlying, segments.starts)
+    states = np.repeat(mean[None], len(lanes), axis=0)
+    counted = segments.known & inlying[segments.rows][:, :, segments.columns]
+    weights = segments.weights(counted / np.square(noise.sigma))
+    return segments.estimated_states(lanes, states, spread, weights), mean, spread
 
 
 @dataclass(frozen=True)
@@ -214,24 +224,29 @@ class _Solution:
     Parameters
     ----------
     segments : Segments
+    motion : Motion
+        Smoothed.
     parameters : (n,) array
-    states : (K, n_x) array
     noise : Mixture
         Of the compared signals.
+    states, mean, spread : (K, n_x), (K, n_x) and (n_x,) array
+        Initial states, and means and standard deviations of their prior.
     """
 
     segments: Segments
+    motion: Motion
     parameters: FloatArray
-    states: FloatArray
     noise: Mixture
+    states: FloatArray
+    mean: FloatArray
+    spread: FloatArray
 
     @classmethod
     def begin(cls, segments: Segments, motion: Motion, parameters: FloatArray, noise: Mixture) -> _Solution:
         """The solution with states that agree best with the samples of their segments."""
         lanes = np.repeat(parameters[None, None], len(segments), axis=1)
-        weights = segments.weights(segments.known / np.square(noise.sigma))
-        states = segments.estimated_states(lanes, _states(segments, motion)[None], weights)[0]
-        return cls(segments, parameters, states, noise)
+        states, mean, spread = _first_states(segments, motion, lanes, noise)
+        return cls(segments, motion, parameters, noise, states[0], mean, spread)
 
     @cached_property
     def _lanes(self) -> tuple[FloatArray, FloatArray]:
@@ -241,31 +256,46 @@ class _Solution:
     @cached_property
     def errors(self) -> FloatArray:
         """Simulated less measured samples ``(K n_rows, n_s)``."""
-        return _flat(self.segments.errors(*self._lanes)[0])
+        return np.asarray(self.segments.errors(*self._lanes)[0].reshape(-1, len(self.segments.columns)))
 
     @cached_property
     def _known(self) -> BoolArray:
-        return _flat(self.segments.known)
+        return self.segments.known.reshape(self.errors.shape)
 
     @cached_property
-    def total_cost(self) -> float:
-        """Negative log-likelihood."""
-        return float(self.noise.negative_log_likelihood(self.errors, self._known).sum())
-
-    @property
     def cost(self) -> float:
-        """Negative log-likelihood per known sample; infinite where a simulation diverges."""
-        if np.abs(self.errors).max(initial=0.0) >= _DIVERGED:
-            return np.inf
-        return self.total_cost / max(int(self._known.sum()), 1)
+        """Negative logarithm of the probability of samples and states."""
+        of_states = 0.5 * np.square((self.states - self.mean) / self.spread).sum()
+        return float(self.noise.negative_log_likelihood(self.errors, self._known).sum() + of_states)
 
     @cached_property
-    def equations(self) -> _Equations:
-        """Gauss-Newton equations of each segment, weighted by the noise."""
-        shape = self.segments.known.shape
-        inlying = self.noise.inlying(self.errors, self._known).reshape(shape)
-        weights = self.segments.weights(inlying / np.square(self.noise.sigma))
-        return _Equations.of(self.segments, *self._lanes, weights)
+    def _equations(self) -> tuple[FloatArray, FloatArray]:
+        """Gauss-Newton matrix and gradient of each segment's state and of all parameters; zero after a divergence."""
+        segments, (K, n_x) = self.segments, self.states.shape
+        inlying = self.noise.inlying(self.errors, self._known).reshape(segments.known.shape)
+        weights = segments.weights(inlying / np.square(self.noise.sigma))
+        sums = segments.gauss_newton(*self._lanes, weights, parameters_too=True)
+        own = segments.intervals.layout.index[segments.intervals.log_of_row[segments.starts]]
+        at = np.hstack([np.tile(np.arange(n_x), (K, 1)), n_x + own])
+        H, g = np.zeros((K, *2 * (n_x + len(self.parameters),))), np.zeros((K, n_x + len(self.parameters)))
+        k = np.flatnonzero(np.isfinite(sums.normal_matrix).all(axis=(1, 2)) & np.isfinite(sums.gradient).all(axis=1))
+        H[k[:, None, None], at[k][:, :, None], at[k][:, None, :]] = sums.normal_matrix[k]
+        g[k[:, None], at[k]] = sums.gradient[k]
+        H[:, :n_x, :n_x] += np.diag(self.spread**-2.0)
+        g[:, :n_x] += (self.states - self.mean) / np.square(self.spread)
+        return H, g
+
+    def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray]:
+        """Equations ``(K, n, n + 1)`` of the parameters, the gradient last, without the states.
+
+        After a step dp of the parameters, these change by ``-following (dp, 1)``, with ``following (K, n_x, n + 1)``.
+        """
+        (H, g), n_x = self._equations, self.states.shape[1]
+        d = np.sqrt(np.einsum("kii->ki", H[:, :n_x, :n_x])) + _TINY
+        scaled = H[:, :n_x, :n_x] / d[:, :, None] / d[:, None, :] + (damping + _RIDGE) * np.eye(n_x)
+        right = np.concatenate([H[:, :, n_x:], g[:, :, None]], axis=2)
+        following = np.linalg.solve(scaled, right[:, :n_x] / d[:, :, None]) / d[:, :, None]
+        return right[:, n_x:] - H[:, n_x:, :n_x] @ following, following
 
     def descended(self) -> _Solution:
         """The solution after steps of Levenberg and Marquardt, each with an update of the noise (EM)."""
@@ -276,8 +306,6 @@ class _Solution:
             noise = now.noise.updated(now.errors, now._known, inlying, outliers=bool(now.noise.pi.any()))
             is_steady = bool((np.abs(np.log(noise.sigma / now.noise.sigma)) < _NOISE_MOVES).all())
             now = replace(now, noise=noise)
-            if not now.equations.is_finite:
-                break
             then, change, damping = now._stepped(damping)
             if then is None:
                 break
@@ -290,45 +318,38 @@ class _Solution:
         """The solution after a step that lowers the cost, or None; its change, standard errors; the next damping."""
         intervals = self.segments.intervals
         while damping <= _DAMPING_BOUNDS[1]:
-            part = self.equations.reduced(damping)
-            matrix, gradient = part.with_prior(intervals, self.parameters)
+            parts, following = self._reduced(damping)
+            matrix, gradient = _with_priors(intervals, self.parameters, parts)
             p = _moved(intervals, self.parameters, -_solved(matrix, gradient, damping))
             change = p - self.parameters
-            then = replace(self, parameters=p, states=self.states - part.own - part.following @ change)
-            if then.total_cost < self.total_cost:
+            then = replace(self, parameters=p, states=self.states - following @ np.append(change, 1.0))
+            if then.cost < self.cost:
                 sizes = np.abs(change) * np.sqrt(np.maximum(np.diag(matrix), 0.0))
                 return then, float(sizes.max()), max(0.1 * damping, _DAMPING_BOUNDS[0])
             damping *= 10.0
         return None, 0.0, damping
 
     def grown(self, length: int) -> _Solution:
-        """The solution over longer segments, whose states are those of the shorter ones' simulations."""
+        """The solution over all segments of a length, of which states and noise are their own."""
         longer = _segments(self.segments.intervals, self.segments.acting, length, _MOST_ROWS)
-        nearest = np.clip(np.searchsorted(self.segments.starts, longer.starts, side="right") - 1, 0, None)
-        at = np.clip(longer.starts - self.segments.starts[nearest], 0, self.segments.n_rows - 1)
-        series = self.segments.trajectories(*self._lanes)[0]
-        found = replace(self, segments=longer, states=np.nan_to_num(series[nearest, at, : self.states.shape[1]]))
+        found = _Solution.begin(longer, self.motion, self.parameters, self.noise)
         scale = np.nan_to_num(lower_scale(found.errors.copy(), found._known), nan=1.0)
         return replace(found, noise=replace(self.noise, sigma=np.maximum(scale, self.noise.floor)))
-
-    def with_inputs(self, acting: ActingInputs) -> _Solution:
-        """The solution with inputs that act otherwise."""
-        return replace(self, segments=replace(self.segments, acting=acting))
 
     def candidate(self, blocks: Blocks) -> Candidate:
         """The estimate, and what it is without each block by one Newton step."""
         segments, intervals = self.segments, self.segments.intervals
         block = blocks.of_row[segments.starts + segments.n_rows // 2]
-        part, without = self.equations.reduced(0.0), []
+        parts, without = self._reduced(0.0)[0], []
         for k in range(blocks.n):
-            step = -_solved(*part.of(block != k).with_prior(intervals, self.parameters), 0.0)
+            step = -_solved(*_with_priors(intervals, self.parameters, parts[block != k]), 0.0)
             without.append(_moved(intervals, self.parameters, step))
         name = f"simulation error, {segments.n_rows * intervals.dt:.2g} s, {segments.acting.sentence}"
         return Candidate(name, self.parameters, np.array(without), segments.acting, intervals)
 
     def standard_errors(self, blocks: Blocks) -> FloatArray:
         """Standard errors ``(n,)`` of the parameters, by the jackknife over blocks; those by white noise at least."""
-        matrix, _ = self.equations.reduced(0.0).with_prior(self.segments.intervals, self.parameters)
+        matrix, _ = _with_priors(self.segments.intervals, self.parameters, self._reduced(0.0)[0])
         d = np.sqrt(np.maximum(np.diag(matrix), 0.0)) + _TINY
         white = np.diag(np.linalg.inv(matrix / np.outer(d, d) + _RIDGE * np.eye(len(d)))) / np.square(d)
         return np.asarray(np.sqrt(np.maximum(np.diag(jackknife(self.candidate(blocks).without)), white)))
@@ -339,12 +360,13 @@ class _Solution:
         A pattern search: steps double while they help.  The error is that of the vertex of a parabola, by the jackknife
         over blocks, and of rounding.
         """
-        tried, given, at, step = {0: self}, self.segments.acting, 0, 1
+        tried, one, at, step = {0: self}, self.segments, 0, 1
         while step:
             for x in (at - step, at + step):
-                if x not in tried and abs(x) < self.segments.n_rows:
-                    tried[x] = self.with_inputs(given.shifted(self.segments.intervals, x)).descended()
-            best = min(tried, key=lambda x: tried[x].total_cost)
+                if x not in tried and abs(x) < one.n_rows:
+                    shifted = replace(one, acting=one.acting.shifted(one.intervals, x))
+                    tried[x] = replace(self, segments=shifted).descended()
+            best = min(tried, key=lambda x: tried[x].cost)
             at, step = best, (2 * step if best != at else step // 2)
         if not {at - 1, at + 1} <= tried.keys():
             return tried[at], at, np.inf
@@ -359,91 +381,20 @@ class _Solution:
         block = blocks.of_row[self.segments.starts + self.segments.n_rows // 2]
         return np.array([each[block != k].sum() for k in range(blocks.n)])
 
-    def simulated(self, motion: Motion) -> Motion:
-        """The motion of the segments; the given one in rows that none covers."""
-        series, signals = self.segments.trajectories(*self._lanes)[0], motion.signals.copy()
-        finite = np.isfinite(series).all(axis=(1, 2))
-        signals[self.segments.rows[finite].ravel()] = _flat(series[finite])
-        return replace(motion, signals=signals)
-
-
-@dataclass(frozen=True)
-class _Equations:
-    """Gauss-Newton equations of K segments, their states' and all parameters'.
-
-    Parameters
-    ----------
-    H_xx, H_xp, H_pp : (K, n_x, n_x), (K, n_x, n) and (K, n, n) array
-        J' W J.
-    g_x, g_p : (K, n_x) and (K, n) array
-        J' W e.
-    """
-
-    H_xx: FloatArray
-    H_xp: FloatArray
-    H_pp: FloatArray
-    g_x: FloatArray
-    g_p: FloatArray
-
-    @classmethod
-    def of(cls, segments: Segments, parameters: FloatArray, states: FloatArray, weights: FloatArray) -> _Equations:
-        """Equations with parameters in the places of each segment's log."""
-        sums, layout = (
-            segments.gauss_newton(parameters, states, weights, parameters_too=True),
-            segments.intervals.layout,
-        )
-        H, g, n_x, n = sums.normal_matrix, sums.gradient, states.shape[2], parameters.shape[2]
-        if layout.is_shared:
-            return cls(H[:, :n_x, :n_x], H[:, :n_x, n_x:], H[:, n_x:, n_x:], g[:, :n_x], g[:, n_x:])
-        places = layout.index[segments.intervals.log_of_row[segments.starts]]
-        k = np.arange(len(H))[:, None]
-        H_xp, H_pp, g_p = np.zeros((len(H), n_x, n)), np.zeros((len(H), n, n)), np.zeros((len(H), n))
-        H_xp[k[:, :, None], np.arange(n_x)[None, :, None], places[:, None, :]] = H[:, :n_x, n_x:]
-        H_pp[k[:, :, None], places[:, :, None], places[:, None, :]] = H[:, n_x:, n_x:]
-        g_p[k, places] = g[:, n_x:]
-        return cls(H[:, :n_x, :n_x], H_xp, H_pp, g[:, :n_x], g_p)
-
     @property
-    def is_finite(self) -> bool:
-        """False after a divergence."""
-        return all(bool(np.isfinite(x).all()) for x in (self.H_xx, self.H_xp, self.H_pp, self.g_x, self.g_p))
-
-    def reduced(self, damping: float) -> _Reduced:
-        """The equations of the parameters, without the states."""
-        d = np.sqrt(np.einsum("kii->ki", self.H_xx)) + _TINY
-        scaled = self.H_xx / d[:, :, None] / d[:, None, :] + (damping + _RIDGE) * np.eye(self.H_xx.shape[1])
-        right = np.concatenate([self.H_xp, self.g_x[:, :, None]], axis=2) / d[:, :, None]
-        solved = np.linalg.solve(scaled, right) / d[:, :, None]
-        following, own = solved[:, :, :-1], solved[:, :, -1]
-        matrix = self.H_pp - np.einsum("kxi,kxj->kij", self.H_xp, following)
-        return _Reduced(matrix, self.g_p - np.einsum("kxi,kx->ki", self.H_xp, own), following, own)
+    def simulated(self) -> Motion:
+        """The motion of the segments; the smoothed one in rows that none covers."""
+        series, signals = self.segments.trajectories(*self._lanes)[0], self.motion.signals.copy()
+        finite = np.isfinite(series).all(axis=(1, 2))
+        signals[self.segments.rows[finite]] = series[finite]
+        return replace(self.motion, signals=signals)
 
 
-@dataclass(frozen=True)
-class _Reduced:
-    """Schur complement of each segment's state: ``dx = -own - following dp``.
-
-    Parameters
-    ----------
-    matrix, gradient : (K, n, n) and (K, n) array
-        Each segment's part of the parameters' equations.
-    following, own : (K, n_x, n) and (K, n_x) array
-    """
-
-    matrix: FloatArray
-    gradient: FloatArray
-    following: FloatArray
-    own: FloatArray
-
-    def of(self, chosen: BoolArray) -> _Reduced:
-        """Some of the segments."""
-        return _Reduced(self.matrix[chosen], self.gradient[chosen], self.following[chosen], self.own[chosen])
-
-    def with_prior(self, intervals: ShootingIntervals, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Sums over the segments, with the priors of the parameters."""
-        precision = 1.0 / np.square(intervals.layout.prior_std)
-        away = np.where(precision > 0.0, p - intervals.layout.prior_mean, 0.0)
-        return self.matrix.sum(axis=0) + np.diag(precision), self.gradient.sum(axis=0) + precision * away
+def _with_priors(intervals: ShootingIntervals, p: FloatArray, parts: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Matrix and gradient of the parameters, of segments' parts ``(K, n, n + 1)`` and of priors."""
+    precision, total = 1.0 / np.square(intervals.layout.prior_std), parts.sum(axis=0)
+    away = np.where(precision > 0.0, p - intervals.layout.prior_mean, 0.0)
+    return total[:, :-1] + np.diag(precision), total[:, -1] + precision * away
 
 
 def _solved(matrix: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
