@@ -550,11 +550,15 @@ class Model:
         return v[: self.n_q, 0] if self.kinematics is None else self.kinematics(q, v)
 
     def _solve_mass(self, q: ca.SX, v: ca.SX, u: ca.SX, p: ca.SX, rhs: ca.SX) -> ca.SX:
-        """``M^-1 rhs``: LDL^T where the probe found ``M`` symmetric and definite, CasADi's solve elsewhere."""
-        M = self._mass_matrix(q, v, u, p)
+        """``M^-1 rhs``: LDL^T where the probe found ``M`` symmetric and definite, CasADi's solve elsewhere.
+
+        Raises ModelError: there would be too many operations.
+        """
+        M = ca.sparsify((self._definite or 1) * self._mass_matrix(q, v, u, p))
+        derivation.check_solution(self._label, M.sparsity(), rhs.size2(), symmetric=self._definite != 0)
         if self._definite == 0:
             return ca.solve(ca.densify(M), ca.densify(rhs))
-        D, LT, order = ca.ldl(ca.sparsify(self._definite * M))
+        D, LT, order = ca.ldl(M)
         return self._definite * ca.ldl_solve(ca.densify(rhs), D, LT, order)
 
     def equations_text(self) -> tuple[str, ...]:
