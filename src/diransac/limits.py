@@ -12,8 +12,11 @@ __all__ = [
     "LARGEST_RESULT",
     "LARGEST_TABLE",
     "LARGEST_TEXT",
+    "MOST_CELLS",
     "MOST_COLUMNS",
     "MOST_COMPILED",
+    "MOST_ELEMENTS",
+    "MOST_JOINTS",
     "MOST_NAMES",
     "MOST_NUMBERS",
     "MOST_OPERATIONS",
@@ -56,6 +59,12 @@ MOST_SOLVED = 2_000_000
 
 MOST_COMPILED = 60_000
 """Operations of one compiled function, with 15 for a sine and the like: they compile within a minute or two."""
+
+MOST_ELEMENTS, MOST_CELLS = 100_000, 2**24
+"""Elements of a robot's description with their copies, and numbers in fields of heights and textures."""
+
+MOST_JOINTS = 400
+"""Joints of a robot; the time for its equations grows with the square."""
 
 _MIB = 2**20
 

@@ -15,9 +15,10 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.errors import ModelError
+from diransac.errors import DiransacError, ModelError
 from diransac.limits import MOST_NAMES, MOST_SOLVED, beyond
 from diransac.model import expressions
+from diransac.user_files import in_words
 
 if TYPE_CHECKING:
     from diransac.model.parameter import Parameter
@@ -30,8 +31,6 @@ _SINGULAR = 1e-10
 _TOLERANCE = 1e-8
 _NEAR_NOMINAL = 1e-3
 _ARGUMENTS = "qvaup"
-# Errors of a user's function that gets a symbol instead of a number, or a wrong number of arguments.
-_USER_ERRORS = (RuntimeError, TypeError, ValueError, ArithmeticError, LookupError, NameError, AttributeError)
 
 
 class Symbols:
@@ -68,13 +67,15 @@ def call_user(label: str, what: str, function: Callable[..., Any], *arguments: S
     """
     try:
         returned = function(*arguments)
-    except _USER_ERRORS as error:
-        if "truth value" in str(error):
+    except (DiransacError, KeyboardInterrupt):
+        raise
+    except BaseException as error:  # users' code raises anything
+        said = in_words(error)
+        if "truth value" in said:
             raise ModelError(
                 f"{label}: {what} branch on a symbol (if, and, or, min, max); use casadi.if_else, fmin or fmax"
             ) from error
-        reason = str(error).partition("\n")[0]
-        raise ModelError(f"{label}: {what} failed: {type(error).__name__}: {reason}") from error
+        raise ModelError(f"{label}: {what} failed: {said:.300}") from error
     values = list(returned.values()) if isinstance(returned, Mapping) else returned
     try:
         column = ca.vertcat(*(values if isinstance(values, list | tuple) else [values]), ca.SX(0, 1))
@@ -97,6 +98,13 @@ def call_sensor(label: str, name: str, equation: Callable[..., Any], *arguments:
     if value.shape != (1, 1):
         raise ModelError(f"{label}: {what} return {value.size1()} x {value.size2()} values; return one for each sensor")
     return value
+
+
+def check_texts(given: Mapping[str, object]) -> None:
+    """Raises ModelError: the name or description of a model is no text."""
+    for what, value in given.items():
+        if not isinstance(value, str):
+            raise ModelError(f"the {what} of a model is {value!r:.60}; give a text")
 
 
 def check_groups(label: str, units: Mapping[str, object], parameters: object) -> None:

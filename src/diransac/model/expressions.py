@@ -115,8 +115,8 @@ def check_size(label: str, function: ca.Function) -> None:
     n = function.n_instructions()
     if n > MOST_OPERATIONS:
         raise ModelError(
-            f"{label}: the equations have {beyond(MOST_OPERATIONS, 'operations', n)}. Simplify them, or split the machine "
-            "into independent parts"
+            f"{label}: the equations have {beyond(MOST_OPERATIONS, 'operations', n)}. Simplify them, or split the "
+            "machine into independent parts"
         )
 
 

@@ -125,6 +125,7 @@ class Model:
         description: str,
         sensors: Mapping[str, str],
     ) -> None:
+        derivation.check_texts({"name": name, "description": description})
         self.name, self.description, self.sensors = name, description, dict(sensors)
         units = {"coordinates": coordinates, "inputs": inputs, "velocities": velocities or {}}
         derivation.check_groups(self._label, {**units, "first_order": first_order, "sensors": sensors}, parameters)
@@ -585,7 +586,7 @@ class Model:
         """
         if set(parameters) != set(self.parameters):
             raise ModelError(
-                f"{self._label}: parameters are {', '.join(self.parameters)}; found {', '.join(parameters)}"
+                f"{self._label}: parameters are {', '.join(self.parameters)}; found {', '.join(map(str, parameters))}"
             )
         values = np.array([parameters[n] for n in self.parameters], dtype=float)
         if not np.isfinite(values).all():

@@ -220,6 +220,7 @@ def write(figure: Figure, path: Path) -> None:
     from matplotlib import rc_context
 
     ending = check_ending(path)
+    _take_literally(figure)
 
     def save(temporary: Path) -> None:
         with rc_context(_SALT):
@@ -235,8 +236,17 @@ def svg(figure: Figure) -> str:
     """Figure as an ``<svg>`` element with selectable text, for embedding in a page."""
     from matplotlib import rc_context
 
+    _take_literally(figure)
     memory = io.StringIO()
     with rc_context({**_SALT, "svg.fonttype": "none"}):
         figure.savefig(memory, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = memory.getvalue()
     return text[text.index("<svg") :]
+
+
+def _take_literally(figure: Figure) -> None:
+    """Draw texts as they are: a name with dollar signs is no formula."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)

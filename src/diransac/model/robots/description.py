@@ -17,8 +17,13 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
+from diransac.limits import MOST_JOINTS, beyond
+from diransac.model.robots.sizes import check_description
 
 __all__ = ["Body", "Coupling", "Description", "Joint", "mujoco_module", "parsed", "read_description"]
+
+_FAILURES = (ValueError, RuntimeError, MemoryError)
+"""Errors of MuJoCo's reader and compiler."""
 
 _ROUNDING = 1e-15
 """Entries of rotations that differ from 0, 1 or -1 by less are these: rounding of quarter turns' quaternions."""
@@ -176,9 +181,10 @@ def parsed(path: str | Path) -> Any:
     mujoco = mujoco_module()
     if not Path(path).is_file():
         raise ModelError(f'robot description "{path}" does not exist; give an MJCF (.xml) or URDF file')
+    check_description(Path(path), f'robot description "{path}"')
     try:
         return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
+    except _FAILURES as error:
         raise _unreadable(path, error) from error
 
 
@@ -221,10 +227,12 @@ def _description(path: str | Path, base: str | None) -> Description:
     try:
         spec.compiler.fusestatic = False
         model = spec.compile()
-    except ValueError as error:
+    except _FAILURES as error:
         raise _unreadable(path, error) from error
     label = f'robot description "{path}"'
     _check_supported(label, model)
+    if model.njnt > MOST_JOINTS:
+        raise ModelError(f"{label}: it has {beyond(MOST_JOINTS, 'joints', model.njnt)}; split the robot")
     joints = tuple(_joint(model, k, drives) for k in range(model.njnt))
     if not joints:
         raise ModelError(f"{label}: there are no joints, and nothing can move")
@@ -243,7 +251,7 @@ def _measured_base(label: str, bodies: Sequence[Body], floating: Sequence[str]) 
     return [body.name for body in bodies].index(floating[0])
 
 
-def _unreadable(path: str | Path, error: ValueError) -> ModelError:
+def _unreadable(path: str | Path, error: Exception) -> ModelError:
     return ModelError(f'robot description "{path}" cannot be read: {" ".join(str(error).split())}')
 
 
