@@ -5,6 +5,7 @@ import io
 import json
 import os
 import zipfile
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -89,7 +90,7 @@ def test_groups_within_themselves_end_and_many_paths_are_refused(tmp_path, monke
 
     def paths(_h5py, file, _name):
         chain = [file.create_group(f"g{k}") for k in range(14)]
-        for above, below in zip(chain, chain[1:], strict=False):
+        for above, below in pairwise(chain):
             for k in range(8):
                 above[f"to{k}"] = below
 
@@ -284,6 +285,6 @@ def test_a_loop_of_links_is_no_input(tmp_path):
 
 
 def test_a_store_in_a_missing_folder_is_not_made_beside_it(tmp_path):
-    with pytest.raises(dr.StudyError, match="the folder .* does not exist; make it first"):
+    with pytest.raises(dr.StudyError, match=r"the folder .* does not exist; make it first"):
         dr.run_study("gauntlet-gusts", store=tmp_path / "no" / ".." / "a.db")
     assert not list(tmp_path.iterdir())

@@ -47,7 +47,7 @@ def read_npz(data: bytes, source: str) -> Table:
                     continue
                 shapes.append(_shape(file))
                 check_shapes(shapes, source)
-            with archive.open(entry) as file:
+                file.seek(0)
                 arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
         except (*_DAMAGED, zipfile.BadZipFile) as error:
             raise LogError(f'{source}: array "{name}" cannot be read ({error})') from error

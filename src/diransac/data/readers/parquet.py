@@ -40,7 +40,8 @@ def read_parquet(data: bytes, source: str) -> Table:
             schema = lazy.collect_schema()
             check_size(source, lazy.select(pl.len()).collect().item(), len(schema))
             numeric = [name for name, kind in schema.items() if _is_numeric(kind)]
-            frame, few = lazy.select(numeric).collect(), lazy.drop(numeric).head(_FEW).collect()
+            frame = pl.read_parquet(io.BytesIO(data), columns=numeric)
+            few = lazy.drop(numeric).head(_FEW).collect() if len(numeric) < len(schema) else frame.clear()
             metadata = pl.read_parquet_metadata(io.BytesIO(data)).get(KEY)
     except pl.exceptions.PanicException as error:
         raise LogError(f"{source}: the Parquet data are damaged; write the file again") from error
