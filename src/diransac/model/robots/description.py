@@ -7,7 +7,9 @@ here.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -183,7 +185,8 @@ def parsed(path: str | Path) -> Any:
         raise ModelError(f'robot description "{path}" does not exist; give an MJCF (.xml) or URDF file')
     check_description(Path(path), f'robot description "{path}"')
     try:
-        return mujoco.MjSpec.from_file(str(path))
+        with _without_warnings():
+            return mujoco.MjSpec.from_file(str(path))
     except _FAILURES as error:
         raise _unreadable(path, error) from error
 
@@ -226,7 +229,8 @@ def _description(path: str | Path, base: str | None) -> Description:
     _drop_shapes(spec)
     try:
         spec.compiler.fusestatic = False
-        model = spec.compile()
+        with _without_warnings():
+            model = spec.compile()
     except _FAILURES as error:
         raise _unreadable(path, error) from error
     label = f'robot description "{path}"'
@@ -240,6 +244,14 @@ def _description(path: str | Path, base: str | None) -> Description:
     name = re.sub(r"\W+", "-", spec.modelname) or Path(path).stem
     measured = _measured_base(label, bodies, names) if base == "measured" else None
     return Description(name, bodies, joints, tuple(_couplings(label, model)), np.array(model.opt.gravity), measured)
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Context in which MuJoCo does not warn of what is left out here, such as cloth."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def _measured_base(label: str, bodies: Sequence[Body], floating: Sequence[str]) -> int:
