@@ -27,6 +27,9 @@ __all__ = ["Body", "Coupling", "Description", "Joint", "mujoco_module", "parsed"
 _FAILURES = (ValueError, RuntimeError, MemoryError)
 """Errors of MuJoCo's reader and compiler."""
 
+_LARGEST = 1e50
+"""Of masses, lengths and coefficients; products of several of them do not overflow."""
+
 _ROUNDING = 1e-15
 """Entries of rotations that differ from 0, 1 or -1 by less are these: rounding of quarter turns' quaternions."""
 
@@ -285,7 +288,11 @@ def _drop_shapes(spec: Any) -> None:
 
 
 def _check_supported(label: str, model: Any) -> None:
-    """Raises ModelError: the robot has parts for which there are no equations here."""
+    """Raises ModelError: the robot has parts for which there are no equations here, or numbers that overflow."""
+    of_bodies = (model.body_mass, model.body_inertia, model.body_ipos, model.body_pos)
+    of_joints = (model.dof_armature, model.dof_damping, model.dof_frictionloss, model.jnt_stiffness, model.jnt_pos)
+    if not all(np.all(np.abs(x) < _LARGEST) for x in (*of_bodies, *of_joints)):
+        raise ModelError(f"{label}: a mass, inertia, position or coefficient is {_LARGEST:g} or more; correct it")
     kinds = mujoco_module().mjtJoint
     for k in range(model.njnt):
         name = model.joint(k).name
