@@ -66,11 +66,11 @@ def test_an_exception_of_any_class_in_a_file_is_an_error_of_the_file(tmp_path):
 
 @pytest.mark.parametrize("name", [5, None, b"x", ("a",)])
 def test_names_units_and_sources_are_texts(name):
-    with pytest.raises(dr.ModelError, match="the name of a model is .*; give a text"):
+    with pytest.raises(dr.ModelError, match=r"the name of a model is .*; give a text"):
         sledge(name=name)
-    with pytest.raises(dr.ModelError, match="the unit of a parameter is .*; give a text"):
+    with pytest.raises(dr.ModelError, match=r"the unit of a parameter is .*; give a text"):
         dr.Parameter(name)
-    with pytest.raises(dr.LogError, match="the source of a log is .*; give a text"):
+    with pytest.raises(dr.LogError, match=r"the source of a log is .*; give a text"):
         dr.Log.from_arrays([0.0, 1.0], {"x": [0.0, 1.0]}, source=name)
     with pytest.raises(dr.ModelError, match="parameters are m, d; found"):
         dr.Plant(sledge(), {name: 1.0})
@@ -96,7 +96,7 @@ def test_a_description_with_numbers_that_overflow_is_refused(tmp_path):
     inertial = '<inertial pos="0 0 1e300" mass="1e300" diaginertia="1 1 1"/>'
     body = f'<body><joint type="hinge" damping="1"/>{inertial}</body>'
     (tmp_path / "a.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-    with pytest.raises(dr.ModelError, match="1e\\+50 or more|cannot be read"):
+    with pytest.raises(dr.ModelError, match=r"1e\+50 or more|cannot be read"):
         dr.models.robot(tmp_path / "a.xml")
 
 
