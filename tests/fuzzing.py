@@ -119,7 +119,7 @@ def listing(folder: Path) -> dict[str, tuple[int, int]]:
     return found
 
 
-def outcome(folder: Path, words: Sequence[str], outputs: Sequence[str] = ()) -> int:
+def outcome(folder: Path, words: Sequence[str], outputs: Sequence[str] = (), memory: int = MOST_MEMORY) -> int:
     """Exit code of a command line in a folder, which keeps the rule.
 
     Parameters
@@ -127,6 +127,7 @@ def outcome(folder: Path, words: Sequence[str], outputs: Sequence[str] = ()) -> 
     folder : working directory; the only place, beside the cache of machine code, where files may be written
     words : arguments
     outputs : names of files that the command may write where it succeeds; they are removed again
+    memory : bytes by which the largest size of the process may grow
 
     Raises
     ------
@@ -162,7 +163,7 @@ def outcome(folder: Path, words: Sequence[str], outputs: Sequence[str] = ()) -> 
     allowed = set(outputs) if done.exit_code == 0 else set()
     assert made <= allowed, f"{words}: exit code {done.exit_code} leaves {made - allowed}"
     grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - largest)
-    assert grown < MOST_MEMORY, f"{words}: {grown / 2**20:.0f} MiB more"
+    assert grown < memory, f"{words}: {grown / 2**20:.0f} MiB more"
     assert threading.active_count() < 64
     check_printed(words, done.stdout, done.stderr)
     for name in made:
@@ -523,6 +524,7 @@ class Kind:
     changed : a mutation of the data by a random generator
     commands : command lines that read the file
     beside : further files by name
+    memory : bytes that a command may take
     """
 
     name: str
@@ -530,6 +532,7 @@ class Kind:
     changed: Callable[[bytes, Random], bytes]
     commands: Sequence[Command]
     beside: Mapping[str, bytes] = field(default_factory=dict)
+    memory: int = MOST_MEMORY
 
     def place(self, folder: Path, data: bytes) -> None:
         """Write a file of the kind, and those beside it."""
@@ -541,7 +544,7 @@ class Kind:
         """Exit code of one command over one mutation.  Raises AssertionError: the rule is broken."""
         self.place(folder, self.changed(rng.choice(self.data), rng))
         (chosen,) = rng.choices(self.commands, [one.share for one in self.commands])
-        return outcome(folder, chosen.words, chosen.outputs)
+        return outcome(folder, chosen.words, chosen.outputs, self.memory)
 
     def undamaged(self, folder: Path) -> Iterator[tuple[Command, int]]:
         """Every command over every undamaged file, and its exit code."""

@@ -140,7 +140,7 @@ def test_deep_equations_are_printed_in_parts_and_endless_ones_refused(monkeypatc
     assert sum(text.count("sin(") for text in texts) == 2000
     assert max(map(len, texts)) < 5000
     monkeypatch.setattr(expressions, "MOST_OPERATIONS", 1000)
-    with pytest.raises(dr.ModelError, match=r"have 1\d\d\d operations; up to 1000 are possible"):
+    with pytest.raises(dr.ModelError, match=r"have 1,\d\d\d operations; up to 1,000 are possible"):
         axis(nested(1001))
 
 

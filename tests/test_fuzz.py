@@ -4,6 +4,7 @@ The suite runs the same few examples every time; `make fuzz FUZZ_EXAMPLES=n` run
 their outcomes.
 """
 
+import gzip
 import io
 import json
 import os
@@ -11,6 +12,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -35,6 +37,18 @@ from fuzzing import (
     changed_store,
     changed_table,
     command,
+)
+from fuzzing_sizes import (
+    MOST_MEMORY,
+    Place,
+    another_place,
+    model_text,
+    odd_model,
+    sized_graph,
+    sized_gzip,
+    sized_hdf5,
+    sized_npz,
+    sized_robot,
 )
 from hostile import SETTINGS as BESIDE
 from hostile import URDF
@@ -267,6 +281,21 @@ def ros2(part: str, folder: Path) -> Kind:
     return log(name, files.pop(name), changed, "--mapping ros-joint-states", files)
 
 
+def sizes(name: str, data: bytes, changed) -> Kind:
+    """A kind of log that declares any size."""
+    return replace(log(name, data, changed), memory=MOST_MEMORY)
+
+
+def places(name: str, content: bytes, words: str, outputs: str = "") -> Kind:
+    """A name that stands for no file."""
+    return Place(name, (b"file",), another_place, (command(words, outputs),), {"swim.csv": table()}, content=content)
+
+
+def model_file(_: Path) -> Kind:
+    commands = (command(f"identify swim.csv --model m.py --time-limit 5 --method {method}") for method in dr.METHODS)
+    return Kind("m.py", (model_text(),), odd_model, tuple(commands), {"swim.csv": table()})
+
+
 SEARCH = "--model underwater-vehicle --method i-diransac --time-limit 1"
 KINDS = {
     "results": (40, lambda folder: result(changed_result, folder)),
@@ -293,6 +322,19 @@ KINDS = {
     "settings": (8, lambda _: options("s.toml", SETTINGS, f"identify swim.csv {SEARCH} --settings s.toml")),
     "configuration": (8, lambda _: options("c.toml", CONFIG, "identify --config c.toml")),
     "robot": (8, robot),
+    "sizes of npz": (6, lambda folder: sizes("log.npz", columns(".npz", folder), sized_npz)),
+    "sizes of hdf5": (6, lambda folder: sizes("log.h5", hdf5(folder), sized_hdf5)),
+    "sizes of text": (4, lambda _: sizes("log.csv.gz", gzip.compress(table()), sized_gzip)),
+    "sizes of equations": (2, lambda folder: replace(result(sized_graph, folder), memory=MOST_MEMORY)),
+    "sizes of robots": (6, lambda folder: replace(robot(folder), changed=sized_robot, memory=MOST_MEMORY)),
+    "models": (8, model_file),
+    "places of results": (6, lambda _: places("a.json", results()[0], "export a.json -o out.py", "out.py")),
+    "places of logs": (6, lambda _: places("a.csv", table(), f"identify a.csv {MODEL}")),
+    "places of studies": (
+        6,
+        lambda _: places("a.toml", TINY_TOML.encode(), "study run a.toml --store out.db", "out.db"),
+    ),
+    "places of outputs": (6, lambda _: places("a.json", b"", f"identify swim.csv {MODEL} -o a.json", "a.json")),
 }
 """Examples of each kind in the suite, and what makes the kind."""
 

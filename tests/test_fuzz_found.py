@@ -14,7 +14,6 @@ import pytest
 import diransac as dr
 from command_line import run, working_folder
 from diransac.data.preprocessing.spikes import hampel
-from diransac.data.readers import comma_separated, npz, parquet
 from diransac.plain_data import json_data
 from diransac.study import load, status
 from diransac.study.reading import read
@@ -39,21 +38,10 @@ def test_polars_prints_nothing_where_it_panics(tmp_path, monkeypatch, capfd):
         os.write(2, b"thread 'x' panicked\nstack backtrace\n")
         raise pl.exceptions.PanicException("assertion failed")
 
-    monkeypatch.setattr(pl, "read_parquet", panics)
+    monkeypatch.setattr(pl, "read_parquet_metadata", panics)
     with pytest.raises(dr.LogError, match=r"the Parquet data are damaged; write the file again$"):
         dr.read_log(path)
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize(
-    ("ending", "reader"), [(".parquet", parquet), (".npz", npz), (".csv.gz", comma_separated)], ids=str
-)
-def test_a_log_that_unpacks_to_more_than_two_gibibytes_is_refused(tmp_path, monkeypatch, ending, reader):
-    path = written(tmp_path / f"a{ending}", x=np.zeros(40))
-    assert len(dr.read_log(path)) == 40
-    monkeypatch.setattr(reader, "LARGEST", 300)
-    with pytest.raises(dr.LogError, match="larger than 2 GiB"):
-        dr.read_log(path)
 
 
 def test_a_signalling_nan_is_a_nan(tmp_path):

@@ -271,10 +271,11 @@ def is_log_or_sentence(folder, data, name="a.csv"):
 
 
 def test_a_file_that_the_system_withholds_is_refused(tmp_path, monkeypatch):
-    def withhold(self):
+    def withhold(self, mode):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("pathlib.Path.read_bytes", withhold)
+    (tmp_path / "a.csv").write_text("t,x\n0,1\n1,2\n")
+    monkeypatch.setattr("pathlib.Path.open", withhold)
     with pytest.raises(LogError, match="it cannot be read: Permission denied"):
         read_log(tmp_path / "a.csv")
 

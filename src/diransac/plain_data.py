@@ -9,14 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-__all__ = ["LARGEST", "LARGEST_TABLE", "json_data", "read_text", "toml_table"]
+from diransac.limits import DEEPEST, LARGEST_RESULT, beyond, read_bytes
 
-LARGEST = 256 * 2**20
-"""Bytes of the largest result."""
-
-LARGEST_TABLE = 2**20
-"""Bytes of the largest settings or study."""
-
+__all__ = ["json_data", "read_text", "toml_table"]
 
 _DEEPEST_KEY = 64
 """Dots in a key of TOML."""
@@ -25,7 +20,7 @@ _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 """One half of a character in JSON's escapes; only pairs of them are text."""
 
 
-def read_text(path: str | Path, largest: int = LARGEST) -> str:
+def read_text(path: str | Path, largest: int = LARGEST_RESULT) -> str:
     """Text of a file.
 
     Parameters
@@ -37,16 +32,12 @@ def read_text(path: str | Path, largest: int = LARGEST) -> str:
     Raises
     ------
     OSError
-        The file cannot be read.
+        The file cannot be read, or is not an ordinary one.
     ValueError
         It is larger, or not UTF-8; the message is a part of a sentence.
     """
-    with Path(path).open("rb") as file:
-        content = file.read(largest + 1)
-    if len(content) > largest:
-        raise ValueError(f"it is larger than {largest // 2**20} MiB")
     try:
-        return content.decode("utf-8-sig")
+        return read_bytes(path, largest).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError("it is not UTF-8 text") from error
 
@@ -61,9 +52,21 @@ def json_data(text: str | bytes) -> Any:
     """
     with _bounded():
         found = json.loads(text, parse_constant=_refused)
+        _check_depth(found)
         if _SURROGATE.search(text if isinstance(text, str) else text.decode("latin-1")):
             _check_encodable(found)
         return found
+
+
+def _check_depth(found: object) -> None:
+    """Raises ValueError: lists and mappings are nested so deeply that what walks over them may not."""
+    level: list[Any] = [found]
+    depth = 0
+    while level:
+        if (depth := depth + 1) > DEEPEST:
+            raise ValueError(f"it is nested too deeply: it has {beyond(DEEPEST, 'levels')}")
+        inner = (x.values() if type(x) is dict else x for x in level if type(x) in (dict, list))
+        level = [y for x in inner for y in x if type(y) in (dict, list)]
 
 
 def _check_encodable(value: object) -> None:
@@ -92,7 +95,9 @@ def toml_table(text: str) -> dict[str, Any]:
     if any(key.count(".") > _DEEPEST_KEY and "," not in key for key in keys):  # tomllib takes their number squared
         raise ValueError("it is nested too deeply")
     with _bounded():
-        return tomllib.loads(text)
+        found = tomllib.loads(text)
+    _check_depth(found)
+    return found
 
 
 @contextmanager

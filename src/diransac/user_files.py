@@ -18,7 +18,7 @@ from pathlib import Path
 
 from diransac.errors import DiransacError, ModelError
 
-__all__ = ["blaming", "definitions", "file_and_name", "leave_stdout", "running", "silenced"]
+__all__ = ["blaming", "definitions", "file_and_name", "in_words", "leave_stdout", "running", "silenced"]
 
 _ALONE = threading.RLock()
 """Held without output, and while users' code runs, which may run more of it: threads share stdout and stderr."""
@@ -67,12 +67,12 @@ def blaming(file: Path, what: str) -> Iterator[None]:
     """Context that turns every error into a ModelError of one line, which names the file and its line."""
     try:
         yield
+    except KeyboardInterrupt:
+        raise
     except DiransacError as error:
-        raise ModelError(f'{what} file "{file}"{_line(error, file)}: {_in_one_line(error)}') from error
-    except (Exception, SystemExit) as error:
-        found = error.msg if isinstance(error, SyntaxError) else error
-        said = f"{type(error).__name__}: {_in_one_line(found)}"
-        raise ModelError(f'{what} file "{file}"{_line(error, file)}: {said}') from error
+        raise ModelError(f'{what} file "{file}"{_line(error, file)}: {" ".join(str(error).split())}') from error
+    except BaseException as error:
+        raise ModelError(f'{what} file "{file}"{_line(error, file)}: {in_words(error)}') from error
 
 
 @contextlib.contextmanager
@@ -95,9 +95,13 @@ def _line(error: BaseException, file: Path) -> str:
     return f", line {lines[-1]}" if lines else ""
 
 
-def _in_one_line(said: object) -> str:
-    """Text without line breaks."""
-    return " ".join(str(said).split())
+def in_words(error: BaseException) -> str:
+    """Class and message of an error of users' code, without line breaks; a class of their own may have no message."""
+    try:
+        said = str(error.msg if isinstance(error, SyntaxError) else error)
+    except Exception:  # noqa: BLE001  # users' code raises anything
+        said = "it has no message"
+    return f"{type(error).__name__}: {' '.join(said.split())}"
 
 
 # ---------------------------------------------------------------------- output

@@ -13,8 +13,9 @@ from diransac.errors import ModelError, SettingsError
 from diransac.identification.method import Method
 from diransac.identification.methods import WITH_ESTIMATOR, configured, estimator_named, setting_names
 from diransac.identification.settings import Settings, nearest_names
+from diransac.limits import LARGEST_TABLE
 from diransac.model import Model
-from diransac.plain_data import LARGEST_TABLE, read_text, toml_table
+from diransac.plain_data import read_text, toml_table
 from diransac.user_files import definitions, file_and_name
 
 __all__ = [

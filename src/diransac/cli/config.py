@@ -10,7 +10,8 @@ from typing import Any
 
 from diransac.errors import SettingsError
 from diransac.identification.settings import nearest_names
-from diransac.plain_data import LARGEST_TABLE, read_text, toml_table
+from diransac.limits import LARGEST_TABLE
+from diransac.plain_data import read_text, toml_table
 
 __all__ = ["config_defaults"]
 

@@ -27,6 +27,7 @@ from diransac.data.readers.repair import REPAIRS
 from diransac.errors import LogError, SettingsError
 from diransac.identification.method import Method
 from diransac.identification.methods import ESTIMATORS, METHODS
+from diransac.limits import LARGEST_TEXT
 from diransac.model import Model
 from diransac.simulation import HOLDS
 
@@ -324,7 +325,7 @@ class Preparation:
 
     def _of_stdin(self) -> Log:
         """The prepared log of CSV text on stdin.  Raises LogError: as `read`, or there is none."""
-        data = typer.get_binary_stream("stdin").read()
+        data = typer.get_binary_stream("stdin").read(LARGEST_TEXT + 1)
         if not data:
             raise LogError('"-" is standard input, which is empty; pipe CSV text into this command')
         with tempfile.TemporaryDirectory() as folder:

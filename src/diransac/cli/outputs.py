@@ -40,7 +40,7 @@ def checked(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) 
     ResultError
         An output's folder is missing or not writable, or an output is not an ordinary file, or is an input.
     """
-    sources = {path.resolve() for path in inputs if path is not None}
+    sources = {_followed(path) for path in inputs if path is not None}
     targets = [None if path is None else _place(path, sources) for path in outputs]
     named = [path for path in targets if path is not None]
     if len(set(named)) < len(named):
@@ -125,14 +125,22 @@ def _made(target: Path, folders: ExitStack) -> Path:
     return found
 
 
+def _followed(path: Path) -> Path:
+    """The place to which symbolic links lead; one of them where they lead round in a loop."""
+    return Path(os.path.realpath(path))
+
+
 def _place(path: Path, sources: Set[Path]) -> Path:
     if path == STDOUT:
         return path
-    target = path.resolve()
+    target = _followed(path)
+    if target.is_symlink():
+        raise ResultError(f'output "{path}" is a loop of symbolic links; remove it, or choose another place')
     if target.exists() and not target.is_file():
         raise ResultError(f'output "{path}" is not an ordinary file; give the name of a file')
-    if not target.parent.is_dir():
-        raise ResultError(f'output "{path}": the folder "{target.parent}" does not exist; make it first')
+    for folder in (path.parent, target.parent):  # a/../b is b, also where there is no a
+        if not folder.is_dir():
+            raise ResultError(f'output "{path}": the folder "{folder}" does not exist; make it first')
     if not os.access(target.parent, os.W_OK | os.X_OK) or (target.exists() and not os.access(target, os.W_OK)):
         raise ResultError(f'output "{path}" cannot be written: permission denied; choose another folder')
     if target in sources:

@@ -93,6 +93,8 @@ class Log:
     filter: FilterSpecification | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.source, str):
+            raise LogError(f"the source of a log is {self.source!r:.60}; give a text")
         checks.check_names(self.signals, self.source)
         time = as_column(self.time, "t", self.source)
         signals = {name: as_column(values, name, self.source) for name, values in self.signals.items()}

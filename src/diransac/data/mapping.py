@@ -39,7 +39,8 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import LogError
-from diransac.plain_data import LARGEST_TABLE, read_text, toml_table
+from diransac.limits import LARGEST_TABLE
+from diransac.plain_data import read_text, toml_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

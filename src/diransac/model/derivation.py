@@ -15,8 +15,10 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.errors import ModelError
+from diransac.errors import DiransacError, ModelError
+from diransac.limits import MOST_NAMES, MOST_SOLVED, beyond
 from diransac.model import expressions
+from diransac.user_files import in_words
 
 if TYPE_CHECKING:
     from diransac.model.parameter import Parameter
@@ -25,15 +27,10 @@ __all__ = ["Probe", "Symbols"]
 
 
 _N_POINTS = 40
-_MOST_NAMES = 3000
-"""Largest number of names of a model; matrices grow with its square."""
-
 _SINGULAR = 1e-10
 _TOLERANCE = 1e-8
 _NEAR_NOMINAL = 1e-3
 _ARGUMENTS = "qvaup"
-# Errors of a user's function that gets a symbol instead of a number, or a wrong number of arguments.
-_USER_ERRORS = (RuntimeError, TypeError, ValueError, ArithmeticError, LookupError, NameError, AttributeError)
 
 
 class Symbols:
@@ -70,13 +67,15 @@ def call_user(label: str, what: str, function: Callable[..., Any], *arguments: S
     """
     try:
         returned = function(*arguments)
-    except _USER_ERRORS as error:
-        if "truth value" in str(error):
+    except (DiransacError, KeyboardInterrupt):
+        raise
+    except BaseException as error:  # users' code raises anything
+        said = in_words(error)
+        if "truth value" in said:
             raise ModelError(
                 f"{label}: {what} branch on a symbol (if, and, or, min, max); use casadi.if_else, fmin or fmax"
             ) from error
-        reason = str(error).partition("\n")[0]
-        raise ModelError(f"{label}: {what} failed: {type(error).__name__}: {reason}") from error
+        raise ModelError(f"{label}: {what} failed: {said:.300}") from error
     values = list(returned.values()) if isinstance(returned, Mapping) else returned
     try:
         column = ca.vertcat(*(values if isinstance(values, list | tuple) else [values]), ca.SX(0, 1))
@@ -101,6 +100,13 @@ def call_sensor(label: str, name: str, equation: Callable[..., Any], *arguments:
     return value
 
 
+def check_texts(given: Mapping[str, object]) -> None:
+    """Raises ModelError: the name or description of a model is no text."""
+    for what, value in given.items():
+        if not isinstance(value, str):
+            raise ModelError(f"the {what} of a model is {value!r:.60}; give a text")
+
+
 def check_groups(label: str, units: Mapping[str, object], parameters: object) -> None:
     """Raises ModelError: signals are not mappings from names to units, or parameters from names to `Parameter`."""
     for kind, group in units.items():
@@ -122,8 +128,8 @@ def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
     Raises ModelError: a name is not an identifier or is used twice, or there are no states or parameters.
     """
     names = [n for group in groups for n in group]
-    if len(names) > _MOST_NAMES:
-        raise ModelError(f"{label}: there are {len(names)} names; up to {_MOST_NAMES} are possible")
+    if len(names) > MOST_NAMES:
+        raise ModelError(f"{label}: there are {beyond(MOST_NAMES, 'names', len(names))}")
     known = set[object]()
     for name in names:
         if str(name) != name or not name.isidentifier() or keyword.iskeyword(name) or name.startswith("__"):
@@ -315,6 +321,26 @@ def mass_matrix_sign(label: str, probe: Probe, mass_matrix: ca.Function, acceler
         return 0
     eigenvalues = np.linalg.eigvalsh(M)
     return int((eigenvalues > 0.0).all()) - int((eigenvalues < 0.0).all())
+
+
+def check_solution(label: str, mass_matrix: ca.Sparsity, n_columns: int, *, symmetric: bool) -> None:
+    """Raises ModelError: the solution for so many columns has more operations than memory and compiler can take.
+
+    LDL^T: the sum over columns of the factor of half the square of their numbers, and each number twice for each
+    right-hand side.  A general solution is dense: ``2 n^3 + 2 n^2`` for each right-hand side.
+    """
+    n = mass_matrix.size1()
+    if symmetric:
+        factor, _ = mass_matrix.ldl()
+        numbers = np.diff(factor.colind())
+        operations = int((numbers * (numbers + 3)).sum()) // 2 + 2 * int(numbers.sum()) * n_columns
+    else:
+        operations = 2 * n * n * (n + n_columns)
+    if operations > MOST_SOLVED:
+        raise ModelError(
+            f"{label}: the accelerations of {n} equations take {beyond(MOST_SOLVED, 'operations', operations)}. "
+            "Simplify the equations, or split the machine into independent parts"
+        )
 
 
 def nonlinear_parameters(probe: Probe, names: Sequence[str]) -> tuple[str, ...]:

@@ -23,11 +23,9 @@ from typing import Any, NamedTuple
 import casadi as ca
 
 from diransac.errors import ModelError, ResultError
+from diransac.limits import MOST_OPERATIONS, beyond
 
-__all__ = ["MOST_OPERATIONS", "Step", "check_size", "has_nan", "printed", "restored", "steps", "stored"]
-
-MOST_OPERATIONS = 200_000
-"""Largest number of operations of a model's equations. A quadruped with twelve joints has some 20,000."""
+__all__ = ["Step", "check_size", "has_nan", "printed", "restored", "steps", "stored"]
 
 _VERSION = 1
 _LONGEST = 80
@@ -117,8 +115,8 @@ def check_size(label: str, function: ca.Function) -> None:
     n = function.n_instructions()
     if n > MOST_OPERATIONS:
         raise ModelError(
-            f"{label}: the equations have {n} operations; up to {MOST_OPERATIONS} are possible. Simplify them, or "
-            "split the machine into independent parts"
+            f"{label}: the equations have {beyond(MOST_OPERATIONS, 'operations', n)}. Simplify them, or split the "
+            "machine into independent parts"
         )
 
 

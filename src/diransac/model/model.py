@@ -125,6 +125,7 @@ class Model:
         description: str,
         sensors: Mapping[str, str],
     ) -> None:
+        derivation.check_texts({"name": name, "description": description})
         self.name, self.description, self.sensors = name, description, dict(sensors)
         units = {"coordinates": coordinates, "inputs": inputs, "velocities": velocities or {}}
         derivation.check_groups(self._label, {**units, "first_order": first_order, "sensors": sensors}, parameters)
@@ -550,11 +551,15 @@ class Model:
         return v[: self.n_q, 0] if self.kinematics is None else self.kinematics(q, v)
 
     def _solve_mass(self, q: ca.SX, v: ca.SX, u: ca.SX, p: ca.SX, rhs: ca.SX) -> ca.SX:
-        """``M^-1 rhs``: LDL^T where the probe found ``M`` symmetric and definite, CasADi's solve elsewhere."""
-        M = self._mass_matrix(q, v, u, p)
+        """``M^-1 rhs``: LDL^T where the probe found ``M`` symmetric and definite, CasADi's solve elsewhere.
+
+        Raises ModelError: there would be too many operations.
+        """
+        M = ca.sparsify((self._definite or 1) * self._mass_matrix(q, v, u, p))
+        derivation.check_solution(self._label, M.sparsity(), rhs.size2(), symmetric=self._definite != 0)
         if self._definite == 0:
             return ca.solve(ca.densify(M), ca.densify(rhs))
-        D, LT, order = ca.ldl(ca.sparsify(self._definite * M))
+        D, LT, order = ca.ldl(M)
         return self._definite * ca.ldl_solve(ca.densify(rhs), D, LT, order)
 
     def equations_text(self) -> tuple[str, ...]:
@@ -581,7 +586,7 @@ class Model:
         """
         if set(parameters) != set(self.parameters):
             raise ModelError(
-                f"{self._label}: parameters are {', '.join(self.parameters)}; found {', '.join(parameters)}"
+                f"{self._label}: parameters are {', '.join(self.parameters)}; found {', '.join(map(str, parameters))}"
             )
         values = np.array([parameters[n] for n in self.parameters], dtype=float)
         if not np.isfinite(values).all():

@@ -47,6 +47,8 @@ class Parameter:
     combination: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
+        if not isinstance(self.unit, str):
+            raise ModelError(f'the unit of a parameter is {self.unit!r:.60}; give a text, such as "kg"')
         if not self.lower <= self.upper or (self.positive and self.upper <= 0.0):
             raise ModelError(
                 f"parameter bounds leave no room: lower {self.lower}, upper {self.upper}, positive {self.positive}; "

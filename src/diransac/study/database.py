@@ -133,6 +133,8 @@ def connected_to(path: Path, mode: str) -> sqlite3.Connection:
         raise StudyError(
             f'store "{path}" has a write-ahead log, which no study makes; PRAGMA journal_mode = DELETE takes it out'
         )
+    if not path.parent.is_dir():  # SQLite takes a/../b for b, also where there is no a
+        raise StudyError(f'store "{path}" cannot be opened: the folder "{path.parent}" does not exist; make it first')
     try:
         uri = f"{path.absolute().as_uri()}?mode={mode}"
         connection = sqlite3.connect(uri, timeout=_LOCK_TIMEOUT, isolation_level=None, uri=True)

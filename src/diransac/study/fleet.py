@@ -38,6 +38,7 @@ from diransac.identification.method import Method
 from diransac.identification.methods import DEFAULT
 from diransac.identification.result import Result
 from diransac.identification.settings import EXECUTION, Settings
+from diransac.limits import check_ordinary
 from diransac.model import Model
 from diransac.plain_data import json_data
 from diransac.plain_text import cell
@@ -287,6 +288,7 @@ def _hash(path: Path) -> str:
     found = sha256()
     for file in _files(path):
         found.update(repr((file.name, file.stat().st_size)).encode())
+        check_ordinary(file)
         with file.open("rb") as data:
             while block := data.read(2**20):
                 found.update(block)

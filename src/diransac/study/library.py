@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from diransac.errors import SettingsError
-from diransac.plain_data import LARGEST_TABLE, read_text, toml_table
+from diransac.limits import LARGEST_TABLE
+from diransac.plain_data import read_text, toml_table
 from diransac.study.specification import Study
 from diransac.study.tables import changed
 

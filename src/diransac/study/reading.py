@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["Status", "TrialCounts", "about", "export", "paths", "read", "status"]
 
 _NEEDED = ("level", "trial", "method", "status", "seed", "versions", "seconds", "host")
+_LARGEST = 1e150
 _LARGEST_PATH = 64 * 2**20
 """Bytes of the longest flown path."""
 
@@ -83,6 +85,8 @@ def _checked(columns: Mapping[str, Sequence[Any]], schema: Mapping[str, type]) -
         wrong = [value for value in columns[name] if value is not None and type(value) not in allowed]
         if wrong:
             raise TypeError(f"{name} is {wrong[0]!r:.40}")
+        if kind is float:
+            _check_squares(name, columns[name])
     for trial in columns["trial"]:
         whole(trial)
     times = [json_data(text) for text in columns["seconds"]]
@@ -91,6 +95,13 @@ def _checked(columns: Mapping[str, Sequence[Any]], schema: Mapping[str, type]) -
         if not stages or list(time) != stages or not all(type(value) in (int, float) for value in time.values()):
             raise ValueError(f"seconds are {time!r:.40}")
     return [json.dumps(dict(zip(stages, map(float, time.values()), strict=True))) for time in times]
+
+
+def _check_squares(name: str, values: Sequence[float | None]) -> None:
+    """Raises ValueError: the square of a number overflows."""
+    for value in values:
+        if value is not None and _LARGEST < abs(value) < math.inf:
+            raise ValueError(f"{name} is {value!r:.40}")
 
 
 def about(store: str | Path) -> dict[str, str]:

@@ -210,6 +210,9 @@ def _summary(
 ) -> Summary:
     """Summary of what a store holds.  Raises LookupError, TypeError, ValueError: its parts do not fit together."""
     levels = _in_order(list(dict.fromkeys(level for level, *_ in cells)))
+    values = [value for value in map(_value, levels) if value is not None]
+    if len(set(values)) < len(values):
+        raise ValueError(f"levels {', '.join(levels)} have equal values")
     methods = tuple(dict.fromkeys(method for _, method, _ in cells))
     plants = [noted.get(level) or _facts(level, parts) for level in levels]
     if any((list(x.units), list(x.parameters)) != (list(plants[0].units), list(plants[0].parameters)) for x in plants):
@@ -275,6 +278,9 @@ class _Table:
 
 def _flights(table: _Table, shape: str, states: Sequence[str]) -> TrackingErrors:
     errors = {state: table.column(f"{shape}_{state}") for state in states}
+    for state, found in errors.items():
+        if (found < 0.0).any():
+            raise ValueError(f"{shape}_{state} is {np.nanmin(found):.6g}")
     return TrackingErrors(errors, table.ran, table.ran & np.isnan(errors[states[0]]))
 
 

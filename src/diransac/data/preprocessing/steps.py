@@ -12,6 +12,7 @@ import numpy.typing as npt
 from diransac.arrays import FloatArray
 from diransac.data.preprocessing.continuity import interpolated
 from diransac.errors import LogError, SettingsError
+from diransac.limits import MOST_ROWS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -37,7 +38,6 @@ __all__ = [
 Column = TypeVar("Column")
 
 _BRIDGED_INTERVALS = 3.5
-_MOST_ROWS = 10_000_000
 # New rows per old one, of more than so many, that only a damaged time takes.
 _MOST_NEW, _MANY_ROWS = 1000, 100_000
 _ROUNDING = 1e-6
@@ -300,14 +300,14 @@ def _rate(rate: float | str, usual: float) -> float:
 
 
 def _new_rows(seconds: float, hertz: float, source: str) -> int:
-    """Number of rows at a rate.  Raises LogError: fewer than 2, or more than `_MOST_ROWS`."""
+    """Number of rows at a rate.  Raises LogError: fewer than 2, or more than `MOST_ROWS`."""
     rows = seconds * hertz * (1.0 + 1e-12) + 1e-9
     if rows < 1.0:
         raise LogError(f"{source}: resampling at {hertz:.6g} Hz leaves 1 row of {seconds:.6g} s")
-    if rows >= _MOST_ROWS:
+    if rows >= MOST_ROWS:
         raise LogError(
             f"{source}: resampling {seconds:.6g} s at {hertz:.6g} Hz would make {rows:.4g} rows; at most "
-            f"{_MOST_ROWS:,} are made: give a lower rate, or --scale t=FACTOR if t is not in seconds"
+            f"{MOST_ROWS:,} are made: give a lower rate, or --scale t=FACTOR if t is not in seconds"
         )
     return math.floor(rows) + 1
 

@@ -20,6 +20,7 @@ from diransac.data.readers.repair import Repairs
 from diransac.data.readers.table import Table
 from diransac.data.units import conversion, split_unit
 from diransac.errors import LogError, SettingsError
+from diransac.limits import LARGEST_LOG, LARGEST_TEXT, check_ordinary, read_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -280,9 +281,8 @@ def _opened_folder(path: Path, source: str, repairs: Repairs) -> Table | Recordi
 def _check_content(path: Path, source: str) -> None:
     """Raise LogError for a file that cannot be read, or is empty."""
     try:
-        with path.open("rb") as file:
-            if not file.read(1):
-                raise LogError(f"{source}: it is empty")
+        if not check_ordinary(path).st_size:
+            raise LogError(f"{source}: it is empty")
     except FileNotFoundError as error:
         raise LogError(f"{source}: there is no such file") from error
     except OSError as error:
@@ -290,8 +290,11 @@ def _check_content(path: Path, source: str) -> None:
 
 
 def _content(path: Path, source: str) -> bytes:
+    is_text = _ending(path) in _TEXTS and not path.name.lower().endswith(".gz")
     try:
-        data = path.read_bytes()
+        data = read_bytes(path, LARGEST_TEXT if is_text else LARGEST_LOG)
+    except ValueError as error:
+        raise LogError(f"{source}: {error}; split it") from error
     except FileNotFoundError as error:
         raise LogError(f"{source}: there is no such file") from error
     except OSError as error:

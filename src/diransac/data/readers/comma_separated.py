@@ -15,9 +15,10 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.files import COMMENT
 from diransac.data.readers.repair import Repairs
-from diransac.data.readers.table import LARGEST, Table, check_unique, with_metadata
+from diransac.data.readers.table import Table, check_size, check_unique, with_metadata
 from diransac.data.units import split_unit
 from diransac.errors import LogError
+from diransac.limits import LARGEST_TEXT, beyond
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -52,8 +53,8 @@ def _unpacked(data: bytes, source: str) -> bytes:
         while part := file.read(_CHUNK):
             parts.append(part)
             size += len(part)
-            if size > LARGEST:
-                raise LogError(f"{source}: its text is larger than 2 GiB; split it")
+            if size > LARGEST_TEXT:
+                raise LogError(f"{source}: its text has {beyond(LARGEST_TEXT, 'bytes')}; split it")
     return b"".join(parts)
 
 
@@ -69,16 +70,17 @@ def read_csv(data: bytes, source: str, names: Sequence[str] | None = None, repai
     repairs : Repairs, optional
         Of comments, rows, timestamps and cells, where they are allowed.
 
-    Raises LogError: the data are not UTF-8 text with a header line and as many fields in every line.
+    Raises LogError: the data are not UTF-8 text with a header line and as many fields in every line, or too large.
     """
     repairs = Repairs() if repairs is None else repairs
-    lines = _text(data, source).split("\n")
+    lines = _lines(data, source)
     metadata = lines.pop(0).strip('"').removeprefix(COMMENT) if _is_metadata(lines[0]) else None
     lines = _without_comments(lines, repairs)
     if not lines:
         raise LogError(f"{source}: there is no header line after the metadata; give one, and one line per row")
     line = 1 if metadata is None else 2
     separator = _separator(lines[0])
+    check_size(source, len(lines), lines[0].count(separator) + 1)
     if names is None:
         headers = _header(lines[0], separator, source)
     else:
@@ -182,6 +184,13 @@ def _text(data: bytes, source: str) -> str:
     return text
 
 
+def _lines(data: bytes, source: str) -> list[str]:
+    """Lines of the text.  Raises LogError: as `_text`, or there are too many."""
+    text = _text(data, source)
+    check_size(source, text.count("\n"), 1)
+    return text.split("\n")
+
+
 def _separator(header: str) -> str:
     """The semicolon or tab of a header that has no other separator; the comma otherwise."""
     found = [s for s in _SEPARATORS if s in header]
@@ -214,9 +223,9 @@ def _check_ragged(lines: list[str], first: int, separator: str, source: str) -> 
     if any('"' in line for line in lines):
         counts = _quoted_counts(lines, first, separator, source)
     else:
-        counts = [(number, line.count(separator) + 1) for number, line in enumerate(lines, first)]
-    expected = counts[0][1]
-    for number, count in counts:
+        counts = [line.count(separator) + 1 for line in lines]
+    expected = counts[0]
+    for number, count in enumerate(counts, first):
         if count != expected and not lines[number - first].strip():
             n = sum(not line.strip() for line in lines)
             which = f"line {number} is blank, the first of {n}" if n > 1 else f"line {number} is blank"
@@ -225,15 +234,15 @@ def _check_ragged(lines: list[str], first: int, separator: str, source: str) -> 
             raise LogError(f"{source}: line {number} has {count} fields, the header has {expected}")
 
 
-def _quoted_counts(lines: list[str], first: int, separator: str, source: str) -> list[tuple[int, int]]:
-    """Line number and number of fields of every record; separators in quotation marks do not count."""
+def _quoted_counts(lines: list[str], first: int, separator: str, source: str) -> list[int]:
+    """Number of fields of every record; separators in quotation marks do not count."""
     reader = csv.reader((line + "\n" for line in lines), delimiter=separator, strict=True)
     counts = []
     try:
         for number, record in enumerate(reader, first):
             if reader.line_num + first - 1 != number:
                 raise LogError(f"{source}: line {number} has a line break in quotation marks; remove it")
-            counts.append((number, len(record)))
+            counts.append(len(record))
     except csv.Error as error:
         raise LogError(f"{source}: line {reader.line_num + first - 1} cannot be read ({error})") from error
     return counts

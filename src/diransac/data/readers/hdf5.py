@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import io
+import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from diransac.data.readers.table import LARGEST, Table, table_of_arrays
+from diransac.data.readers.table import Table, check_shapes, table_of_arrays
 from diransac.errors import LogError
+from diransac.limits import LARGEST_LOG, MOST_COLUMNS, beyond
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -17,7 +20,8 @@ if TYPE_CHECKING:
 __all__ = ["MAGIC", "read_hdf5"]
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
-_MOST = 10_000
+_DEEPEST = 16
+_MOST_LINKS = 2 * MOST_COLUMNS
 _DAMAGED = (OSError, ValueError, TypeError, KeyError, RuntimeError, MemoryError, OverflowError, AttributeError)
 
 
@@ -31,7 +35,7 @@ def read_hdf5(data: bytes, source: str, *, transposed: bool = False) -> Table:
     transposed : bool
         True for MATLAB's files, whose matrices stand with their columns first.
 
-    Raises LogError: h5py is missing; the file is damaged, or its arrays are larger than 2 GiB together.
+    Raises LogError: h5py is missing; the file is damaged, larger than a log may be, or refers to other files.
     """
     try:
         import h5py
@@ -40,13 +44,12 @@ def read_hdf5(data: bytes, source: str, *, transposed: bool = False) -> Table:
             f'{source}: HDF5 needs the package h5py; install it with pip install "diransac[logs]"'
         ) from error
     arrays: dict[str, npt.NDArray[Any]] = {}
-    total = 0
     try:
         with h5py.File(io.BytesIO(data), "r") as file:
-            for name, dataset in _datasets(file, ""):
-                total += dataset.size * dataset.dtype.itemsize
-                if total > LARGEST or len(arrays) >= _MOST:
-                    raise LogError(f"{source}: its arrays are larger than 2 GiB together, or too many")
+            found = dict(_Walk(source).datasets(file, "", ()))
+            check_shapes([dataset.shape[::-1] if transposed else dataset.shape for dataset in found.values()], source)
+            for name, dataset in found.items():
+                _check_storage(dataset, f'{source}: dataset "{name}"')
                 values = np.asarray(dataset[()])
                 arrays[name] = values.T if transposed else values
     except _DAMAGED as error:
@@ -55,15 +58,39 @@ def read_hdf5(data: bytes, source: str, *, transposed: bool = False) -> Table:
     return table_of_arrays(arrays, source)
 
 
-def _datasets(group: Any, prefix: str, depth: int = 0) -> Iterator[tuple[str, Any]]:
-    """Numeric datasets below a group, by dotted names; what MATLAB keeps for itself, ``#refs#``, is left out."""
-    import h5py
+@dataclass
+class _Walk:
+    """Walk over the groups of a file, in which a few links may make endless paths."""
 
-    for name in group if depth < 16 else ():
-        if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            continue
-        item = group[name]
-        if isinstance(item, h5py.Group):
-            yield from _datasets(item, f"{prefix}{name}.", depth + 1)
-        elif isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.shape is not None:
-            yield f"{prefix}{name}", item
+    source: str
+    n_links: int = 0
+
+    def datasets(self, group: Any, prefix: str, above: tuple[Any, ...]) -> Iterator[tuple[str, Any]]:
+        """Numeric datasets below a group, by dotted names; what MATLAB keeps for itself, ``#refs#``, is left out.
+
+        Raises LogError: the paths to them have too many links.
+        """
+        import h5py
+
+        if group in above or len(above) >= _DEEPEST:
+            return
+        for name in group:
+            self.n_links += 1
+            if self.n_links > _MOST_LINKS:
+                raise LogError(f"{self.source}: it has {beyond(_MOST_LINKS, 'links')}; write its datasets alone")
+            if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                continue
+            item = group[name]
+            if isinstance(item, h5py.Group):
+                yield from self.datasets(item, f"{prefix}{name}.", (*above, group))
+            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.shape is not None:
+                yield f"{prefix}{name}", item
+
+
+def _check_storage(dataset: Any, what: str) -> None:
+    """Raise LogError for values that stand in other datasets or files, or in chunks of any size."""
+    if dataset.is_virtual or dataset.external:
+        raise LogError(f"{what} takes its values from other datasets or files; write the values themselves")
+    size = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize
+    if size > LARGEST_LOG:
+        raise LogError(f"{what} is stored in chunks of {beyond(LARGEST_LOG, 'bytes', size)}; write it anew")

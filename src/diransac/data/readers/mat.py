@@ -19,15 +19,16 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.data.readers import hdf5
-from diransac.data.readers.table import LARGEST, Table, check_unique, table_of_arrays
+from diransac.data.readers.table import Table, check_unique, table_of_arrays
 from diransac.errors import LogError
+from diransac.limits import LARGEST_LOG, MOST_COLUMNS, beyond
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 __all__ = ["read_mat"]
 
-_HEADER, _DEEPEST, _MOST = 128, 8, 10_000
+_HEADER, _DEEPEST = 128, 8
 _MATRIX, _COMPRESSED = 14, 15
 _CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _STRUCTURE, _COMPLEX = 2, 0x0800
@@ -105,14 +106,14 @@ def _level_5(data: bytes) -> Iterator[tuple[str, npt.NDArray[Any]]]:
     """Arrays of a file of version 5, those of structures by dotted names."""
     order = "<" if data[126:128] == b"IM" else ">"
     elements = _Elements(memoryview(data)[_HEADER:], order)
-    budget = LARGEST
+    budget = LARGEST_LOG
     while elements:
         kind, content = elements.take()
         if kind == _COMPRESSED:
             unpacker = zlib.decompressobj()
             unpacked = unpacker.decompress(content, budget)
             if not unpacker.eof:
-                raise ValueError("a variable is cut off, or larger than 2 GiB")
+                raise ValueError(f"a variable is cut off, or the arrays have {beyond(LARGEST_LOG, 'bytes')}")
             budget -= len(unpacked)
             kind, content = _Elements(memoryview(unpacked), order).take()
         if kind == _MATRIX:
@@ -148,7 +149,7 @@ def _fields(elements: _Elements, order: str, name: str, depth: int) -> Iterator[
     """Arrays of the fields of a structure."""
     width = int(elements.numbers()[0])
     text = elements.take()[1].tobytes()
-    if width < 1 or len(text) // width > _MOST:
+    if width < 1 or len(text) // width > MOST_COLUMNS:
         raise ValueError(f'the fields of "{name}" cannot be read')
     for start in range(0, len(text), width):
         kind, inner = elements.take()

@@ -9,7 +9,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.files import KEY
-from diransac.data.readers.table import LARGEST, Table, check_unique, with_metadata
+from diransac.data.readers.table import Table, check_size, check_unique, with_metadata
 from diransac.data.units import split_unit
 from diransac.errors import LogError
 from diransac.user_files import silenced
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 __all__ = ["read_parquet"]
 
 _MAGIC = b"PAR1"
-_NUMBER = 8
-"""Bytes of a number."""
+_FEW = 1000
+"""Rows of a column without numbers that are looked at: texts and lists may be of any size."""
 
 
 def read_parquet(data: bytes, source: str) -> Table:
@@ -37,28 +37,43 @@ def read_parquet(data: bytes, source: str) -> Table:
     try:
         with silenced():  # Polars prints where it panics
             lazy = pl.scan_parquet(io.BytesIO(data))
-            n_columns, n_rows = len(lazy.collect_schema()), lazy.select(pl.len()).collect().item()
-            if n_columns * n_rows * _NUMBER > LARGEST:
-                raise LogError(f"{source}: its columns are larger than 2 GiB together; split it")
-            frame = pl.read_parquet(io.BytesIO(data))
+            schema = lazy.collect_schema()
+            check_size(source, lazy.select(pl.len()).collect().item(), len(schema))
+            numeric = [name for name, kind in schema.items() if _is_numeric(kind)]
+            frame = pl.read_parquet(io.BytesIO(data), columns=numeric)
+            few = lazy.drop(numeric).head(_FEW).collect() if len(numeric) < len(schema) else frame.clear()
             metadata = pl.read_parquet_metadata(io.BytesIO(data)).get(KEY)
     except pl.exceptions.PanicException as error:
         raise LogError(f"{source}: the Parquet data are damaged; write the file again") from error
     except (pl.exceptions.PolarsError, OSError, MemoryError) as error:
         reason = f"{error!s:.200}".partition("\n")[0]
         raise LogError(f"{source}: the Parquet data are damaged ({reason})") from error
-    named = [split_unit(header) for header in frame.columns]
+    named = [split_unit(header) for header in schema]
     check_unique([name for name, _ in named], source)
-    columns = {name: _numbers(series) for (name, _), series in zip(named, frame.get_columns(), strict=True)}
+    numbers = {header: _numbers(frame.drop_in_place(header)) for header in numeric}
+    columns = {
+        name: numbers[header] if header in numbers else _first(few[header])
+        for (name, _), header in zip(named, schema, strict=True)
+    }
     table = Table(columns, {name: unit for name, unit in named if unit is not None})
     return table if metadata is None else with_metadata(table, metadata, source)
 
 
-def _numbers(series: pl.Series) -> FloatArray | str:
-    """Numbers of a column, null as NaN, or its first value, which is no number."""
+def _is_numeric(kind: pl.DataType) -> bool:
     import polars as pl
 
-    if series.dtype.is_numeric() or series.dtype in (pl.Boolean, pl.Null):
-        return series.cast(pl.Float64).fill_null(np.nan).to_numpy().astype(np.float64)
+    return kind.is_numeric() or kind in (pl.Boolean, pl.Null)
+
+
+def _numbers(series: pl.Series) -> FloatArray:
+    """Numbers of a column, null as NaN."""
+    import polars as pl
+
+    return series.cast(pl.Float64).fill_null(np.nan).to_numpy().astype(np.float64)
+
+
+def _first(series: pl.Series) -> str:
+    """The first value of a column without numbers."""
     row = series.is_not_null().arg_max() or 0
-    return f"is not numeric: row {row} holds {series[row]!s:.60} ({series.dtype})"
+    value = " ".join(str(series[row]).split())
+    return f"is not numeric: row {row} holds {value:.60} ({series.dtype})"

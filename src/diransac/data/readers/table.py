@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -14,14 +15,12 @@ from diransac.data.files import decode_metadata
 from diransac.data.filters import FilterSpecification
 from diransac.data.units import split_unit
 from diransac.errors import LogError
+from diransac.limits import MOST_COLUMNS, MOST_NUMBERS, MOST_ROWS, beyond
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["LARGEST", "Table", "check_unique", "table_of_arrays", "with_metadata"]
-
-LARGEST = 1 << 31
-"""Bytes that a compressed file may unpack to, 2 GiB."""
+__all__ = ["Table", "check_shapes", "check_size", "check_unique", "table_of_arrays", "with_metadata"]
 
 
 @dataclass(frozen=True)
@@ -63,6 +62,23 @@ def with_metadata(table: Table, text: str | bytes, source: str, remedy: str = "w
     )
 
 
+def check_size(source: str, rows: int, columns: int, numbers: int | None = None) -> None:
+    """Raise LogError for more rows, columns or numbers than a log may have.
+
+    Parameters
+    ----------
+    source : str
+    rows, columns : int
+    numbers : int, optional
+        In all columns; by default rows times columns.
+    """
+    numbers = rows * columns if numbers is None else numbers
+    of_log = ((columns, MOST_COLUMNS, "columns"), (rows, MOST_ROWS, "rows"), (numbers, MOST_NUMBERS, "numbers"))
+    for found, most, what in of_log:
+        if found > most:
+            raise LogError(f"{source}: it has {beyond(most, what, found)}; split it, or leave some out")
+
+
 def check_unique(names: Sequence[str], source: str) -> None:
     """Raise LogError if two columns have one name."""
     repeated = [name for name, count in Counter(names).items() if count > 1]
@@ -72,11 +88,29 @@ def check_unique(names: Sequence[str], source: str) -> None:
         )
 
 
+def check_shapes(shapes: Sequence[tuple[int, ...]], source: str) -> None:
+    """Raise LogError where arrays of these shapes make a table that is larger than a log may be."""
+    matrices = [shape for shape in shapes if _is_matrix(shape)]
+    others = [math.prod(shape) for shape in shapes if not _is_matrix(shape)]
+    check_size(
+        source,
+        max((*others, *(rows for rows, _ in matrices)), default=0),
+        len(others) + sum(columns for _, columns in matrices),
+        sum(others) + sum(math.prod(shape) for shape in matrices),
+    )
+
+
+def _is_matrix(shape: tuple[int, ...]) -> bool:
+    """True for an array that is a column of each of its own."""
+    return len(shape) == 2 and 1 not in shape
+
+
 def table_of_arrays(arrays: Mapping[str, npt.NDArray[Any]], source: str) -> Table:
     """Table of named arrays: a vector is one column, a matrix ``q (n, k)`` the columns ``q_1`` to ``q_k``.
 
-    Raises LogError: two columns would have one name.
+    Raises LogError: two columns would have one name; the table is larger than a log may be.
     """
+    check_shapes([x.shape for x in arrays.values()], source)
     headers = [split_unit(name) for name in arrays]
     pieces = [piece for (name, _), x in zip(headers, arrays.values(), strict=True) for piece in _pieces(name, x)]
     check_unique([name for name, _ in pieces], source)
@@ -84,7 +118,7 @@ def table_of_arrays(arrays: Mapping[str, npt.NDArray[Any]], source: str) -> Tabl
 
 
 def _pieces(name: str, array: npt.NDArray[Any]) -> list[tuple[str, FloatArray | str]]:
-    if array.ndim == 2 and 1 not in array.shape:
+    if _is_matrix(array.shape):
         return [(f"{name}_{k + 1}", as_numbers(array[:, k])) for k in range(array.shape[1])]
     if array.ndim > 2:
         return [(name, f"has {array.ndim} dimensions: {array.shape}")]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import threading
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,12 +20,19 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
+from diransac.limits import MOST_JOINTS, beyond
+from diransac.model.robots.sizes import check_description
 from diransac.process import module_path_safe
 
 __all__ = ["Body", "Coupling", "Description", "Joint", "mujoco_module", "parsed", "read_description"]
 
 _ALONE = threading.Lock()
 """Held while warnings are dropped, which all threads share."""
+_FAILURES = (ValueError, RuntimeError, MemoryError)
+"""Errors of MuJoCo's reader and compiler."""
+
+_LARGEST = 1e50
+"""Of masses, lengths and coefficients; products of several of them do not overflow."""
 
 _ROUNDING = 1e-15
 """Entries of rotations that differ from 0, 1 or -1 by less are these: rounding of quarter turns' quaternions."""
@@ -183,9 +191,11 @@ def parsed(path: str | Path) -> Any:
     mujoco = mujoco_module()
     if not Path(path).is_file():
         raise ModelError(f'robot description "{path}" does not exist; give an MJCF (.xml) or URDF file')
+    check_description(Path(path), f'robot description "{path}"')
     try:
-        return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
+        with _without_warnings():
+            return mujoco.MjSpec.from_file(str(path))
+    except _FAILURES as error:
         raise _unreadable(path, error) from error
 
 
@@ -211,22 +221,9 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
         that exerts forces, or a surrounding fluid.
     """
     try:
-        with _warnings_dropped(mujoco_module()):
-            return _description(path, base)
+        return _description(path, base)
     except UnicodeDecodeError as error:  # a name in another encoding, or none
         raise _unreadable(path, error) from error
-
-
-@contextmanager
-def _warnings_dropped(mujoco: ModuleType) -> Iterator[None]:
-    """Context of one thread at a time in which MuJoCo neither prints warnings nor appends them to MUJOCO_LOG.TXT."""
-    with _ALONE:
-        before = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(lambda _: None)
-        try:
-            yield
-        finally:
-            mujoco.set_mju_user_warning(before)
 
 
 def _description(path: str | Path, base: str | None) -> Description:
@@ -240,11 +237,14 @@ def _description(path: str | Path, base: str | None) -> Description:
     _drop_shapes(spec)
     try:
         spec.compiler.fusestatic = False
-        model = spec.compile()
-    except ValueError as error:
+        with _without_warnings():
+            model = spec.compile()
+    except _FAILURES as error:
         raise _unreadable(path, error) from error
     label = f'robot description "{path}"'
     _check_supported(label, model)
+    if model.njnt > MOST_JOINTS:
+        raise ModelError(f"{label}: it has {beyond(MOST_JOINTS, 'joints', model.njnt)}; split the robot")
     joints = tuple(_joint(model, k, drives) for k in range(model.njnt))
     if not joints:
         raise ModelError(f"{label}: there are no joints, and nothing can move")
@@ -252,6 +252,23 @@ def _description(path: str | Path, base: str | None) -> Description:
     name = re.sub(r"\W+", "-", spec.modelname) or Path(path).stem
     measured = _measured_base(label, bodies, names) if base == "measured" else None
     return Description(name, bodies, joints, tuple(_couplings(label, model)), np.array(model.opt.gravity), measured)
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Context of one thread at a time in which MuJoCo warns of nothing, neither here nor in MUJOCO_LOG.TXT.
+
+    It warns of what is left out, such as cloth.
+    """
+    mujoco = mujoco_module()
+    with _ALONE, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        before = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(lambda _: None)
+        try:
+            yield
+        finally:
+            mujoco.set_mju_user_warning(before)
 
 
 def _measured_base(label: str, bodies: Sequence[Body], floating: Sequence[str]) -> int:
@@ -263,7 +280,7 @@ def _measured_base(label: str, bodies: Sequence[Body], floating: Sequence[str]) 
     return [body.name for body in bodies].index(floating[0])
 
 
-def _unreadable(path: str | Path, error: ValueError) -> ModelError:
+def _unreadable(path: str | Path, error: Exception) -> ModelError:
     return ModelError(f'robot description "{path}" cannot be read: {" ".join(str(error).split())}')
 
 
@@ -285,7 +302,11 @@ def _drop_shapes(spec: Any) -> None:
 
 
 def _check_supported(label: str, model: Any) -> None:
-    """Raises ModelError: the robot has parts for which there are no equations here."""
+    """Raises ModelError: the robot has parts for which there are no equations here, or numbers that overflow."""
+    of_bodies = (model.body_mass, model.body_inertia, model.body_ipos, model.body_pos)
+    of_joints = (model.dof_armature, model.dof_damping, model.dof_frictionloss, model.jnt_stiffness, model.jnt_pos)
+    if not all(np.all(np.abs(x) < _LARGEST) for x in (*of_bodies, *of_joints)):
+        raise ModelError(f"{label}: a mass, inertia, position or coefficient is {_LARGEST:g} or more; correct it")
     kinds = mujoco_module().mjtJoint
     for k in range(model.njnt):
         name = model.joint(k).name

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from llvmlite import ir
 
 from diransac.errors import ModelError
+from diransac.limits import MOST_COMPILED, beyond
 from diransac.simulation.compiler import elementary
 from diransac.simulation.compiler.lanes import map_signature
 from diransac.simulation.compiler.machine_code import LANES
@@ -102,6 +103,22 @@ OPERATIONS: dict[str, Operation] = {
 """Vector form of every operation of an expression graph, by CasADi's name for it; FMA, FMS and FNMA are ours."""
 
 
+_LONG = frozenset(name for name, operation in OPERATIONS.items() if operation.emit.__module__ == elementary.__name__)
+"""Operations that are written out as some hundred instructions."""
+
+_LENGTH = 15
+
+
+def _check_length(graph: Graph, positions: Collection[int]) -> None:
+    """Raise ModelError: compilation, whose time grows with the square of the length, would take minutes."""
+    length = sum(_LENGTH if graph.instructions[k].operation in _LONG else 1 for k in positions)
+    if length > MOST_COMPILED:
+        raise ModelError(
+            f"simulation of the equations takes {beyond(MOST_COMPILED, 'operations', length)}, a sine and the like "
+            f"counted as {_LENGTH}; simplify them, or split the machine into independent parts"
+        )
+
+
 def evaluate(
     v: Vectors,
     graph: Graph,
@@ -123,10 +140,12 @@ def evaluate(
     -------
     the results by instruction, those of `known` included
 
-    Raises ModelError: an operation that is not in `OPERATIONS`.
+    Raises ModelError: an operation that is not in `OPERATIONS`; there are too many.
     """
     values: dict[int, Value] = dict(known or {})
-    for position in sorted(graph.needed(wanted, values)):
+    positions = sorted(graph.needed(wanted, values))
+    _check_length(graph, positions)
+    for position in positions:
         instruction = graph.instructions[position]
         if instruction.operation == "CONST":
             values[position] = v.number(instruction.value)

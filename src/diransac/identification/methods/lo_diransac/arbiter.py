@@ -91,7 +91,7 @@ class Comparison:
         Horizons over which no candidate predicts better than that nothing changes do not count: there, an unstable
         machine is lost, and estimates that respond less to their inputs have the smaller errors.
         """
-        told = np.nanmin([x.errors for x in scores], axis=0) < 1.0
+        told = np.fmin.reduce([x.errors for x in scores]) < 1.0
         told = told if told.any() else np.ones_like(told)
         losses = _means(np.array([x.losses[told] for x in scores]).swapaxes(1, 2))
         logs = np.log(losses + _NEGLIGIBLE) + _TIMING * timed[:, None]

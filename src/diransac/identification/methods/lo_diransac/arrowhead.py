@@ -155,6 +155,11 @@ def _size(diagonal: FloatArray) -> FloatArray:
 
 
 def _inverse(A: FloatArray) -> FloatArray:
-    """Inverse of a symmetric matrix; singular directions have a large variance instead of an error."""
+    """Inverse of a symmetric matrix; singular directions have a large variance instead of an error.
+
+    Raises LinAlgError: a number overflowed, which LAPACK would report on the terminal.
+    """
+    if not np.isfinite(A).all():
+        raise np.linalg.LinAlgError("a number overflows")
     values, vectors = np.linalg.eigh(0.5 * (A + A.T))
     return np.asarray((vectors / np.maximum(values, 1e-15)) @ vectors.T)

@@ -259,6 +259,8 @@ class Contest:
         if self.arbiter is None:
             return None
         self.scores = [self.arbiter.scores(x) for x in self.candidates]
+        if not any(np.isfinite(x.losses).any() for x in self.scores):
+            return None
         self.comparison = Comparison.of(self.scores, self._timed)
         return self.comparison.best
 

@@ -195,6 +195,8 @@ def _ordinary(own: Dataset, block: IntArray, n_blocks: int) -> tuple[FloatArray,
         gram[:-1, :-1] += variance * np.diag(precision)
         gram[:-1, -1] += variance * precision * own.layout.prior_mean / unit
     every = [gram, *(gram - x for x in sums)]
+    if not np.isfinite(every).all():  # LAPACK would report it on the terminal
+        raise np.linalg.LinAlgError("a number overflows")
     found = np.array([_within_bounds(G, unit, own.layout.bounds) for G in every])
     return found[0], found[1:]
 
