@@ -49,8 +49,9 @@ _ROWS_OF_SEARCH, _MOST_ROWS = 3_000, 50_000
 """Rows of the fits from several starts, and of others, at most."""
 _WHOLE_ROW = 1.0 / 12.0
 """Variance of a number that is rounded to a whole one."""
-_STEPS, _CONVERGED, _NOISE_MOVES = 25, 0.1, 0.03
-"""Steps at most; change of parameters, standard errors, and relative change of the noise that end them."""
+_STEPS, _FEW_STEPS, _CONVERGED, _NOISE_MOVES = 25, 3, 0.1, 0.03
+"""Steps at most, and of a solution that is close to another; change of parameters, standard errors, and relative change
+of the noise that end them."""
 _DAMPING, _DAMPING_BOUNDS = 1e-6, (1e-12, 1e6)
 _RIDGE, _FLOOR, _TINY = 1e-10, 1e-5, 1e-150
 
@@ -136,6 +137,7 @@ def estimates_of_logs(one: Candidate, motion: Motion, n_rows: int, *, outliers: 
             noise = _first_noise(own, motion.spread, outliers=outliers)
             fitted = _Solution.begin(own, motion, one.parameters, noise).descended()
             fitted, late, late_error = fitted.with_own_timing(blocks)
+            fitted = fitted.descended() if late else fitted
             parameters, errors = fitted.parameters, fitted.standard_errors(blocks)
         values, spans = (dict(zip(names, x.tolist(), strict=True)) for x in (parameters, errors))
         found.append(LogEstimate(values, spans, late * intervals.dt, late_error * intervals.dt))
@@ -297,10 +299,10 @@ class _Solution:
         following = np.linalg.solve(scaled, right[:, :n_x] / d[:, :, None]) / d[:, :, None]
         return right[:, n_x:] - H[:, n_x:, :n_x] @ following, following
 
-    def descended(self) -> _Solution:
-        """The solution after steps of Levenberg and Marquardt, each with an update of the noise (EM)."""
+    def descended(self, steps: int = _STEPS) -> _Solution:
+        """The solution after some steps of Levenberg and Marquardt, each with an update of the noise (EM)."""
         now, damping = self, _DAMPING
-        for _ in range(_STEPS):
+        for _ in range(steps):
             check_time()
             inlying = now.noise.inlying(now.errors, now._known)
             noise = now.noise.updated(now.errors, now._known, inlying, outliers=bool(now.noise.pi.any()))
@@ -365,7 +367,7 @@ class _Solution:
             for x in (at - step, at + step):
                 if x not in tried and abs(x) < one.n_rows:
                     shifted = replace(one, acting=one.acting.shifted(one.intervals, x))
-                    tried[x] = replace(self, segments=shifted).descended()
+                    tried[x] = replace(self, segments=shifted).descended(_FEW_STEPS)
             best = min(tried, key=lambda x: tried[x].cost)
             at, step = best, (2 * step if best != at else step // 2)
         if not {at - 1, at + 1} <= tried.keys():
