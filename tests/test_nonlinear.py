@@ -163,6 +163,20 @@ def test_leaving_rows_out_is_fitting_the_others():
     assert bound.fit_without(groups, rows) == pytest.approx(others, rel=1e-6)
 
 
+@pytest.mark.parametrize("priors", [{}, {"l": (0.5, 0.1)}], ids=["no prior", "a prior"])
+def test_one_step_leaves_rows_out_to_first_order(priors):
+    """What a group changes is small; the step is right but for the square of it."""
+    bound = dr.NonlinearLeastSquares().bind(Dataset.of(hanging_mass(), swing(noise=0.02), priors=priors))
+    rows = np.arange(400)
+    groups = np.array_split(rows, 10)
+    whole = bound.select([rows]).fit()[0]
+    exact, stepped = (
+        bound.fit_without(groups, rows) / whole - 1.0,
+        bound.steps_without(groups, rows, whole) / whole - 1.0,
+    )
+    assert np.abs(stepped - exact).max() < 0.1 * np.abs(exact).max()
+
+
 def test_estimate_on_its_bound_is_named_and_has_no_interval(tmp_path):
     """A block against which the fit stops says nothing of how well the value is known."""
     bounded = hanging_mass(parameters=hanging_mass().parameters | {"c": Parameter("N m s", lower=0.2)})

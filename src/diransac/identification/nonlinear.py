@@ -18,7 +18,6 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.estimators import (
-    BoundEstimator,
     OrdinaryLeastSquares,
     correlations,
     regression,
@@ -86,12 +85,12 @@ class NonlinearLeastSquares:
     max_steps: int = 60
     min_eigenvalue: float = 1e-6
 
-    def bind(self, dataset: Dataset) -> BoundEstimator:
+    def bind(self, dataset: Dataset) -> BoundNonlinear:
         """The estimator over the usable rows of a dataset."""
-        return _BoundNonlinear(self, dataset)
+        return BoundNonlinear(self, dataset)
 
 
-class _BoundNonlinear:
+class BoundNonlinear:
     """Measured accelerations and sensors of the usable rows, and the compiled model of them."""
 
     def __init__(self, settings: NonlinearLeastSquares, dataset: Dataset) -> None:
@@ -169,6 +168,30 @@ class _BoundNonlinear:
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
         start = self._chart.to_free(self._fit_equal(rows[None]))[:, None]
         return np.array([self._likeliest(rows_without(rows, group)[None], start)[0] for group in groups])
+
+    def steps_without(self, groups: Sequence[IntArray], rows: IntArray, p: FloatArray) -> FloatArray:
+        """Parameters ``(n_groups, n)`` without each group of positions in the rows, by one step from the fit of all.
+
+        Parameters
+        ----------
+        groups : sequence of int array
+            Positions in ``rows``.
+        rows : (n,) int array
+        p : (n,) array
+            Fit of all rows.
+        """
+        free, r = self._chart.to_free(p[None]), len(self._scale)
+        errors, J = (x[0].reshape(len(rows), r, *x.shape[2:]) for x in self._errors(rows[None], free))
+        H, slope = np.einsum("nri,nrj->ij", J, J), np.einsum("nri,nr->i", J, errors)
+        if len(self._layout.with_prior):
+            prior = self._prior_errors(np.array([np.square(errors).mean()]), None)
+            of_prior, slopes = (x[0] for x in prior.errors(p[None], self._chart.slope(free)))
+            H, slope = H + slopes.T @ slopes, slope + slopes.T @ of_prior
+        left = np.array([H - np.einsum("nri,nrj->ij", J[x], J[x]) for x in groups])
+        slopes = np.array([slope - np.einsum("nri,nr->i", J[x], errors[x]) for x in groups])
+        left += 1e-12 * np.einsum("kii->ki", left)[:, :, None] * np.eye(self._n_p)
+        steps = np.nan_to_num(solve_definite(left, slopes))
+        return self._chart.to_parameters(self._chart.clip(free - steps))
 
     def _fit_equal(self, rows: IntArray) -> FloatArray:
         """Parameters ``(B, n_p)`` from row sets ``(B, n)``: each from the best of its followed starts."""
@@ -311,7 +334,7 @@ class _PriorErrors:
 class _SelectedRows:
     """Sets of rows for nonlinear least squares."""
 
-    bound: _BoundNonlinear
+    bound: BoundNonlinear
     row_sets: Sequence[IntArray]
 
     def well_defined(self) -> BoolArray:

@@ -76,7 +76,8 @@ def simulation_error_candidates(
     starts : (m, n) array
         Parameters to start from, within the bounds; further ones are random about them.
     actings : sequence of ActingInputs
-        Over short segments the likeliest is taken; the others follow from the result over the longest ones.
+        Starts are compared with the first; the others follow from its result.  Over short segments the likeliest is
+        taken, and the others follow again over the longest ones.
     seed : int
     blocks : Blocks
     outliers : bool, optional
@@ -88,15 +89,14 @@ def simulation_error_candidates(
         The shortest segments first; empty where the logs are too short.
     """
     starts, lengths = np.vstack([starts, _random_starts(intervals, starts, seed)]), _lengths(intervals, blocks)
-    tried = [_from_starts(intervals, motion, starts, acting, lengths[0], outliers=outliers) for acting in actings]
-    solved = [x for x in tried if x is not None]
-    if not solved:
+    first = _from_starts(intervals, motion, starts, actings[0], lengths[0], outliers=outliers)
+    if first is None:
         return []
-    chain = [min(solved, key=lambda x: x.cost)]
+    chain = [min([first, *(first.with_inputs(x) for x in actings[1:])], key=lambda x: x.cost)]
     for length in lengths:
         chain.append(chain[-1].grown(length).descended())
     last, taken = chain[-1], chain[-1].segments.acting
-    others = [replace(last, segments=replace(last.segments, acting=x)).descended() for x in actings if x is not taken]
+    others = [last.with_inputs(x) for x in actings if x is not taken]
     return [(x.candidate(blocks), x.simulated) for x in (*chain[1:], *others)]
 
 
@@ -338,6 +338,10 @@ class _Solution:
         scale = np.nan_to_num(lower_scale(found.errors.copy(), found._known), nan=1.0)
         return replace(found, noise=replace(self.noise, sigma=np.maximum(scale, self.noise.floor)))
 
+    def with_inputs(self, acting: ActingInputs, steps: int = _STEPS) -> _Solution:
+        """The solution with inputs that act otherwise, after some steps from this one."""
+        return replace(self, segments=replace(self.segments, acting=acting)).descended(steps)
+
     def candidate(self, blocks: Blocks) -> Candidate:
         """The estimate, and what it is without each block by one Newton step."""
         segments, intervals = self.segments, self.segments.intervals
@@ -366,8 +370,7 @@ class _Solution:
         while step:
             for x in (at - step, at + step):
                 if x not in tried and abs(x) < one.n_rows:
-                    shifted = replace(one, acting=one.acting.shifted(one.intervals, x))
-                    tried[x] = replace(self, segments=shifted).descended(_FEW_STEPS)
+                    tried[x] = self.with_inputs(one.acting.shifted(one.intervals, x), _FEW_STEPS)
             best = min(tried, key=lambda x: tried[x].cost)
             at, step = best, (2 * step if best != at else step // 2)
         if not {at - 1, at + 1} <= tried.keys():
