@@ -128,3 +128,14 @@ def test_training_and_held_out_logs_of_every_machine_are_read(shared_data):
         "px4-appended_multiple",
         "px4-roll",
     ]
+
+
+@pytest.mark.skipif(not (real.DATA / "silverbox").is_dir(), reason=f"the real records are not in {real.DATA}")
+def test_the_terms_that_silverbox_lacks_are_suggested_and_added():
+    """A constant and a quadratic spring, by which the simulated arrow comes to a tenth of the error."""
+    bare, full = (records.RECORDS[name](real.DATA) for name in ("silverbox", "silverbox-offset"))
+    found = dr.identify(bare.model, bare.train[0], differentiate=True, with_suggestions=True)
+    parameters = dict(found.parameters) | {"c": found.parameters["bias_y"]}
+    parameters["k2"] = found.parameters["quadratic_stiffness_y"]
+    resolution = found.estimate.resolution
+    assert full.judge(parameters, Inputs(resolution.hold)).error < 1.0  # mV
