@@ -262,7 +262,11 @@ class Contest:
         if not any(np.isfinite(x.losses).any() for x in self.scores):
             return None
         self.comparison = Comparison.of(self.scores, self._timed)
-        return self.comparison.best
+        best = self.comparison.best
+        error = float(np.nanmedian(self.scores[best].errors))
+        best_so_far = f"best so far: {self.candidates[best].name}, held-out error {error:.2g} of that of no change"
+        report(self.callback, "comparing predictions", 0.89, best_so_far)
+        return best
 
     @property
     def _timed(self) -> BoolArray:
