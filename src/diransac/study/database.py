@@ -56,6 +56,9 @@ _MODES = slice(18, 20)
 _LARGEST_VALUE = 64 * 2**20
 """Bytes of the largest value in a store."""
 
+_FULL = ("SQLITE_FULL", "SQLITE_IOERR")
+"""Names of SQLite's errors where the disk is full, or a file may not grow."""
+
 _DAMAGE = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, EOFError,
            NotImplementedError, zipfile.BadZipFile, zlib.error)  # fmt: skip
 """Errors of values that a store of diransac never holds."""
@@ -164,7 +167,9 @@ def reported(path: Path) -> Iterator[None]:
     try:
         yield
     except (sqlite3.Error, UnicodeError) as error:
-        raise StudyError(f'store "{path}": {error}; give a store of diransac, or a new file') from error
+        is_full = getattr(error, "sqlite_errorname", "").startswith(_FULL)
+        advice = "is the disk full? Rows that it has are kept" if is_full else "give a store of diransac, or a new file"
+        raise StudyError(f'store "{path}": {error}; {advice}') from error
 
 
 @contextmanager
@@ -174,10 +179,11 @@ def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
         connection.execute("BEGIN IMMEDIATE")
         try:
             yield
+            connection.execute("COMMIT")
         except BaseException:
-            connection.execute("ROLLBACK")
+            if connection.in_transaction:  # SQLite itself ends some that have failed
+                connection.execute("ROLLBACK")
             raise
-        connection.execute("COMMIT")
 
 
 def roll_back(path: Path) -> None:
