@@ -254,6 +254,13 @@ def test_a_table_of_a_fleet_has_a_line_per_log_and_no_formula(fleet, tmp_path):
     assert rows[0][header.index("error")] == "'" + TEXTS["formula"]
 
 
+@pytest.mark.parametrize("letter", ["=", "\x1b"])
+def test_a_cell_is_no_longer_than_spreadsheets_and_python_read(letter):
+    shown = cell(letter * 1_000_000)
+    assert len(shown) <= 32_767
+    assert next(csv.reader([shown])) == [shown]
+
+
 def test_a_table_of_a_study_has_a_line_per_trial_and_no_formula(tmp_path):
     with Store(tmp_path / "a.db", load(tiny(trials=3))) as kept:
         kept.add([row(trial=0), row(trial=1, status="failed", error=TEXTS["formula"]), row(trial=2, host=TEXTS["c1"])])

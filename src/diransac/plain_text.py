@@ -18,6 +18,9 @@ from collections.abc import Callable
 __all__ = ["cell", "comment", "identifier", "literal", "printable"]
 
 _LONGEST_COMMENT, _LONGEST_IDENTIFIER = 2000, 60
+_LONGEST_CELL = 32_766
+"""Letters that spreadsheets read in a cell, of which one may be a ``'``; Python reads four times as many."""
+
 _SPLIT = (("\\", "_"), ("??", "? ?"), ("*/", "* /"), ("/*", "/ *"), ('"""', "'''"))
 """Texts that continue a line of C, end its comment, or end a docstring, and what is written for them."""
 
@@ -128,6 +131,8 @@ def identifier(text: str) -> str:
 def cell(text: str) -> str:
     """Text of a cell that no spreadsheet takes for a formula: one that begins like a formula has a ``'`` before it.
 
+    A longer text than spreadsheets read is cut.
+
     Parameters
     ----------
     text : str
@@ -141,7 +146,7 @@ def cell(text: str) -> str:
     >>> cell("=1+1"), cell("flight 1.csv")
     ("'=1+1", 'flight 1.csv')
     """
-    shown = printable(text).replace("\n", " ")
+    shown = printable(text[:_LONGEST_CELL]).replace("\n", " ")[:_LONGEST_CELL]
     return f"'{shown}" if shown.lstrip().startswith(("=", "+", "-", "@")) else shown
 
 
