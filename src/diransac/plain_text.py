@@ -3,6 +3,7 @@
 | function | place of the text |
 |---|---|
 | `printable` | terminal, and JSON, of which the values stay the same |
+| `one_line` | part of a printed line |
 | `comment` | comment of C, Python, YAML or TOML |
 | `literal` | string of Python, YAML or TOML, which reads back |
 | `identifier` | name of a function of C or CasADi |
@@ -15,7 +16,7 @@ import keyword
 import re
 from collections.abc import Callable
 
-__all__ = ["cell", "comment", "identifier", "literal", "printable"]
+__all__ = ["cell", "comment", "identifier", "literal", "one_line", "printable"]
 
 _LONGEST_COMMENT, _LONGEST_IDENTIFIER = 2000, 60
 _LONGEST_CELL = 32_766
@@ -59,6 +60,25 @@ def printable(text: str) -> str:
     'a\\u001b[2Jb\\u009b\\u202e'
     """
     return "\n".join(line if line.isprintable() else _escaped(line, _in_json) for line in text.split("\n"))
+
+
+def one_line(text: str) -> str:
+    r"""Text for a part of a printed line, which it cannot end: a line break is written as ``\u000a``.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> print(one_line("m" + chr(10) + "verdict: usable"))
+    m\u000averdict: usable
+    """
+    return text.replace("\n", r"\u000a")
 
 
 def comment(text: str) -> str:

@@ -54,7 +54,7 @@ class Sensor:
     Raises
     ------
     ModelError
-        The unit is not a text, the equation is not a function, or parameters are not a mapping of `Parameter`.
+        The unit is not a text of one line, the equation is not a function, or parameters are not a mapping of `Parameter`.
     """
 
     unit: str
@@ -62,8 +62,8 @@ class Sensor:
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.unit, str):
-            raise ModelError(f'the unit of a sensor is {self.unit!r}; give a text, such as "m/s^2"')
+        if not isinstance(self.unit, str) or "\n" in self.unit:
+            raise ModelError(f'the unit of a sensor is {self.unit!r:.60}; give a text of one line, such as "m/s^2"')
         if not callable(self.equation):
             raise ModelError(f"the equation of a sensor is {self.equation!r}; give a function of (q, v, a, u, p)")
         if not all(isinstance(x, Parameter) for x in dict(self.parameters).values()):

@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import Any, ClassVar, Self
 
 from diransac.errors import StudyError
+from diransac.plain_text import one_line
 
 __all__ = [
     "AGAIN",
@@ -120,10 +121,10 @@ def damage(path: Path) -> Iterator[None]:
 
 
 def word(value: object) -> str:
-    """A text.  Raises TypeError: the value is none."""
+    """A text of one line.  Raises TypeError: the value is no text."""
     if not isinstance(value, str):
         raise TypeError(f"{value!r:.40} is no text")
-    return value
+    return one_line(value)
 
 
 # SQLite --------------------------------------------------------------------------------------------------------------
