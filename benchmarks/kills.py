@@ -45,9 +45,12 @@ levels = [0, 40]
 """
 COMMANDS = {
     "identify": (f"identify 0.csv {MODEL} -o out.json --report out.html", ("out.json", "out.html")),
-    "report": (f"validate model.json 1.csv --report out.html", ("out.html",)),
+    "report": ("validate model.json 1.csv --report out.html", ("out.html",)),
     "study run": ("study run tiny.toml --store trials.db --jobs 2", ("trials.db",)),
-    "identify --each": (f"identify {' '.join(f'{k}.csv' for k in range(8))} {MODEL} --each --store logs.db --jobs 2", ("logs.db",)),
+    "identify --each": (
+        f"identify {' '.join(f'{k}.csv' for k in range(8))} {MODEL} --each --store logs.db --jobs 2",
+        ("logs.db",),
+    ),
 }
 """Command lines, and what each writes; a store has a table of its name."""
 COUNTED = ("kills", "lost", "half-written", "failed", "other numbers", "drafts")
@@ -95,7 +98,9 @@ def killed(folder: Path, words: list[str], outputs: tuple[str, ...], n_kills: in
             after = [content(path) for path in paths]
             for old, new, all_of_it in zip(before, after, whole, strict=True):
                 counts["lost"] += not (new >= old if isinstance(old, frozenset) else new in (old, all_of_it))
-                counts["half-written"] += not (new <= all_of_it if isinstance(old, frozenset) else new in (old, all_of_it))
+                counts["half-written"] += not (
+                    new <= all_of_it if isinstance(old, frozenset) else new in (old, all_of_it)
+                )
             before = after
             if counts["kills"] == n_kills or not isinstance(before[0], frozenset):
                 break

@@ -36,7 +36,7 @@ VALUES = {"mass": 2.0, "drag": 0.5}
 ROLES = [(*NAMES, *NAMES)[k : k + 4] for k in range(len(NAMES))]
 LINES = {name: text for name, text in TEXTS.items() if "\n" not in text}
 MODELS = [named(text) for text in LINES.values()] + [named("N*s/m", names) for names in ROLES]
-"""Every text of one line as unit and name of a model; every name as that of a coordinate, an input and either parameter."""
+"""Every text of one line as unit and name; every name as that of a coordinate, an input and either parameter."""
 
 
 def exported(model: dr.Model, name: str = "") -> PortableModel:
@@ -55,9 +55,9 @@ def whole(text: str) -> str:
 
 @pytest.mark.parametrize("text", [text for text in TEXTS.values() if "\n" in text])
 def test_a_name_or_unit_of_several_lines_is_refused(text):
-    with pytest.raises(ModelError, match="of a parameter is .*; give a text of one line"):
+    with pytest.raises(ModelError, match=r"of a parameter is .*; give a text of one line"):
         dr.Parameter(text)
-    with pytest.raises(ModelError, match="of a sensor is .*; give a text of one line"):
+    with pytest.raises(ModelError, match=r"of a sensor is .*; give a text of one line"):
         dr.Sensor(text, lambda q, v, a, u, p: q.x)
     model = named()
     for changes in ({"name": text}, {"description": text}, {"coordinates": {"x": text}}, {"inputs": {"push": text}}):

@@ -16,7 +16,7 @@ import keyword
 import re
 from collections.abc import Callable
 
-__all__ = ["cell", "comment", "identifier", "literal", "one_line", "printable"]
+__all__ = ["cell", "comment", "identifier", "is_one_line", "literal", "one_line", "printable"]
 
 _LONGEST_COMMENT, _LONGEST_IDENTIFIER = 2000, 60
 _LONGEST_CELL = 32_766
@@ -62,6 +62,16 @@ def printable(text: str) -> str:
     return "\n".join(line if line.isprintable() else _escaped(line, _in_json) for line in text.split("\n"))
 
 
+def is_one_line(value: object) -> bool:
+    """True for a text without line breaks.
+
+    Parameters
+    ----------
+    value : object
+    """
+    return isinstance(value, str) and "\n" not in value
+
+
 def one_line(text: str) -> str:
     r"""Text for a part of a printed line, which it cannot end: a line break is written as ``\u000a``.
 
@@ -75,8 +85,8 @@ def one_line(text: str) -> str:
 
     Examples
     --------
-    >>> print(one_line("m" + chr(10) + "verdict: usable"))
-    m\u000averdict: usable
+    >>> one_line("m" + chr(10) + "verdict: usable") == r"m\u000averdict: usable"
+    True
     """
     return text.replace("\n", r"\u000a")
 

@@ -18,7 +18,6 @@ from typer.core import TyperGroup
 from diransac.cli import INTERRUPTED, screen
 from diransac.cli.config import config_defaults
 from diransac.errors import DiransacError, SettingsError
-from diransac.plain_text import one_line
 
 __all__ = ["Group", "grouped"]
 
@@ -178,7 +177,7 @@ def _message(error: DiransacError | OSError) -> str:
 
 def _say(message: str, code: int, *more: str) -> int:
     """Print a message on one line of stderr, and further lines; the exit code."""
-    screen.note("\n".join([f"error: {one_line(message)}" if message.strip() else "error", *more]))
+    screen.note(f"error: {message}" if message.strip() else "error", *more)
     return code
 
 
