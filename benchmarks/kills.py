@@ -4,10 +4,12 @@
 
 KILLS, 25 by default, of each command. A row of the table has the kills that came before the end, those after which an
 older output or row was lost or changed, those after which an output was neither the old one nor that of an undisturbed
-run, failures of the same command afterwards, other numbers than those of an undisturbed run, and drafts that are left.
+run, failures of the same command afterwards, other numbers than those of an undisturbed run, and drafts that are left;
+and of every fifth kill, runs of two processes at once with an empty cache of machine code that ended otherwise.
 """
 
 import json
+import os
 import random
 import signal
 import sqlite3
@@ -53,7 +55,7 @@ COMMANDS = {
     ),
 }
 """Command lines, and what each writes; a store has a table of its name."""
-COUNTED = ("kills", "lost", "half-written", "failed", "other numbers", "drafts")
+COUNTED = ("kills", "lost", "half-written", "failed", "other numbers", "drafts", "at once")
 
 
 def main() -> None:
@@ -107,7 +109,19 @@ def killed(folder: Path, words: list[str], outputs: tuple[str, ...], n_kills: in
         counts["failed"] += run(folder, words) != 0
         counts["other numbers"] += [content(path) for path in paths] != whole
         counts["drafts"] += sum(path.name.endswith((".part", "-journal")) for path in folder.iterdir())
+    counts["at once"] = sum(differs_at_once(folder, words, paths, whole) for _ in range(-(-n_kills // 5)))
     return counts
+
+
+def differs_at_once(folder: Path, words: list[str], paths: list[Path], whole: list[object]) -> bool:
+    """True if two processes at once, which begin anew, do not end as one."""
+    forget(paths)
+    with tempfile.TemporaryDirectory() as cache:
+        given = {"cwd": folder, "env": os.environ | {"DIRANSAC_CACHE": cache}}
+        both = [subprocess.Popen([*PROGRAM, *words], **given, stdout=subprocess.DEVNULL) for _ in range(2)]
+        codes = [process.wait() for process in both]
+        has_drafts = any(path.suffix != ".code" for path in Path(cache).iterdir())
+    return any(codes) or has_drafts or [content(path) for path in paths] != whole
 
 
 def forget(paths: list[Path]) -> None:
