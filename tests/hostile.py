@@ -39,6 +39,9 @@ TEXTS = {
     "outside": "\U0001d6fc",
 }
 
+SECOND_LINES = tuple({line[:12] for text in TEXTS.values() for line in text.split("\n")[1:] if line.strip(' "')})
+"""Beginnings of the lines that a text with line breaks would add to what is printed."""
+
 NAMES = (
     "derivative", "derivative_of", "step", "parameters", "np", "STATES", "INPUTS", "PARAMETERS", "dt", "w0",
     "double", "void", "main", "printf", "sin", "INFINITY", "NAN", "template", "operator", "requires", "print", "list",

@@ -10,11 +10,14 @@ from xml.etree import ElementTree
 
 import pytest
 
+from hostile import SECOND_LINES
+
 
 def check_printed(words: Sequence[str], *texts: str) -> None:
-    """Raises AssertionError: a command has printed a control character."""
+    """Raises AssertionError: a command has printed a control character, or a line that begins within a text."""
     for line in (line for text in texts for line in text.split("\n")):
         assert line.isprintable(), f"{words}: {line!r}"
+        assert not line.startswith(SECOND_LINES), f"{words}: {line!r}"
 
 
 def check_reads_back(path: Path) -> None:

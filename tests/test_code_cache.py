@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 
 import casadi as ca
 import numpy as np
@@ -35,6 +36,9 @@ bits = b"".join(a.tobytes() for a in (sums.cost, sums.gradient, sums.normal_matr
 print(len(emitted), hashlib.sha256(bits).hexdigest())
 """
 """Prints the number of modules that were compiled, and the digest of what they compute."""
+
+N_CHANGED = int(os.environ.get("FUZZ_EXAMPLES", "30"))
+"""Bytes of entries that are changed, one at a time."""
 
 
 @pytest.fixture
@@ -200,6 +204,34 @@ def test_code_is_compiled_again_where_its_entry_is_damaged(cache: CodeCache, com
     assert np.array_equal(square()([3.0, 4.0])[0], [[9.0, 16.0]])
     assert np.array_equal(square()([3.0, 4.0])[0], [[9.0, 16.0]])
     assert len(compiled) == 2
+
+
+def scanned() -> np.ndarray:
+    carry, row, constant = (ca.SX.sym(name) for name in "crk")
+    step = ca.Function("step", [carry, row, constant], [carry + row, carry * constant])
+    return Scan(step.serialize(), None)([[1.0]], np.arange(6.0).reshape(6, 1), [[2.0]])[0]
+
+
+def rolled_out() -> np.ndarray:
+    batch = RolloutBatch(np.array([[2.0, 1.0]]), np.zeros(2), np.full((8, 1), 2.5), 0.01)
+    return fresh_rollouts().trajectories(batch)
+
+
+@pytest.mark.slow
+def test_no_changed_byte_of_an_entry_changes_a_number(cache: CodeCache, compiled: list[str]):
+    rng, runs = Random(0), [lambda: square(3.0)([3.0, 4.0])[0], scanned, rolled_out]
+    entries = []
+    for run in runs:
+        numbers, (path,) = run(), cache.sizes().keys() - {path for _, _, path, _ in entries}
+        entries.append((run, numbers, path, path.read_bytes()))
+    compiled.clear()
+    for k in range(N_CHANGED):
+        run, numbers, path, content = entries[k % len(entries)]
+        at = rng.randrange(len(content))
+        path.write_bytes(content[:at] + bytes([content[at] ^ rng.randrange(1, 256)]) + content[at + 1 :])
+        assert np.array_equal(run(), numbers)
+        assert len(compiled) == k + 1
+        assert path.read_bytes() == content
 
 
 # Folders -------------------------------------------------------------------------------------------------------------

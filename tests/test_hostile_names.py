@@ -23,7 +23,7 @@ from diransac.data.suggested_mapping import suggest_mapping
 from diransac.errors import ModelError
 from diransac.export import PortableModel, write_model
 from diransac.model.robots.calibration import calibrated
-from diransac.plain_text import cell, identifier, literal
+from diransac.plain_text import cell, comment, identifier, literal
 from diransac.plots.figure import draw_heading, empty_figure, name_panel, panel, svg, write
 from diransac.study import identify_each, load
 from diransac.study.fleet import export_fleet
@@ -34,8 +34,9 @@ from studies import row, tiny
 
 VALUES = {"mass": 2.0, "drag": 0.5}
 ROLES = [(*NAMES, *NAMES)[k : k + 4] for k in range(len(NAMES))]
-MODELS = [named(text) for text in TEXTS.values()] + [named("N*s/m", names) for names in ROLES]
-"""Every text as unit and name of a model; every name as that of a coordinate, an input and either parameter."""
+LINES = {name: text for name, text in TEXTS.items() if "\n" not in text}
+MODELS = [named(text) for text in LINES.values()] + [named("N*s/m", names) for names in ROLES]
+"""Every text of one line as unit and name; every name as that of a coordinate, an input and either parameter."""
 
 
 def exported(model: dr.Model, name: str = "") -> PortableModel:
@@ -50,6 +51,26 @@ def exported(model: dr.Model, name: str = "") -> PortableModel:
 def whole(text: str) -> str:
     """The text with half characters replaced, as files have it."""
     return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text)
+
+
+@pytest.mark.parametrize("text", [text for text in TEXTS.values() if "\n" in text])
+def test_a_name_or_unit_of_several_lines_is_refused(text):
+    with pytest.raises(ModelError, match=r"of a parameter is .*; give a text of one line"):
+        dr.Parameter(text)
+    with pytest.raises(ModelError, match=r"of a sensor is .*; give a text of one line"):
+        dr.Sensor(text, lambda q, v, a, u, p: q.x)
+    model = named()
+    for changes in ({"name": text}, {"description": text}, {"coordinates": {"x": text}}, {"inputs": {"push": text}}):
+        given = {"name": "m", "coordinates": {"x": "m"}, "inputs": {"push": "N"}, "parameters": model.parameters}
+        with pytest.raises(ModelError, match=r"(name|description|unit) of .* is .*; give a text of one line"):
+            dr.Model(**given | changes, equations=lambda q, v, a, u, p: [p.mass * a.x + p.drag * v.x - u.push])
+
+
+@pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
+def test_a_comment_is_one_line_that_ends_nothing(text):
+    shown = comment(text)
+    assert shown.isprintable()
+    assert not re.search(r'\\|\?\?|\*/|/\*|"""', shown)
 
 
 # C --------------------------------------------------------------------------------------------------------------------
@@ -98,7 +119,7 @@ def test_no_two_functions_of_c_have_one_name_and_none_is_a_word_of_a_language():
 
 
 # Python, CasADi -------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("models", [MODELS[: len(TEXTS)], MODELS[len(TEXTS) :]], ids=["texts", "names"])
+@pytest.mark.parametrize("models", [MODELS[: len(LINES)], MODELS[len(LINES) :]], ids=["texts", "names"])
 def test_python_is_imported_with_the_names_of_the_model_and_runs_nothing_else(tmp_path, models):
     for model in models:
         write_model(exported(model), tmp_path / "m.py", "python")
@@ -252,6 +273,13 @@ def test_a_table_of_a_fleet_has_a_line_per_log_and_no_formula(fleet, tmp_path):
         assert value.isprintable()
         assert not value.lstrip().startswith(("=", "+", "@"))
     assert rows[0][header.index("error")] == "'" + TEXTS["formula"]
+
+
+@pytest.mark.parametrize("letter", ["=", "\x1b"])
+def test_a_cell_is_no_longer_than_spreadsheets_and_python_read(letter):
+    shown = cell(letter * 1_000_000)
+    assert len(shown) <= 32_767
+    assert next(csv.reader([shown])) == [shown]
 
 
 def test_a_table_of_a_study_has_a_line_per_trial_and_no_formula(tmp_path):

@@ -70,6 +70,7 @@ STORED = {
     "declared": (shaped((1_900_000_000,), "i1", (1 << 20,)), "1,900,000,000 rows; up to 10,000,000"),
     "columns": (shaped((2, 1_000_000), "i1", (1, 1 << 19)), "1,000,002 columns; up to 10,000"),
     "numbers": (shaped((40_000, 9_000), "i1", (1, 100)), "360,000,080 numbers; up to 134,217,728"),
+    "chunks": (shaped((9_999_999,), "i1", (1,)), "10,000,001 chunks; up to 200,000 are possible; write it in larger"),
     "a chunk": (shaped((40,), "f8", (1 << 28,), maxshape=(None,)), "in chunks of 2,048 MiB; up to 1,024"),
 }
 

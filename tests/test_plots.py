@@ -5,6 +5,7 @@ import subprocess
 import sys
 from importlib.resources import files
 from itertools import combinations, pairwise
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -362,7 +363,7 @@ def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path, monkeypat
     def full(*arguments, **options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(SettingsError, match=r'cannot write ".*a\.png": No space left on device'):
         plot_flight(trajectory(), flown(), target)
     assert target.read_text() == "before"

@@ -243,7 +243,8 @@ def test_what_people_call_things_and_how_many_there_are_decide_nothing():
     ("changes", "message"),
     [
         ({"plnt.kind": "x"}, 'no key "plnt"; in a study there are .*plant'),
-        ({"trials": 0}, "trials is 0; give a whole number of at least 1"),
+        ({"trials": 10**20}, "trials is 100000000000000000000; give a whole number from 1 to 10,000,000"),
+        ({"trials": 0}, "trials is 0; give a whole number from 1 to 10,000,000"),
         ({"trials": 2.5}, "trials is 2.5; give a whole number"),
         ({"seed": "x"}, "seed is 'x'; give a whole number"),
         ({"plant.kind": "car"}, "plant.kind is 'car'; there are extended-rotorcraft, planar-rotorcraft"),

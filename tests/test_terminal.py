@@ -2,8 +2,11 @@
 
 import json
 import re
+import sqlite3
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,10 @@ from command_line import MODEL, run, swim
 from diransac.cli import screen, workers
 from diransac.identification.method import Progress
 from diransac.plain_text import printable
+from diransac.study import identify_each, load
+from diransac.study.store import Store
 from hostile import TEXTS, named
+from studies import TINY_TOML, row, tiny
 
 SOURCE = Path(dr.__file__).parent
 HARMFUL = "".join(TEXTS[name] for name in ("escape", "c1", "delete", "bidirectional", "carriage return", "surrogate"))
@@ -32,7 +38,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     t = 0.05 * np.arange(80)
     dr.Log.from_arrays(t, swim(t)).write("swim.csv")
-    model = named(HARMFUL.encode("utf-8", "replace").decode(), ("x", "thrust", "mass", "drag"))
+    model = named(HARMFUL.encode("utf-8", "replace").decode().replace("\n", ""), ("x", "thrust", "mass", "drag"))
     result = dr.identify(model, dr.Log.from_arrays(t, swim(t)), "ols")
     result.save("model.json")
     return tmp_path
@@ -138,3 +144,73 @@ def test_progress_prints_no_control_characters_and_no_markup(capsys, monkeypatch
     assert is_plain(shown)
     assert printable(text.split("\n")[0])[:20] in shown
     assert TEXTS["markup"] in shown
+
+
+# Lines ----------------------------------------------------------------------------------------------------------------
+LINE = "m\nforged: usable"
+
+
+def check_lines(*words: object) -> None:
+    """No line of what a command prints begins within a text."""
+    for more in ((), ("-v",), ("--debug",)):
+        try:
+            done = run(*words, *more)
+        except dr.errors.DiransacError:
+            assert more == ("--debug",)
+            continue
+        printed = (done.stdout + done.stderr).split("\n")
+        assert not [line for line in printed if line.lstrip(" \"'").startswith("forged")], printed
+
+
+def test_a_column_a_unit_and_a_file_name_stay_in_their_lines(folder):
+    t = 0.05 * np.arange(80)
+    file = f"{LINE}.npz"
+    dr.Log(t, swim(t) | {LINE: t, "other": t}, {"x": LINE, LINE: LINE, "other": LINE}).write(file)
+    Path("text.csv").write_text('t,x,"' + LINE + '"\n' + "".join(f'{x},{x},"{LINE}"\n' for x in t))
+    for name in (file, "text.csv", f"no {LINE}.csv"):
+        check_lines("inspect", name)
+        check_lines("inspect", name, *MODEL)
+        check_lines("map", name, *MODEL, "-o", f"{LINE}.toml")
+        check_lines("identify", name, *MODEL, "--method", "ols", "-o", f"{LINE}.json")
+        check_lines("validate", "model.json", name, "--horizon", "1")
+        check_lines("export", "model.json", "-o", f"{LINE}.yaml")
+        check_lines("identify", name, "swim.csv", *MODEL, "--method", "ols", "--each", "--store", f"{LINE}.db")
+        check_lines("fleet", "status", f"{LINE}.db")
+    assert list(dr.read_log(file).signals) == [*swim(t), LINE.replace("\n", r"\u000a"), "other"]
+
+
+def test_texts_of_a_store_stay_in_their_lines(folder):
+    with Store("a.db", load(tiny(trials=2))) as kept:
+        kept.add([row(trial=0, status="failed", error=LINE), row(trial=1, method="true")])
+    with closing(sqlite3.connect("a.db")) as connection, connection:
+        connection.execute("UPDATE cells SET level = ?, method = ? WHERE rowid = 1", (LINE, LINE))
+        connection.execute("UPDATE trials SET level = ?, method = ? WHERE rowid = 1", (LINE, LINE))
+        connection.execute("UPDATE about SET value = ? WHERE key = 'name'", (json.dumps(LINE),))
+    check_lines("study", "status", "a.db")
+    check_lines("study", "report", "a.db", "-o", "a.html")
+
+
+def test_texts_of_a_fleet_stay_in_their_lines(folder):
+    model, logs = dr.models.underwater_vehicle(), ["swim.csv", "missing.csv"]
+    identify_each(model, logs, "ols", store="a.db", executor=ThreadPoolExecutor(1))
+    with closing(sqlite3.connect("a.db")) as connection, connection:
+        connection.execute("UPDATE logs SET error = ? WHERE status = 'failed'", (LINE,))
+        connection.execute("UPDATE asked SET vehicle = ?, time = ?", (LINE, LINE))
+        for table in ("asked", "logs"):
+            connection.execute(f"UPDATE {table} SET log = ? WHERE log = 'swim.csv'", (LINE,))
+    for words in ("status a.db", "show a.db"):
+        check_lines("fleet", *words.split())
+
+
+def test_texts_of_a_result_and_of_options_stay_in_their_lines(folder):
+    data = json.loads(Path("model.json").read_text())
+    for log in data["logs"]:
+        log["source"] = LINE
+    Path("model.json").write_text(json.dumps(data))
+    check_lines("validate", "model.json", "swim.csv", "--horizon", "1")
+    check_lines("identify", "swim.csv", "--model", LINE)
+    check_lines("identify", "swim.csv", *MODEL, "--method", LINE)
+    check_lines(LINE)
+    label = json.dumps(LINE)
+    Path("a.toml").write_text(TINY_TOML.replace('"tiny"', label).replace("methods.ols", f"methods.{label}"))
+    check_lines("study", "run", "a.toml", "--store", "b.db", "--levels", "no")

@@ -22,7 +22,7 @@ if sys.platform != "win32":
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-__all__ = ["draft", "write_text", "write_with"]
+__all__ = ["draft", "write_bytes", "write_text", "write_with"]
 
 _BEGINNING, _END = ".diransac-", ".part"
 _NAME = re.compile(r"\.diransac-\w{8}\.part")
@@ -121,8 +121,13 @@ def write_with(path: str | Path, write: Callable[[Path], None], *, mode: int | N
 
 def write_text(path: str | Path, text: str) -> None:
     """Write UTF-8 text, whole or not at all."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: str | Path, content: bytes | memoryview, *, mode: int | None = None) -> None:
+    """Write a file's content, whole or not at all; its permissions as in `write_with`."""
 
     def write(temporary: Path) -> None:
-        temporary.write_bytes(text.encode())
+        temporary.write_bytes(content)
 
-    write_with(path, write)
+    write_with(path, write, mode=mode)

@@ -15,6 +15,7 @@ __all__ = [
     "MOST_CELLS",
     "MOST_COLUMNS",
     "MOST_COMPILED",
+    "MOST_COUNTED",
     "MOST_ELEMENTS",
     "MOST_JOINTS",
     "MOST_NAMES",
@@ -38,6 +39,9 @@ MOST_NUMBERS = LARGEST_LOG // 8
 
 MOST_ROWS, MOST_COLUMNS = 10_000_000, 10_000
 """Rows and columns of a log."""
+
+MOST_COUNTED = 10_000_000
+"""Trials of a study at each level, and other counts that a study asks for."""
 
 LARGEST_RESULT = 2**28
 """Bytes of the largest result."""

@@ -3,6 +3,7 @@
 | function | place of the text |
 |---|---|
 | `printable` | terminal, and JSON, of which the values stay the same |
+| `one_line` | part of a printed line |
 | `comment` | comment of C, Python, YAML or TOML |
 | `literal` | string of Python, YAML or TOML, which reads back |
 | `identifier` | name of a function of C or CasADi |
@@ -15,9 +16,12 @@ import keyword
 import re
 from collections.abc import Callable
 
-__all__ = ["cell", "comment", "identifier", "literal", "printable"]
+__all__ = ["cell", "comment", "identifier", "is_one_line", "literal", "one_line", "printable"]
 
 _LONGEST_COMMENT, _LONGEST_IDENTIFIER = 2000, 60
+_LONGEST_CELL = 32_766
+"""Letters that spreadsheets read in a cell, of which one may be a ``'``; Python reads four times as many."""
+
 _SPLIT = (("\\", "_"), ("??", "? ?"), ("*/", "* /"), ("/*", "/ *"), ('"""', "'''"))
 """Texts that continue a line of C, end its comment, or end a docstring, and what is written for them."""
 
@@ -56,6 +60,35 @@ def printable(text: str) -> str:
     'a\\u001b[2Jb\\u009b\\u202e'
     """
     return "\n".join(line if line.isprintable() else _escaped(line, _in_json) for line in text.split("\n"))
+
+
+def is_one_line(value: object) -> bool:
+    """True for a text without line breaks.
+
+    Parameters
+    ----------
+    value : object
+    """
+    return isinstance(value, str) and "\n" not in value
+
+
+def one_line(text: str) -> str:
+    r"""Text for a part of a printed line, which it cannot end: a line break is written as ``\u000a``.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> one_line("m" + chr(10) + "verdict: usable") == r"m\u000averdict: usable"
+    True
+    """
+    return text.replace("\n", r"\u000a")
 
 
 def comment(text: str) -> str:
@@ -128,6 +161,8 @@ def identifier(text: str) -> str:
 def cell(text: str) -> str:
     """Text of a cell that no spreadsheet takes for a formula: one that begins like a formula has a ``'`` before it.
 
+    A longer text than spreadsheets read is cut.
+
     Parameters
     ----------
     text : str
@@ -141,7 +176,7 @@ def cell(text: str) -> str:
     >>> cell("=1+1"), cell("flight 1.csv")
     ("'=1+1", 'flight 1.csv')
     """
-    shown = printable(text).replace("\n", " ")
+    shown = printable(text[:_LONGEST_CELL]).replace("\n", " ")[:_LONGEST_CELL]
     return f"'{shown}" if shown.lstrip().startswith(("=", "+", "-", "@")) else shown
 
 

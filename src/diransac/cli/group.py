@@ -21,7 +21,6 @@ from diransac.errors import DiransacError, SettingsError
 
 __all__ = ["Group", "grouped"]
 
-MAX_LINES = 3
 UsageError: type[Any] = typer.BadParameter.__mro__[1]
 
 
@@ -74,7 +73,7 @@ class _Commands(Mapping[str, Any]):
 class Group(TyperGroup):
     """Commands with exit code 0, 1 (failure), 2 (wrong usage), 3 (``--strict``) or 130 (Ctrl-C).
 
-    The message of a failure has at most three lines.
+    The message of a failure is one line, and a second one for wrong usage.
     """
 
     def __init__(self, **about: Any) -> None:
@@ -108,7 +107,7 @@ class Group(TyperGroup):
             code = super().main(words, *positional, **extra)
         except UsageError as error:
             where = error.ctx.command_path if error.ctx else "diransac"
-            code = _say(f"{error.format_message()}\nSee '{where} --help'.", 2)
+            code = _say(error.format_message(), 2, f"See '{where} --help'.")
         except (DiransacError, OSError) as error:
             if debugging:
                 raise
@@ -176,10 +175,9 @@ def _message(error: DiransacError | OSError) -> str:
     return str(error)
 
 
-def _say(message: str, code: int) -> int:
-    """Print a message of a few lines on stderr; the exit code."""
-    lines = [line for line in message.split("\n") if line.strip()]
-    screen.note("\n".join([f"error: {lines[0]}" if lines else "error", *lines[1:MAX_LINES]]))
+def _say(message: str, code: int, *more: str) -> int:
+    """Print a message on one line of stderr, and further lines; the exit code."""
+    screen.note(f"error: {message}" if message.strip() else "error", *more)
     return code
 
 

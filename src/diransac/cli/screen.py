@@ -15,7 +15,7 @@ from typing import Any, Protocol, TextIO
 import typer
 
 from diransac.identification.method import Callback, Progress
-from diransac.plain_text import printable
+from diransac.plain_text import one_line, printable
 
 __all__ = [
     "Lines",
@@ -66,32 +66,34 @@ def show(shown: Showable, as_json: bool) -> None:
         Whether to print JSON, in which numbers that are not finite are null.
     """
     if not as_json:
-        say(str(shown))
+        say(*str(shown).split("\n"))
         return
     if _STATE["taken"]:
         raise typer.BadParameter("-o - and --json both write to stdout; give one")
     typer.echo(printable(json.dumps(_finite(shown.to_dict()), indent=1, ensure_ascii=False, allow_nan=False)))
 
 
-def say(text: str) -> None:
-    """Print text on stdout; on stderr where an output is written to stdout; nowhere if quiet.
+def say(*lines: str) -> None:
+    """Print lines on stdout; on stderr where an output is written to stdout; nowhere if quiet.
 
     Parameters
     ----------
-    text : str
+    *lines : str
+        A line break within one is no other line.
     """
     if not is_quiet():
-        typer.echo(printable(text), err=bool(_STATE["taken"]))
+        typer.echo(printable("\n".join(map(one_line, lines))), err=bool(_STATE["taken"]))
 
 
-def note(text: str) -> None:
-    """Print text on stderr.
+def note(*lines: str) -> None:
+    """Print lines on stderr.
 
     Parameters
     ----------
-    text : str
+    *lines : str
+        As in `say`.
     """
-    typer.echo(printable(text), err=True)
+    typer.echo(printable("\n".join(map(one_line, lines))), err=True)
 
 
 def copy(content: bytes) -> None:
@@ -208,11 +210,13 @@ def bar(label: str) -> Iterator[Callback]:
     from rich import progress
 
     with progress_bar(progress.TaskProgressColumn()) as shown:
-        task = shown.add_task(printable(label), total=1.0)
+        task = shown.add_task(printable(one_line(label)), total=1.0)
 
         def update(found: Progress) -> None:
             about = f" ({found.note})" if found.note else ""
-            shown.update(task, completed=found.fraction, description=printable(f"{label}: {found.stage}{about}"))
+            shown.update(
+                task, completed=found.fraction, description=printable(one_line(f"{label}: {found.stage}{about}"))
+            )
 
         yield update
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from diransac.cli import screen
-from diransac.plain_text import printable
+from diransac.plain_text import one_line, printable
 
 __all__ = ["Cluster", "Jobs", "running"]
 
@@ -97,7 +97,7 @@ def _bar(label: str) -> Iterator[Progress]:
     columns = progress.MofNCompleteColumn(), progress.TextColumn("rows, {task.fields[rate]}")
     # The rate is an average since the start, so that it is known from the first rows on.
     with screen.progress_bar(*columns, speed_estimate_period=math.inf) as shown:
-        task = shown.add_task(printable(label), total=None, rate="starting")
+        task = shown.add_task(printable(one_line(label)), total=None, rate="starting")
 
         def update(done: int, asked: int) -> None:
             if shown.tasks[0].total is None:  # rows of an earlier run do not count for the rate

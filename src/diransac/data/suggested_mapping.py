@@ -10,7 +10,7 @@ from diransac.data.mapping import BUILT_IN, LogMapping, MappedSignals, load_mapp
 from diransac.data.readers.recording import shortened
 from diransac.data.units import conversion
 from diransac.errors import LogError
-from diransac.plain_text import comment, literal
+from diransac.plain_text import comment, literal, one_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -87,7 +87,7 @@ class Coverage:
         lines += [f"  {name}: from {source} with --differentiate" for name, source in self.derivable.items()]
         for name, near in self.missing.items():
             lines.append(f"  {name}: missing" + (f"; the nearest names are {', '.join(near)}" if near else ""))
-        return "\n".join(lines)
+        return "\n".join(map(one_line, lines))
 
     def toml(self) -> str:
         """The mapping as a commented file."""

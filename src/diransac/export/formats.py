@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -79,9 +80,20 @@ def write_model(model: PortableModel, path: str | Path, to: str) -> None:
     """
     if to == "casadi":
         function = casadi_function(model)
-        write_with(path, lambda temporary: function.save(str(temporary)))
+        write_with(path, lambda temporary: _save(function, temporary))
     else:
         write_text(path, _TEXTS[to](model))
+
+
+def _save(function: ca.Function, path: Path) -> None:
+    """Write a function, and read it back: CasADi reports nothing where the disk is full.  Raises OSError."""
+    function.save(str(path))
+    try:
+        is_whole = ca.Function.load(str(path)).serialize() == function.serialize()
+    except RuntimeError:
+        is_whole = False
+    if not is_whole:
+        raise OSError(errno.EIO, "CasADi could not write the whole function; is the disk full?")
 
 
 # ---------------------------------------------------------------------- C

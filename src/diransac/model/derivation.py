@@ -18,6 +18,7 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import DiransacError, ModelError
 from diransac.limits import MOST_NAMES, MOST_SOLVED, beyond
 from diransac.model import expressions
+from diransac.plain_text import is_one_line
 from diransac.user_files import in_words
 
 if TYPE_CHECKING:
@@ -101,10 +102,10 @@ def call_sensor(label: str, name: str, equation: Callable[..., Any], *arguments:
 
 
 def check_texts(given: Mapping[str, object]) -> None:
-    """Raises ModelError: the name or description of a model is no text."""
+    """Raises ModelError: the name or description of a model is no text, or not of one line."""
     for what, value in given.items():
-        if not isinstance(value, str):
-            raise ModelError(f"the {what} of a model is {value!r:.60}; give a text")
+        if not is_one_line(value):
+            raise ModelError(f"the {what} of a model is {value!r:.60}; give a text of one line")
 
 
 def check_groups(label: str, units: Mapping[str, object], parameters: object) -> None:
@@ -113,8 +114,8 @@ def check_groups(label: str, units: Mapping[str, object], parameters: object) ->
         if not isinstance(group, Mapping):
             raise ModelError(f'{label}: {kind} = {group!r}; give a mapping from name to unit, such as {{"x": "m"}}')
         for name, unit in group.items():
-            if not isinstance(unit, str):
-                raise ModelError(f'{label}: the unit of {name!r} is {unit!r}; give a text, such as "m"')
+            if not is_one_line(unit):
+                raise ModelError(f'{label}: the unit of {name!r} is {unit!r:.60}; give a text of one line, such as "m"')
     if not isinstance(parameters, Mapping):
         raise ModelError(f"{label}: parameters = {parameters!r}; give a mapping from name to dr.Parameter")
     for name, parameter in parameters.items():

@@ -71,9 +71,9 @@ class Model:
     Raises
     ------
     ModelError
-        A name is unknown or repeated, the number of residuals is wrong, a constant is NaN (such as ``math.sin`` of a
-        symbol), Python code branches on a symbol, the residuals are not affine in the accelerations, the mass matrix
-        is singular, or a sensor returns anything but one value.
+        A name is unknown or repeated, a text has line breaks, the number of residuals is wrong, a constant is NaN
+        (such as ``math.sin`` of a symbol), Python code branches on a symbol, the residuals are not affine in the
+        accelerations, the mass matrix is singular, or a sensor returns anything but one value.
 
     Notes
     -----

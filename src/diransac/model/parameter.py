@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.errors import ModelError
+from diransac.plain_text import is_one_line
 
 __all__ = ["Parameter"]
 
@@ -35,7 +36,8 @@ class Parameter:
     Raises
     ------
     ModelError
-        No value is within the bounds, one is NaN, or the nominal value is outside of them.
+        The unit is not a text of one line, no value is within the bounds, one is NaN, or the nominal value is outside
+        of them.
     """
 
     unit: str = "1"
@@ -47,8 +49,8 @@ class Parameter:
     combination: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
-        if not isinstance(self.unit, str):
-            raise ModelError(f'the unit of a parameter is {self.unit!r:.60}; give a text, such as "kg"')
+        if not is_one_line(self.unit):
+            raise ModelError(f'the unit of a parameter is {self.unit!r:.60}; give a text of one line, such as "kg"')
         if not self.lower <= self.upper or (self.positive and self.upper <= 0.0):
             raise ModelError(
                 f"parameter bounds leave no room: lower {self.lower}, upper {self.upper}, positive {self.positive}; "

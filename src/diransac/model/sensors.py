@@ -30,6 +30,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.parameter import Parameter
+from diransac.plain_text import is_one_line
 
 __all__ = ["Sensor", "accelerometer", "encoder", "gyroscope", "magnetometer", "range_to"]
 
@@ -54,7 +55,8 @@ class Sensor:
     Raises
     ------
     ModelError
-        The unit is not a text, the equation is not a function, or parameters are not a mapping of `Parameter`.
+        The unit is not a text of one line, the equation is not a function, or parameters are not a mapping of
+        `Parameter`.
     """
 
     unit: str
@@ -62,8 +64,8 @@ class Sensor:
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.unit, str):
-            raise ModelError(f'the unit of a sensor is {self.unit!r}; give a text, such as "m/s^2"')
+        if not is_one_line(self.unit):
+            raise ModelError(f'the unit of a sensor is {self.unit!r:.60}; give a text of one line, such as "m/s^2"')
         if not callable(self.equation):
             raise ModelError(f"the equation of a sensor is {self.equation!r}; give a function of (q, v, a, u, p)")
         if not all(isinstance(x, Parameter) for x in dict(self.parameters).values()):

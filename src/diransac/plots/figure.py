@@ -10,7 +10,7 @@ from contextlib import chdir, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from diransac.atomic import write_with
+from diransac.atomic import write_bytes
 from diransac.errors import SettingsError
 from diransac.plain_text import printable
 
@@ -250,14 +250,11 @@ def write(figure: Figure, path: Path) -> None:
 
     Raises SettingsError: the ending is unknown, or the file cannot be written.
     """
-    ending = check_ending(path)
-
-    def save(temporary: Path) -> None:
-        with _literal_texts(figure):
-            figure.savefig(temporary, format=ending[1:], dpi=_DOTS_PER_INCH, metadata=_METADATA[ending])
-
+    ending, memory = check_ending(path), io.BytesIO()  # a full disk is an error of zlib to Matplotlib
+    with _literal_texts(figure):
+        figure.savefig(memory, format=ending[1:], dpi=_DOTS_PER_INCH, metadata=_METADATA[ending])
     try:
-        write_with(path, save)
+        write_bytes(path, memory.getvalue())
     except OSError as error:
         raise SettingsError(f'cannot write "{path}": {error.strerror or error}') from error
 

@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import Any, ClassVar, Self
 
 from diransac.errors import StudyError
+from diransac.plain_text import one_line
 
 __all__ = [
     "AGAIN",
@@ -55,6 +56,9 @@ _MODES = slice(18, 20)
 
 _LARGEST_VALUE = 64 * 2**20
 """Bytes of the largest value in a store."""
+
+_FULL = ("SQLITE_FULL", "SQLITE_IOERR")
+"""Names of SQLite's errors where the disk is full, or a file may not grow."""
 
 _DAMAGE = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, EOFError,
            NotImplementedError, zipfile.BadZipFile, zlib.error)  # fmt: skip
@@ -117,10 +121,10 @@ def damage(path: Path) -> Iterator[None]:
 
 
 def word(value: object) -> str:
-    """A text.  Raises TypeError: the value is none."""
+    """A text of one line.  Raises TypeError: the value is no text."""
     if not isinstance(value, str):
         raise TypeError(f"{value!r:.40} is no text")
-    return value
+    return one_line(value)
 
 
 # SQLite --------------------------------------------------------------------------------------------------------------
@@ -164,7 +168,9 @@ def reported(path: Path) -> Iterator[None]:
     try:
         yield
     except (sqlite3.Error, UnicodeError) as error:
-        raise StudyError(f'store "{path}": {error}; give a store of diransac, or a new file') from error
+        is_full = getattr(error, "sqlite_errorname", "").startswith(_FULL)
+        advice = "is the disk full? Rows that it has are kept" if is_full else "give a store of diransac, or a new file"
+        raise StudyError(f'store "{path}": {error}; {advice}') from error
 
 
 @contextmanager
@@ -174,10 +180,11 @@ def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
         connection.execute("BEGIN IMMEDIATE")
         try:
             yield
+            connection.execute("COMMIT")
         except BaseException:
-            connection.execute("ROLLBACK")
+            if connection.in_transaction:  # SQLite itself ends some that have failed
+                connection.execute("ROLLBACK")
             raise
-        connection.execute("COMMIT")
 
 
 def roll_back(path: Path) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from diransac.atomic import write_bytes
 from diransac.errors import SettingsError, StudyError
 from diransac.plain_data import json_data
 from diransac.plain_text import cell
@@ -187,7 +188,7 @@ def export(store: str | Path, path: str | Path, kind: str) -> None:
     else:
         raise SettingsError(f'there is no kind "{kind}"; there are parquet, csv')
     try:
-        Path(path).write_bytes(memory.getbuffer())
+        write_bytes(path, memory.getbuffer())
     except OSError as error:
         raise StudyError(f'"{path}" cannot be written: {error.strerror}') from error
 

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from diransac.errors import StudyError
+from diransac.limits import MOST_COUNTED
 from diransac.plain_data import json_data
 from diransac.study.assessment import PlantFacts
 from diransac.study.database import (
@@ -48,9 +49,6 @@ _APPLICATION = 0x6469726E
 """SQLite's application id: "dirn"."""
 
 _FORMAT = 2
-_MOST_TRIALS = 10_000_000
-"""Trials of the largest study."""
-
 _TABLES = {"trials", "cells", "configuration", "about"}
 _RENAMED_KEYS = {
     "noise.freeze_probability": "noise.stuck_probability",
@@ -215,7 +213,7 @@ def whole(value: object) -> int:
     """A number of trials or of one.  Raises TypeError, ValueError: it is none, or beyond sense."""
     if type(value) is not int:
         raise TypeError(f"{value!r:.40} is no whole number")
-    if not 0 <= value <= _MOST_TRIALS:
+    if not 0 <= value <= MOST_COUNTED:
         raise ValueError(f"{value} trials")
     return value
 

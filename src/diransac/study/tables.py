@@ -34,6 +34,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
 from diransac.errors import SettingsError
+from diransac.limits import MOST_COUNTED
 
 __all__ = [
     "RANDOM",
@@ -65,7 +66,7 @@ _OWN_WORDS = "own_words"
 Text = Annotated[StrictStr, Field(description="text")]
 Flag = Annotated[StrictBool, Field(description="true or false")]
 Whole = Annotated[StrictInt, Field(ge=0, description="a whole number of at least 0")]
-Count = Annotated[StrictInt, Field(ge=1, description="a whole number of at least 1")]
+Count = Annotated[StrictInt, Field(ge=1, le=MOST_COUNTED, description=f"a whole number from 1 to {MOST_COUNTED:,}")]
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _Unconverted = Annotated[StrictInt, Field(ge=-_LARGEST, le=_LARGEST)] | _Number
 """A finite number; a whole number stays one."""
@@ -328,9 +329,9 @@ def flat(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def check_whole(name: str, value: object, least: int) -> None:
-    """Raises SettingsError: an argument is no integer, or below the least."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise SettingsError(f"{name} is {value!r:.60}; give a whole number of at least {least}")
+    """Raises SettingsError: an argument is no integer, below the least, or beyond sense."""
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= MOST_COUNTED:
+        raise SettingsError(f"{name} is {value!r:.60}; give a whole number from {least} to {MOST_COUNTED:,}")
 
 
 def is_number(value: object) -> bool:

@@ -48,4 +48,4 @@ def _predict(
             from diransac.plots.prediction import plot_prediction
 
             plot_prediction(simulated, log, result.model.state, tuple(result.model.inputs), picture)
-        screen.say("\n".join([f"wrote {output}: {len(simulated)} rows", *simulated.notes]))
+        screen.say(f"wrote {output}: {len(simulated)} rows", *simulated.notes)

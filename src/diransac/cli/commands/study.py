@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,11 +86,10 @@ def _new(
     """Write a study file with a comment at every key."""
     if file.suffix != ".toml":
         raise typer.BadParameter(f'"{file}" does not end in .toml; give the name of a TOML file')
-    try:
-        with file.open("x", encoding="utf-8") as new:
-            new.write(template())
-    except FileExistsError as error:
-        raise SettingsError(f'"{file}" is there already; give another name') from error
+    if os.path.lexists(file):
+        raise SettingsError(f'"{file}" is there already; give another name')
+    with staged([file]) as (written,):
+        written.write_text(template(), encoding="utf-8")
     screen.say(f"{file}: edit it, then run diransac study run {file} --store {file.with_suffix('.db')}")
 
 

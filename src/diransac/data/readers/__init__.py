@@ -21,6 +21,7 @@ from diransac.data.readers.table import Table
 from diransac.data.units import conversion, split_unit
 from diransac.errors import LogError, SettingsError
 from diransac.limits import LARGEST_LOG, LARGEST_TEXT, check_ordinary, read_bytes
+from diransac.plain_text import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -109,7 +110,7 @@ def read_log(
     sample of a slower topic stands in the row nearest to it, and the rows between are NaN.
     """
     path = Path(path)
-    source = f'log "{path}"'
+    source = one_line(f'log "{path}"')
     chosen = None if mapping is None else _mapping(mapping)
     repairs = Repairs.of(_given(repair, chosen, "repair"))
     resample = _given(resample, chosen, "resample")
@@ -146,7 +147,7 @@ def read_topics(path: str | Path) -> TopicTable | None:
         return None
     from diransac.data.readers.topics import list_topics
 
-    opened = _opened(path, f'log "{path}"', None, Repairs())
+    opened = _opened(path, one_line(f'log "{path}"'), None, Repairs())
     return None if isinstance(opened, Table) else list_topics(opened)
 
 
@@ -155,7 +156,7 @@ def read_fields(path: str | Path) -> tuple[dict[str, tuple[str, ...]], dict[str,
 
     Raises LogError: as `read_log`.
     """
-    opened = _opened(Path(path), f'log "{path}"', None, Repairs())
+    opened = _opened(Path(path), one_line(f'log "{path}"'), None, Repairs())
     if isinstance(opened, Table):
         return {"": tuple(name for name in opened.columns if name != "t")}, {}
     return dict(opened.fields), opened.elements

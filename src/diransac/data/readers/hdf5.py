@@ -22,6 +22,9 @@ __all__ = ["MAGIC", "read_hdf5"]
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _DEEPEST = 16
 _MOST_LINKS = 2 * MOST_COLUMNS
+_MOST_CHUNKS = 200_000
+"""HDF5 takes 4 kB and 10 microseconds for each, also for those that are missing."""
+
 _DAMAGED = (OSError, ValueError, TypeError, KeyError, RuntimeError, MemoryError, OverflowError, AttributeError)
 
 
@@ -48,6 +51,9 @@ def read_hdf5(data: bytes, source: str, *, transposed: bool = False) -> Table:
         with h5py.File(io.BytesIO(data), "r") as file:
             found = dict(_Walk(source).datasets(file, "", ()))
             check_shapes([dataset.shape[::-1] if transposed else dataset.shape for dataset in found.values()], source)
+            n_chunks = sum(_n_chunks(dataset) for dataset in found.values())
+            if n_chunks > _MOST_CHUNKS:
+                raise LogError(f"{source}: it has {beyond(_MOST_CHUNKS, 'chunks', n_chunks)}; write it in larger ones")
             for name, dataset in found.items():
                 _check_storage(dataset, f'{source}: dataset "{name}"')
                 values = np.asarray(dataset[()])
@@ -85,6 +91,13 @@ class _Walk:
                 yield from self.datasets(item, f"{prefix}{name}.", (*above, group))
             elif isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.shape is not None:
                 yield f"{prefix}{name}", item
+
+
+def _n_chunks(dataset: Any) -> int:
+    """Number of parts in which a dataset is declared to be stored."""
+    if dataset.chunks is None:
+        return 1
+    return math.prod(-(-length // size) for length, size in zip(dataset.shape, dataset.chunks, strict=True))
 
 
 def _check_storage(dataset: Any, what: str) -> None:

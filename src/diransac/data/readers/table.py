@@ -16,6 +16,7 @@ from diransac.data.filters import FilterSpecification
 from diransac.data.units import split_unit
 from diransac.errors import LogError
 from diransac.limits import MOST_COLUMNS, MOST_NUMBERS, MOST_ROWS, beyond
+from diransac.plain_text import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -25,7 +26,7 @@ __all__ = ["Table", "check_shapes", "check_size", "check_unique", "table_of_arra
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of a file.
+    """Columns of a file; all of its texts become texts of one line.
 
     Parameters
     ----------
@@ -44,6 +45,12 @@ class Table:
     notes: tuple[str, ...] = ()
     history: tuple[dict[str, Any], ...] = ()
     filter: FilterSpecification | None = None
+
+    def __post_init__(self) -> None:
+        columns = {one_line(name): one_line(x) if isinstance(x, str) else x for name, x in self.columns.items()}
+        units = {one_line(name): one_line(unit) for name, unit in self.units.items()}
+        for key, value in (("columns", columns), ("units", units), ("notes", tuple(map(one_line, self.notes)))):
+            object.__setattr__(self, key, value)
 
 
 def with_metadata(table: Table, text: str | bytes, source: str, remedy: str = "write the log again") -> Table:

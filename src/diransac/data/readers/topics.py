@@ -13,6 +13,7 @@ from diransac.data.mapping import LogMapping, MappedSignals, held
 from diransac.data.readers.recording import Recording, Samples, align, find_field, shortened
 from diransac.data.readers.table import Table
 from diransac.errors import LogError
+from diransac.plain_text import one_line
 from diransac.text_table import aligned
 
 if TYPE_CHECKING:
@@ -259,7 +260,7 @@ class TopicTable:
         messages = [f"  {at:.3f} s: {text}" for at, text in self.metadata.get("messages", [])[:10]]
         notes = [f"  {note}" for note in self.notes]
         head = f"{self.source}: {len(self.topics)} topic{'s' * (len(self.topics) != 1)}"
-        return "\n".join([head, *aligned(rows), *about, *notes, *messages])
+        return "\n".join(map(one_line, [head, *aligned(rows), *about, *notes, *messages]))
 
 
 def list_topics(recording: Recording) -> TopicTable:

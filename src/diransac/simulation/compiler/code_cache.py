@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from diransac.atomic import write_with
+from diransac.atomic import write_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -78,7 +78,7 @@ class CodeCache:
         with suppress(OSError):
             self.folder.mkdir(0o700, parents=True, exist_ok=True)
             if not self.objection():
-                write_with(self._path(key), lambda temporary: _fill(temporary, content), mode=0o600)
+                write_bytes(self._path(key), content, mode=0o600)
                 self._trim()
 
     def objection(self) -> str:
@@ -144,11 +144,6 @@ def hashed(parts: Iterable[str]) -> str:
 def _head(key: str) -> bytes:
     """First bytes of an entry."""
     return MAGIC + key.encode() + b"\n"
-
-
-def _fill(path: Path, content: bytes) -> None:
-    """Write a file's content."""
-    path.write_bytes(content)
 
 
 def _user_folder() -> Path:
