@@ -150,17 +150,20 @@ def test_log_and_its_arrays_are_left_alone():
 
 
 @pytest.mark.parametrize(
-    ("name", "unit", "hint"),
-    [
-        ("theta", "deg", "--scale theta=0.0174533"),
-        ("thrust", "kN", "--scale thrust=1000"),
-        ("x_ddot", "g", "--scale x_ddot=9.80665"),
-        ("thrust", "V", "check the column"),
-    ],
+    ("name", "unit", "factor"), [("theta", "deg", np.pi / 180.0), ("thrust", "kN", 1e3), ("x_ddot", "g", 9.80665)]
 )
-def test_unit_that_is_not_the_models_is_refused_with_the_scale_to_pass(name, unit, hint):
-    with pytest.raises(LogError, match=f'"{name}" is in {unit}, the model needs .*{hint}'):
-        bind_log(MODEL, plane_log(units={name: unit}))
+def test_unit_that_is_not_the_models_is_converted_with_a_note(name, unit, factor):
+    log = plane_log(units={name: unit})
+    segment = bind_log(MODEL, log)
+    np.testing.assert_allclose(segment.log[name], factor * log[name], rtol=1e-15)
+    assert segment.log.units[name] == MODEL.units[name]
+    assert f"converted: {name} from {unit} to {MODEL.units[name]}" in segment.notes
+    assert segment.log.history[-1] == {"step": "units", "from": {name: unit}, "to": {name: MODEL.units[name]}}
+
+
+def test_unit_of_another_dimension_is_refused():
+    with pytest.raises(LogError, match='"thrust" is in V, the model needs N; check the column'):
+        bind_log(MODEL, plane_log(units={"thrust": "V"}))
 
 
 def test_unit_in_another_spelling_is_the_same():

@@ -13,7 +13,6 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.log import Log
-from diransac.data.units import conversion, same_unit
 from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
@@ -42,7 +41,7 @@ class Segment:
     ----------
     model : Model
     log : Log
-        The log, with continuous coordinates; see `preprocessing.continuous`.
+        The log in the model's units, with continuous coordinates; see `preprocessing.in_units` and `continuous`.
     offset : int
         Row of the log that is row 0 of the arrays: the first that counts.
     signals : tuple of str
@@ -165,9 +164,8 @@ class Segment:
         coordinate = name.removesuffix("_dot")
         if rule == "robust" and self.model.kinematics is None and coordinate in self.present:
             return self._line(coordinate, _ROWS_FOR_SLOPE)[1]
-        hint = "" if name in self.model.first_order else "pass --differentiate, or "
         raise LogError(
-            f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; {hint}give '
+            f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; give '
             f"initial_state = {{{name} = ...}}"
         )
 
@@ -222,7 +220,7 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     Raises
     ------
     LogError
-        A signal is missing, all NaN, infinite, too large to square, or in another unit; too few rows.
+        A signal is missing, all NaN, infinite, too large to square, or of another dimension; too few rows.
     """
     needed = model.required_signals if pointwise else tuple(model.inputs)
     for name in needed:
@@ -233,8 +231,7 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
         _raise_missing(model, log, model.signals[0])
     used = [n for n in (*signals, *model.inputs) if n in log]
     log.check(used)
-    _check_units(model, log, used)
-    log = preprocessing.continuous(log, model)
+    log = preprocessing.continuous(preprocessing.in_units(log, model), model)
     inputs, held = _held_inputs(model, log)
     measured = np.column_stack([log[n] for n in signals])
     gaps = long_runs(held, _LONG_HOLD) | silent_rows(np.isfinite(measured), log.dt)
@@ -250,6 +247,7 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     offset = int(np.argmax(valid))
     notes = (
         *log.notes,
+        *_unmeasured_notes(model, log, signals),
         *_row_notes(valid, held & ~gaps, sampled=known.any(axis=1) | gaps),
         *_gap_notes(log, gaps, offset),
     )
@@ -345,23 +343,13 @@ def silent_rows(known: BoolArray, dt: float) -> BoolArray:
 def _raise_missing(model: Model, log: Log, name: str) -> None:
     hint = "name its column with --map"
     if name in model.first_order:
-        hint = "estimate it by lo-diransac, of all methods the only one that can, with --differentiate"
+        hint = "estimate it by lo-diransac, of all methods the only one that can"
     elif name in model.velocities or name in model.accelerations:
-        hint = "pass --differentiate to estimate velocities and accelerations"
+        hint = "pass --differentiate to estimate velocities and accelerations, or use lo-diransac, which needs none"
     if name in log.unusable:
         raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; correct the column, or {hint}')
     found = ", ".join(("t", *log.names))
     raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}.')
-
-
-def _check_units(model: Model, log: Log, names: Sequence[str]) -> None:
-    for name in names:
-        found, wanted = log.units.get(name), model.units[name]
-        if found is None or same_unit(found, wanted):
-            continue
-        factor = conversion(found, wanted)
-        hint = f"pass --scale {name}={factor:.6g}" if factor is not None else "check the column"
-        raise LogError(f'{log.source}: signal "{name}" is in {found}, the model needs {wanted}; {hint}')
 
 
 def _held_inputs(model: Model, log: Log) -> tuple[FloatArray, BoolArray]:
@@ -375,6 +363,14 @@ def _held_inputs(model: Model, log: Log) -> tuple[FloatArray, BoolArray]:
         held |= ~good & (last >= 0)
         columns.append(np.where(last >= 0, column[last], np.nan))
     return np.column_stack(columns) if columns else np.zeros((len(log), 0)), held
+
+
+def _unmeasured_notes(model: Model, log: Log, signals: Sequence[str]) -> list[str]:
+    """A note on coordinates that act on what is measured, and that the log lacks; none where it has all."""
+    absent = [n for n in model.coordinates if n not in log]
+    acting = absent and set(model.states_behind(signals))
+    found = ", ".join(("t", *log.names))
+    return [f'"{n}" is not in the log, and counts as unmeasured; found {found}' for n in absent if n in acting]
 
 
 def _row_notes(valid: BoolArray, held: BoolArray, sampled: BoolArray) -> list[str]:

@@ -46,6 +46,10 @@ class Table:
     history: tuple[dict[str, Any], ...] = ()
     filter: FilterSpecification | None = None
 
+    def with_step(self, step: Mapping[str, Any]) -> Table:
+        """The table with one more step in its history."""
+        return replace(self, history=(*self.history, dict(step)))
+
 
 def with_metadata(table: Table, text: str | bytes, source: str, remedy: str = "write the log again") -> Table:
     """Table completed by the metadata of its file; units in headers, which an editor may have changed, prevail.
