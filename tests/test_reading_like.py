@@ -113,3 +113,12 @@ def test_derived_columns_are_not_judged_as_measured():
     assert set(dr.validate(plant, derived).rmse) == {"position"}
     result = dr.identify(model, derived)
     assert set(result.diagnosis.outlier_fraction) == {"position"}
+
+
+def test_a_table_of_a_spreadsheet_with_decimal_commas_needs_no_option(tmp_path):
+    rows = (f"{1e3 * t:.4f};{x:.6f}".replace(".", ",") for t, x in zip(T, X, strict=True))
+    (tmp_path / "a.csv").write_text("\r\n".join(["\ufeffTime [ms];x (mm)", *rows]) + "\r\n", encoding="utf-8")
+    log = read_log(tmp_path / "a.csv")
+    np.testing.assert_allclose(log.time, T, atol=1e-12)
+    np.testing.assert_allclose(log["x"], X, atol=1e-6)
+    assert log.units == {"x": "mm"}

@@ -375,8 +375,8 @@ class Log:
         Notes
         -----
         The columns are the time ``t`` and the signals.  Units, filter, history, notes and the reasons for unusable
-        columns are metadata: a first line ``# diransac: {...}`` of CSV text, which other tools skip with
-        ``comment="#"``, a key of a Parquet file, or a member of an NPZ archive.  The file is written whole or not at
+        columns are metadata: of CSV text in the file ``NAME.csv-metadata.json`` beside it (CSV on the Web), which is to
+        be moved with it; a key of a Parquet file; or a member of an NPZ archive.  The file is written whole or not at
         all.
         """
         facts = Metadata(self.units, self.filter, self.history, self.notes, self.unusable)

@@ -14,12 +14,13 @@ from diransac.arrays import FloatArray
 from diransac.data import preprocessing
 from diransac.data.checks import check_clock, check_names
 from diransac.data.clock import Gridded, in_order, is_even, on_own_grid, runs_freely
+from diransac.data.files import place_of_metadata
 from diransac.data.log import Log
 from diransac.data.preprocessing.steps import check_factor, origins_of, rename_columns, resample_columns
 from diransac.data.readers.recording import Samples
 from diransac.data.readers.repair import Repairs
 from diransac.data.readers.repeated import Reading
-from diransac.data.readers.table import Table
+from diransac.data.readers.table import Table, with_metadata
 from diransac.data.readers.time_column import seconds, time_column, unit_of_name
 from diransac.data.units import split_unit
 from diransac.errors import LogError, SettingsError
@@ -91,8 +92,8 @@ def read_log(
         even.
     like : iterable of dict, optional
         History of a log of the same recorder, such as ``result.logs[0].preparation``.  Its mapping, names, factors,
-        rates, repairs, delays and despiking apply where the arguments above give none, unless a diransac wrote the
-        file, with all of these done.
+        rates, repairs, delays and despiking apply where the arguments above give none.  What the history in the file
+        itself has is not done again.
 
     Returns
     -------
@@ -118,13 +119,16 @@ def read_log(
     """
     path = Path(path)
     source = f'log "{path}"'
+    like = list(like)
     earlier = Reading.of(like)
     chosen = earlier.mapping if mapping is None else _mapping(mapping)
     repairs = Repairs.of(_given(earlier.repairs if repair is None else repair, chosen, "repair"))
     columns = earlier.columns if columns is None else columns
     opened = _opened(path, source, columns, repairs)
-    if isinstance(opened, Table) and opened.history:
-        earlier, chosen = Reading(), None if mapping is None else chosen
+    if isinstance(opened, Table):
+        done = {step["step"] for step in opened.history}
+        earlier = Reading.of(step for step in like if step["step"] not in done)
+        chosen = earlier.mapping if mapping is None else chosen
     resample = _given(earlier.resample if resample is None else resample, chosen, "resample")
     if isinstance(opened, Table):
         opened = opened if columns is None else opened.with_step({"step": "columns", "names": list(columns)})
@@ -272,7 +276,7 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
     if columns is not None and ending not in _TEXTS:
         raise LogError(f"{source}: names of columns are those of CSV text without a header; leave them out")
     if ending in _TEXTS:
-        return _imported(_TEXTS[ending])(_content(path, source), source, columns, repairs)
+        return _described(path, _imported(_TEXTS[ending])(_content(path, source), source, columns, repairs), source)
     if ending is not None:
         return _imported(_TABLES[ending])(_content(path, source), source)
     from diransac.data.readers.crazyflie import MAGIC, CrazyflieRecording
@@ -283,6 +287,14 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
     if is_crazyflie:
         return CrazyflieRecording(_content(path, source), source)
     raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}')
+
+
+def _described(path: Path, read: Table | Recording, source: str) -> Table | Recording:
+    """A table with the metadata of the file beside it, where there is one."""
+    beside = place_of_metadata(path)
+    if not beside.is_file() or not isinstance(read, Table) or read.is_described:
+        return read
+    return with_metadata(read, _content(beside, f'metadata "{beside}"'), source, f'remove "{beside}"')
 
 
 def _imported(place: str) -> Callable[..., Table | Recording]:

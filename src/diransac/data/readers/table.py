@@ -38,6 +38,8 @@ class Table:
         Findings of the reader, a sentence each.
     history, filter
         Those of the log that was written to the file, as in `Log`.
+    is_described : bool
+        True with the metadata of a log.
     """
 
     columns: Mapping[str, FloatArray | str]
@@ -45,6 +47,7 @@ class Table:
     notes: tuple[str, ...] = ()
     history: tuple[dict[str, Any], ...] = ()
     filter: FilterSpecification | None = None
+    is_described: bool = False
 
     def with_step(self, step: Mapping[str, Any]) -> Table:
         """The table with one more step in its history."""
@@ -64,6 +67,7 @@ def with_metadata(table: Table, text: str | bytes, source: str, remedy: str = "w
         notes=(*facts.notes, *table.notes),
         history=facts.history,
         filter=facts.filter,
+        is_described=True,
     )
 
 
