@@ -301,3 +301,13 @@ def test_start_of_a_model_with_velocities_of_its_own_is_named_as_the_model_names
     segment = bind_log(model, dr.Log.from_arrays(np.arange(30) * 0.01, columns), pointwise=False)
     with pytest.raises(LogError, match='"wx"'):
         segment.initial_state("robust")
+
+
+def test_inputs_are_interpolated_in_lost_rows_and_held_in_others():
+    log = plane_log({((20, 21), name): np.nan for name in (*MODEL.signals, *MODEL.inputs)} | {(30, "thrust"): np.nan})
+    segment = bind_log(MODEL, log)
+    thrust = segment.inputs[:, 0]
+    np.testing.assert_allclose(thrust[20:22], np.interp([20, 21], [19, 22], log["thrust"][[19, 22]]), rtol=1e-12)
+    assert thrust[30] == log["thrust"][29]
+    assert "inputs were interpolated in 2 lost rows" in segment.notes
+    assert "inputs were held from the last good sample in 1 rows, where they are NaN" in segment.notes
