@@ -68,14 +68,17 @@ def in_order(time: FloatArray, source: str) -> IntArray:
 
     Raises LogError: stamps are not finite, or more than a few are repeated or run backwards.
     """
-    steps, n = np.diff(time), len(time)
-    if n < 2 or not np.isfinite(time).all() or steps.min() > 0.0:
+    n = len(time)
+    if n < 2 or not np.isfinite(time).all():
+        checks.check_time_order(time, source)
+    steps = np.diff(time)
+    if steps.min() > 0.0:
         checks.check_time_order(time, source)
         return np.arange(n)
     rows = np.argsort(time, kind="stable")
     rows = rows[np.r_[True, np.diff(time[rows]) > 0.0]]
     usual = float(np.median(np.diff(time[rows]))) if len(rows) > 1 else 0.0
-    if float(steps.min()) < -_FURTHEST_BACK * usual or n - len(rows) > max(1.0, _MOST_REPEATED * n):
+    if len(rows) < 2 or steps.min() < -_FURTHEST_BACK * usual or n - len(rows) > max(1.0, _MOST_REPEATED * n):
         checks.check_time_order(time, source)
     return rows
 
@@ -99,13 +102,17 @@ def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str
     if is_even(time):
         return Gridded(time, signals, np.ones(len(time), bool))
     dt = float(np.median(np.diff(time[rows])))
+    with np.errstate(over="ignore"):
+        n_new = float(time[rows[-1]] - time[rows[0]]) / dt
+    if not n_new < max(_MANY_ROWS, _MOST_NEW * len(time)):
+        checks.check_even(time[rows], source)
     dt = _interval(time[rows], _places(time[rows], dt)[0])
     places, off = _places(time[rows], dt)
     kept = _kept(places, off)
     n, n_gaps = int(places[kept].max()) + 1, int((np.diff(places[kept]) > 1).sum())
     n_repeated = len(time) - int(kept.sum())
     is_grid = (np.abs(off) > _OFF_GRID).mean() <= _MOST_OFF and n_gaps <= _MOST_GAPS * len(rows)
-    if not is_grid or n_repeated > max(1.0, _MOST_REPEATED * len(time)) or n > max(_MANY_ROWS, _MOST_NEW * len(time)):
+    if not is_grid or n_repeated > max(1.0, _MOST_REPEATED * len(time)):
         checks.check_even(time[rows], source)
         raise LogError(f"{source}: {n_repeated} of {len(time)} rows repeat a time; remove them")
     rows, at = rows[kept], places[kept]

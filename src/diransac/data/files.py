@@ -144,7 +144,7 @@ def decode_metadata(text: str | bytes, source: str, remedy: str) -> Metadata:
 
     try:
         found = json_data(text)
-        facts = _of_csv_on_the_web(found) if "@context" in found else found
+        facts = _of_csv_on_the_web(found) if isinstance(found, dict) and "@context" in found else found
         version = facts.get("version")
         if version == _VERSION:
             return _metadata(facts)
