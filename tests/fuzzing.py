@@ -32,6 +32,8 @@ from diransac.model.model import _checksum
 from hostile import NAMES, TEXTS
 from read_back import check_printed, check_reads_back
 
+BESIDE = "-metadata.json"
+"""Ending of the metadata beside a CSV file."""
 MOST_LINES, MOST_SECONDS, MOST_MEMORY = 3, 60, 2**30
 """Lines on stderr, s, and bytes by which the largest size of the process may grow in one command."""
 
@@ -160,14 +162,16 @@ def outcome(folder: Path, words: Sequence[str], outputs: Sequence[str] = (), mem
     assert not watch.seen, f"{words}: {watch.seen}"
     after = listing(folder)
     made = {name for name in after if after[name] != before.get(name)} | (before.keys() - after.keys())
-    allowed = set(outputs) if done.exit_code == 0 else set()
+    described = {f"{name}{BESIDE}" for name in outputs if name.endswith((".csv", ".csv.gz"))}
+    allowed = {*outputs, *described} if done.exit_code == 0 else set()
     assert made <= allowed, f"{words}: exit code {done.exit_code} leaves {made - allowed}"
     grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - largest)
     assert grown < memory, f"{words}: {grown / 2**20:.0f} MiB more"
     assert threading.active_count() < 64
     check_printed(words, done.stdout, done.stderr)
-    for name in made:
+    for name in made - described:  # a table with its metadata
         check_reads_back(folder / name)
+    for name in made:
         (folder / name).unlink()
     return done.exit_code
 

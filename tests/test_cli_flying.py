@@ -140,7 +140,7 @@ def test_simulate_takes_every_field_of_the_noise(folder: Path):
 def test_simulate_draws_the_flight_beside_the_log(folder: Path):
     done = run("simulate", "square", *OUTLIERS, "-o", "flight.csv", "--plot", "flight.png")
     assert done.exit_code == 0
-    assert set(contents(folder)) == {"flight.csv", "flight.png"}
+    assert set(contents(folder)) == {"flight.csv", "flight.csv-metadata.json", "flight.png"}
     assert Path("flight.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -92,8 +92,8 @@ def test_inspect_shows_a_log_whose_clock_is_uneven(folder: Path):
     clock = [f"{now!r},{row.split(',', 1)[1]}" for now, row in zip(t.tolist(), rows[1:], strict=True)]
     Path("gap.csv").write_text("\n".join([rows[0], *clock]) + "\n")
     found = json.loads(run("inspect", "gap.csv", "--json").stdout)
-    assert run("identify", "gap.csv", *MODEL).exit_code == 1
-    assert any("gap" in note for note in found["notes"])
+    assert run("identify", "gap.csv", *MODEL).exit_code == 0
+    assert sum("gap" in note for note in found["notes"]) == 1
     assert found["signals"]["x"]["n_missing"] > 90
 
 

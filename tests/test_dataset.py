@@ -150,17 +150,20 @@ def test_log_and_its_arrays_are_left_alone():
 
 
 @pytest.mark.parametrize(
-    ("name", "unit", "hint"),
-    [
-        ("theta", "deg", "--scale theta=0.0174533"),
-        ("thrust", "kN", "--scale thrust=1000"),
-        ("x_ddot", "g", "--scale x_ddot=9.80665"),
-        ("thrust", "V", "check the column"),
-    ],
+    ("name", "unit", "factor"), [("theta", "deg", np.pi / 180.0), ("thrust", "kN", 1e3), ("x_ddot", "g", 9.80665)]
 )
-def test_unit_that_is_not_the_models_is_refused_with_the_scale_to_pass(name, unit, hint):
-    with pytest.raises(LogError, match=f'"{name}" is in {unit}, the model needs .*{hint}'):
-        bind_log(MODEL, plane_log(units={name: unit}))
+def test_unit_that_is_not_the_models_is_converted_with_a_note(name, unit, factor):
+    log = plane_log(units={name: unit})
+    segment = bind_log(MODEL, log)
+    np.testing.assert_allclose(segment.log[name], factor * log[name], rtol=1e-15)
+    assert segment.log.units[name] == MODEL.units[name]
+    assert f"converted: {name} from {unit} to {MODEL.units[name]}" in segment.notes
+    assert segment.log.history[-1] == {"step": "units", "from": {name: unit}, "to": {name: MODEL.units[name]}}
+
+
+def test_unit_of_another_dimension_is_refused():
+    with pytest.raises(LogError, match='"thrust" is in V, the model needs N; check the column'):
+        bind_log(MODEL, plane_log(units={"thrust": "V"}))
 
 
 def test_unit_in_another_spelling_is_the_same():
@@ -298,3 +301,13 @@ def test_start_of_a_model_with_velocities_of_its_own_is_named_as_the_model_names
     segment = bind_log(model, dr.Log.from_arrays(np.arange(30) * 0.01, columns), pointwise=False)
     with pytest.raises(LogError, match='"wx"'):
         segment.initial_state("robust")
+
+
+def test_inputs_are_interpolated_in_lost_rows_and_held_in_others():
+    log = plane_log({((20, 21), name): np.nan for name in (*MODEL.signals, *MODEL.inputs)} | {(30, "thrust"): np.nan})
+    segment = bind_log(MODEL, log)
+    thrust = segment.inputs[:, 0]
+    np.testing.assert_allclose(thrust[20:22], np.interp([20, 21], [19, 22], log["thrust"][[19, 22]]), rtol=1e-12)
+    assert thrust[30] == log["thrust"][29]
+    assert "inputs were interpolated in 2 lost rows" in segment.notes
+    assert "inputs were held from the last good sample in 1 rows, where they are NaN" in segment.notes

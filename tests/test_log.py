@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import json
 import pickle
 import re
 
@@ -12,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from diransac.data.files import place_of_metadata
 from diransac.data.filters import FilterSpecification
 from diransac.data.log import Log
 from diransac.data.preprocessing import differentiate, rename, scale
@@ -69,11 +71,12 @@ def test_integers_and_booleans_become_floats():
         ([0.0], "at least 2 rows; found 1"),
         ([0.0, 1.0, np.nan, 3.0], "time is nan at row 2"),
         ([0.0, 1.0, np.inf, 3.0], "time is inf at row 2"),
-        ([0.0, 1.0, 1.0, 2.0], "time 1 s repeats at row 2; remove the duplicate"),
         ([0.0, 1.0, 1.0, 1.0], r"repeats at row 2 \(and 1 more like it\)"),
-        ([0.0, 2.0, 1.0, 3.0], "time runs backwards at row 2: 1 s follows 2 s; sort"),
-        ([0.0, 1.0, 2.0, 5.0, 6.0], r"1 gap, the longest after t = 2 s \(row 2\) is 3 s long, the usual interval 1 s"),
-        ([0.0, 1.0, 2.3, 3.0, 4.0], r"most uneven interval after t = 1 s \(row 1\) is 1.3 s long"),
+        ([0.0, 1.0, 2.0, 3.0, 4.0, 0.0], "time runs backwards at row 5: 0 s follows 4 s; sort"),
+        (
+            [0.0, 1.0, 2.0, 20.0, 20.5],
+            r"1 gap, the longest after t = 2 s \(row 2\) is 18 s long, the usual interval 1 s",
+        ),
     ],
 )
 def test_a_time_that_cannot_be_used_is_refused_with_the_place(time, message):
@@ -297,14 +300,17 @@ def test_the_same_log_gives_the_same_bytes_and_nothing_else(tmp_path, ending):
     for path in paths:
         path.parent.mkdir()
         example().write(path)
-        assert list(path.parent.iterdir()) == [path]
-    assert paths[0].read_bytes() == paths[1].read_bytes()
+        beside = [place_of_metadata(path)] if ".csv" in ending else []
+        assert sorted(path.parent.iterdir()) == [path, *beside]
+    for name in {x.name for x in paths[0].parent.iterdir()}:
+        assert (paths[0].parent / name).read_bytes() == (paths[1].parent / name).read_bytes()
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_failed_write_leaves_the_existing_file(tmp_path, ending, monkeypatch):
     path = tmp_path / f"a{ending}"
     path.write_bytes(b"precious")
+    place_of_metadata(path).write_bytes(b"of the precious")
 
     def refuse(self, target):
         raise OSError(28, "No space left on device")
@@ -312,8 +318,9 @@ def test_a_failed_write_leaves_the_existing_file(tmp_path, ending, monkeypatch):
     monkeypatch.setattr("pathlib.Path.replace", refuse)
     with pytest.raises(LogError, match=r"cannot write .* No space left"):
         example().write(path)
-    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    assert sorted(tmp_path.iterdir()) == [path, place_of_metadata(path)]
     assert path.read_bytes() == b"precious"
+    assert place_of_metadata(path).read_bytes() == b"of the precious"
 
 
 def test_an_unknown_ending_or_folder_is_refused(tmp_path):
@@ -430,9 +437,9 @@ def test_other_tools_read_the_columns(tmp_path):
     with np.load(tmp_path / "a.npz") as arrays:
         assert np.array_equal(arrays["position"], log["position"])
     for frame in (
-        pl.read_csv(tmp_path / "a.csv", comment_prefix="#"),
-        pd.read_csv(tmp_path / "a.csv", comment="#"),
-        pd.read_csv(tmp_path / "a.csv.gz", comment="#"),
+        pl.read_csv(tmp_path / "a.csv"),
+        pd.read_csv(tmp_path / "a.csv"),
+        pd.read_csv(tmp_path / "a.csv.gz"),
         pl.read_parquet(tmp_path / "a.parquet"),
     ):
         assert list(frame.columns) == ["t", *log.names]
@@ -441,8 +448,55 @@ def test_other_tools_read_the_columns(tmp_path):
 
 def test_a_log_without_facts_is_written_without_metadata(tmp_path):
     log = Log.from_arrays([0, 1], {"x": [0, 1]})
+    example().write(tmp_path / "a.csv")  # whose metadata are removed
     log.write(tmp_path / "a.csv")
     assert (tmp_path / "a.csv").read_text() == "t,x\n0.0,0.0\n1.0,1.0\n"
+    assert list(tmp_path.iterdir()) == [tmp_path / "a.csv"]
+
+
+def test_metadata_beside_a_table_are_csv_on_the_web(tmp_path):
+    log = Log.from_arrays([0, 1], {"x": [0, 1], "u": [2, 3]}, {"x": "mm"}).with_step({"step": "mine"})
+    log.write(tmp_path / "a.csv")
+    found = json.loads((tmp_path / "a.csv-metadata.json").read_text())
+    assert found == {
+        "@context": "http://www.w3.org/ns/csvw",
+        "url": "a.csv",
+        "tableSchema": {
+            "columns": [
+                {"titles": "t", "datatype": "number", "schema:unitText": "s"},
+                {"titles": "x", "datatype": "number", "schema:unitText": "mm"},
+                {"titles": "u", "datatype": "number"},
+            ]
+        },
+        "notes": [{"diransac": {"version": 1, "history": [{"step": "mine"}]}}],
+    }
+
+
+def test_metadata_of_another_tool_give_units(tmp_path):
+    (tmp_path / "a.csv").write_text("t,x\n0,1\n1,2\n")
+    columns = [{"titles": "t"}, {"titles": "x", "schema:unitText": "mm"}]
+    content = {"@context": "http://www.w3.org/ns/csvw", "url": "a.csv", "tableSchema": {"columns": columns}}
+    (tmp_path / "a.csv-metadata.json").write_text(json.dumps(content))
+    assert read_log(tmp_path / "a.csv").units == {"x": "mm"}
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"@context": 1, "tableSchema": []}', '{"@context": 1, "notes": 3}'])
+def test_damaged_metadata_beside_a_table_are_refused_with_the_remedy(tmp_path, text):
+    (tmp_path / "a.csv").write_text("t,x\n0,1\n1,2\n")
+    (tmp_path / "a.csv-metadata.json").write_text(text)
+    with pytest.raises(LogError, match=r'metadata are damaged .*; remove ".*a\.csv-metadata\.json"'):
+        read_log(tmp_path / "a.csv")
+
+
+def test_the_first_line_of_earlier_versions_is_still_read(tmp_path):
+    (tmp_path / "a.csv").write_text('# diransac: {"version": 1, "units": {"x": "m"}}\nt,x\n0,1\n1,2\n')
+    assert read_log(tmp_path / "a.csv").units == {"x": "m"}
+
+
+def test_the_footer_of_parquet_has_the_metadata(tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="NOT CHECKED with pyarrow, which is missing")
+    example().write(tmp_path / "a.parquet")
+    assert b"diransac" in parquet.read_metadata(tmp_path / "a.parquet").metadata
 
 
 def test_a_step_that_json_cannot_hold_is_refused(tmp_path):

@@ -255,9 +255,6 @@ REFUSED = {
     "comments": "line",
     "rows": "line 301 has 1 fields",
     "timestamps": 'the time column "t" is not numeric',
-    "sort": "time runs backwards",
-    "duplicates": "repeats",
-    "clock": "time is not uniform",
 }
 
 

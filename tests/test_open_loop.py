@@ -150,3 +150,17 @@ def test_prediction_from_the_command_line(result, log, tmp_path, monkeypatch):
     assert done.exit_code == 1
     assert run("predict", "model.json", "flight.csv", "-o", "none.txt").exit_code == 2
     assert not list(tmp_path.glob("none*"))
+
+
+def test_velocities_that_are_no_derivatives_start_from_the_smoothed_motion():
+    model = dr.models.differential_drive()
+    parameters = {"mass": 20.0, "inertia": 1.0, "moment": 0.2, "viscous_friction": 0.5, "dry_friction": 0.1}
+    t = 0.01 * np.arange(1000.0)
+    torques = {"left_torque": 2.0 + np.sin(0.7 * t), "right_torque": 2.2 + np.sin(0.9 * t)}
+    start = dict.fromkeys(model.state, 0.0) | {"speed": 0.5}
+    plant = dr.Plant(model, parameters)
+    moved = dr.simulate(plant, dr.Log.from_arrays(t, torques), initial_state=start)
+    poses = dr.Log.from_arrays(t, {**{n: moved[n] for n in model.coordinates}, **torques})
+    again = dr.simulate(plant, poses, horizon=1.0)
+    assert np.abs(again["x"] - moved["x"]).max() < 0.01 * np.ptp(moved["x"])
+    assert np.abs(again["yaw"] - moved["yaw"]).max() < 0.01 * np.ptp(moved["yaw"])

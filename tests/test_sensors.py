@@ -368,12 +368,12 @@ def test_inspection_rates_the_parameters_of_sensors(model, columns):
     assert found.fitness.excitation["acc_arm_x"].verdict == "well"
 
 
-def test_a_sensor_in_another_unit_is_refused(model, columns):
-    log = dr.Log.from_arrays(
-        columns["t"], {n: x for n, x in columns.items() if n != "t"}, {"gyro": "deg/s"}, source="flight"
-    )
+def test_a_sensor_in_another_unit_is_converted_and_of_another_dimension_refused(model, columns):
+    signals = {n: x for n, x in columns.items() if n != "t"}
+    (segment,) = Dataset.of(model, dr.Log.from_arrays(columns["t"], signals, {"gyro": "deg/s"})).segments
+    np.testing.assert_allclose(segment.column("gyro"), np.deg2rad(columns["gyro"])[segment.offset :], rtol=1e-14)
     with pytest.raises(dr.LogError, match="gyro"):
-        Dataset.of(model, log)
+        Dataset.of(model, dr.Log.from_arrays(columns["t"], signals, {"gyro": "deg"}, source="flight"))
 
 
 # ---------------------------------------------------------------------- lo-diransac

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, isnan
 from pathlib import Path
@@ -28,7 +28,6 @@ from diransac.errors import LogError, SettingsError
 from diransac.identification.method import Method
 from diransac.identification.methods import ESTIMATORS, METHODS
 from diransac.limits import LARGEST_TEXT
-from diransac.model import Model
 from diransac.simulation import HOLDS
 
 __all__ = [
@@ -220,10 +219,16 @@ class Search:
 
 @dataclass(frozen=True)
 class Derivation:
-    """Options of the differentiation of signals that the log lacks."""
+    """Options of the differentiation of signals that the log lacks, which regressions need.
+
+    A simulation is compared with what was measured: commands that simulate accept them without effect.
+    """
 
     differentiate: Annotated[
-        bool, typer.Option("--differentiate", help="Derive the velocities and accelerations that the log lacks.")
+        bool,
+        typer.Option(
+            "--differentiate", help="For regressions: derive velocities and accelerations that the log lacks."
+        ),
     ] = False
     bandwidth: Annotated[
         float | None, typer.Option(metavar="HZ", help="Bandwidth of that filter; chosen from the log if not given.")
@@ -231,15 +236,11 @@ class Derivation:
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of `diransac.identify`.  Raises SettingsError: a bandwidth without differentiation."""
-        self._check()
+        self.check()
         return {"differentiate": self.differentiate, "bandwidth": self.bandwidth}
 
-    def derive(self, log: Log, model: Model) -> Log:
-        """The log, with derived signals if requested.  Raises LogError: not derivable; SettingsError: `arguments`."""
-        self._check()
-        return preprocessing.differentiate(log, model, self.bandwidth) if self.differentiate else log
-
-    def _check(self) -> None:
+    def check(self) -> None:
+        """Raise SettingsError: a bandwidth without differentiation."""
         if self.bandwidth is not None and not self.differentiate:
             raise SettingsError("--bandwidth is that of --differentiate, which is not given; give both or neither")
 
@@ -293,16 +294,20 @@ class Preparation:
         list[str] | None, _option("--shift", metavar="NAME=S,...", help="Signals to move later in time: thrust=0.02.")
     ] = None
 
-    def read_all(self, files: Sequence[Path]) -> list[Log]:
-        """The logs of several files, all prepared alike."""
-        return [self.read(file) for file in files]
+    def read_all(self, files: Sequence[Path], like: Sequence[Mapping[str, Any]] = ()) -> list[Log]:
+        """The logs of several files, all prepared alike, and like a log of the same recorder, by its history."""
+        return [self.read(file, like) for file in files]
 
-    def read(self, file: Path) -> Log:
-        """The prepared log of a file.  Raises LogError: it cannot be read or prepared."""
+    def read(self, file: Path, like: Sequence[Mapping[str, Any]] = ()) -> Log:
+        """The prepared log of a file, like another one of the same recorder, as far as no option says otherwise.
+
+        Raises LogError: it cannot be read or prepared.
+        """
         rename, scale = pairs("--map", self.rename or ()), numbers("--scale", self.scale or ())
         delays, rate = numbers("--shift", self.shift or ()), _rate(self.resample)
         if file == Path("-"):
-            return self._of_stdin()
+            return self._of_stdin(like)
+        replaced = {"despike": self.despike, "shift": self.shift}
         log = read_log(
             file,
             mapping=self.mapping,
@@ -312,6 +317,7 @@ class Preparation:
             rename=rename,
             scale=scale,
             resample=rate,
+            like=[step for step in like if replaced.get(step["step"]) is None],
         )
         if self.start is not None or self.stop is not None:
             log = log.between(-inf if self.start is None else self.start, inf if self.stop is None else self.stop)
@@ -323,7 +329,7 @@ class Preparation:
             log = preprocessing.despike(log, None if self.despike == "all" else names(self.despike))
         return preprocessing.shift(log, delays) if delays else log
 
-    def _of_stdin(self) -> Log:
+    def _of_stdin(self, like: Sequence[Mapping[str, Any]]) -> Log:
         """The prepared log of CSV text on stdin.  Raises LogError: as `read`, or there is none."""
         data = typer.get_binary_stream("stdin").read(LARGEST_TEXT + 1)
         if not data:
@@ -332,7 +338,7 @@ class Preparation:
             file = Path(folder) / "stdin.csv"
             file.write_bytes(data)
             try:
-                return replace(self.read(file), source="standard input")
+                return replace(self.read(file, like), source="standard input")
             except LogError as error:
                 raise LogError(str(error).replace(f'log "{file}"', "standard input")) from error
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from diransac.atomic import draft
 from diransac.cli.screen import copy, stdout_taken
+from diransac.data.files import put_in_place
 from diransac.errors import DiransacError, ResultError
 
 __all__ = ["PAGE", "RESULT", "STDOUT", "check_ending", "checked", "staged"]
@@ -95,7 +96,7 @@ def staged(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -
             elif target is not None:
                 if target.exists():
                     written.chmod(target.stat().st_mode)
-                written.replace(target)
+                put_in_place(written, target)
 
 
 @contextmanager

@@ -259,7 +259,8 @@ class Dataset:
         also : sequence of str, optional
             Signals in use besides those that the equations name: those with a weight or a threshold.
         pointwise : bool, optional
-            Whether the equations are evaluated at each row, which needs every signal that they name.
+            Whether the equations are evaluated at each row, which needs every signal that they name.  Otherwise
+            simulations are compared with measurements, so that derived signals are left out.
         given : sequence of Log, optional
             Logs as the user gave them, where ``logs`` were derived from them.
         input_hold : str, optional
@@ -277,7 +278,8 @@ class Dataset:
             As `bind_log`; the message names the log.
         """
         several = as_logs(logs)
-        segments = [bind_log(model, log, also, pointwise=pointwise) for log in several]
+        compared = several if pointwise else tuple(log.measured for log in several)
+        segments = [bind_log(model, log, also, pointwise=pointwise) for log in compared]
         found = {name for one in segments for name in one.signals}
         signals = tuple(name for name in model.signals if name in found)
         layout = ParameterLayout(model.parameters, len(several), priors)

@@ -6,12 +6,13 @@ left out.  Their place in a file cannot be taken by a signal, whatever its name:
 ========  =========================================================================================
 format    place
 ========  =========================================================================================
-CSV       a first line ``# diransac: {...}``, which ``pandas.read_csv(..., comment="#")`` skips
+CSV       the file ``NAME.csv-metadata.json`` beside it, as CSV on the Web of the W3C has it
 Parquet   the key ``diransac`` of the file's key-value metadata
 NPZ       the archive's member ``diransac.json``; members of arrays end in ``.npy``
 ========  =========================================================================================
 
-A log without any of it is written without metadata.
+A log without any of it is written without metadata.  Earlier versions wrote those of CSV text into a first line
+``# diransac: {...}``, which is still read.
 """
 
 from __future__ import annotations
@@ -25,19 +26,31 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.atomic import write_with
+from diransac.atomic import draft
 from diransac.data.filters import FilterSpecification
 from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-__all__ = ["COMMENT", "ENDINGS", "KEY", "MEMBER", "Metadata", "decode_metadata", "write_columns"]
+__all__ = [
+    "COMMENT",
+    "ENDINGS",
+    "KEY",
+    "MEMBER",
+    "Metadata",
+    "decode_metadata",
+    "place_of_metadata",
+    "put_in_place",
+    "write_columns",
+]
 
 
 KEY, MEMBER, COMMENT = "diransac", "diransac.json", "# diransac:"
-"""Place of the metadata in a Parquet file, in an NPZ archive and in CSV text."""
+"""Place of the metadata in a Parquet file, in an NPZ archive and, of earlier versions, in CSV text."""
+_BESIDE = "-metadata.json"
+_CSV_ON_THE_WEB, _UNIT = "http://www.w3.org/ns/csvw", "schema:unitText"
 
 _VERSION = 1
 
@@ -71,15 +84,67 @@ class Metadata:
             raise LogError(f"the log's history cannot be written as JSON: {error}") from error
 
 
+def place_of_metadata(table: Path) -> Path:
+    """The file beside a CSV file that describes it."""
+    return table.with_name(table.name + _BESIDE)
+
+
+def put_in_place(written: Path, target: Path) -> None:
+    """Replace a table and the metadata beside it by those that were written elsewhere in the same file system.
+
+    A table is never found beside the metadata of another one.
+    """
+    if not target.name.lower().endswith(_TEXTS):
+        written.replace(target)
+        return
+    old, new, aside = (place_of_metadata(x) for x in (target, written, written.with_name("previous")))
+    if old.exists():
+        old.replace(aside)
+    try:
+        written.replace(target)
+    except OSError:
+        if aside.exists():
+            aside.replace(old)
+        raise
+    if new.exists():
+        new.replace(old)
+
+
+def _csv_on_the_web(table: Path, columns: Sequence[str], metadata: str) -> str:
+    """JSON that describes a CSV file: its columns with their units, and all other metadata as a note."""
+    facts = json.loads(metadata)
+    units = {"t": "s", **facts.pop("units", {})}
+    described = [
+        {"titles": name, "datatype": "number", **({_UNIT: units[name]} if name in units else {})} for name in columns
+    ]
+    content = {
+        "@context": _CSV_ON_THE_WEB,
+        "url": table.name,
+        "tableSchema": {"columns": described},
+        "notes": [{KEY: facts}],
+    }
+    return json.dumps(content, indent=1)
+
+
+def _of_csv_on_the_web(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Facts in the description of a CSV file, which may be that of another tool."""
+    columns = content.get("tableSchema", {}).get("columns", [])
+    titled = {x["titles"]: x[_UNIT] for x in columns if _UNIT in x and isinstance(x.get("titles"), str)}
+    own = [x[KEY] for x in content.get("notes", []) if isinstance(x, dict) and KEY in x]
+    units = {name: unit for name, unit in titled.items() if name != "t"}
+    return {"version": _VERSION, **(own[0] if own else {}), "units": units}
+
+
 def decode_metadata(text: str | bytes, source: str, remedy: str) -> Metadata:
-    """The metadata that `Metadata.encode` wrote.
+    """The metadata that `Metadata.encode` wrote, or that stand beside a CSV file.
 
     Raises LogError: they are damaged, or of a later version; the message ends with the remedy.
     """
     from diransac.plain_data import json_data
 
     try:
-        facts = json_data(text)
+        found = json_data(text)
+        facts = _of_csv_on_the_web(found) if isinstance(found, dict) and "@context" in found else found
         version = facts.get("version")
         if version == _VERSION:
             return _metadata(facts)
@@ -126,28 +191,34 @@ def write_columns(path: Path, columns: Mapping[str, FloatArray], metadata: Metad
         raise LogError(f'cannot write "{path}": its ending is not known; use one of {", ".join(_WRITERS)}')
     text = "" if metadata is None else metadata.encode()
     try:
-        write_with(path, lambda file: _WRITERS[endings[0]](columns, text, file))
+        with draft(path) as written:
+            _WRITERS[endings[0]](columns, text, written)
+            if text and endings[0] in _TEXTS:
+                described = _csv_on_the_web(path, list(columns), text)
+                place_of_metadata(written).write_text(described, encoding="utf-8")
+            if path.exists():
+                written.chmod(path.stat().st_mode)
+            put_in_place(written, path)
     except OSError as error:
         raise LogError(f'cannot write "{path}": {error.strerror or error}') from error
 
 
-def _csv(columns: Mapping[str, FloatArray], metadata: str) -> bytes:
+def _csv(columns: Mapping[str, FloatArray]) -> bytes:
     import polars as pl
 
-    first = f"{COMMENT} {metadata}\n" if metadata else ""
-    return (first + pl.DataFrame(dict(columns)).write_csv()).encode()
+    return pl.DataFrame(dict(columns)).write_csv().encode()
 
 
-def _write_csv(columns: Mapping[str, FloatArray], metadata: str, file: Path) -> None:
-    file.write_bytes(_csv(columns, metadata))
+def _write_csv(columns: Mapping[str, FloatArray], _: str, file: Path) -> None:
+    file.write_bytes(_csv(columns))
 
 
-def _write_csv_gz(columns: Mapping[str, FloatArray], metadata: str, file: Path) -> None:
+def _write_csv_gz(columns: Mapping[str, FloatArray], _: str, file: Path) -> None:
     with (
         file.open("wb") as packed,
         gzip.GzipFile(fileobj=packed, mode="wb", filename="", mtime=0, compresslevel=6) as unpacked,
     ):
-        unpacked.write(_csv(columns, metadata))
+        unpacked.write(_csv(columns))
 
 
 def _write_parquet(columns: Mapping[str, FloatArray], metadata: str, file: Path) -> None:
@@ -170,5 +241,6 @@ def _write_npz(columns: Mapping[str, FloatArray], metadata: str, file: Path) -> 
 
 
 _WRITERS = {".csv": _write_csv, ".csv.gz": _write_csv_gz, ".parquet": _write_parquet, ".npz": _write_npz}
+_TEXTS = (".csv", ".csv.gz")
 ENDINGS = tuple(_WRITERS)
 """Endings of the files that `write_columns` writes."""

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, Protocol, overload
 import numpy as np
 import numpy.typing as npt
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.data import checks
 from diransac.data.checks import as_column, numeric_columns
+from diransac.data.clock import on_own_grid
 from diransac.data.files import Metadata, write_columns
 from diransac.data.filters import FilterSpecification
 from diransac.data.units import split_unit
@@ -190,13 +191,29 @@ class Log:
         unknown = [name for name in units if name not in columns and name not in (unusable or {})]
         if unknown:
             raise LogError(f'{source}: a unit is given for "{unknown[0]}"; found {", ".join(columns)}')
-        log = cls(time, columns, units, source, unusable=unusable or {})
-        return replace(log, notes=(*checks.check_clock(log.time, source), *log.findings()))
+        stamps = as_column(time, "t", source)
+        signals = {name: as_column(values, name, source) for name, values in columns.items()}
+        if any(len(x) != len(stamps) for x in signals.values()):
+            return cls(stamps, signals, units, source)  # which raises
+        found = on_own_grid(stamps, signals, source)
+        history = () if found.step is None else (found.step,)
+        log = cls(found.time, found.signals, units, source, history, unusable=unusable or {})
+        notes = (*found.notes, *checks.check_clock(log.time, source), *log.findings(found.recorded))
+        return replace(log, notes=notes)
 
-    def findings(self) -> tuple[str, ...]:
-        """Sentences about columns that are left out, an uneven clock, missing samples and infinities."""
+    def findings(self, recorded: BoolArray | None = None) -> tuple[str, ...]:
+        """Sentences about columns that are left out, an uneven clock, and samples that are missing or infinite.
+
+        Parameters
+        ----------
+        recorded : (N,) bool array, optional
+            Rows that were recorded: those of which the missing samples are named.  None: all.
+        """
         left_out = [f'column "{name}" is left out: it {why}' for name, why in self.unusable.items()]
-        return (*left_out, *checks.describe_jitter(self.time), *checks.describe_gaps(self.time, self.signals))
+        rows = np.ones(len(self), bool) if recorded is None else recorded
+        recorded_signals = {name: x[rows] for name, x in self.signals.items()}
+        gaps = checks.describe_gaps(self.time[rows], recorded_signals)
+        return (*left_out, *checks.describe_jitter(self.time), *gaps)
 
     # ------------------------------------------------------------------ contents
 
@@ -217,6 +234,16 @@ class Log:
     @property
     def _found(self) -> tuple[str, ...]:
         return ("t", *self.names)
+
+    @property
+    def measured(self) -> Log:
+        """The log without the signals that were derived from others, which are no measurements; itself without any."""
+        derived = {} if self.filter is None else self.filter.derived
+        if self.filter is None or not set(derived) & set(self.signals):
+            return self
+        signals = {name: values for name, values in self.signals.items() if name not in derived}
+        specification = replace(self.filter, derived={})
+        return replace(self, signals=signals, filter=specification)
 
     @property
     def dt(self) -> float:
@@ -350,8 +377,8 @@ class Log:
         Notes
         -----
         The columns are the time ``t`` and the signals.  Units, filter, history, notes and the reasons for unusable
-        columns are metadata: a first line ``# diransac: {...}`` of CSV text, which other tools skip with
-        ``comment="#"``, a key of a Parquet file, or a member of an NPZ archive.  The file is written whole or not at
+        columns are metadata: of CSV text in the file ``NAME.csv-metadata.json`` beside it (CSV on the Web), which is to
+        be moved with it; a key of a Parquet file; or a member of an NPZ archive.  The file is written whole or not at
         all.
         """
         facts = Metadata(self.units, self.filter, self.history, self.notes, self.unusable)

@@ -45,7 +45,7 @@ from diransac.plain_data import read_text, toml_table
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["BUILT_IN", "Condition", "Event", "LogMapping", "MappedSignals", "held", "load_mapping"]
+__all__ = ["BUILT_IN", "Condition", "Event", "LogMapping", "MappedSignals", "held", "load_mapping", "parse_mapping"]
 
 TextArray = np.ndarray[Any, np.dtype[np.object_]]
 
@@ -228,6 +228,8 @@ class LogMapping:
     preparation : mapping
         ``resample``, ``repair``, ``from``, ``until``, ``while``, ``despike``, ``shift``, which `read_log` does, and
         ``differentiate``, ``bandwidth``, which the command line does.
+    text : str
+        The file, in TOML.
     """
 
     source: str
@@ -237,6 +239,7 @@ class LogMapping:
     time_column: str | None = None
     time_scale: float = 1.0
     preparation: Mapping[str, Any] | None = None
+    text: str = ""
 
     def option(self, name: str) -> Any:
         """A step of the preparation, or None."""
@@ -358,11 +361,16 @@ def load_mapping(mapping: str | Path) -> LogMapping:
         path = Path(mapping)
         source = f'mapping "{path}"'
         text = _text(path, source)
+    return parse_mapping(text, source)
+
+
+def parse_mapping(text: str, source: str) -> LogMapping:
+    """Mapping of TOML text, by its name in messages.  Raises LogError: as `load_mapping`."""
     try:
         content = toml_table(text)
     except ValueError as error:
         raise LogError(f"{source}: it is not TOML ({' '.join(str(error).split()):.120})") from error
-    return _parse(content, source)
+    return replace(_parse(content, source), text=text)
 
 
 def _text(path: Path, source: str) -> str:

@@ -13,7 +13,7 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.log import Log
-from diransac.data.units import conversion, same_unit
+from diransac.data.preprocessing.continuity import interpolated
 from diransac.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Segment:
     ----------
     model : Model
     log : Log
-        The log, with continuous coordinates; see `preprocessing.continuous`.
+        The log in the model's units, with continuous coordinates; see `preprocessing.in_units` and `continuous`.
     offset : int
         Row of the log that is row 0 of the arrays: the first that counts.
     signals : tuple of str
@@ -50,7 +50,7 @@ class Segment:
     measured : (N, n_s) array
         Measured signals, each in its unit; NaN where missing.
     inputs : (N, n_u) array
-        Inputs, each in its unit; NaN is replaced by the last good sample.
+        Inputs, each in its unit; NaN is replaced by the last good sample, in lost rows by interpolation.
     valid : (N,) bool array
         Rows in which every signal in use is finite, outside of gaps.
     notes : tuple of str
@@ -165,9 +165,8 @@ class Segment:
         coordinate = name.removesuffix("_dot")
         if rule == "robust" and self.model.kinematics is None and coordinate in self.present:
             return self._line(coordinate, _ROWS_FOR_SLOPE)[1]
-        hint = "" if name in self.model.first_order else "pass --differentiate, or "
         raise LogError(
-            f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; {hint}give '
+            f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; give '
             f"initial_state = {{{name} = ...}}"
         )
 
@@ -222,7 +221,7 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     Raises
     ------
     LogError
-        A signal is missing, all NaN, infinite, too large to square, or in another unit; too few rows.
+        A signal is missing, all NaN, infinite, too large to square, or of another dimension; too few rows.
     """
     needed = model.required_signals if pointwise else tuple(model.inputs)
     for name in needed:
@@ -233,11 +232,10 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
         _raise_missing(model, log, model.signals[0])
     used = [n for n in (*signals, *model.inputs) if n in log]
     log.check(used)
-    _check_units(model, log, used)
-    log = preprocessing.continuous(log, model)
-    inputs, held = _held_inputs(model, log)
+    log = preprocessing.continuous(preprocessing.in_units(log, model), model)
+    inputs, missing, lost = _known_inputs(model, log)
     measured = np.column_stack([log[n] for n in signals])
-    gaps = long_runs(held, _LONG_HOLD) | silent_rows(np.isfinite(measured), log.dt)
+    gaps = long_runs(missing, _LONG_HOLD) | silent_rows(np.isfinite(measured), log.dt)
     critical = [i for i, n in enumerate(signals) if n in needed or n in also]
     known = np.isfinite(measured[:, critical])
     is_sensor = np.array([signals[i] in model.sensors for i in critical], bool)
@@ -250,7 +248,8 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     offset = int(np.argmax(valid))
     notes = (
         *log.notes,
-        *_row_notes(valid, held & ~gaps, sampled=known.any(axis=1) | gaps),
+        *_unmeasured_notes(model, log, signals),
+        *_row_notes(valid, missing & ~gaps & ~lost, lost & ~gaps, sampled=known.any(axis=1) | gaps),
         *_gap_notes(log, gaps, offset),
     )
     return Segment(
@@ -345,45 +344,59 @@ def silent_rows(known: BoolArray, dt: float) -> BoolArray:
 def _raise_missing(model: Model, log: Log, name: str) -> None:
     hint = "name its column with --map"
     if name in model.first_order:
-        hint = "estimate it by lo-diransac, of all methods the only one that can, with --differentiate"
+        hint = "estimate it by lo-diransac, of all methods the only one that can"
     elif name in model.velocities or name in model.accelerations:
-        hint = "pass --differentiate to estimate velocities and accelerations"
+        hint = "pass --differentiate to estimate velocities and accelerations, or use lo-diransac, which needs none"
     if name in log.unusable:
         raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; correct the column, or {hint}')
     found = ", ".join(("t", *log.names))
     raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}.')
 
 
-def _check_units(model: Model, log: Log, names: Sequence[str]) -> None:
-    for name in names:
-        found, wanted = log.units.get(name), model.units[name]
-        if found is None or same_unit(found, wanted):
-            continue
-        factor = conversion(found, wanted)
-        hint = f"pass --scale {name}={factor:.6g}" if factor is not None else "check the column"
-        raise LogError(f'{log.source}: signal "{name}" is in {found}, the model needs {wanted}; {hint}')
+def _known_inputs(model: Model, log: Log) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """Inputs ``(N, n_u)`` without NaN, and in which rows (N,) one was missing, and one was interpolated.
 
-
-def _held_inputs(model: Model, log: Log) -> tuple[FloatArray, BoolArray]:
-    """Inputs ``(N, n_u)`` with NaN held from the last good sample, and in which rows (N,) one was."""
-    held = np.zeros(len(log), dtype=bool)
+    A missing input is held from the last good sample.  In a few lost rows, in which nothing has a sample, it is
+    interpolated instead: there it is the log that lacks a sample, not the input that has none.
+    """
+    some = [np.isfinite(log[n]) for n in (*model.signals, *model.inputs) if n in log]
+    absent: BoolArray = ~np.any(some, axis=0)
+    lost = absent & ~long_runs(absent, _LONG_HOLD)
+    missing, rows = np.zeros(len(log), dtype=bool), np.arange(len(log))
     columns = []
     for name in model.inputs:
         column = log[name] if name in log else np.zeros(len(log))
         good = np.isfinite(column)
-        last = np.maximum.accumulate(np.where(good, np.arange(len(column)), -1))
-        held |= ~good & (last >= 0)
-        columns.append(np.where(last >= 0, column[last], np.nan))
-    return np.column_stack(columns) if columns else np.zeros((len(log), 0)), held
+        last = np.maximum.accumulate(np.where(good, rows, -1))
+        missing |= ~good & (last >= 0)
+        column = np.where(last >= 0, column[last], np.nan)
+        between = rows[lost & ~good & (last >= 0)]
+        known = rows[good]
+        if len(between) and len(known) > 1:
+            left = np.clip(np.searchsorted(known, between) - 1, 0, len(known) - 2)
+            weight = np.minimum((between - known[left]) / np.diff(known)[left], 1.0)
+            column[between] = interpolated({name: column[known]}, left, weight)[name]
+        columns.append(column)
+    return np.column_stack(columns) if columns else np.zeros((len(log), 0)), missing, missing & lost
 
 
-def _row_notes(valid: BoolArray, held: BoolArray, sampled: BoolArray) -> list[str]:
+def _unmeasured_notes(model: Model, log: Log, signals: Sequence[str]) -> list[str]:
+    """A note on coordinates that act on what is measured, and that the log lacks; none where it has all."""
+    absent = [n for n in model.coordinates if n not in log]
+    acting = absent and set(model.states_behind(signals))
+    found = ", ".join(("t", *log.names))
+    return [f'"{n}" is not in the log, and counts as unmeasured; found {found}' for n in absent if n in acting]
+
+
+def _row_notes(valid: BoolArray, held: BoolArray, lost: BoolArray, sampled: BoolArray) -> list[str]:
     notes = []
     skipped = int((~valid & sampled).sum())
     if skipped:
         notes.append(f"{skipped} of {len(valid)} rows were skipped: a signal in use is NaN there")
     if held.any():
         notes.append(f"inputs were held from the last good sample in {held.sum()} rows, where they are NaN")
+    if lost.any():
+        notes.append(f"inputs were interpolated in {lost.sum()} lost rows")
     return notes
 
 

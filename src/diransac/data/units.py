@@ -23,6 +23,7 @@ _STANDARD_GRAVITY = 9.80665
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 _TOKEN = re.compile(r"\s*([*/^()]|[+-]?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?|[^\W\d_]+|[°%])")
 _HEADER = re.compile(r"^(?P<name>.*\S)\s*\[\s*(?P<unit>[^\[\]]*[^\W\d_°%][^\[\]]*|°|%)\s*\]$")
+_IN_PARENTHESES = re.compile(r"^(?P<name>.*\S)\s*\((?P<unit>.*[^\W\d_].*|°|%)\)$")
 
 
 @dataclass(frozen=True)
@@ -94,9 +95,16 @@ _NAMED = {
 
 
 def split_unit(header: str) -> tuple[str, str | None]:
-    """Name and unit of a column's header: ``theta [deg]`` is ``("theta", "deg")``, ``q[0]`` is ``("q[0]", None)``."""
+    """Name and unit of a column's header: ``theta [deg]`` is ``("theta", "deg")``, ``q[0]`` is ``("q[0]", None)``.
+
+    Parentheses are read alike where they hold a known unit: ``theta (deg)``, but not ``theta (raw)``.
+    """
     match = _HEADER.match(header.strip())
-    return (match["name"], match["unit"].strip()) if match else (header.strip(), None)
+    if match is None:
+        match = _IN_PARENTHESES.match(header.strip())
+        if match is None or _parse(match["unit"]) is None:
+            return header.strip(), None
+    return match["name"], match["unit"].strip()
 
 
 def same_unit(a: str, b: str) -> bool:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diransac.data import preprocessing
 from diransac.data.dataset import distinct_logs
 from diransac.data.log import Log
 from diransac.errors import DiransacError, SettingsError
@@ -153,8 +152,6 @@ def _fold(
     except DiransacError as error:
         return str(error), "no model of the other logs"
     try:
-        if arguments.get("differentiate"):
-            left_out = preprocessing.differentiate(left_out, model, arguments.get("bandwidth"))
         return result, validate(result, left_out, horizon)
     except DiransacError as error:
         return result, str(error)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from diransac.identification.window_starts import SmoothedLog, WindowStarts
     from diransac.model import Model
 
-__all__ = ["HorizonScores", "OpenLoop", "StartRule", "pooled_scores"]
+__all__ = ["HorizonScores", "OpenLoop", "StartRule", "derived_velocities", "pooled_scores"]
 
 StartRule = Literal["smoothed", "measured"]
 
@@ -408,7 +408,7 @@ def _states(
     """
     model, matter = segment.model, segment.model.states_behind(segment.present)
     hidden = tuple(n for n in model.first_order if n in matter and n not in segment.present)
-    derived = () if smoothed is None else _derived(segment, matter)
+    derived = () if smoothed is None else derived_velocities(segment, matter)
     given = dict.fromkeys((*hidden, *derived), 0.0)
     states = np.tile(segment.initial_state(given or "first"), (len(segment), 1))
     for i, name in enumerate(model.state):
@@ -422,8 +422,8 @@ def _states(
     return states
 
 
-def _derived(segment: Segment, matter: Sequence[str]) -> tuple[str, ...]:
-    """Velocities that the log lacks, and that are derivatives of coordinates that it has."""
+def derived_velocities(segment: Segment, matter: Sequence[str]) -> tuple[str, ...]:
+    """Velocities among some states that the log lacks, and that follow from coordinates that it has."""
     model, present = segment.model, segment.present
     lacking = [n for n in model.velocities_of_motion if n in matter and n not in present]
     if model.kinematics is not None:

@@ -75,7 +75,8 @@ def identify(
     differentiate : bool, optional
         Whether to derive the velocities and accelerations that a log lacks, and to filter both sides of the equations
         alike; the identification is then repeated at half and at twice the bandwidth, for
-        ``result.bandwidth_sensitivity``.  lo-diransac estimates missing signals without a filter.
+        ``result.bandwidth_sensitivity``.  The regressions need it for a log of positions; lo-diransac fits what is
+        measured, with or without it.
     bandwidth : float, optional
         Bandwidth of the differentiating filter, Hz; None: chosen from each log.
     input_hold : str, optional
@@ -138,9 +139,8 @@ def identify(
         )
     if with_suggestions and not getattr(chosen, "suggestions", False):
         raise SettingsError(f"with_suggestions=True needs suggestions, which method {chosen.name} does not give")
-    pointwise = chosen.needs_all_signals or not differentiate
     known = KnownParameters.of(model, fixed, priors)
-    task = _Task(known, given, chosen, int(seed), pointwise, hold, compares=compare_logs and len(given) > 1)
+    task = _Task(known, given, chosen, int(seed), hold, compares=compare_logs and len(given) > 1)
     with time_limited(time_limit), numerical_failures(given):
         if with_suggestions:
             return task.with_suggestions(progress)
@@ -239,7 +239,7 @@ class Identification:
         """The result of a method.  Raises as `identify` does."""
         _check_arguments(self._known.model, seed)
         several = len(self._given) > 1
-        task = _Task(self._known, self._given, method, int(seed), True, None, several, self._dataset)
+        task = _Task(self._known, self._given, method, int(seed), None, several, self._dataset)
         with numerical_failures(self._given):
             return task.run(self._given)
 
@@ -268,13 +268,15 @@ class _Task:
     given: tuple[Log, ...]
     method: Method
     seed: int
-    pointwise: bool
     input_hold: str | None
     compares: bool
     dataset_of: Callable[..., Dataset] = _moving_dataset
 
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
         """Identify from prepared logs."""
+        logs = logs if self.method.needs_all_signals else [log.measured for log in logs]
+        required = set(self.known.model.required_signals)
+        pointwise = self.method.needs_all_signals or all(required <= set(log.signals) for log in logs)
         known, unused = self._observed(logs)
         criteria, model = self.method.criteria, known.free()
         judged = judged_signals(model, logs, criteria)
@@ -282,7 +284,7 @@ class _Task:
             model,
             logs,
             judged,
-            pointwise=self.pointwise,
+            pointwise=pointwise,
             given=self.given,
             input_hold=self.input_hold,
             priors=known.priors_of_fit,

@@ -257,7 +257,7 @@ def _fitness(log: Log, model: Model) -> Fitness:
     derived = _derived(log, model) if missing else log
     derivable = tuple(name for name in missing if name in derived)
     if derivable != missing:
-        later = "lo-diransac estimates them with --differentiate; excitation is known only after identification"
+        later = "lo-diransac estimates them; excitation is known only after identification"
         return Fitness(model.name, missing, derivable, {}, "" if set(missing) & set(model.inputs) else later)
     if model.nonlinear_parameters:
         names = ", ".join(model.nonlinear_parameters)

@@ -8,15 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, as_logs
 from diransac.data.log import Log
 from diransac.data.segment import Segment
 from diransac.errors import LogError, ResultError, SettingsError
 from diransac.identification.estimate import Diagnosis, Resolution
 from diransac.identification.evaluation import Simulation
+from diransac.identification.horizons import derived_velocities
 from diransac.identification.identify import checked_hold
 from diransac.identification.prediction import Restarts, restart_rows, simulated_rows
 from diransac.identification.result import Result
+from diransac.identification.window_starts import smoothed_log
 from diransac.model import Model
 from diransac.model.plant import ModelWithParameters, as_plant
 
@@ -70,14 +73,15 @@ def simulate(
     known = as_plant(plant)
     if initial_state is not None and horizon is not None:
         raise SettingsError("initial_state and horizon are given; a restart takes the states of the log: give one")
-    (recorded,) = as_logs([log])
+    (given,) = as_logs([log])
+    recorded = preprocessing.in_units(given, known.model)
     driven = recorded if initial_state is None else _with_start(recorded, known.model, initial_state)
     dataset = Dataset.of(known.model, driven, pointwise=False)
-    (observations,) = dataset.segments
-    parameters = plant.parameters_in(log) if isinstance(plant, Result) else known.parameters
+    observations = _with_velocities(dataset)
+    parameters = plant.parameters_in(given) if isinstance(plant, Result) else known.parameters
     resolution = resolution_of(plant, integrator, substeps, input_hold)
     bound = _Bound(Simulation(dataset, resolution=resolution), known.model.parameter_vector(parameters), observations)
-    restarts = _starts(plant, recorded, bound, horizon)
+    restarts = _starts(plant, given, bound, horizon)
     series = simulated_rows(bound.simulation, 0, bound.parameters, observations, restarts)
     _check_finite(series, observations, restarts)
     return _as_log(known.model, recorded, observations, series, [*dataset.notes, _note(restarts, horizon, resolution)])
@@ -181,6 +185,21 @@ def _smoothed_starts(bound: _Bound, diagnosis: Diagnosis, n_rows: int) -> Restar
     elapsed = np.maximum(rows - at[of_row], 0)
     states = found[of_row, elapsed] + (elapsed / widths[of_row])[:, None] * differences[of_row]
     return Restarts(rows, states, n_rows)
+
+
+def _with_velocities(dataset: Dataset) -> Segment:
+    """The only log of a dataset with the velocities that it lacks, from its motion as it is smoothed without the model.
+
+    These are velocities that are no derivatives of coordinates; others are those of the line through the first samples.
+    """
+    (one,), model = dataset.segments, dataset.model
+    lacking = derived_velocities(one, model.states_behind(one.present)) if model.kinematics is not None else ()
+    smoothed = smoothed_log(dataset) if lacking else None
+    if smoothed is None:
+        return one
+    signals = tuple(n for n in model.signals if n in one.signals or n in lacking)
+    columns = [smoothed.signals[:, model.signals.index(n)] if n in lacking else one.column(n) for n in signals]
+    return replace(one, signals=signals, measured=np.column_stack(columns))
 
 
 def _measured_starts(observations: Segment, rows: IntArray, n_rows: int) -> Restarts:

@@ -105,7 +105,7 @@ def preparation(entries: Sequence[Entry]) -> list[str]:
 
 
 def _step(step: Mapping[str, Any]) -> str:
-    details = ", ".join(f"{key} {_value(value)}" for key, value in step.items() if key != "step")
+    details = ", ".join(f"{key} {_value(value)}" for key, value in step.items() if key not in ("step", "text"))
     return f"{step.get('step', 'step')}: {details}" if details else str(step.get("step"))
 
 
@@ -148,9 +148,7 @@ def _call(entry: Entry) -> str:
         arguments.append(f"settings=dr.Settings({', '.join(f'{name}={value!r}' for name, value in chosen)})")
     if result.iterations and result.diagnosis is None and result.estimator not in _DEFAULT_ESTIMATORS:
         arguments.append(f"estimator={result.estimator}(...)")
-    if result.diagnosis is not None and not set(result.model.required_signals) <= set(result.diagnosis.noise_std):
-        arguments.append("differentiate=True")
-    elif steps and steps[-1].get("step") == "differentiate":
+    if steps and steps[-1].get("step") == "differentiate":
         arguments.append(f"differentiate=True, bandwidth={steps[-1]['bandwidth']!r}")
     if result.estimate.resolution.hold != _HOLD:
         arguments.append(f"input_hold={result.estimate.resolution.hold!r}")

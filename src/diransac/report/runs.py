@@ -256,7 +256,7 @@ def _simulate(
     simulation = Simulation(dataset, scoring.judged, result.estimate.resolution, stretches, threads=1)
     observations, parameters = dataset.segments[0], result.model.parameter_vector(view.parameters)
     first_row = observations.first_row_in(given)
-    validation = _validation(result, log, horizon)
+    validation = _validation(result, given, horizon)
     held_out = OpenLoop(dataset, 0, view.parameters, result.estimate.resolution) if view.held_out else None
     begin = None if held_out is None else _estimated_starts(held_out, len(observations))
     whole = simulated_rows(simulation, 0, parameters, observations, begin)
@@ -334,6 +334,7 @@ def _last_step(history: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 def _dataset(result: Result, log: Log, given: Log) -> Dataset:
     """The dataset as `identify` makes it; of a held-out log without all signals, with those that a simulation needs."""
+    log = log if result.diagnosis is None else log.measured
     try:
         return Dataset.of(result.model, log, judged_signals(result.model, [log], result.settings), given=[given])
     except LogError:

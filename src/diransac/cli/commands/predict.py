@@ -12,6 +12,7 @@ from diransac.cli.flight_options import FlightPicture, LogOutput
 from diransac.cli.group import grouped
 from diransac.cli.options import Derivation, LogFile, Preparation, ResultFile
 from diransac.cli.outputs import staged
+from diransac.data.preprocessing import in_units
 from diransac.identification.result import Result
 
 __all__ = ["app"]
@@ -38,14 +39,17 @@ def _predict(
     """Simulate an identified model over the inputs of a log, and write the simulated signals."""
     from diransac.identification.open_loop import simulate
 
+    derivation.check()
     start = numbers("--initial", initial) if initial else None
     with staged([output, plot], [model, file]) as (written, picture):
         result = Result.load(model)
-        log = derivation.derive(preparation.read(file), result.model)
+        log = preparation.read(file, result.logs[0].preparation)
         simulated = simulate(result, log, initial_state=start, horizon=horizon)
         simulated.write(written)
         if plot:
             from diransac.plots.prediction import plot_prediction
 
-            plot_prediction(simulated, log, result.model.state, tuple(result.model.inputs), picture)
+            plot_prediction(
+                simulated, in_units(log, result.model), result.model.state, tuple(result.model.inputs), picture
+            )
         screen.say(f"wrote {output}: {len(simulated)} rows", *simulated.notes)

@@ -31,10 +31,11 @@ def _validate(
     strict: StrictFlag = False,
 ) -> None:
     """Predict other logs with an identified model, open loop."""
+    derivation.check()
     check_ending(report, PAGE)
     with staged([report], [model, *files]) as (page,):
-        result, derivation = Result.load(model), preparation.completed(derivation)
-        logs = [derivation.derive(log, result.model) for log in preparation.read_all(files)]
+        result = Result.load(model)
+        logs = preparation.read_all(files, result.logs[0].preparation)
         found = validate(result, logs, horizon)
         if report:
             from diransac.report import write_report

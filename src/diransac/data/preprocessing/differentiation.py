@@ -20,6 +20,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.data.filters import REACH, FilterSpecification, convolve, half_length, kernels
 from diransac.data.preprocessing.continuity import continuous, unit_quaternions, whole_quaternions
+from diransac.data.preprocessing.steps import in_units
 from diransac.data.units import same_unit
 from diransac.errors import LogError, SettingsError
 
@@ -78,7 +79,7 @@ def differentiate(log: Log, model: Model, bandwidth: float | None = None) -> Log
     have unit norm; see `continuous`.
     """
     sources = _sources(log, model)
-    log = continuous(log, model)
+    log = continuous(in_units(log, model), model)
     names = _filtered(log, model)
     log.check(names)
     bridged = {name: _bridge(log[name]) for name in names}

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.data.preprocessing.continuity import interpolated
+from diransac.data.units import conversion, same_unit
 from diransac.errors import LogError, SettingsError
 from diransac.limits import MOST_ROWS
 
@@ -18,10 +19,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from diransac.data.log import Log
+    from diransac.model import Model
 
 __all__ = [
     "check_factor",
     "describe_resampling",
+    "in_units",
     "interpolate_at",
     "keep_while",
     "leave_out",
@@ -120,6 +123,41 @@ def scale(log: Log, factors: Mapping[str, float]) -> Log:
     units = {name: unit for name, unit in log.units.items() if abs(factors.get(name, 1.0)) == 1.0}
     step = {"step": "scale", "factors": {name: float(factor) for name, factor in factors.items()}}
     return log.with_step(step, signals=signals, units=units)
+
+
+def in_units(log: Log, model: Model) -> Log:
+    """Log with the signals and inputs of a model in the model's units; the same log if they are.
+
+    Parameters
+    ----------
+    log : Log
+        A signal without a known unit is in the model's.
+    model : Model
+
+    Raises
+    ------
+    LogError
+        A unit has another dimension than the model's.
+    """
+    factors: dict[str, float] = {}
+    for name in (n for n in (*model.signals, *model.inputs) if n in log and n in log.units):
+        found, wanted = log.units[name], model.units[name]
+        if same_unit(found, wanted):
+            continue
+        factor = conversion(found, wanted)
+        if factor is None:
+            raise LogError(
+                f'{log.source}: signal "{name}" is in {found}, the model needs {wanted}; check the column and its unit'
+            )
+        factors[name] = factor
+    if not factors:
+        return log
+    return log.with_step(
+        {"step": "units", "from": {n: log.units[n] for n in factors}, "to": {n: model.units[n] for n in factors}},
+        signals={**log.signals, **{n: log[n] * factor for n, factor in factors.items()}},
+        units={**log.units, **{n: model.units[n] for n in factors}},
+        notes=[f"converted: {', '.join(f'{n} from {log.units[n]} to {model.units[n]}' for n in factors)}"],
+    )
 
 
 def keep_while(log: Log, events: Sequence[str]) -> Log:

@@ -12,15 +12,19 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data import preprocessing
-from diransac.data.checks import check_clock, check_even, check_names, check_time_order
+from diransac.data.checks import check_clock, check_names
+from diransac.data.clock import Gridded, in_order, is_even, on_own_grid, runs_freely
+from diransac.data.files import place_of_metadata
 from diransac.data.log import Log
 from diransac.data.preprocessing.steps import check_factor, origins_of, rename_columns, resample_columns
 from diransac.data.readers.recording import Samples
 from diransac.data.readers.repair import Repairs
-from diransac.data.readers.table import Table
-from diransac.data.units import conversion, split_unit
+from diransac.data.readers.repeated import Reading
+from diransac.data.readers.table import Table, with_metadata
+from diransac.data.readers.time_column import seconds, time_column, unit_of_name
+from diransac.data.units import split_unit
 from diransac.errors import LogError, SettingsError
-from diransac.limits import LARGEST_LOG, LARGEST_TEXT, check_ordinary, read_bytes
+from diransac.limits import LARGEST_LOG, LARGEST_RESULT, LARGEST_TEXT, check_ordinary, read_bytes
 from diransac.plain_text import one_line
 
 if TYPE_CHECKING:
@@ -64,6 +68,7 @@ def read_log(
     rename: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     resample: float | str | None = None,
+    like: Iterable[Mapping[str, Any]] = (),
 ) -> Log:
     """Log of a CSV (plain or gzip), Parquet, NPZ, MAT, HDF5, ULog, MCAP or bag file, or of a Crazyflie's micro SD log.
 
@@ -87,6 +92,10 @@ def read_log(
     resample : float or "median", optional
         Rate in Hz for linear interpolation, or ``"median"`` for one row per median interval.  None: the time must be
         even.
+    like : iterable of dict, optional
+        History of a log of the same recorder, such as ``result.logs[0].preparation``.  Its mapping, names, factors,
+        rates, repairs, delays and despiking apply where the arguments above give none.  What the history in the file
+        itself has is not done again.
 
     Returns
     -------
@@ -102,29 +111,41 @@ def read_log(
 
     Notes
     -----
-    The time column is ``t``, in seconds.  Every other column is a signal; a column that does not hold numbers is left
-    out, with a note.  A header ``theta [deg]`` is the signal ``theta`` in degrees.  Rows count from 0, lines of text
-    from 1.
+    The time column is ``t``, else the only one with a name such as ``time``, ``timestamp`` or ``t_ms``; it is converted
+    to seconds from the unit of its header or name.  Every other column is a signal; a column that does not hold numbers
+    is left out, with a note.  A header ``theta [deg]`` or ``theta (deg)`` is the signal ``theta`` in degrees, which a
+    model in radians converts.  Rows count from 0, lines of text from 1.
 
     Topics have clocks of their own.  The rows of the log are those of the fastest topic, or at ``resample`` Hz; a
     sample of a slower topic stands in the row nearest to it, and the rows between are NaN.
     """
     path = Path(path)
     source = one_line(f'log "{path}"')
-    chosen = None if mapping is None else _mapping(mapping)
-    repairs = Repairs.of(_given(repair, chosen, "repair"))
-    resample = _given(resample, chosen, "resample")
+    like = list(like)
+    earlier = Reading.of(like)
+    chosen = earlier.mapping if mapping is None else _mapping(mapping)
+    repairs = Repairs.of(_given(earlier.repairs if repair is None else repair, chosen, "repair"))
+    columns = earlier.columns if columns is None else columns
     opened = _opened(path, source, columns, repairs)
     if isinstance(opened, Table):
-        table = repairs.in_si(_with_clock(opened, rate, source))
-        rename = _stripped(rename, table)
+        done = {step["step"] for step in opened.history}
+        earlier = Reading.of(step for step in like if step["step"] not in done)
+        chosen = earlier.mapping if mapping is None else chosen
+    resample = _given(earlier.resample if resample is None else resample, chosen, "resample")
+    if isinstance(opened, Table):
+        opened = opened if columns is None else opened.with_step({"step": "columns", "names": list(columns)})
+        table = repairs.in_si(_with_clock(opened, earlier.rate if rate is None else rate, source))
+        rename = earlier.names(table, _stripped(rename, table))
+        if chosen is None or chosen.time_column is None:
+            rename = _with_time(rename, table)
     else:
         from diransac.data.readers.topics import is_one_table, table_of_topics, whole_topic
 
-        if chosen is None and is_one_table(opened, rename or {}):
+        rename = {**earlier.rename, **(rename or {})}
+        if chosen is None and is_one_table(opened, rename):
             table = whole_topic(opened, repairs)
         else:
-            table, resample = table_of_topics(opened, chosen, rename or {}, resample, repairs)
+            table, resample = table_of_topics(opened, chosen, rename, resample, repairs)
             rename = None
     if rename:
         table = _renamed(table, rename, source)
@@ -132,8 +153,8 @@ def read_log(
         from diransac.data.readers.topics import mapped_table
 
         table = mapped_table(table, chosen, source)
-    log = _log(table, scale or {}, resample, repairs, source)
-    return log if chosen is None else _prepared(log, chosen)
+    log = _log(table, earlier.factors(table, scale or {}), resample, repairs, source)
+    return earlier.prepared(log if chosen is None else _prepared(log, chosen))
 
 
 def read_topics(path: str | Path) -> TopicTable | None:
@@ -193,39 +214,54 @@ def _log(table: Table, scale: Mapping[str, float], resample: float | str | None,
     """Log of a table: scaled, repaired, resampled and checked."""
     history: list[dict[str, Any]] = list(table.history)
     factors = {name: float(factor) for name, factor in scale.items()}
-    time = _time(table, factors, source)
+    for name, factor in factors.items():
+        check_factor(name, factor)
+    time, converted = seconds(table, factors, source)
     signals, unusable = _signals(table, len(time), source)
     for name in factors:
         if name != "t" and name not in signals:
             raise LogError(f'{source}: there is no signal "{name}" to scale; found {", ".join(table.columns)}')
     if factors:
-        time, signals = time * factors.get("t", 1.0), {n: x * factors.get(n, 1.0) for n, x in signals.items()}
-        history.append({"step": "scale", "factors": factors})
+        signals = {n: x * factors.get(n, 1.0) for n, x in signals.items()}
+        units = {name: table.units[name] for name in factors if name in table.units}
+        history.append({"step": "scale", "factors": factors, **({"units": units} if units else {})})
     ordered = repairs.ordered(Samples(time, signals), "")
     time, signals = ordered.time, dict(ordered.columns)
-    check_time_order(time, source)
-    notes = [*table.notes, *check_clock(time, source)]
-    if resample is None and "clock" in repairs and _is_uneven(time, source):
-        resample = "median"
-        repairs.record("clock", "the clock is uneven")
+    rows = in_order(time, source)
+    notes = [*table.notes, *([converted] if converted else []), *check_clock(time[rows], source)]
+    gridded, resample = _gridded(time, signals, resample, repairs, source)
     if repairs.step is not None:
         history.append(repairs.step)
         notes += repairs.notes
-    if resample is not None:
-        time, signals, step, said = resample_columns(time, signals, resample, source)
+    if gridded is not None:
+        time, signals, recorded = gridded.time, dict(gridded.signals), gridded.recorded
+        history += [] if gridded.step is None else [gridded.step]
+        notes += gridded.notes
+    elif resample is not None:
+        columns = {name: x[rows] for name, x in signals.items()}
+        time, signals, step, said = resample_columns(time[rows], columns, resample, source)
         history.append(step)
-        notes += said
+        recorded, notes = np.ones(len(time), bool), [*notes, *said]
     units = {n: unit for n, unit in table.units.items() if abs(factors.get(n, 1.0)) == 1.0}
     log = Log(time, signals, units, source, tuple(history), unusable=unusable, filter=table.filter)
-    return replace(log, notes=tuple(dict.fromkeys((*notes, *log.findings()))))
+    return replace(log, notes=tuple(dict.fromkeys((*notes, *log.findings(recorded)))))
 
 
-def _is_uneven(time: FloatArray, source: str) -> bool:
+def _gridded(
+    time: FloatArray, signals: Mapping[str, FloatArray], resample: float | str | None, repairs: Repairs, source: str
+) -> tuple[Gridded | None, float | str | None]:
+    """Columns on the log's own grid, or the rate at which they are resampled.  Raises LogError: neither is known."""
+    if resample is not None:
+        return None, resample
+    if "clock" in repairs and not is_even(time):
+        repairs.record("clock", "the clock is uneven")
+        return None, "median"
     try:
-        check_even(time, source)
+        return on_own_grid(time, signals, source), None
     except LogError:
-        return True
-    return False
+        if not runs_freely(time[in_order(time, source)]):
+            raise
+    return None, "median"
 
 
 # ---------------------------------------------------------------------- files
@@ -242,7 +278,7 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
     if columns is not None and ending not in _TEXTS:
         raise LogError(f"{source}: names of columns are those of CSV text without a header; leave them out")
     if ending in _TEXTS:
-        return _imported(_TEXTS[ending])(_content(path, source), source, columns, repairs)
+        return _described(path, _imported(_TEXTS[ending])(_content(path, source), source, columns, repairs), source)
     if ending is not None:
         return _imported(_TABLES[ending])(_content(path, source), source)
     from diransac.data.readers.crazyflie import MAGIC, CrazyflieRecording
@@ -253,6 +289,14 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
     if is_crazyflie:
         return CrazyflieRecording(_content(path, source), source)
     raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}')
+
+
+def _described(path: Path, read: Table | Recording, source: str) -> Table | Recording:
+    """A table with the metadata of the file beside it, where there is one."""
+    beside = place_of_metadata(path)
+    if not beside.is_file() or not isinstance(read, Table) or read.is_described:
+        return read
+    return with_metadata(read, _content(beside, f'metadata "{beside}"', LARGEST_RESULT), source, f'remove "{beside}"')
 
 
 def _imported(place: str) -> Callable[..., Table | Recording]:
@@ -290,10 +334,11 @@ def _check_content(path: Path, source: str) -> None:
         raise LogError(f"{source}: it cannot be read: {error.strerror}") from error
 
 
-def _content(path: Path, source: str) -> bytes:
+def _content(path: Path, source: str, largest: int | None = None) -> bytes:
+    """The bytes of a file; with the largest size of a log, unless there is another one."""
     is_text = _ending(path) in _TEXTS and not path.name.lower().endswith(".gz")
     try:
-        data = read_bytes(path, LARGEST_TEXT if is_text else LARGEST_LOG)
+        data = read_bytes(path, largest or (LARGEST_TEXT if is_text else LARGEST_LOG))
     except ValueError as error:
         raise LogError(f"{source}: {error}; split it") from error
     except FileNotFoundError as error:
@@ -317,8 +362,8 @@ def _with_clock(table: Table, rate: float | None, source: str) -> Table:
     if "t" in table.columns:
         raise LogError(f"{source}: it has a time column; leave out the rate of {rate:.6g} Hz")
     n = max((len(x) for x in table.columns.values() if not isinstance(x, str)), default=0)
-    step = {"step": "clock", "rate": float(rate)}
-    return replace(table, columns={"t": np.arange(n) / rate, **table.columns}, history=(*table.history, step))
+    clocked = replace(table, columns={"t": np.arange(n) / rate, **table.columns})
+    return clocked.with_step({"step": "clock", "rate": float(rate)})
 
 
 def _stripped(rename: Mapping[str, str] | None, table: Table) -> dict[str, str]:
@@ -326,36 +371,21 @@ def _stripped(rename: Mapping[str, str] | None, table: Table) -> dict[str, str]:
     return {new: split_unit(old)[0] if old not in table.columns else old for new, old in (rename or {}).items()}
 
 
+def _with_time(rename: Mapping[str, str], table: Table) -> dict[str, str]:
+    """New names of columns, with that of the time ``t``, where one column alone can be the time."""
+    name = None if "t" in rename else time_column(table, rename.values())
+    return dict(rename) if name is None else {"t": name, **rename}
+
+
 def _renamed(table: Table, names: Mapping[str, str], source: str) -> Table:
     columns = rename_columns(table.columns, names, source)
     units = {new: table.units[old] for new, old in names.items() if old in table.units}
+    named = unit_of_name(names["t"]) if "t" in names else None
+    units |= {"t": named} if named is not None and "t" not in units else {}
     kept = {name: unit for name, unit in table.units.items() if name in columns and name not in names}
     specification = None if table.filter is None else table.filter.renamed(origins_of(table.columns, names))
-    history = (*table.history, {"step": "rename", "names": dict(names)})
-    return replace(table, columns=columns, units=kept | units, filter=specification, history=history)
-
-
-def _time(table: Table, factors: Mapping[str, float], source: str) -> FloatArray:
-    """Column ``t`` (N,) of the file, not scaled.  Raises LogError: there is none, or it is not in seconds."""
-    for name, factor in factors.items():
-        check_factor(name, factor)
-    if "t" not in table.columns:
-        raise LogError(f'{source}: there is no time column "t"; found {", ".join(table.columns)}. {_time_hint(table)}')
-    time = table.columns["t"]
-    if isinstance(time, str):
-        raise LogError(f'{source}: the time column "t" {time}')
-    to_seconds = conversion(table.units.get("t", "s"), "s")
-    if to_seconds not in (None, 1.0) and "t" not in factors:
-        raise LogError(f"{source}: the time is in {table.units['t']}; pass --scale t={to_seconds:.6g}")
-    return time
-
-
-def _time_hint(table: Table) -> str:
-    likely = [name for name in table.columns if name.lower().startswith(("t_", "time", "stamp"))]
-    if len(likely) != 1:
-        return "Say which one it is: --map t=NAME"
-    factor = " --scale t=0.001" if likely[0].lower().endswith(("_ms", "millis")) else ""
-    return f"Say which one it is: --map t={likely[0]}{factor}"
+    renamed = replace(table, columns=columns, units=kept | units, filter=specification)
+    return renamed.with_step({"step": "rename", "names": dict(names)})
 
 
 def _signals(table: Table, n: int, source: str) -> tuple[dict[str, FloatArray], dict[str, str]]:

@@ -38,6 +38,8 @@ class Table:
         Findings of the reader, a sentence each.
     history, filter
         Those of the log that was written to the file, as in `Log`.
+    is_described : bool
+        True with the metadata of a log.
     """
 
     columns: Mapping[str, FloatArray | str]
@@ -45,6 +47,11 @@ class Table:
     notes: tuple[str, ...] = ()
     history: tuple[dict[str, Any], ...] = ()
     filter: FilterSpecification | None = None
+    is_described: bool = False
+
+    def with_step(self, step: Mapping[str, Any]) -> Table:
+        """The table with one more step in its history."""
+        return replace(self, history=(*self.history, dict(step)))
 
     def __post_init__(self) -> None:
         columns = {one_line(name): one_line(x) if isinstance(x, str) else x for name, x in self.columns.items()}
@@ -66,6 +73,7 @@ def with_metadata(table: Table, text: str | bytes, source: str, remedy: str = "w
         notes=(*facts.notes, *table.notes),
         history=facts.history,
         filter=facts.filter,
+        is_described=True,
     )
 
 

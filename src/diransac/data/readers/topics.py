@@ -54,10 +54,10 @@ def mapped_table(table: Table, mapping: LogMapping, source: str) -> Table:
     numeric = {name: x for name, x in columns.items() if not isinstance(x, str)}
     events = [x for x in mapping.events_in({"": list(numeric)}) if not x.topic]
     mapped |= {x.name: x.flags(numeric) for x in events}
-    step = {"step": "map", "mapping": mapping.source, "signals": _origins(entries)}
+    step = {"step": "map", "mapping": mapping.source, "text": mapping.text, "signals": _origins(entries)}
     step |= {"events": [x.name for x in events]} if events else {}
-    history = (*table.history, step)
-    return replace(table, columns=mapped, units=units, notes=(*table.notes, *notes), history=history, filter=None)
+    made = replace(table, columns=mapped, units=units, notes=(*table.notes, *notes), filter=None)
+    return made.with_step(step)
 
 
 def is_one_table(recording: Recording, rename: Mapping[str, str]) -> bool:
@@ -114,6 +114,8 @@ def table_of_topics(
     made = align(parts, resample if len(parts) > 1 else None, source)
     units = {name: unit for entry in entries for name, unit in entry.known_units().items()}
     step: dict[str, Any] = {"step": "map", "mapping": None if mapping is None else mapping.source}
+    step |= {} if mapping is None else {"text": mapping.text}
+    step |= {"renamed": dict(rename)} if rename else {}
     step["signals"] = _origins(entries)
     information = recording.metadata.get("information", {})
     step |= {"log": {name: information[name] for name in _KEPT if name in information}} if information else {}
