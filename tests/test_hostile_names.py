@@ -281,6 +281,14 @@ def test_a_cell_is_no_longer_than_spreadsheets_and_python_read(letter):
     assert next(csv.reader([shown])) == [shown]
 
 
+def test_bytes_in_a_store_of_a_fleet_are_damage(fleet, tmp_path):
+    with closing(sqlite3.connect(fleet)) as connection, connection:
+        connection.execute("UPDATE logs SET verdict = zeroblob(100000)")
+    with pytest.raises(dr.StudyError, match=r"is damaged: TypeError: .* is no text; begin a new one"):
+        export_fleet(fleet, tmp_path / "fleet.csv")
+    assert not (tmp_path / "fleet.csv").exists()
+
+
 def test_a_table_of_a_study_has_a_line_per_trial_and_no_formula(tmp_path):
     with Store(tmp_path / "a.db", load(tiny(trials=3))) as kept:
         kept.add([row(trial=0), row(trial=1, status="failed", error=TEXTS["formula"]), row(trial=2, host=TEXTS["c1"])])

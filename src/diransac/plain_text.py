@@ -176,7 +176,7 @@ def cell(text: str) -> str:
     >>> cell("=1+1"), cell("flight 1.csv")
     ("'=1+1", 'flight 1.csv')
     """
-    shown = printable(text[:_LONGEST_CELL]).replace("\n", " ")[:_LONGEST_CELL]
+    shown = printable(one_line(text[:_LONGEST_CELL]))[:_LONGEST_CELL]
     return f"'{shown}" if shown.lstrip().startswith(("=", "+", "-", "@")) else shown
 
 

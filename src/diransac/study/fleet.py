@@ -576,7 +576,7 @@ def export_fleet(store: str | Path, path: str | Path) -> None:
     Raises
     ------
     StudyError
-        There is no such store.
+        There is no such store, or it has values that are neither numbers nor texts.
     """
     with FleetStore.existing(store) as kept:
         names = [name for _, name, *_ in kept.select("PRAGMA table_info(logs)") if name not in _INTERNAL]
@@ -585,11 +585,13 @@ def export_fleet(store: str | Path, path: str | Path) -> None:
             f"SELECT log, coalesce(vehicle, own_vehicle), time, {columns} FROM asked LEFT JOIN logs USING (log) "
             "ORDER BY place"
         )
+    with damage(Path(store)):
+        lines = [[x if isinstance(x, int | float | None) else cell(word(x)) for x in row] for row in rows]
 
     def write(temporary: Path) -> None:
         with temporary.open("w", newline="", encoding="utf-8") as file:
             table = csv.writer(file)
             table.writerow(["log", "vehicle", "time", *(cell(name.rstrip(AGAIN)) for name in names[1:])])
-            table.writerows([cell(x) if isinstance(x, str) else x for x in row] for row in rows)
+            table.writerows(lines)
 
     write_with(path, write)
