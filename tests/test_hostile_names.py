@@ -27,6 +27,7 @@ from diransac.plain_text import cell, comment, identifier, literal
 from diransac.plots.figure import draw_heading, empty_figure, name_panel, panel, svg, write
 from diransac.study import identify_each, load
 from diransac.study.fleet import export_fleet
+from diransac.study.fleet_findings import summarise_fleet
 from diransac.study.reading import export
 from diransac.study.store import Store
 from hostile import NAMES, TEXTS, named
@@ -287,6 +288,14 @@ def test_bytes_in_a_store_of_a_fleet_are_damage(fleet, tmp_path):
     with pytest.raises(dr.StudyError, match=r"is damaged: TypeError: .* is no text; begin a new one"):
         export_fleet(fleet, tmp_path / "fleet.csv")
     assert not (tmp_path / "fleet.csv").exists()
+
+
+@pytest.mark.parametrize("number", [1.1e150, -1e308])
+def test_an_estimate_whose_square_overflows_is_damage(fleet, number):
+    with closing(sqlite3.connect(fleet)) as connection, connection:
+        connection.execute("UPDATE logs SET parameter_mass = ?", (number,))
+    with pytest.raises(dr.StudyError, match="the square of an estimate overflows"):
+        summarise_fleet(fleet)
 
 
 def test_a_table_of_a_study_has_a_line_per_trial_and_no_formula(tmp_path):

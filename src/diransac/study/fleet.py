@@ -61,6 +61,9 @@ from diransac.time_limit import time_limited
 
 __all__ = ["FleetRows", "FleetStatus", "export_fleet", "fleet_status", "identify_each", "read_fleet"]
 
+_LARGEST = 1e150
+"""Of an estimate: statistics of a fleet have its square."""
+
 _APPLICATION = 0x64697266
 """SQLite's application id: "dirf"."""
 
@@ -547,7 +550,9 @@ def read_fleet(store: str | Path) -> FleetRows:
     with damage(Path(store)):
         rows.sort(key=lambda row: (word(row[1]), _moment(row[2]), int(row[3])))
         numbers = np.array([row[5:] for row in rows], np.float64).reshape(len(rows), 2 * len(units))
-        vehicles = np.array([row[1] for row in rows], np.str_)
+        if np.any(np.isfinite(numbers) & (np.abs(numbers) > _LARGEST)):
+            raise ValueError("the square of an estimate overflows")
+        vehicles = np.array([word(row[1]) for row in rows], np.str_)
         return FleetRows(
             model,
             units,
