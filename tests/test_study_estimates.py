@@ -67,7 +67,7 @@ def test_the_data_of_a_trial_are_to_be_had_alone(whole: dict):
     with pytest.raises(dr.SettingsError, match='no level "some" of outlier magnitude'):
         trial_data(DRAWN, "some")
     for trial in (-1, 1.5, True):
-        with pytest.raises(dr.SettingsError, match=f"trial is {trial}; give a whole number of at least 0"):
+        with pytest.raises(dr.SettingsError, match=f"trial is {trial}; give a whole number from 0 to 10,000,000"):
             trial_data(DRAWN, 40, trial=trial)
 
 

@@ -164,7 +164,8 @@ def _decided(contest: Contest, first: Searched | None, notes: tuple[str, ...]) -
     result = contest.result(winner, chosen.likeliest)
     acting = None if of_fit else contest.candidates[winner].acting
     decided = Decided(contest.summary(winner), acting, contest.of_logs(winner, result.parameters))
-    return replace(chosen, result=result, decided=decided, impossible=of_fit.impossible if of_fit else ())
+    impossible = of_fit.impossible if of_fit else ()
+    return replace(chosen, motion=contest.motion, result=result, decided=decided, impossible=impossible)
 
 
 @dataclass
@@ -263,8 +264,8 @@ class Contest:
             return None
         self.comparison = Comparison.of(self.scores, self._timed)
         best = self.comparison.best
-        error = float(np.nanmedian(self.scores[best].errors))
-        best_so_far = f"best so far: {self.candidates[best].name}, held-out error {error:.2g} of that of no change"
+        errors = ", ".join(f"{x:.2g}" for x in self.scores[best].errors)
+        best_so_far = f"best so far: {self.candidates[best].name}, held-out errors {errors} of those of no change"
         report(self.callback, "comparing predictions", 0.89, best_so_far)
         return best
 
