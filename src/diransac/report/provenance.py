@@ -12,6 +12,7 @@ from diransac.identification.estimate import Resolution
 from diransac.identification.methods import default_options
 from diransac.identification.settings import Settings
 from diransac.model import Model
+from diransac.plain_text import one_line
 from diransac.report.rendering import numbered
 from diransac.report.runs import Entry, summaries
 from diransac.text_table import number, percent, plural
@@ -121,16 +122,12 @@ def snippet(entries: Sequence[Entry]) -> str:
     groups = dict.fromkeys(tuple(s.source for s in summaries(entry.result)) for entry in entries)
     for sources in groups:
         if len(sources) == 1:
-            lines.append(f"log = dr.read_log(...)  # {_one_line(sources[0])}, prepared as above")
+            lines.append(f"log = dr.read_log(...)  # {one_line(sources[0])}, prepared as above")
         else:
-            reads = [f"    dr.read_log(...),  # {_one_line(source)}" for source in sources]
+            reads = [f"    dr.read_log(...),  # {one_line(source)}" for source in sources]
             lines += ["log = [  # prepared as above", *reads, "]"]
-    lines += [f"model = ...  # {_one_line(model.name)}" for model in unique_models(entries)]
+    lines += [f"model = ...  # {one_line(model.name)}" for model in unique_models(entries)]
     return "\n".join([*lines, *(_call(entry) for entry in entries)])
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
 
 
 def _call(entry: Entry) -> str:
