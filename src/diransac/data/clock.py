@@ -98,9 +98,9 @@ def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str
     LogError
         There is no such grid: as `in_order`; or intervals have any length.
     """
-    rows = in_order(time, source)
     if is_even(time):
         return Gridded(time, signals, np.ones(len(time), bool))
+    rows = in_order(time, source)
     dt = float(np.median(np.diff(time[rows])))
     with np.errstate(over="ignore"):
         n_new = float(time[rows[-1]] - time[rows[0]]) / dt

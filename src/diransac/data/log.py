@@ -210,9 +210,8 @@ class Log:
             Rows that were recorded: those of which the missing samples are named.  None: all.
         """
         left_out = [f'column "{name}" is left out: it {why}' for name, why in self.unusable.items()]
-        rows = np.ones(len(self), bool) if recorded is None else recorded
-        recorded_signals = {name: x[rows] for name, x in self.signals.items()}
-        gaps = checks.describe_gaps(self.time[rows], recorded_signals)
+        rows = slice(None) if recorded is None or recorded.all() else recorded  # a view where none is missing
+        gaps = checks.describe_gaps(self.time[rows], {name: x[rows] for name, x in self.signals.items()})
         return (*left_out, *checks.describe_jitter(self.time), *gaps)
 
     # ------------------------------------------------------------------ contents
