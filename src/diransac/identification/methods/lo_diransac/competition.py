@@ -308,14 +308,20 @@ class Contest:
         return float(min(own, default=np.inf))
 
     def of_logs(self, winner: int, parameters: FloatArray) -> tuple[LogEstimate, ...]:
-        """Estimates of each of several logs alone, over the horizon at which the winner predicts best."""
+        """Estimates of each of several logs alone, over the horizon at which the winner predicts best.
+
+        None after the time limit: what was decided stays.
+        """
         if len(self.dataset.segments) < 2:
             return ()
         assert self.arbiter is not None
         report(self.callback, "comparing logs", 0.895)
         n_rows = self.arbiter.steps[int(np.argmin(self.scores[winner].errors))]
         one = replace(self.candidates[winner], parameters=parameters)
-        return estimates_of_logs(one, self.motion, n_rows, outliers=self.settings.outliers)
+        try:
+            return estimates_of_logs(one, self.motion, n_rows, outliers=self.settings.outliers)
+        except TimeLimitError:
+            return ()
 
     def second(self, winner: int, notes: tuple[str, ...]) -> Searched | None:
         """A search from an estimate and its simulated motion; None where it fails."""
