@@ -1,148 +1,288 @@
-"""Ablation of lo-diransac: error of the worst parameter with each part left out by its setting.
+"""Ablation of lo-diransac: what each part contributes, on real records, on regimes, and on a corrupted flight.
 
-Errors are relative to the true parameters; under a model error, to the least squares of the log without noise.
+``python benchmarks/ablation.py [--parts projection,"delays of inputs"] [--seeds 1000:1001] [--records emps,go2-RL]
+[--out rows.jsonl] [--table FILE]``
 
-Run: ``python benchmarks/ablation.py [number of seeds]``.  Prints the error of the worst parameter, %, median over seeds
-[largest], for each scenario and each part that is left out, as a table in Markdown.
+Every run is repeated without one part at a time: by a setting where there is one, else by a patch of the function that
+does the part's work.  Rows are written as they are measured, and a run that is repeated with the same ``--out`` goes on
+from them.  The table has, for each part, the geometric mean of the ratio of errors without and with it, and the runs
+whose error changes by more than a tenth, better or worse.  Errors are held-out ones of real records (`real`), and those
+of the worst parameter elsewhere: relative to the truth in regimes, to least squares of the noise-free flight in the
+corrupted ones.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from real import DATA, RECORDS, Record, logs_of, scores_of
+from regime_flights import REGIMES, recordings
+
 import diransac as dr
-from diransac.errors import DiransacError
+from diransac.identification.methods.lo_diransac.arbiter import Comparison
 from simulated import MACHINES, as_log, flight
 
-MACHINE, MODEL, DT = MACHINES["planar-rotorcraft"], dr.models.planar_rotorcraft(), 0.01
-TRUTH = np.array(list(MACHINE.truth.values()))
-
+METHOD = "diransac.identification.methods.lo_diransac"
+DEFAULT = dr.LoDiransac()
+REAL = "pendulum-A0-one-run,emps,silverbox,crazyflie-log15,go2-RL,go2-RR"
+CHANGED, LEAST = 0.1, 1e-4
 Arrays = tuple[np.ndarray, np.ndarray]
+Row = dict[str, Any]
 
 
-# ---------------------------------------------------------------------- scenarios: signals and inputs, seed by seed
-def outliers(probability: float, magnitude: float) -> Callable[[int], Arrays]:
-    """Outliers in each sample with some probability."""
+@dataclass(frozen=True)
+class Part:
+    """What is left out: by the settings of the method, and by patches of functions and constants."""
 
-    def make(seed: int) -> Arrays:
-        (signals, inputs), rng = CLEAN, np.random.default_rng(seed)
-        hit = rng.random(signals.shape) < probability
-        return signals + hit * rng.uniform(-magnitude, magnitude, signals.shape), inputs
+    settings: dr.LoDiransac = DEFAULT
+    patches: tuple[tuple[str, object], ...] = ()
 
-    return make
+    def left_out(self) -> list[AbstractContextManager[object]]:
+        """Contexts in which the part is missing."""
+        return [patch(f"{METHOD}.{name}", value) for name, value in self.patches] or [nullcontext()]
 
 
-def leverage(seed: int) -> Arrays:
-    """One-sided outliers at high thrust, with probability 0.8."""
-    (signals, inputs), rng = CLEAN, np.random.default_rng(seed)
+def _without_source(name: str) -> Part:
+    return Part(replace(DEFAULT, sources=tuple(x for x in DEFAULT.sources if x != name)))
+
+
+_COMPARED = Comparison.of
+
+
+def _alone(scores: Sequence[Any], timed: np.ndarray) -> Any:
+    """The comparison in which the winner has all the weight."""
+    found = _COMPARED(scores, timed)
+    return replace(found, weights=np.where(np.arange(len(found.weights)) == found.best, 1.0, 0.0))
+
+
+def _parts() -> dict[str, Part]:
+    off = {"input_delay": False, "input_lag": False, "max_recording_errors": 0}
+    return {
+        "nothing": Part(),
+        "random samples": Part(replace(DEFAULT, n_samples=0, n_nonlinear_samples=1)),
+        "outlier component of the noise": Part(replace(DEFAULT, outliers=False)),
+        "unmodelled accelerations": Part(replace(DEFAULT, model_error=False)),
+        "input gain and bias discrepancy": Part(replace(DEFAULT, prior_discrepancy=1e-6, initial_discrepancy=1e-6)),
+        "finer intervals": Part(patches=(("local_search.fewest_parts", lambda _: 0),)),
+        "second start of the exact model": Part(patches=(("local_search._APART", np.inf),)),
+        "errors of recordings": Part(replace(DEFAULT, **off)),
+        "delays by whole samples": Part(patches=(("local_search.LocalSearch._late", lambda *_: 0.0),)),
+        "errors must explain forces": Part(
+            patches=(("local_search._EXPLAINS", -np.inf), ("local_search._EXPLAINS_DRIFT", -np.inf))
+        ),
+        "screening": Part(replace(DEFAULT, stuck_rows=False)),
+        "spikes of inputs": Part(patches=(("search.find_spikes", lambda s, i, m, h, *_: (i, h, 0)),)),
+        "projection": Part(replace(DEFAULT, projection=False)),
+        "robust loss of the projection": Part(patches=(("projection._REWEIGHTED", 0),)),
+        "observers": Part(patches=(("search.with_observed_states", lambda *_: None),)),
+        "least squares": _without_source("least squares"),
+        "simulation error": _without_source("simulation error"),
+        "second fit": _without_source("second fit"),
+        "competition": Part(replace(DEFAULT, sources=())),
+        "mean of as good estimates": Part(patches=(("competition.Comparison.of", _alone),)),
+        "price of another timing": Part(patches=(("arbiter._TIMING", 0.0),)),
+        "exact fits that cannot win end early": Part(
+            patches=(("refinement._is_lost", lambda *_: False), ("local_search.Explanation.exact_is_hopeless", False))
+        ),
+        "second-order correction of steps": Part(patches=(("refinement._CORRECTED", 0.0),)),
+    }
+
+
+# ---------------------------------------------------------------------- runs: a name, and an identification's error
+Run = Callable[[dr.LoDiransac], float]
+
+
+def real_runs(names: Sequence[str]) -> Iterator[tuple[str, Run]]:
+    """Real records by held-out error; none where they are missing."""
+    if not DATA.is_dir():
+        print(f"{DATA} is missing: no real records", file=sys.stderr)
+        return
+    for name in names:
+        yield f"real/{name}", partial(_real, RECORDS[name](DATA))
+
+
+def _real(record: Record, method: dr.LoDiransac) -> float:
+    """Held-out error of a real record."""
+    found = dr.identify(record.model, logs_of(record), method, differentiate=True)
+    resolution = found.estimate.resolution
+    inputs = {"hold": resolution.hold, "delay": resolution.timing.delay, "lag": resolution.timing.lag}
+    return float(scores_of(record, {"parameters": found.parameters, "inputs": inputs})["error"])
+
+
+def regime_runs(seeds: Sequence[int]) -> Iterator[tuple[str, Run]]:
+    """Regimes by the error of the worst parameter."""
+    for name, regime in REGIMES.items():
+        for seed, recording in zip(seeds, recordings(regime, list(seeds)), strict=True):
+            kind = "exact" if regime.exact else "mismatched"
+            yield f"{kind}/{name}/{seed}", partial(_error, regime.machine.model, recording.log, recording.truth)
+
+
+def _error(model: dr.Model, log: dr.Log, truth: Mapping[str, float], method: dr.LoDiransac) -> float:
+    """Relative error of the worst parameter."""
+    found = dr.identify(model, log, method, differentiate=True).parameters
+    return max(abs(found[name] / x - 1.0) for name, x in truth.items())
+
+
+def corrupted_runs(seeds: Sequence[int]) -> Iterator[tuple[str, Run]]:
+    """A flight of the planar rotorcraft with outliers, leverage, the noise of Table III, stuck samples, and a lift."""
+    machine, model, dt = MACHINES["planar-rotorcraft"], dr.models.planar_rotorcraft(), 0.01
+    clean, lifted = (flight(x, 2500, dt) for x in (machine, replace(machine, acceleration=_lifted)))
+    regressors, known = machine.rows(*lifted)
+    least_squares = np.linalg.lstsq(regressors.reshape(-1, 3), known.ravel())[0]
+    pseudo_true = dict(zip(machine.truth, least_squares.tolist(), strict=True))
+    for name, corrupt in CORRUPTIONS.items():
+        for seed in seeds:
+            signals, inputs = corrupt(*(lifted if name == "lift" else clean), np.random.default_rng(seed))
+            truth = pseudo_true if name == "lift" else machine.truth
+            log = as_log(machine, signals, inputs, dt)
+            yield f"corrupted/{name}/{seed}", partial(_error, model, log, truth)
+
+
+def _lifted(q: object, v: object, u: object, p: object) -> tuple[float, ...]:
+    """Accelerations of the rotorcraft with an excess of a tenth of its thrust, straight up."""
+    x, z, theta = MACHINES["planar-rotorcraft"].acceleration(q, v, u, p)
+    return x, z + 0.1 * u[0] / p[0], theta
+
+
+def _outliers(signals: np.ndarray, inputs: np.ndarray, rng: np.random.Generator) -> Arrays:
+    hit = rng.random(signals.shape) < 0.5
+    return signals + hit * rng.uniform(-100.0, 100.0, signals.shape), inputs
+
+
+def _leverage(signals: np.ndarray, inputs: np.ndarray, rng: np.random.Generator) -> Arrays:
+    """One-sided outliers at high thrust, with probability .8."""
     high = np.abs(inputs[:, 0]) > np.quantile(np.abs(inputs[:, 0]), 0.7)
     hit = (rng.random(signals.shape) < 0.8) & high[:, None]
     return signals + hit * rng.uniform(0.0, 80.0, signals.shape), inputs
 
 
-def noise(seed: int) -> Arrays:
+def _noise(signals: np.ndarray, inputs: np.ndarray, rng: np.random.Generator) -> Arrays:
     """Gaussian noise, Table III's maximum: 2.5 m/s^2, 1 rad/s, and both integrated over a sample."""
-    (signals, inputs), rng, r = CLEAN, np.random.default_rng(seed), np.sqrt(DT)
-    sizes = [2.5 * DT, 2.5 * DT, r, 2.5 * r, 2.5 * r, 1.0, 2.5, 2.5, 1.0 / r]
+    dt, r = 0.01, 0.1
+    sizes = [2.5 * dt, 2.5 * dt, r, 2.5 * r, 2.5 * r, 1.0, 2.5, 2.5, 1.0 / r]
     return signals + sizes * rng.normal(size=signals.shape), inputs
 
 
-def stuck(seed: int) -> Arrays:
+def _stuck(signals: np.ndarray, inputs: np.ndarray, rng: np.random.Generator) -> Arrays:
     """Stuck samples in a fifth of the rows, outliers in a tenth, little noise."""
-    signals, inputs = outliers(0.1, 80.0)(seed)
-    rng = np.random.default_rng(seed)
-    signals = signals + 0.02 * CLEAN[0].std(axis=0) * rng.normal(size=signals.shape)
+    signals = signals + 0.02 * signals.std(axis=0) * rng.normal(size=signals.shape)
+    signals = signals + (rng.random(signals.shape) < 0.1) * rng.uniform(-80.0, 80.0, signals.shape)
     for first in rng.choice(np.arange(50, 2400, 50), 10, replace=False):
         signals[first : first + 50] = signals[first - 1]
     return signals, inputs
 
 
-def delayed(seed: int) -> Arrays:
+def _late(signals: np.ndarray, inputs: np.ndarray, rng: np.random.Generator) -> Arrays:
     """Inputs that act 20 ms late, and outliers."""
-    signals, inputs = outliers(0.1, 80.0)(seed)
-    return signals, np.vstack([inputs[2:], inputs[-1:], inputs[-1:]])
+    hit = rng.random(signals.shape) < 0.1
+    return signals + hit * rng.uniform(-80.0, 80.0, signals.shape), np.vstack([inputs[2:], inputs[-1:], inputs[-1:]])
 
 
-def lifted_acceleration(q: object, v: object, u: object, p: object) -> tuple[float, ...]:
-    """Accelerations of the rotorcraft with an excess of a tenth of its thrust, straight up."""
-    x, z, theta = MACHINE.acceleration(q, v, u, p)
-    return x, z + 0.1 * u[0] / p[0], theta
-
-
-def mismatch(seed: int) -> Arrays:
-    """An excess of a tenth of the thrust, straight up; noise; outliers."""
-    (signals, inputs), rng = LIFTED, np.random.default_rng(seed)
+def _lift(signals: np.ndarray, inputs: np.ndarray, rng: np.random.Generator) -> Arrays:
+    """Noise and outliers."""
     hit = rng.random(signals.shape) < 0.2
     noisy = signals + 0.05 * signals.std(axis=0) * rng.normal(size=signals.shape)
     return noisy + hit * rng.uniform(-80.0, 80.0, signals.shape), inputs
 
 
-SCENARIOS: dict[str, Callable[[int], Arrays]] = {
-    "outliers .5 x 100": outliers(0.5, 100.0),
-    "leverage .8 x 80": leverage,
-    "noise, Table III's maximum": noise,
-    "stuck": stuck,
-    "delay": delayed,
-    "mismatch": mismatch,
+CORRUPTIONS: dict[str, Callable[[np.ndarray, np.ndarray, np.random.Generator], Arrays]] = {
+    "outliers .5 x 100": _outliers,
+    "leverage .8 x 80": _leverage,
+    "noise, Table III's maximum": _noise,
+    "stuck": _stuck,
+    "late inputs": _late,
+    "lift": _lift,
 }
 
 
-# ---------------------------------------------------------------------- parts that are left out
-LEFT_OUT = {
-    "nothing": dr.LoDiransac(),
-    "random samples": dr.LoDiransac(n_samples=0),
-    "local optimisation": dr.LoDiransac(max_steps=0, projection=False),
-    "outlier component of the noise": dr.LoDiransac(outliers=False),
-    "unmodelled accelerations": dr.LoDiransac(model_error=False),
-    "prior of a thousandth": dr.LoDiransac(prior_model_error=1e-5),
-    "input gain and bias discrepancy": dr.LoDiransac(prior_discrepancy=1e-6, initial_discrepancy=1e-6),
-    "delay": dr.LoDiransac(input_delay=False, input_lag=False, max_delay_shifts=0),
-    "delay by whole samples first": dr.LoDiransac(delay_range=(0.0, 0.0)),
-    "projection": dr.LoDiransac(projection=False),
-    "screening": dr.LoDiransac(stuck_rows=False),
-}
+# ---------------------------------------------------------------------- rows and table
+def measured(part: str, name: str, run: Run) -> Row:
+    """Error and time of a run without a part; an error of infinity where it is refused."""
+    begin, contexts = time.perf_counter(), PARTS[part].left_out()
+    try:
+        for context in contexts:
+            context.__enter__()
+        error = run(PARTS[part].settings)
+    except dr.DiransacError:
+        error = np.inf
+    finally:
+        for context in contexts:
+            context.__exit__(None, None, None)
+    return {"part": part, "run": name, "error": error, "seconds": time.perf_counter() - begin}
 
 
-def worst_errors(make: Callable[[int], Arrays], method: dr.LoDiransac, n_seeds: int) -> Iterator[float]:
-    """Error of the worst parameter, %, seed by seed; infinite where there is no estimate."""
-    for seed in range(n_seeds):
-        log = as_log(MACHINE, *make(seed), DT)
-        try:
-            found = np.array(list(dr.identify(MODEL, log, method, seed=seed).parameters.values()))
-        except DiransacError:
-            yield np.inf
-        else:
-            yield 100.0 * float(np.abs(found / (PSEUDO_TRUE if make is mismatch else TRUTH) - 1.0).max())
+def table(rows: Sequence[Row]) -> str:
+    """Markdown: a row for each part, a column for each group of runs."""
+    whole = {row["run"]: row for row in rows if row["part"] == "nothing"}
+    groups = list(dict.fromkeys(name.partition("/")[0] for name in whole))
+    lines = ["| without | " + " | ".join(groups) + " | time |", "|---|" + "---|" * (len(groups) + 1)]
+    for part in [x for x in dict.fromkeys(row["part"] for row in rows) if x != "nothing"]:
+        own = [row for row in rows if row["part"] == part and row["run"] in whole]
+        cells = [_cell([row for row in own if row["run"].startswith(f"{group}/")], whole) for group in groups]
+        seconds = sum(row["seconds"] for row in own) / sum(whole[row["run"]]["seconds"] for row in own)
+        lines.append(f"| {part} | {' | '.join(cells)} | {seconds:.2f} |")
+    return "\n".join(lines)
 
 
-def text(error: float) -> str:
-    """An error with two digits."""
-    if not np.isfinite(error):
-        return "no estimate"
-    return "0" if error < 1e-3 else f"{error:.2g}"
+def _cell(rows: Sequence[Row], whole: dict[str, Row]) -> str:
+    """Geometric mean of the ratios of the runs with an error, numbers of worse and better runs, and refusals."""
+    ratios = np.array([max(row["error"], LEAST) / max(whole[row["run"]]["error"], LEAST) for row in rows])
+    known = ratios[np.isfinite(ratios) & (ratios > 0.0)]
+    if not len(known):
+        return "-"
+    worse, better = int((known > 1.0 + CHANGED).sum()), int((known < 1.0 / (1.0 + CHANGED)).sum())
+    refused = int(np.isinf(ratios).sum())
+    counts = [f"{n} {what}" for n, what in ((worse, "worse"), (better, "better"), (refused, "refused")) if n]
+    return f"{np.exp(np.log(known).mean()):.2f}" + (f" ({', '.join(counts)} of {len(rows)})" if counts else "")
 
 
 def main() -> None:
-    """Print the table."""
-    n_seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 3
-    print("| left out | " + " | ".join(SCENARIOS) + " |\n|---|" + "---|" * len(SCENARIOS))
-    for name, method in LEFT_OUT.items():
-        cells = [np.array(list(worst_errors(make, method, n_seeds))) for make in SCENARIOS.values()]
-        shown = " | ".join(f"{text(np.median(errors))} [{text(errors.max())}]" for errors in cells)
-        print(f"| {name} | {shown} |", flush=True)
+    """Measure what is missing, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--parts", help="names or beginnings of names; all by default")
+    parser.add_argument(
+        "--seeds", default="1000:1001", help="of the regimes and the corrupted flights, from A to B - 1"
+    )
+    parser.add_argument("--records", default=REAL, help="real records")
+    parser.add_argument("--out", type=Path, help="rows, as JSON lines, from which a run goes on")
+    parser.add_argument("--table", type=Path, help="a file to write the table to")
+    chosen = parser.parse_args()
+    warnings.simplefilter("ignore")
+    rows = [json.loads(x) for x in chosen.out.read_text().splitlines()] if chosen.out and chosen.out.exists() else []
+    done = {(row["part"], row["run"]) for row in rows}
+    first, last = map(int, chosen.seeds.split(":"))
+    seeds = range(first, last)
+    runs = [*corrupted_runs(seeds), *regime_runs(seeds), *real_runs(chosen.records.split(","))]
+    beginnings = ("nothing", *(chosen.parts.split(",") if chosen.parts else [""]))
+    for part in [x for x in PARTS if x.startswith(beginnings)]:
+        for name, run in runs:
+            if (part, name) not in done:
+                rows.append(measured(part, name, run))
+                print(f"{part}: {name} {rows[-1]['error']:.3g}", file=sys.stderr, flush=True)
+                if chosen.out:
+                    with chosen.out.open("a") as file:
+                        file.write(json.dumps(rows[-1]) + "\n")
+    print(table(rows))
+    if chosen.table:
+        chosen.table.write_text(table(rows) + "\n")
 
 
-CLEAN = flight(MACHINE, 2500, DT)
-LIFTED = flight(replace(MACHINE, acceleration=lifted_acceleration), 2500, DT)
-W, B = MACHINE.rows(*LIFTED)
-PSEUDO_TRUE = np.linalg.lstsq(W.reshape(-1, 3), B.ravel())[0]
+PARTS = _parts()
 
 if __name__ == "__main__":
     main()

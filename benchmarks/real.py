@@ -72,15 +72,16 @@ def rows_of(record: Record, methods: Sequence[str]) -> Iterable[Row]:
 def _method(record: Record, method: str) -> Callable[[], Found | dr.Result] | None:
     """Call that identifies; None where the method does not apply."""
     if method == "default":
-        return lambda: dr.identify(record.model, _logs(record), differentiate=True)
+        return lambda: dr.identify(record.model, logs_of(record), differentiate=True)
     if method in LEAST_SQUARES:
-        return lambda: dr.identify(record.model, _logs(record), method, differentiate=True)
+        return lambda: dr.identify(record.model, logs_of(record), method, differentiate=True)
     if method == "published":
         return (lambda: (record.published, Inputs())) if set(record.published) == set(record.model.parameters) else None
     return record.baselines.get(method)
 
 
-def _logs(record: Record) -> dr.Log | list[dr.Log]:
+def logs_of(record: Record) -> dr.Log | list[dr.Log]:
+    """The training logs."""
     return record.train[0] if len(record.train) == 1 else list(record.train)
 
 
@@ -99,7 +100,7 @@ def _row(record: Record, method: str, identified: Callable[[], Found | dr.Result
     else:
         row |= _estimates(found)
     row["seconds"] = time.perf_counter() - begin
-    return row | _scores(record, row)
+    return row | scores_of(record, row)
 
 
 def _estimates(found: Found | dr.Result) -> Row:
@@ -122,7 +123,7 @@ def _finite(intervals: Mapping[str, Sequence[float]] | None) -> dict[str, list[f
     return {name: [float(x) if np.isfinite(x) else None for x in ends] for name, ends in (intervals or {}).items()}
 
 
-def _scores(record: Record, row: Row) -> Row:
+def scores_of(record: Record, row: Row) -> Row:
     """Held-out error and its parts."""
     if record.judge is None or record.reference is None:
         return {"error": None}
@@ -261,7 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     before, measured = [], []
     for name in records:
         record = RECORDS[name](chosen.data)
-        before += [row | _scores(record, row) for row in earlier if row["record"] == name]
+        before += [row | scores_of(record, row) for row in earlier if row["record"] == name]
         for row in rows_of(record, methods):
             measured.append(row)
             _tell(row, chosen.out)

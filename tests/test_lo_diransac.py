@@ -255,7 +255,7 @@ def test_progress_never_falls_though_several_delays_are_tried():
     calls = []
     dr.identify(model, dr.Log.from_arrays(np.arange(len(spoilt) - 4) * 0.01, columns), progress=calls.append)
     fractions = [x.fraction for x in calls]
-    assert sum(x.stage == "local optimisation" for x in calls) > 1
+    assert sum(x.stage == "errors of the recordings" for x in calls) > 1
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
 
@@ -267,12 +267,9 @@ BAD = {
     "n_samples": (-1, 2.5, True, "many", None),
     "substeps": (0, 1.5, False),
     "max_steps": (-1,),
-    "max_delay_shifts": (-1,),
     "input_window": (0.0, -1.0, np.inf, np.nan, "short"),
     "smoothing_half_width": (0.0,),
     "prior_model_error": (-1e-3, np.nan),
-    "prior_inflation": (0.0,),
-    "prior_delay": (0.0,),
     "delay_range": ((0.01, 0.02), (-0.02, -0.01), 0.1, (0.0,), ("a", "b"), (0.0, np.nan), (-np.inf, np.inf)),
     "outliers": (1, None, "yes"),
     "model_error": (0,),
@@ -328,7 +325,7 @@ LEFT_OUT = [
     {"model_error": False},
     {"prior_model_error": 1e-5},
     {"prior_discrepancy": 1e-6, "initial_discrepancy": 1e-6},
-    {"input_delay": False, "input_lag": False, "max_delay_shifts": 0},
+    {"input_delay": False, "input_lag": False},
     {"projection": False},
     {"stuck_rows": False},
     {"prior_model_error": 0.0},

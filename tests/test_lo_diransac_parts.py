@@ -30,7 +30,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     unexplained,
 )
 from diransac.identification.methods.lo_diransac.recording_errors import effect_on
-from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
+from diransac.identification.methods.lo_diransac.refinement import Refinement
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
     Samples,
@@ -239,28 +239,18 @@ def test_augmented_model_is_the_model_where_nothing_deviates():
     model, rng = augmented_model(ROTORCRAFT).model, np.random.default_rng(7)
     x, u = rng.normal(size=6), rng.normal(size=2)
     free = np.concatenate([TRUTH, np.zeros(model.n_p - 3)])
-    assert np.allclose(
-        model.dynamics(x, [*u, 9, 9], free)[1].full(), ROTORCRAFT.dynamics(x, u, TRUTH)[1].full(), rtol=1e-14
-    )
+    assert np.allclose(model.dynamics(x, u, free)[1].full(), ROTORCRAFT.dynamics(x, u, TRUTH)[1].full(), rtol=1e-14)
 
 
 def test_augmented_model_adds_unmodelled_accelerations_and_forces_that_go_with_the_inputs():
     parts = augmented_model(ROTORCRAFT)
     rng = np.random.default_rng(8)
     x, u, d, push = rng.normal(size=6), rng.normal(size=2), rng.normal(size=3), rng.normal(size=(3, 3))
-    found = parts.model.dynamics(x, [*u, 0, 0], [*TRUTH, *push.ravel(), 0.0, *d])[1].full().ravel()
+    found = parts.model.dynamics(x, u, [*TRUTH, *push.ravel(), *d])[1].full().ravel()
     own = ROTORCRAFT.dynamics(x, u, TRUTH)[1].full().ravel()
     mass, inertia, _ = TRUTH
     expected = own + d + push @ np.append(1.0, u) / [mass, mass, inertia]
     assert np.allclose(found, expected, rtol=1e-12)
-
-
-def test_augmented_model_delays_its_inputs_to_first_order():
-    parts = augmented_model(ROTORCRAFT)
-    x, u, later = np.zeros(6), np.array([2.0, 0.1]), np.array([-0.3, 0.02])
-    free = np.concatenate([TRUTH, np.zeros(parts.n_discrepancies), [0.5], np.zeros(3)])
-    found = parts.model.dynamics(x, [*u, *later], free)[1].full()
-    assert np.allclose(found, ROTORCRAFT.dynamics(x, u + 0.5 * later, TRUTH)[1].full(), rtol=1e-13)
 
 
 def test_intervals_from_true_states_reproduce_the_log():
@@ -297,8 +287,7 @@ def test_intervals_are_split_into_equal_parts_of_three_rows_at_least():
 def test_an_exact_model_is_hopeless_until_unmodelled_accelerations_fall_by_as_much_as_it_was_behind():
     intervals, signals = intervals_of()
     fit = with_residuals(intervals, perturbed_fit(intervals, signals))
-    prior = Prior(fit.tau, fit.prior, 1.0, 1.0, 1.0)
-    now = Explanation(intervals, Refinement(fit, 0.0, 0.1, 9, True), prior, exact=False)
+    now = Explanation(intervals, Refinement(fit, 0.0, 9, True), exact=False)
     left = np.log(np.sqrt(np.square(unexplained(intervals, fit, projected_parameters(intervals, fit))).mean(axis=0)))
     samples = float(intervals.known.sum())
 
@@ -317,8 +306,9 @@ def test_an_exact_model_is_hopeless_until_unmodelled_accelerations_fall_by_as_mu
 
 def test_delay_moves_the_inputs_by_rows():
     intervals, _ = intervals_of()
-    assert np.array_equal(replace(intervals, delay=2).inputs[2:], intervals.inputs[:-2])
-    assert np.array_equal(replace(intervals, delay=-3).inputs[:-3], intervals.inputs[3:])
+    delay = intervals.all_inputs("delay")
+    assert np.array_equal(intervals.with_input_error(delay, 2.0).inputs[2:], intervals.inputs[:-2])
+    assert np.array_equal(intervals.with_input_error(delay, -3.0).inputs[:-3], intervals.inputs[3:])
 
 
 # ---------------------------------------------------------------------- normal equations
@@ -389,7 +379,7 @@ def test_a_gauss_newton_step_solves_a_linear_problem_at_once():
     intervals = intervals_over(measured, inputs, model, dt, 20)
     noise = Mixture(np.ones(3), np.full(3, 0.1), np.full(3, 10.0), np.full(3, 1e-6))
     shared, x, d = np.zeros(intervals.n_shared), np.zeros((5, 2)), np.zeros((5, 1))
-    prior = (np.r_[np.inf, 0.1, 0.1, 1e-9], np.zeros(4))
+    prior = (np.r_[np.inf, 0.1, 0.1], np.zeros(3))
     sizes = (np.array([0.3]), np.array([0.6]), np.array([0.1, 0.1]), *prior)
     fit = with_residuals(intervals, Fit(shared, x, d, measured, x, noise, *sizes))
     weights = rng.uniform(0.5, 2.0, (n, 3))

@@ -61,7 +61,7 @@ def rail_log(gusts, seed=0):
     return dr.Log.from_arrays(t, columns)
 
 
-PLAIN = {"suggestions": False, "input_delay": False, "input_lag": False, "max_sensor_errors": 0, "n_samples": 30}
+PLAIN = {"suggestions": False, "input_delay": False, "input_lag": False, "max_recording_errors": 0, "n_samples": 30}
 
 
 def estimate(log, **options):

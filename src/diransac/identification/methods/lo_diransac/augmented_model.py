@@ -6,7 +6,6 @@ All discrepancies are parameters of an ordinary model, so that compiled rollouts
 - Input gain and bias discrepancies: in every equation a constant force, and one in proportion to each input.  An
   actuator with another gain or direction than in the model deviates by the same amount throughout the motion;
   unmodelled accelerations, free in every interval, would attribute that to the parameters.
-- A delay of the inputs, ``u(t - tau) = u - tau du/dt``.
 
 Sensors measure the motion as it is, unmodelled accelerations included.
 
@@ -41,8 +40,7 @@ class AugmentedModel:
     ----------
     model : Model
         Model whose parameters are the original ones; the discrepancies, equation by equation the bias and one gain per
-        input; the delay in samples; the unmodelled accelerations.  Its inputs are u, and the change of u per sample of
-        delay.
+        input; the unmodelled accelerations.
     n_p, n_v, n_u : int
         Number of parameters, velocities and inputs of the original model.
     """
@@ -66,7 +64,7 @@ class AugmentedModel:
 
 @lru_cache(maxsize=16)
 def augmented_model(model: Model) -> AugmentedModel:
-    """The model with unmodelled accelerations, input gain and bias discrepancies, and an input delay.
+    """The model with unmodelled accelerations, and input gain and bias discrepancies.
 
     Parameters
     ----------
@@ -77,13 +75,12 @@ def augmented_model(model: Model) -> AugmentedModel:
     AugmentedModel
     """
     derived, own = model.kinematics is None, model.rate_names
-    later, latent = [f"{n}_later" for n in model.inputs], [f"unmodelled_{n}" for n in own]
+    latent = [f"unmodelled_{n}" for n in own]
     discrepancies = [f"discrepancy_{i}_{k}" for i in range(model.n_v) for k in range(model.n_u + 1)]
 
     def arguments(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[ca.SX]:
-        applied = _stacked(u, model.inputs) + p.input_delay * _stacked(u, later)
         motion = [_stacked(q, model.coordinates), _stacked(v, own), _stacked(a, own)]
-        return [*motion, applied, _stacked(p, model.parameters)]
+        return [*motion, _stacked(u, model.inputs), _stacked(p, model.parameters)]
 
     def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
         coordinates, velocities, accelerations, applied, parameters = arguments(q, v, a, u, p)
@@ -98,8 +95,8 @@ def augmented_model(model: Model) -> AugmentedModel:
     augmented = Model(
         f"{model.name}, augmented",
         model.coordinates,
-        {**model.inputs, **dict(zip(later, model.inputs.values(), strict=True))},
-        {**model.parameters, **{n: Parameter("") for n in (*discrepancies, "input_delay", *latent)}},
+        model.inputs,
+        {**model.parameters, **{n: Parameter("") for n in (*discrepancies, *latent)}},
         equations,
         velocities=None if derived else model.velocities_of_motion,
         kinematics=None if derived else kinematics,

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.identification.estimate import Finding
-from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs, lags_of_inputs
 from diransac.text_table import duration, number, percent
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.local_search import Explanation
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.parts import Parts
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
@@ -40,15 +38,15 @@ def findings_of_fit(found: Explanation, parts: Parts, acting: ActingInputs | Non
     iterator of Finding
     """
     hold = found.intervals.hold if acting is None else acting.hold
-    if hold != "zero-order" and not (found.intervals.lag and acting is None):
+    if hold != "zero-order" and not (found.intervals.all_errors.input_lag.any() and acting is None):
         how = {"linear": "linearly", "smooth": "smoothly"}[hold]
         yield Finding("note", f"Inputs that vary {how} between samples explain this log better than held ones.")
     if acting is None:
-        yield from _of_recordings(found.intervals, found.refinement.fit)
+        yield from _of_recordings(found.intervals)
     yield from _of_parts(found.intervals.layout.names, parts)
 
 
-def _of_recordings(intervals: ShootingIntervals, fit: Fit) -> Iterator[Finding]:
+def _of_recordings(intervals: ShootingIntervals) -> Iterator[Finding]:
     """Delays and biases of sensors, own delays and lags of inputs, and drifts of their gains."""
     errors = intervals.all_errors
     signals = np.array(intervals.model.signals)
@@ -62,11 +60,8 @@ def _of_recordings(intervals: ShootingIntervals, fit: Fit) -> Iterator[Finding]:
         if bias:
             size, unit = number(bias, 3), intervals.model.units[name]
             yield Finding("care", f"{name} has a sensor bias of {size} {unit}, which the estimate includes.")
-    delays, lags = np.zeros((2, len(intervals.model.inputs)))
-    if errors.input_delay.any():
-        delays = delays_of_inputs(intervals, fit)
-    if errors.input_lag.any():
-        lags = lags_of_inputs(intervals, fit)
+    own = {x.what: x != intervals.all_inputs(x.what) for x in errors.kinds if x.of_inputs and x.what != "drift"}
+    delays, lags = errors.input_delay * own.get("delay", False), errors.input_lag * own.get("lag", False)
     for name, delay, lag, drift in zip(intervals.model.inputs, delays, lags, errors.gain_drift, strict=True):
         if abs(delay) > _SMALL_DELAY:
             time, sense = duration(abs(delay) * intervals.dt), "later" if delay > 0.0 else "earlier"

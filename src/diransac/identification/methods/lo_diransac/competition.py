@@ -210,8 +210,8 @@ class Contest:
 
     def _acting(self, found: Searched) -> ActingInputs:
         """Inputs as they act in a fit."""
-        timing = found.timing(forced=self.settings.forces_timing)
-        return ActingInputs.of_fit(found.likeliest.intervals, found.likeliest.refinement.fit, timing)
+        intervals = found.likeliest.intervals
+        return ActingInputs(intervals.inputs, intervals.hold, found.timing, fitted=True)
 
     def add_sources(self, first: Searched | None) -> None:
         """Add a fit's estimates, least squares of all rows, and simulation error, which starts from all of these."""
@@ -332,7 +332,7 @@ class Contest:
         try:
             return searched(
                 self.settings, replace(intervals, hold=one.acting.hold), motion, notes, self.seed, self.dataset,
-                within(self.callback, 0.88, 0.9), hypotheses=one.parameters[None],
+                within(self.callback, 0.89, 0.895), hypotheses=one.parameters[None],
             )  # fmt: skip
         except (IdentificationError, np.linalg.LinAlgError):
             return None

@@ -1,7 +1,7 @@
 """Local optimisations from the best hypothesis, and what else explains a log: the likeliest explanation wins.
 
 An explanation is a fit with its freedom: whether the model has discrepancies, how fast unmodelled accelerations vary,
-and how inputs act after they are recorded.  Explanations are compared by their evidence, in which freedom costs, so
+and which errors its recordings have.  Explanations are compared by their evidence, in which freedom costs, so
 that an exact model without delay is the estimate wherever it explains the log as well.
 
 References
@@ -12,8 +12,8 @@ MacKay 1992; Schwarz 1978 (the price of a scale).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -24,8 +24,11 @@ from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
 from diransac.identification.methods.lo_diransac.recording_errors import (
+    RecordingError,
     clear_errors,
     errors_of,
+    errors_of_inputs,
+    errors_of_signals,
     with_errors,
 )
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
@@ -33,47 +36,38 @@ from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.recording_errors import RecordingError
     from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["LEAST_LAG", "Explanation", "LocalSearch", "fewest_parts"]
+__all__ = ["LATE", "Explanation", "LocalSearch", "fewest_parts"]
 
-LEAST_LAG = 0.1
-"""Shortest lag of the inputs, samples."""
+LATE: tuple[Literal["delay", "lag"], ...] = ("delay", "lag")
+"""Errors by which inputs act late."""
 
 # Difference of two fits' evidence, nats, below which both are as likely.
 _AS_LIKELY = 5.0
-# Delays that are tried at a time, before they are refined to a sample.
-_DELAYS_AT_A_TIME = 12
+# Delays, or lags, that are tried at a time, before a delay is refined to a sample.
+_AT_A_TIME = 12
 # Samples that the range of delays spans to either side at least, and at most.
 _SAMPLES_OF_DELAY = 2, 100
-# Lags that are tried where one is required.
-_LAGS = 9
 # Shortest interval, samples.
 _SHORTEST = 3
-# A delay that is worth an explanation: so many standard errors, and so many samples.
-_SIGNIFICANT, _SMALL_DELAY = 3.0, 0.1
-# Half a sample of delay or more is taken up by shifting the inputs.
-_WHOLE_SAMPLE = 0.5
 # Relative difference of parameters that makes a second start.
 _APART = 0.2
-# Log of the factor by which a delay, and a drift, must lower unmodelled accelerations.
+# Log of the factor by which an error of a recording, and a drift, must lower unmodelled accelerations.
 _EXPLAINS, _EXPLAINS_DRIFT = float(np.log(1.25)), float(np.log(4.0))
-# Prior delay of a fit without one.
-_FIXED = 1e-6
 # Decrease of the log residuals of each signal by which a delay is worth to be tried.
 _SMALL_GAIN = 0.03
 # Newton steps of the errors of recordings at most; changes over standard errors that end them.
 _REFINEMENTS, _REFINED = 4, 0.1
-# Inputs that vary between samples act half a sample before held ones.
-_CONTINUOUS = (-0.9, -0.1)
+# Delays, samples, of held inputs that vary between samples; shortest lag.
+_CONTINUOUS, _SHORTEST_LAG = (-0.9, -0.1), 0.5
 
 
 @dataclass(frozen=True)
@@ -107,8 +101,6 @@ class Explanation:
     intervals : ShootingIntervals
         With the timing of the inputs.
     refinement : Refinement
-    prior : Prior
-        Of the fit; without a delay, where its delay is fixed.
     exact : bool
         Whether the fit is one of the model as it is.
     complete : bool, optional
@@ -119,17 +111,15 @@ class Explanation:
 
     intervals: ShootingIntervals
     refinement: Refinement
-    prior: Prior
     exact: bool
     complete: bool = True
     trial: ExactTrial | None = None
 
     @property
     def cost(self) -> float:
-        """Negative log evidence, with half the logarithm of the number of rows for each scale and for a delay."""
+        """Negative log evidence, with half the logarithm of the number of rows for each scale and each error."""
         intervals = self.intervals
-        late = abs(intervals.delay + self.refinement.fit.shared[-1]) > _SMALL_DELAY or bool(intervals.lag)
-        n_scales = (0 if self.exact else 2 * intervals.model.n_v + 1) + late
+        n_scales = (0 if self.exact else 2 * intervals.model.n_v + 1) + len(intervals.all_errors.kinds)
         return self.refinement.cost + 0.5 * n_scales * float(np.log(intervals.is_logged.sum()))
 
     @property
@@ -214,94 +204,100 @@ class LocalSearch:
 
     def _ever_likelier(self, intervals: ShootingIntervals, *, free_hold: bool) -> Iterator[Explanation]:
         """The likeliest explanation so far after each stage of the search."""
-        report(self.callback, "searching for a delay", 0.1)
-        delay = self._likeliest_delay(intervals)
-        flexible = self._from_hypothesis(intervals, 0)
+        required = self._required(intervals)
+        flexible = self._from_hypothesis(self._likeliest(intervals, required))
         yield flexible
-        best = self._simplest(flexible, self._prior_of(intervals))
+        best = self._simplest(flexible)
         yield best
-        if delay:
-            delayed = replace(intervals, delay=delay)
-            other = self._simplest(self._from_hypothesis(delayed, 1), self._prior_of(delayed))
-            best = self._better(best, [other])
+        named = [*required, *self._named(intervals)]
+        if named:
+            best = self._simplified(self._with_refined_errors(best, named))
             yield best
-        best = self._with_timing(best, free_hold=free_hold)
-        yield best
-        found = self._with_errors_of_recordings(self._with_named_errors(best))
-        yield found
-        if found is best:
-            return
-        # Inputs are late, or early, with respect to sensors that are so themselves.
-        yield self._with_refined_errors(self._with_timing(found, free_hold=free_hold))
-
-    def _with_timing(self, best: Explanation, *, free_hold: bool) -> Explanation:
-        """The explanation with another timing of the inputs, where that makes it likelier or is required."""
-        settings = self.settings
-        forced = bool(settings.input_delay or settings.input_lag)
-        for k in range(max(settings.max_delay_shifts, forced)):
-            report(self.callback, "timing of the inputs", 0.6 + 0.1 * k)
-            # A free delay suggests the others, even where no delay is admitted.
-            is_free = k > 0 or (best.exact and settings.input_delay is not False)
-            trial = best if is_free else self._refitted(best, best.intervals, self.prior)
-            others = [self._refitted(trial, x) for x in self._timings(trial, free_hold=free_hold)]
-            if settings.input_delay is not False and not (settings.input_lag and k == 0):
-                others.insert(0, trial)
-            required = forced and k == 0
-            likelier = min(others, key=lambda x: x.cost) if required else self._better(best, others)
-            if likelier is best and not required:
+        for k in range(self.settings.max_recording_errors):
+            report(self.callback, "errors of the recordings", 0.6 + 0.03 * k)
+            likelier = [self._settled(x) for x in self._with_another_error(best, free_hold=free_hold)]
+            if not likelier:
                 break
-            best = likelier
-        return best
+            best = min(likelier, key=lambda x: x.cost)
+            yield best
 
-    def _with_named_errors(self, best: Explanation) -> Explanation:
-        """The explanation with the errors of recordings that the settings name."""
-        model, settings = best.intervals.model, self.settings
+    def _required(self, intervals: ShootingIntervals) -> list[ErrorKind]:
+        """The delay or the lag of all inputs, where the settings require it."""
+        settings = self.settings
+        required = {"delay": settings.input_delay, "lag": settings.input_lag}
+        return [intervals.all_inputs(what) for what in LATE if required[what]]
+
+    def _named(self, intervals: ShootingIntervals) -> list[ErrorKind]:
+        """Errors of recordings that the settings name."""
+        model, settings = intervals.model, self.settings
         signals, inputs = model.signals.index, list(model.inputs).index
         delays = settings.sensor_delays or ()
         named = [ErrorKind((signals(x),), "delay") for x in delays if x not in model.inputs]
         named += [ErrorKind((inputs(x),), "delay", of_inputs=True) for x in delays if x in model.inputs]
         named += [ErrorKind((signals(x),), "bias") for x in settings.sensor_biases or ()]
-        named += [ErrorKind((inputs(x),), "drift", of_inputs=True) for x in settings.gain_drifts or ()]
-        if not named:
-            return best
-        report(self.callback, "errors of the recordings", 0.8)
-        return self._simplified(self._with_refined_errors(best, named))
+        return [*named, *(ErrorKind((inputs(x),), "drift", of_inputs=True) for x in settings.gain_drifts or ())]
 
-    def _with_errors_of_recordings(self, best: Explanation) -> Explanation:
-        """The explanation with errors of the recordings, one after the other, as long as they make it likelier.
+    def _sought(self, best: Explanation) -> list[ErrorKind]:
+        """Errors of recordings that the settings leave to the evidence.
 
-        Where the model is exact, groups are tested, and single signals of its measurement equations: nothing else
-        depends on them, so that the motion is as likely whatever their delay.
+        Where the model is exact, all inputs, groups of signals and single signals of its measurement equations are
+        tested: nothing else depends on the latter, so that the motion is as likely whatever their delay.
         """
-        model, settings = best.intervals.model, self.settings
-        named = {"delay": settings.sensor_delays, "bias": settings.sensor_biases, "drift": settings.gain_drifts}
-        kinds = [kind for kind, names in named.items() if names is None]
-        if "delay" in kinds and settings.input_lag is not False:
-            kinds.append("lag")
-        alone = np.full(len(model.signals), not best.exact)
+        intervals, settings = best.intervals, self.settings
+        model, alone = intervals.model, np.full(len(intervals.model.signals), not best.exact)
         alone[len(model.signals) - len(model.sensors) :] = True
-        for k in range(settings.max_sensor_errors):
-            report(self.callback, "errors of the recordings", 0.8 + 0.01 * k)
-            fit, likelier = best.refinement.fit, best
-            errors = clear_errors(best.intervals, fit, alone, kinds, worth=_AS_LIKELY)
-            if not best.exact:
-                from diransac.identification.methods.lo_diransac.missing_terms import clear_errors_of_inputs
+        late = {intervals.all_inputs(what) for what in LATE}
+        switches = {"delay": settings.input_delay, "lag": settings.input_lag}
+        own = {"delay": settings.sensor_delays, "lag": settings.sensor_delays, "bias": settings.sensor_biases}
+        own["drift"] = settings.gain_drifts
 
-                errors += clear_errors_of_inputs(best.intervals, fit, best.projected, kinds)
-            lag_may_help = True
-            for error in errors:
-                if error.kind.what == "lag" and not lag_may_help:
-                    continue
-                trial = self._with_errors(best, [error])
-                if error.kind.of_inputs and error.kind.what == "delay":  # which acts much like a lag
-                    lag_may_help = trial.cost < best.cost
+        def admits(kind: ErrorKind) -> bool:
+            if kind in late:
+                other = settings.input_lag if kind.what == "delay" else settings.input_delay
+                return switches[kind.what] is not False and not other
+            if kind.of_inputs and (best.exact or switches.get(kind.what) is False):
+                return False
+            return own[kind.what] is None
+
+        return [x for x in (*errors_of_signals(intervals, alone), *errors_of_inputs(intervals)) if admits(x)]
+
+    def _with_another_error(self, best: Explanation, *, free_hold: bool) -> list[Explanation]:
+        """Likelier explanations with another error of a recording, or another hold of the inputs."""
+        sought, timings = self._sought(best), [best.intervals.all_inputs(what) for what in LATE]
+        errors = clear_errors(best.intervals, best.refinement.fit, sought, worth=_AS_LIKELY)
+        common = max((x for x in errors if x.kind in timings), key=lambda x: x.gain, default=None)
+        others = [self._moved(best, x) for x in self._timings(best, common, sought, free_hold=free_hold)]
+        found = [self._better(best, others)]
+        for error in errors:
+            if error.kind not in timings:
                 share = _EXPLAINS_DRIFT if error.kind.what == "drift" else _EXPLAINS
-                if trial.cost < likelier.cost and self._better(best, [trial], share, of_one=True) is trial:
-                    likelier = trial
-            if likelier is best:
-                break
-            best = self._settled(likelier)
-        return best
+                found.append(self._better(best, [self._with_errors(best, [error])], share, of_one=True))
+        return [x for x in found if x is not best]
+
+    def _timings(
+        self, best: Explanation, error: RecordingError | None, sought: Sequence[ErrorKind], *, free_hold: bool
+    ) -> list[ShootingIntervals]:
+        """Other timings of all inputs: what an error suggests, a lag instead of a delay, or another hold."""
+        intervals, (delay, lag) = best.intervals, (best.intervals.all_inputs(what) for what in LATE)
+        sizes, found = intervals.all_errors.sizes, []
+        now = sizes.get(delay, 0.0)
+        late = now + sizes.get(lag, 0.0) + (error.size if error else 0.0)
+        free_hold &= intervals.hold == "zero-order"
+        if error is not None:
+            found.append(intervals.with_input_error(error.kind, error.size))
+        if delay in sought:
+            tried = {self._late(intervals, delay, best.projected), round(now + error.size) - now if error else 0.0}
+            found += [intervals.with_input_error(delay, x) for x in tried if x]
+        if lag in sought and lag not in sizes and late > _SHORTEST_LAG:
+            lagging = intervals.with_input_error(delay, -sizes.get(delay, 0.0)).with_input_error(lag, late)
+            found.append(replace(lagging, hold="linear" if free_hold else intervals.hold))
+        if free_hold and _CONTINUOUS[0] < late < _CONTINUOUS[1]:
+            found += [replace(intervals, hold=hold) for hold in ("linear", "smooth")]
+        return found
+
+    def _moved(self, now: Explanation, intervals: ShootingIntervals) -> Explanation:
+        """The explanation with other inputs, and the same freedom."""
+        return self._optimised(now, intervals, with_residuals(intervals, now.refinement.fit))
 
     def _settled(self, found: Explanation) -> Explanation:
         """The explanation with its errors at their optimum, and without the freedom that is no longer likely.
@@ -311,7 +307,7 @@ class LocalSearch:
         """
         if any(x.of_inputs for x in found.intervals.all_errors.kinds):
             found = self._simplified(found)
-        return found if found.exact else self._simplified(self._with_refined_errors(found))
+        return self._simplified(self._with_refined_errors(found))
 
     def _with_refined_errors(self, best: Explanation, more: Sequence[ErrorKind] = ()) -> Explanation:
         """The explanation at the optimum of its errors of recordings, and of more, with the same freedom."""
@@ -327,13 +323,12 @@ class LocalSearch:
 
     def _with_errors(self, now: Explanation, errors: Sequence[RecordingError]) -> Explanation:
         """The explanation with more errors, with the same freedom."""
-        intervals = with_errors(now.intervals, now.refinement.fit, errors)
-        return self._optimised(now, intervals, with_residuals(intervals, now.refinement.fit))
+        return self._moved(now, with_errors(now.intervals, now.refinement.fit, errors))
 
     def _optimised(self, now: Explanation, intervals: ShootingIntervals, begin: Fit) -> Explanation:
         """The explanation of other intervals with the same freedom."""
         fitted = refine_exact if now.exact else refine
-        return replace(now, intervals=intervals, refinement=fitted(self.settings, intervals, begin, now.prior))
+        return replace(now, intervals=intervals, refinement=fitted(self.settings, intervals, begin, self.prior))
 
     def _better(
         self,
@@ -357,32 +352,19 @@ class LocalSearch:
         others = [x for x in others if x.cost < now.cost - _AS_LIKELY and (x.exact or explains(x))]
         return min(others, key=lambda x: x.cost, default=now)
 
-    def _from_hypothesis(self, intervals: ShootingIntervals, k: int) -> Explanation:
-        """Local optimisation from the best hypothesis, with this timing of the inputs and unmodelled accelerations."""
-        report(self.callback, "local optimisation", 0.1 + 0.25 * k)
-        begin = start(self.settings, intervals, self.motion, self.hypotheses[0], self._undelayed)
-        refined = refine(self.settings, intervals, begin, self._undelayed)
-        return Explanation(intervals, refined, self._undelayed, exact=False)
-
-    @property
-    def _undelayed(self) -> Prior:
-        """The prior of a fit without a delay."""
-        return replace(self.prior, delay=_FIXED * self.prior.delay)
-
-    def _prior_of(self, intervals: ShootingIntervals) -> Prior:
-        """The prior of a fit whose delay or lag is free, as far as the settings admit it."""
-        return self._undelayed if self.settings.input_delay is False and not intervals.lag else self.prior
+    def _from_hypothesis(self, intervals: ShootingIntervals) -> Explanation:
+        """Local optimisation from the best hypothesis, with unmodelled accelerations."""
+        report(self.callback, "local optimisation", 0.1)
+        begin = start(self.settings, intervals, self.motion, self.hypotheses[0], self.prior)
+        return Explanation(intervals, refine(self.settings, intervals, begin, self.prior), exact=False)
 
     def _simplified(self, found: Explanation) -> Explanation:
         """The explanation without the freedom that is no longer likely."""
-        return found if found.exact else self._simplest(found, self._prior_of(found.intervals))
+        return found if found.exact else self._simplest(found)
 
-    def _simplest(self, flexible: Explanation, prior: Prior) -> Explanation:
-        """The exact model, if it is as likely; otherwise unmodelled accelerations that vary as fast as is likely.
-
-        The prior is that of the exact model.
-        """
-        exact = None if flexible.exact_is_hopeless else self._likeliest_exact(flexible, prior)
+    def _simplest(self, flexible: Explanation) -> Explanation:
+        """The exact model, if it is as likely; otherwise unmodelled accelerations that vary as fast as is likely."""
+        exact = None if flexible.exact_is_hopeless else self._likeliest_exact(flexible)
         if exact is not None and exact.cost < flexible.cost:
             return exact
         while self.settings.model_error and (parts := fewest_parts(flexible.intervals.length)):
@@ -395,7 +377,7 @@ class LocalSearch:
         cost, length = flexible.cost, flexible.intervals.length
         return replace(flexible, trial=ExactTrial(exact.cost - cost, cost, flexible.unexplained, length))
 
-    def _likeliest_exact(self, flexible: Explanation, prior: Prior) -> Explanation | None:
+    def _likeliest_exact(self, flexible: Explanation) -> Explanation | None:
         """The exact model from the parameters of a fit, or the best hypothesis; None if both are impossible."""
         intervals, fit = flexible.intervals, flexible.refinement.fit
         projected, found = flexible.projected, list[Explanation]()
@@ -405,10 +387,10 @@ class LocalSearch:
             begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
             is_left = any(x.of_inputs for x in intervals.all_errors.kinds)
             try:
-                refined = refine_exact(self.settings, intervals, begin, prior, flexible.cost)
+                refined = refine_exact(self.settings, intervals, begin, self.prior, flexible.cost)
             except np.linalg.LinAlgError:  # simulations by the exact model overflow from here: it is no explanation
                 continue
-            exact = Explanation(intervals, refined, prior, exact=True)
+            exact = Explanation(intervals, refined, exact=True)
             found.append(self._with_refined_errors(exact) if is_left else exact)
             if found[-1].cost < flexible.cost:
                 break
@@ -424,55 +406,15 @@ class LocalSearch:
         begin = with_residuals(intervals, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
         return self._optimised(coarse, intervals, begin)
 
-    def _timings(self, now: Explanation, *, free_hold: bool) -> list[ShootingIntervals]:
-        """Other timings of the inputs that the fit suggests: whole samples of delay, a lag, or another hold."""
-        settings = self.settings
-        intervals, fit = now.intervals, now.refinement.fit
-        local, error = fit.shared[-1], now.refinement.delay_error
-        late = intervals.delay + intervals.lag + local
-        if settings.input_lag and not intervals.lag:
-            hold = "linear" if free_hold else intervals.hold
-            return [self._with_likeliest_lag(replace(intervals, delay=0, hold=hold))]
-        if abs(local) < max(_SIGNIFICANT * error, _SMALL_DELAY) and late == local:
-            return []
-        timings = []
-        if intervals.lag:
-            return [replace(intervals, lag=max(late, LEAST_LAG))]
-        if abs(local) >= _WHOLE_SAMPLE and settings.input_delay is not False:
-            timings.append(replace(intervals, delay=intervals.delay + round(local)))
-        if free_hold and intervals.hold == "zero-order":
-            if late > _WHOLE_SAMPLE and settings.input_lag is not False and not settings.input_delay:
-                timings.append(replace(intervals, delay=0, lag=float(late), hold="linear"))
-            if _CONTINUOUS[0] < late < _CONTINUOUS[1]:
-                timings += [replace(intervals, delay=0, hold=hold) for hold in ("linear", "smooth")]
-        return timings
-
-    def _refitted(self, now: Explanation, intervals: ShootingIntervals, prior: Prior | None = None) -> Explanation:
-        """The likeliest explanation with another timing, from the fit of this one.
-
-        The prior is that of the new fit; None: as the settings admit a delay.
-        """
-        prior = prior or self._prior_of(intervals)
-        fit, old = now.refinement.fit, now.intervals
-        frees = prior.delay > self._undelayed.delay
-        left = old.delay + old.lag + fit.shared[-1] - intervals.delay - intervals.lag
-        left = left if frees and intervals.hold == old.hold else 0.0
-        # A wide prior that the evidence narrows: a narrow one would never widen where nothing moves.
-        is_wide = frees and prior.delay > now.prior.delay
-        sizes = np.append(fit.prior[:-1], max(prior.delay, _WHOLE_SAMPLE) if is_wide else prior.delay)
-        begin = with_residuals(intervals, replace(fit, shared=np.append(fit.shared[:-1], left), prior=sizes))
-        if now.exact:
-            refined = refine_exact(self.settings, intervals, begin, prior)
-            return Explanation(intervals, refined, prior, exact=True)
-        refined = refine(self.settings, intervals, begin, prior)
-        return self._simplest(Explanation(intervals, refined, prior, exact=False, trial=now.trial), prior)
-
-    def _with_likeliest_lag(self, intervals: ShootingIntervals) -> ShootingIntervals:
-        """The lag, from half a sample to the latest delay, with which simulations by the best hypothesis agree best."""
-        longest, every = self.delays(intervals)[1], np.arange(len(intervals))
-        lags = np.geomspace(_WHOLE_SAMPLE, max(_WHOLE_SAMPLE, longest), _LAGS)
-        tried = [replace(intervals, lag=float(x)) for x in lags]
-        return min(tried, key=lambda x: float(robust_scores(x, self.motion, self.hypotheses[:1], every)[0]))
+    def _likeliest(self, intervals: ShootingIntervals, kinds: Iterable[ErrorKind]) -> ShootingIntervals:
+        """The intervals with the sizes of errors of inputs with which simulations by the best hypothesis agree best."""
+        for kind in kinds:
+            low, high = self.delays(intervals)
+            score = self._score(intervals, kind, self.hypotheses[0])
+            lags = np.geomspace(_SHORTEST_LAG, max(_SHORTEST_LAG, high), _AT_A_TIME).tolist()
+            size = min(lags, key=score) if kind.what == "lag" else _whole_samples(score, low, high)
+            intervals = intervals.with_input_error(kind, size)
+        return intervals
 
     def delays(self, intervals: ShootingIntervals) -> tuple[int, int]:
         """Earliest and latest delay, samples: those of the settings, but some samples at least and at most.
@@ -493,33 +435,38 @@ class LocalSearch:
         early, late = (min(max(round(x / intervals.dt), least), most) if x > 0.0 else 0 for x in (-low, high))
         return -early, late
 
-    def _likeliest_delay(self, intervals: ShootingIntervals) -> int:
-        """Delay in samples with which simulations by the best hypothesis agree best with the log.
+    def _late(self, intervals: ShootingIntervals, kind: ErrorKind, parameters: FloatArray) -> float:
+        """The likeliest further delay in whole samples; 0 if none is much likelier.
 
         Inputs that are held for many samples and then step cause few outliers under a wrong delay, which is a local
-        optimum; so the number of whole samples is chosen before local optimisation.
+        optimum of the fit.
         """
-        every, scores = np.arange(len(intervals)), dict[int, float]()
         low, high = self.delays(intervals)
+        score = self._score(intervals, kind, parameters)
+        delay = _whole_samples(score, low, high)
+        return delay if score(0.0) - score(delay) > _SMALL_GAIN * intervals.known.any(axis=0).sum() else 0.0
 
-        def score(rows: int) -> float:
-            if rows not in scores:
-                check_time()
-                delayed = replace(intervals, delay=rows)
-                scores[rows] = float(robust_scores(delayed, self.motion, self.hypotheses[:1], every)[0])
-            return scores[rows]
+    def _score(self, intervals: ShootingIntervals, kind: ErrorKind, parameters: FloatArray) -> Callable[[float], float]:
+        """Score of simulations with further errors of inputs, by size."""
 
-        if low == high or self.settings.input_delay is False:
-            return 0
-        step = max(1, (high - low) // (_DELAYS_AT_A_TIME - 1))
-        tried = range(-(-low // step) * step, high + 1, step)
-        best = min(tried, key=lambda rows: (score(rows), abs(rows)))
-        while step > 1:
-            step = max(1, step // 2)
-            near = [x for x in (best - step, best, best + step) if low <= x <= high]
-            best = min(near, key=lambda rows: (score(rows), abs(rows)))
-        gain = score(0) - score(best)
-        return best if gain > _SMALL_GAIN * intervals.known.any(axis=0).sum() else 0
+        @cache
+        def score(size: float) -> float:
+            check_time()
+            trial = intervals.with_input_error(kind, size)
+            return float(robust_scores(trial, self.motion, parameters[None], np.arange(len(intervals)))[0])
+
+        return score
+
+
+def _whole_samples(score: Callable[[float], float], low: int, high: int) -> float:
+    """Number of samples between two others with the least score: the best of some, refined by bisection."""
+    step = max(1, (high - low) // (_AT_A_TIME - 1))
+    best = min(range(-(-low // step) * step, high + 1, step), key=lambda x: (score(float(x)), abs(x)))
+    while step > 1:
+        step = max(1, step // 2)
+        near = [x for x in (best - step, best, best + step) if low <= x <= high]
+        best = min(near, key=lambda x: (score(float(x)), abs(x)))
+    return float(best)
 
 
 def fewest_parts(length: int) -> int:

@@ -94,15 +94,13 @@ class LoDiransac(LoDiransacSettings):
         Whether inputs act after a delay, or after a first-order lag of the actuators: True, always; False, never; None,
         where that is the likelier explanation of the log.  Where the model is not exact, an actuator may have a lag of
         its own.
-    max_delay_shifts : int, optional
-        Rounds in which other delays, a lag and another hold of the inputs are tried after the first optimisations.
     sensor_delays, sensor_biases, gain_drifts : sequence of str, optional
         Signals, or inputs, whose delay is estimated in any case, signals whose bias is, and inputs whose gain drifts;
         that of no other is.  An input's delay is its own, besides that of all.  None: those that the residuals show
         clearly.
-    max_sensor_errors : int, optional
-        Largest number of unnamed ones of these that are estimated; where the model is exact, only of groups of sensors
-        and of those with a measurement equation.
+    max_recording_errors : int, optional
+        Largest number of unnamed ones of these that are estimated, the timing of all inputs included; where the model
+        is exact, only this, and those of groups of sensors and of sensors with a measurement equation.
     set_points : sequence of str, optional
         Columns of the logs that disturbances do not change: set-points, or inputs of a machine without feedback.  Where
         the model is not exact, they are instruments: a parameter that feedback biases is estimated from them, and
@@ -121,13 +119,9 @@ class LoDiransac(LoDiransacSettings):
     prior_discrepancy, initial_discrepancy : float, optional
         Size of input gain and bias discrepancies, over that which equals an equation's inertial force: of the prior,
         and before the evidence determines it.
-    prior_delay : float, optional
-        Prior standard deviation of the input delay, s.
     projection : bool, optional
         Whether discrepancies in the column space of the regressor are attributed to the parameters; otherwise these are
         those of the fit.
-    prior_inflation : float, optional
-        Factor of the prior on model error under which a change of a parameter during a log must be seen, too.
     sources : sequence of str, optional
         Sources of estimates besides the joint fit: "least squares", "simulation error", and "second fit", a joint fit
         from the best of these where it predicts better.
@@ -220,7 +214,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     predicts = best.decided is None or best.decided.summary.predicts
     if best.impossible or not predicts or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset.model, dataset.layout, rows_of_logs(intervals, motion), dataset.source)
-    parts, lacks = compared_parts(likeliest, result, settings.prior_inflation), None
+    parts, lacks = compared_parts(likeliest, result), None
     if settings.suggestions and not likeliest.exact:
         from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
 
@@ -315,12 +309,13 @@ class _Found:
         """True for a significant delay or lag that all inputs have."""
         return self.best.is_late and (self.best.decided is None or self.best.decided.acting is None)
 
-    def resolution(self, *, forced: bool) -> Resolution:
-        """Simulation of the estimate; a forced delay or lag of the inputs need not be significant."""
+    @property
+    def resolution(self) -> Resolution:
+        """Simulation of the estimate."""
         intervals, decided = self.best.likeliest.intervals, self.best.decided
         if decided is not None and decided.acting is not None:
             return Resolution("rk4", intervals.substeps, decided.acting.hold, decided.acting.timing)
-        return Resolution("rk4", intervals.substeps, intervals.hold, self.best.timing(forced=forced))
+        return Resolution("rk4", intervals.substeps, intervals.hold, self.best.timing)
 
 
 def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Finding, ...]) -> Estimate:
@@ -346,7 +341,7 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
         iterations=settings.n_nonlinear_samples if nonlinear else settings.n_samples,
         n_hypotheses=best.n_hypotheses,
         stop_reason=end,
-        resolution=found.resolution(forced=settings.forces_timing),
+        resolution=found.resolution,
         notes=best.notes,
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),
         checks=checks,
@@ -363,7 +358,7 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
     """Noise, faults and unmodelled forces, by name and over the rows of the given logs."""
     dataset, best, result = found.dataset, found.best, found.result
     intervals, fit = best.likeliest.intervals, best.likeliest.refinement.fit
-    model, dt = dataset.model, intervals.dt
+    model, dt, late = dataset.model, intervals.dt, best.common_timing
     columns = {name: model.signals.index(name) for name in dataset.signals}
     seen = intervals.known.any(axis=0)
     sigma, fraction = (np.where(seen, x, np.nan) for x in (fit.noise.sigma, fit.noise.pi))
@@ -392,8 +387,8 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
         unmodelled_forces=per_equation(forces[0]) if forces else {},
         smoothed_time=begins + dt * place.astype(float),
         smoothed_states=dict(zip(model.state, fit.x[shown].T.copy(), strict=True)),
-        input_delay=best.late * dt,
-        input_delay_error=best.likeliest.refinement.delay_error * dt,
+        input_delay=late.size * dt if late else 0.0,
+        input_delay_error=late.std * dt if late else np.inf,
         input_delay_significant=found.is_late,
         unidentifiable=lost,
         combinations=combinations,

@@ -1,8 +1,8 @@
-"""Causes of the unmodelled forces over the fitted motion: errors of inputs, or terms that the model lacks."""
+"""Terms that the model lacks, from the unmodelled forces over the fitted motion."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
@@ -15,14 +15,8 @@ from diransac.identification.candidate_terms import TermLibrary, candidate_terms
 from diransac.identification.methods.lo_diransac.normal_equations import linearize
 from diransac.identification.methods.lo_diransac.projection import (
     inertia_slopes,
-    means_of_intervals,
     means_of_windows,
     residuals_of_motion,
-)
-from diransac.identification.methods.lo_diransac.recording_errors import (
-    RecordingError,
-    change_of_inputs,
-    errors_of_inputs,
 )
 from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.term_selection import MeanForces, changes_beside, select_terms, spanned, suggestions_of
@@ -32,24 +26,19 @@ if TYPE_CHECKING:
     from diransac.identification.candidate_terms import CandidateTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
-    from diransac.identification.methods.lo_diransac.shooting import ErrorKind, ShootingIntervals
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.suggestions import Suggestion
     from diransac.model import Model
     from diransac.simulation.compiler import Map
 
-__all__ = ["MissingTerms", "candidates_of", "clear_errors_of_inputs", "missing_terms", "short_windows"]
+__all__ = ["MissingTerms", "candidates_of", "missing_terms", "short_windows"]
 
-# Part of the force of an equation that an error of inputs must explain: a payload that is dropped is half a drift.
-_EXPLAINS = {"delay": 0.3, "lag": 0.3, "drift": 0.9}
-# Part of an error's effect that parameters must leave; relative change of a gain that leaves none.
-_INDEPENDENT, _NO_GAIN = 1e-2, 1.0
 # Part of the samples of an input that its size bounds.
 _MOSTLY = 0.99
 # Most intervals over which forces are averaged.
 _LONGEST = 4
 # Number of rows at which the inertia is compared.
 _SOME = 20
-_SMALLEST, _TINY = 1e-6, 1e-300
 
 
 @dataclass(frozen=True)
@@ -159,69 +148,6 @@ def short_windows(windows: IntArray, n: int) -> IntArray:
     return np.flatnonzero(place % _LONGEST == 0)
 
 
-def clear_errors_of_inputs(
-    intervals: ShootingIntervals, fit: Fit, p: FloatArray, kinds: Container[str]
-) -> list[RecordingError]:
-    """The drift of gains, the delay and the lag of inputs that explain most of the unmodelled forces, if much.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-        With unmodelled accelerations.
-    p : (n,) array
-        Parameters that solve the equations on its motion.
-    kinds : container of str
-        Which of "delay", "lag" and "drift" are sought.
-
-    Returns
-    -------
-    list of RecordingError
-        At most one of each, a delay before a lag.
-    """
-    tried = [x for x in errors_of_inputs(intervals) if x.what in kinds]
-    if not tried:
-        return []
-    motion, r, W, _ = residuals_of_motion(intervals, fit, p)
-    slopes = _input_slopes(intervals.model, motion)
-    effects = [np.einsum("nij,nj->ni", slopes, change_of_inputs(intervals, x)) for x in tried]
-    rows = np.concatenate([np.stack([r, *effects], axis=2), W], axis=2) * intervals.counted[:, None, None]
-    means = means_of_intervals(intervals, rows)
-    scale = np.sqrt(np.square(means[:, :, 0]).mean(axis=0))
-    means = means / np.maximum(scale, _SMALLEST * scale.max() + _TINY)[:, None]
-    own = means[:, :, 1 + len(tried) :]
-    found = [_error_of_inputs(x, means[:, :, 0], means[:, :, 1 + k], own) for k, x in enumerate(tried)]
-    possible = (x for x in found if x and _is_possible(intervals, x))
-    likeliest = {x.kind.what: x for x in sorted(possible, key=lambda x: x.gain)}
-    return [likeliest[what] for what in _EXPLAINS if what in likeliest]
-
-
-def _is_possible(intervals: ShootingIntervals, error: RecordingError) -> bool:
-    """False for a time constant below zero."""
-    lags = intervals.lag + intervals.all_errors.input_lag[list(error.kind.columns)]
-    return error.kind.what != "lag" or bool((lags + error.size > 0.0).all())
-
-
-def _error_of_inputs(kind: ErrorKind, force: FloatArray, effect: FloatArray, own: FloatArray) -> RecordingError | None:
-    """An error whose effect ``(W, n_v)`` explains much of the force, or None.
-
-    Parameters take up what they can of both: ``own (W, n_v, n)``.
-    """
-    columns = np.stack([force, effect], axis=2).reshape(force.size, 2)
-    W = own.reshape(force.size, -1)
-    W = W / np.maximum(np.sqrt(np.square(W).sum(axis=0)), _TINY)
-    free = columns - W @ np.linalg.lstsq(W, columns, rcond=None)[0]
-    both, alone = free[:, 0], free[:, 1]
-    if not alone @ alone > _INDEPENDENT * (columns[:, 1] @ columns[:, 1]):
-        return None
-    size = -float(alone @ both / (alone @ alone))
-    before, after = (np.square(x.reshape(force.shape)).sum(axis=0) + _TINY for x in (both, both + size * alone))
-    if (after > (1.0 - _EXPLAINS[kind.what]) * before).all() or (kind.what == "drift" and abs(size) > _NO_GAIN):
-        return None
-    gain = 0.5 * len(force) * float(np.log(before / after).sum())
-    return RecordingError(kind, size, float(np.sqrt(2.0 * max(gain, 0.0))), gain)
-
-
 class _Rows:
     """Fitted motion and residuals in the rows of the intervals, and means over those of a window that count."""
 
@@ -255,8 +181,8 @@ class _Rows:
     @cached_property
     def own(self) -> FloatArray:
         """Columns (N, n_v, n + n_u) of the parameters, and of a delay of each input, ``dr/du_j du_j/dt``."""
-        rates = self.intervals.moving_inputs[:, self.intervals.model.n_u :]
-        delays = _input_slopes(self.intervals.model, self.motion) * rates[:, None, :]
+        later = self.intervals.later_inputs
+        delays = _input_slopes(self.intervals.model, self.motion) * later[:, None, :]
         return np.concatenate([self.W, delays], axis=2)
 
 

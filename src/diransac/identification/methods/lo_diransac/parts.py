@@ -22,7 +22,6 @@ from diransac.identification.methods.lo_diransac.normal_equations import varianc
 from diransac.identification.methods.lo_diransac.projection import (
     batch_sums,
     effect_of_intervals,
-    inflated_prior,
     least_squares_gains,
     means_of_intervals,
     means_of_windows,
@@ -41,8 +40,6 @@ __all__ = ["Change", "Parts", "compared_parts"]
 # A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious,
 # if held-out parts of the logs are predicted worse for it.
 _CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
-# Delay of an input that is worth a sentence, samples.
-_SMALL_DELAY = 0.1
 # Parts of the logs that are predicted by the rest; mean square of what the model leaves of them, over what it is for
 # parameters that do not change, from which on it is no chance; standard errors by which the parameter that changed most
 # differs then, and probability that any of the others differs as much by chance.
@@ -138,15 +135,13 @@ class Parts:
         return self.held_out > _WORSE
 
 
-def compared_parts(found: Explanation, result: ProjectedEstimate, prior_inflation: float) -> Parts:
+def compared_parts(found: Explanation, result: ProjectedEstimate) -> Parts:
     """Parameters of parts of the logs, compared with each other.
 
     Parameters
     ----------
     found : Explanation
     result : ProjectedEstimate
-    prior_inflation : float
-        Factor of the prior on model error under which parameters must differ, too.
 
     Returns
     -------
@@ -157,12 +152,10 @@ def compared_parts(found: Explanation, result: ProjectedEstimate, prior_inflatio
     share = place / np.bincount(intervals.log_of)[intervals.log_of]
     if found.exact:
         return _deviating(intervals, fit, result, share)
-    return _changing(intervals, fit, result, share, prior_inflation)
+    return _changing(intervals, fit, result, share)
 
 
-def _changing(
-    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray, prior_inflation: float
-) -> Parts:
+def _changing(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
     """Halves and held-out fifths of the logs, where the model is not exact."""
     share = share[result.windows]
     first = share < 0.5
@@ -173,11 +166,6 @@ def _changing(
     moved, apart = _of_halves(*equations, first)
     apart[np.isinf(np.diag(result.covariance))] = 0.0
     changed = np.abs(apart) > _clear(apart, held_out)
-    if changed.any():
-        # Noise that the prior takes for unmodelled forces, or the reverse, is no change of the machine.
-        wide = _equations(intervals, inflated_prior(intervals, fit, prior_inflation), result)
-        if all(np.isfinite(x).all() for x in wide):
-            changed &= _of_halves(*wide, first)[1] * np.sign(apart) > _LIKELY
     halves = result.parameters + moved
     both = [Change(int(k), *halves[:, k].tolist()) for k in np.flatnonzero(changed)]
     return Parts([x for x in both if x.apart > _DIFFERENT], held_out)

@@ -70,7 +70,6 @@ __all__ = [
     "fitted_parameters",
     "inertia_slopes",
     "inertial_forces",
-    "inflated_prior",
     "instrumented_contrast",
     "least_squares_gains",
     "mean_regressors",
@@ -432,26 +431,6 @@ def with_parameters(
     return replace(found, parameters=parameters, unexplained=left)
 
 
-def inflated_prior(intervals: ShootingIntervals, fit: Fit, factor: float) -> Fit:
-    """The fit after one step with a prior on model error, `Fit.tau`, that is larger by a factor.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-    factor : float
-
-    Returns
-    -------
-    Fit
-    """
-    inflated, n_x = replace(fit, tau=factor * fit.tau), fit.x.shape[1]
-    at = linearize(intervals, inflated, weights_of(intervals, fit))
-    step = at.system.solve(at.right_z, at.right_s)
-    x, d = fit.x + step.step_z[:, :n_x], fit.d + step.step_z[:, n_x:]
-    return replace(inflated, shared=fit.shared + step.step_p, x=x, d=d)
-
-
 @dataclass(frozen=True)
 class _Rows:
     """Equations on the fitted motion, ``r(p) = g + M d`` with discrepancies g and unmodelled accelerations d.
@@ -545,7 +524,7 @@ def _slopes(
     of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + fit.d.shape[1], n_p))
     level = np.hstack([np.ones((len(rows.push), 1)), intervals.inputs])
     of_s[:n_p] = own
-    of_s[n_p:-1] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
+    of_s[n_p:] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
     of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means * rows.attributed, rows.M)
     return of_z, of_s
 
@@ -941,13 +920,13 @@ def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArra
     Returns
     -------
     (n_shared,) array
-        Infinite for parameters; 1 sample for the delay.
+        Infinite for parameters.
     """
     force = inertial_forces(intervals, motion, p)
     force[force == 0.0] = 1.0  # nor do discrepancies of what is at rest
     level = np.append(1.0, np.sqrt(np.square(intervals.inputs).mean(axis=0)))
     level[level == 0.0] = 1.0  # the gain of an input that never acts stays at its prior
-    return np.concatenate([np.full(intervals.n_p, np.inf), (force[:, None] / level).ravel(), [1.0]])
+    return np.concatenate([np.full(intervals.n_p, np.inf), (force[:, None] / level).ravel()])
 
 
 def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
@@ -1013,7 +992,7 @@ def _motion(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatAr
     model = intervals.model
     series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
     q, v, a, _ = split_signals(model, series.reshape(len(intervals.measured), -1))
-    return q, v, a, intervals.inputs + fit.shared[-1] * intervals.moving_inputs[:, model.n_u :]
+    return q, v, a, intervals.inputs
 
 
 def _row_parameters(intervals: ShootingIntervals, values: FloatArray, *, logged: bool = False) -> FloatArray:

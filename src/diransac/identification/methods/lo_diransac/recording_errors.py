@@ -1,13 +1,12 @@
-"""Systematic errors of recordings: delays and biases of sensors, delays and lags of single inputs, gains that drift.
+"""Systematic errors of recordings: delays and biases of sensors, delays and lags of inputs, gains that drift.
 
 A sensor is here whatever measures a signal, with a measurement equation or without.
 
 An error of a sensor that no parameter and no discrepancy explains is in the residuals: a delay in
 proportion to the signal's rate, a bias a constant.  One of an input is in them as simulations with it differ: an
-actuator that is later than the others, a battery that sags.  A score test finds the most significant error, given all
-else that is estimated; it costs a call of the simulator, and no fit.  The error is then estimated jointly with
-all other unknowns, by one Newton step and a new fit.  Errors of inputs are explained by unmodelled accelerations just
-as well, and found in these: see `missing_terms`.
+actuator that is late, a battery that sags.  A score test finds the most significant error, given all else that is
+estimated; it costs a call of the simulator, and no fit.  The error is then estimated jointly with all other unknowns,
+by one Newton step and a new fit.
 
 References
 ----------
@@ -16,7 +15,7 @@ Rao 1948 (score test); Furgale, Rehder, Siegwart 2013 (delays of sensors).
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -34,13 +33,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "RecordingError",
-    "change_of_inputs",
     "clear_errors",
-    "delays_of_inputs",
     "effect_on",
     "errors_of",
     "errors_of_inputs",
-    "lags_of_inputs",
+    "errors_of_signals",
     "signal_rates",
     "with_errors",
 ]
@@ -58,8 +55,9 @@ _FEWEST = 50
 _DETERMINED, _ROUNDED = 1e-6, 1e-12
 # Errors of inputs by which simulations are compared: samples, relative change of a gain.
 _STEPS = {"delay": 0.5, "lag": 0.5, "drift": 0.01}
-# Kinds of errors by which an input acts later than others.
-_LATE: tuple[Literal["delay", "lag"], ...] = ("delay", "lag")
+_OF_INPUTS: tuple[Literal["delay", "lag", "drift"], ...] = ("delay", "lag", "drift")
+# Relative change of a gain that leaves none.
+_NO_GAIN = 1.0
 # Change of a signal over its size that is a rounding error.
 _ROUNDING, _TINY = 1e-9, 1e-300
 
@@ -73,56 +71,68 @@ class RecordingError:
     kind : ErrorKind
     size : float
         Its estimate: samples, the signal's unit, or relative to the gain.
-    ratio : float
-        Its size over its standard error.
+    std : float
+        Its standard error.
     gain : float
         Evidence that it would gain, nats, if the residuals were white.
     """
 
     kind: ErrorKind
     size: float
-    ratio: float
+    std: float
     gain: float
+
+    @property
+    def ratio(self) -> float:
+        """Its size over its standard error."""
+        return abs(self.size) / self.std
 
 
 def clear_errors(
-    intervals: ShootingIntervals, fit: Fit, among: BoolArray, kinds: Container[str], *, worth: float
+    intervals: ShootingIntervals, fit: Fit, tested: Sequence[ErrorKind], *, worth: float
 ) -> list[RecordingError]:
-    """Errors of the sensors that the residuals show most clearly: one of a single signal, and some of groups.
+    """Errors that the residuals show most clearly: of a single signal, some of groups of signals, and of inputs.
 
-    Groups that are late alike show nearly as clearly as others that are early; fits of each tell them apart.  They are
-    judged by the evidence that they promise: a delay of many samples leaves residuals whose scores scatter by itself.
+    Groups that are late alike show nearly as clearly as others that are early, and a delay of inputs nearly as a lag;
+    fits of each tell them apart.  They are judged by the evidence that they promise: a delay of many samples leaves
+    residuals whose scores scatter by itself.
 
     Parameters
     ----------
     intervals : ShootingIntervals
     fit : Fit
         At its optimum.
-    among : (n_s,) bool array
-        Signals whose own errors are tested, besides those of groups.
-    kinds : container of str
-        Which of "delay" and "bias" are tested.
+    tested : sequence of ErrorKind
     worth : float
-        Evidence that a group's error must promise, nats.
+        Evidence that an error of a group, or of inputs, must promise, nats.
 
     Returns
     -------
     list of RecordingError
         Empty if no error is clear.
     """
-    tested = [x for x in _candidates(intervals, among) if x.what in kinds]
-    if not tested:
-        return []
     scores, at_a_time = _Scores(intervals, fit), max(1, _NUMBERS_AT_A_TIME // intervals.measured.size)
     latest = _LATEST * max(x.stop - x.start for x in intervals.rows_of_logs)
     parts = [tested[k : k + at_a_time] for k in range(0, len(tested), at_a_time)]
     found = [x for part in parts for x in scores.tested(part)]
     found = [x for x in found if x.kind.what != "delay" or _LEAST_DELAY < abs(x.size) < latest]
-    single = [x for x in found if len(x.kind.columns) == 1 and x.ratio > _CLEAR]
-    groups = [x for x in found if len(x.kind.columns) > 1 and x.gain > worth]
+    inputs = [x for x in found if x.kind.of_inputs and x.gain > worth and _is_possible(intervals, x)]
+    single = [x for x in found if len(x.kind.columns) == 1 and not x.kind.of_inputs and x.ratio > _CLEAR]
+    groups = [x for x in found if len(x.kind.columns) > 1 and not x.kind.of_inputs and x.gain > worth]
     single.sort(key=lambda x: x.ratio, reverse=True)
     groups.sort(key=lambda x: x.gain, reverse=True)
-    return [*single[:1], *groups[:_GROUPS]]
+    common = [intervals.all_inputs(what) for what in _OF_INPUTS]
+    inputs.sort(key=lambda x: x.gain + worth * (x.kind in common))  # an input without effect has no timing of its own
+    likeliest = {x.kind.what: x for x in inputs}
+    return [*single[:1], *groups[:_GROUPS], *likeliest.values()]
+
+
+def _is_possible(intervals: ShootingIntervals, error: RecordingError) -> bool:
+    """False for a time constant below zero, and for a gain that changes its sign."""
+    if error.kind.what == "drift":
+        return abs(error.size) < _NO_GAIN
+    lags = intervals.all_errors.input_lag[list(error.kind.columns)]
+    return error.kind.what != "lag" or bool((lags + error.size > 0.0).all())
 
 
 def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> list[RecordingError]:
@@ -144,10 +154,10 @@ def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]
     slopes = [scores.slope(x) for x in kinds]
     determined, covariance, _, _ = scores.together(slopes)
     sizes = -covariance @ np.array([slopes[k].score for k in determined])
-    ratios = np.abs(sizes) / (np.sqrt(np.diag(covariance)) + _TINY)
+    errors = np.sqrt(np.diag(covariance)) + _TINY
     return [
-        RecordingError(kinds[k], float(x), float(r), float(0.5 * r**2))
-        for k, x, r in zip(determined, sizes, ratios, strict=True)
+        RecordingError(kinds[k], float(x), float(std), float(0.5 * (x / std) ** 2))
+        for k, x, std in zip(determined, sizes, errors, strict=True)
     ]
 
 
@@ -219,16 +229,16 @@ class _Scores:
         """Derivatives with respect to an error."""
         return self._of_inputs(kind) if kind.of_inputs else self._of_signals(kind)
 
-    def _slopes_of_signals(self, kinds: Sequence[ErrorKind]) -> list[_Slope]:
-        """Derivatives with respect to errors of signals; those of a group that others make up are sums of theirs."""
+    def _slopes(self, kinds: Sequence[ErrorKind]) -> list[_Slope]:
+        """Derivatives with respect to errors; those of a group of signals that others make up are sums of theirs."""
         found = dict[ErrorKind, _Slope]()
         for kind in sorted(kinds, key=lambda x: len(x.columns)):
             left, parts = set(kind.columns), list[_Slope]()
             for other, slope in reversed(found.items()):
-                if other.what == kind.what and left.issuperset(other.columns):
+                if other.what == kind.what and not other.of_inputs and left.issuperset(other.columns):
                     left.difference_update(other.columns)
                     parts.append(slope)
-            found[kind] = self.slope(kind) if left else _Slope.sum(kind, parts)
+            found[kind] = self.slope(kind) if left or kind.of_inputs else _Slope.sum(kind, parts)
         return [found[x] for x in kinds]
 
     def _of_signals(self, kind: ErrorKind) -> _Slope:
@@ -257,7 +267,7 @@ class _Scores:
 
     def tested(self, kinds: Sequence[ErrorKind]) -> list[RecordingError]:
         """Estimates of errors one by one, given all else that is estimated; without those not determined by the log."""
-        slopes = self._slopes_of_signals(kinds)
+        slopes = self._slopes(kinds)
         n, weighted = len(self.intervals), [self.weights * x.sensitivity for x in slopes]
 
         def by_interval(values: Sequence[FloatArray]) -> FloatArray:
@@ -271,8 +281,8 @@ class _Scores:
                 rows=by_interval([self.fit.residuals] * len(slopes)),
                 of_z=np.stack([x.of_z for x in slopes], axis=-1),
                 of_s=np.stack([x.of_s for x in slopes], axis=-1),
-                by_jumps=np.zeros(len(slopes)),
-                score_of_jumps=np.zeros(len(slopes)),
+                by_jumps=np.array([(self.at.precision * np.square(x.jumps)).sum() for x in slopes]),
+                score_of_jumps=np.array([(self.at.precision * x.jumps * self.at.jumps).sum() for x in slopes]),
             ),
         )
         return [x for k, slope in enumerate(slopes) if (x := self._estimate(slope, tests, k)) is not None]
@@ -280,13 +290,13 @@ class _Scores:
     def _estimate(self, slope: _Slope, tests: ScoreTests, k: int) -> RecordingError | None:
         """Estimate of the k-th error, or None if the log does not determine it."""
         information = float(tests.information[k])
-        if information <= _DETERMINED * tests.direct[k]:
+        if information <= _least_information(slope.kind) * tests.direct[k]:
             return None
         n = len(self.intervals)
         batches = np.add.reduceat(tests.scores[:, k], np.arange(0, n, max(1, round(np.sqrt(n)))))
         variance = max(information, float(np.square(batches).sum()))
         gain = 0.5 * slope.score**2 / information
-        return RecordingError(slope.kind, -slope.score / information, abs(slope.score) / np.sqrt(variance), gain)
+        return RecordingError(slope.kind, -slope.score / information, float(np.sqrt(variance)) / information, gain)
 
     def together(self, slopes: Sequence[_Slope]) -> tuple[list[int], FloatArray, FloatArray, FloatArray]:
         """Errors that the log determines, their covariance, and what they change of the gradient of the fit."""
@@ -294,8 +304,8 @@ class _Scores:
         z, s = self.at.system.functional(of_z, of_s)
         direct = np.array([[self._product(x, y) for y in slopes] for x in slopes])
         information = direct - np.einsum("wke,wkf->ef", of_z, z) - of_s.T @ s
-        least = [_ROUNDED if x.kind.of_inputs else _DETERMINED for x in slopes]
-        found = [k for k in range(len(slopes)) if information[k, k] > least[k] * direct[k, k]]
+        least = np.array([_least_information(x.kind) for x in slopes])
+        found = np.flatnonzero(np.diag(information) > least * np.diag(direct)).tolist()
         covariance = np.linalg.pinv(information[np.ix_(found, found)], hermitian=True)
         return found, covariance, of_z[..., found], of_s[:, found]
 
@@ -303,6 +313,11 @@ class _Scores:
         """Information that two errors have in common, before other unknowns take theirs."""
         of_signals = (self.weights * x.sensitivity * y.sensitivity).sum()
         return float(of_signals + (self.at.precision * x.jumps * y.jumps).sum())
+
+
+def _least_information(kind: ErrorKind) -> float:
+    """Part of the information of an error that other unknowns must leave."""
+    return _ROUNDED if kind.of_inputs else _DETERMINED
 
 
 def with_errors(intervals: ShootingIntervals, fit: Fit, errors: Sequence[RecordingError]) -> ShootingIntervals:
@@ -344,11 +359,21 @@ def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return np.where(np.abs(rates).max(axis=0) > _ROUNDING * np.abs(signals).max(axis=0), rates, 0.0)
 
 
-def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[ErrorKind]:
-    """Signals and kinds of the errors that are tested: of each signal, and delays of groups.
+def errors_of_signals(intervals: ShootingIntervals, among: BoolArray) -> list[ErrorKind]:
+    """Errors that signals may have: delays and biases of single ones, and delays of groups.
 
     A group are the coordinates, the velocities, ..., or those of one unit, as one instrument measures them.  The bias
-    of a sensor that has one as a parameter is not tested.
+    of a sensor that has one as a parameter is none.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    among : (n_s,) bool array
+        Single signals.
+
+    Returns
+    -------
+    list of ErrorKind
     """
     model = intervals.model
     seen = intervals.known.sum(axis=0) >= _FEWEST
@@ -366,7 +391,7 @@ def _candidates(intervals: ShootingIntervals, among: BoolArray) -> list[ErrorKin
 
 
 def errors_of_inputs(intervals: ShootingIntervals) -> list[ErrorKind]:
-    """Errors that inputs may have: drifts of each gain, of those of one unit, and of all; delays and lags of some.
+    """Errors that inputs may have: delays, lags and drifts of the gain, of all, of those of one unit, and of each.
 
     Parameters
     ----------
@@ -381,59 +406,7 @@ def errors_of_inputs(intervals: ShootingIntervals) -> list[ErrorKind]:
     moving = np.ptp(intervals.inputs, axis=0) > 0.0
     masks = [moving, *(moving & (unit == u) for u in dict.fromkeys(unit.tolist())), *np.eye(len(unit), dtype=bool)]
     some = [x for x in masks if (x & moving).any()]
-    drifts = [ErrorKind(_places(x), "drift", of_inputs=True) for x in some]
-    some = [x for x in some if not (x == moving).all()]
-    late = [ErrorKind(_places(x), what, of_inputs=True) for what in _LATE for x in some]
-    return list(dict.fromkeys([*drifts, *late]))
-
-
-def change_of_inputs(intervals: ShootingIntervals, kind: ErrorKind) -> FloatArray:
-    """Derivatives ``(N, n_u)`` of the inputs that act with respect to an error.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    kind : ErrorKind
-        Of inputs.
-
-    Returns
-    -------
-    (N, n_u) array
-    """
-    moved = intervals.with_input_error(kind, _STEPS[kind.what])
-    return np.asarray((moved.inputs - intervals.inputs) / _STEPS[kind.what])
-
-
-def delays_of_inputs(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
-    """Samples ``(n_u,)`` after which each input acts: its own delay, and that of all unless they have a lag.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-
-    Returns
-    -------
-    (n_u,) array
-    """
-    common = 0.0 if intervals.lag else intervals.delay + fit.shared[-1]
-    return np.asarray(intervals.all_errors.input_delay + common)
-
-
-def lags_of_inputs(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
-    """Time constants ``(n_u,)`` of the actuators, samples; 0 without a lag.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-
-    Returns
-    -------
-    (n_u,) array
-    """
-    common = intervals.lag + fit.shared[-1] if intervals.lag else 0.0
-    return np.asarray(np.maximum(intervals.all_errors.input_lag + common, 0.0))
+    return list(dict.fromkeys(ErrorKind(_places(x), what, of_inputs=True) for what in _OF_INPUTS for x in some))
 
 
 def _places(mask: BoolArray) -> tuple[int, ...]:

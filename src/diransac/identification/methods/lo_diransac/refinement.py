@@ -6,7 +6,7 @@ Gauss-Newton steps on `normal_equations`, each followed by an update of every sc
 - tau, the size of the unmodelled accelerations, by the evidence: with tau large, intervals stand alone; with tau = 0,
   a log is one rollout.  Models of real machines are accurate to a thousandth of the accelerations at best; this prior
   has the weight of one interval, so that tau does not vanish where noise hides the discrepancies;
-- the size of the input gain and bias discrepancies, and of the delay, likewise.
+- the size of the input gain and bias discrepancies, likewise.
 
 All scales decrease gradually from large values, and so does the standard deviation of continuity: far from the solution
 intervals are independent problems, near it they are one (graduated non-convexity).
@@ -25,8 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.lost_intervals import with_lost_intervals_restarted
+from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
@@ -62,13 +61,11 @@ _EXACT = 1e-3
 # Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
 # the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
 _UNBROKEN = 0.01
-# Size of a delay, samples, before the evidence narrows it; a prior that leaves none.
-_FREE_DELAY, _PINNED = 1.0, 1e-5
 # Where they start, and the factor by which they are lowered in a step.
 _NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
 # Correlation of unmodelled accelerations from interval to interval at most.
 _MOST_ALIKE = 0.98
-_MAX_TRIALS, _MAX_SWEEPS = 8, 12
+_MAX_TRIALS = 8
 # Part of what is left of the excess of its cost when a step is corrected for the curvature of the rollouts, at most.
 _CORRECTED = 0.3
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
@@ -85,20 +82,17 @@ class Prior:
     tau : (n_v,) array
         Unmodelled accelerations.
     unit : (n_s,) array
-        Discrepancy that equals an equation's inertial force; a sample of delay; infinite for parameters.
+        Discrepancy that equals an equation's inertial force; infinite for parameters.
     discrepancy : float
         Prior size of the discrepancies in those units.
     guarded : float
         Size with which a fit starts, before the evidence determines it.
-    delay : float
-        Prior size of the input delay, samples.
     """
 
     tau: FloatArray
     unit: FloatArray
     discrepancy: float
     guarded: float
-    delay: float
 
 
 @dataclass(frozen=True)
@@ -111,8 +105,6 @@ class Refinement:
         Most probable motion and parameters.
     cost : float
         Negative log evidence, the likelihood integrated over all unknowns (Laplace), up to a constant.
-    delay_error : float
-        Standard error of the delay of the inputs, samples; infinite where a rollout diverges.
     steps : int
         Number of Gauss-Newton steps.
     converged : bool
@@ -121,7 +113,6 @@ class Refinement:
 
     fit: Fit
     cost: float
-    delay_error: float
     steps: int
     converged: bool
 
@@ -146,7 +137,6 @@ def make_prior(settings: LoDiransacSettings, intervals: ShootingIntervals, motio
         unit=unit,
         discrepancy=settings.prior_discrepancy,
         guarded=settings.initial_discrepancy,
-        delay=settings.prior_delay / intervals.dt,
     )
 
 
@@ -159,7 +149,7 @@ def _accelerations(model: Model, motion: Motion) -> FloatArray:
 def start(
     settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, p: FloatArray, prior: Prior
 ) -> Fit:
-    """Initial fit from a hypothesis and the smoothed motion at the intervals' starts, or their neighbours' ends.
+    """Initial fit from a hypothesis and the smoothed motion at the intervals' starts.
 
     Parameters
     ----------
@@ -187,67 +177,11 @@ def start(
     seen: BoolArray = np.asarray(intervals.known.any(axis=0))
     whole = [four for four in intervals.model.quaternions if seen[list(four)].all()]
     noise = Mixture(sigma, fraction, np.where(high > low, high - low, 1.0), floor, whole)
-    sizes = prior.unit * np.r_[np.full(len(shared) - 1, prior.guarded), prior.delay]
+    sizes = prior.guarded * prior.unit
     sizes[: len(p)] = intervals.layout.prior_std
     mean = np.concatenate([intervals.layout.prior_mean, np.zeros(len(shared) - len(p))])
     tau = _TAU_START * _accelerations(intervals.model, motion)
-    fit = Fit(shared, x, d, residuals, ends, noise, tau, np.zeros(n_v), motion.spread[:n_x].copy(), sizes, mean)
-    return _anchored(intervals, fit)
-
-
-def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
-    """The fit with initial states propagated from neighbouring intervals, where they have a higher likelihood.
-
-    Where outliers are in the majority for longer than an interval, its state follows from its neighbours alone.
-    """
-    n, losses = len(intervals), _losses(intervals, fit.noise, fit.residuals, fit.ends, np.arange(len(intervals)))
-    # States that changed since those of their neighbours were last propagated from them: others give what they gave.
-    forward, backward = np.ones(n, bool), np.ones(n, bool)
-    for _ in range(_MAX_SWEEPS):
-        after = 1 + np.flatnonzero(intervals.linked & forward[:-1] & _ends_well(fit.ends)[:-1])
-        fit, losses, forward = _better(intervals, fit, losses, after, fit.ends[after - 1])
-        backward |= forward
-        before = np.flatnonzero(intervals.linked & (backward[:-1] | backward[1:]))
-        if len(before):
-            found = intervals.origins(fit.shared, fit.x, fit.d, before)
-            fit, losses, backward = _better(intervals, fit, losses, before, found)
-            forward |= backward
-        if not forward.any():
-            break
-    return fit
-
-
-def _better(
-    intervals: ShootingIntervals, fit: Fit, losses: FloatArray, chosen: IntArray, states: FloatArray
-) -> tuple[Fit, FloatArray, BoolArray]:
-    """The fit with other initial states of chosen intervals where they have a higher likelihood, and its losses.
-
-    The last result is the mask ``(W,)`` of the intervals whose states are new.
-    """
-    changed = np.zeros(len(intervals), bool)
-    if not len(chosen):
-        return fit, losses, changed
-    x, residuals, ends = fit.x.copy(), fit.residuals.copy(), fit.ends.copy()
-    x[chosen] = states
-    simulated, ended = intervals.simulated(fit.shared, x, fit.d, chosen)
-    found = _losses(intervals, fit.noise, simulated, ended, chosen)
-    better = found < losses[chosen]
-    x[chosen[~better]] = fit.x[chosen[~better]]
-    changed[chosen[better]] = True
-    residuals[np.repeat(changed, intervals.length)] = simulated[np.repeat(better, intervals.length)]
-    ends[changed] = ended[better]
-    losses = losses.copy()
-    losses[changed] = found[better]
-    return replace(fit, x=x, residuals=residuals, ends=ends), losses, changed
-
-
-def _losses(
-    intervals: ShootingIntervals, noise: Mixture, residuals: FloatArray, ends: FloatArray, chosen: IntArray
-) -> FloatArray:
-    """Negative log-likelihood ``(n,)`` of the samples of chosen intervals; infinite where a rollout diverges."""
-    known = intervals.known if len(chosen) == len(intervals) else intervals.known[intervals.rows_of(chosen)]
-    found = noise.negative_log_likelihood(residuals, known).reshape(len(chosen), -1).sum(axis=1)
-    return np.where(_ends_well(ends), found, np.inf)
+    return Fit(shared, x, d, residuals, ends, noise, tau, np.zeros(n_v), motion.spread[:n_x].copy(), sizes, mean)
 
 
 def _ends_well(ends: FloatArray) -> BoolArray:
@@ -289,7 +223,7 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
         errors = np.sqrt(np.diag(solved.var_p)[: intervals.n_p])
         converged = _unchanged(fit, updated, errors)
         fit, at = updated, _linearized(intervals, updated)
-    return Refinement(fit, *_evidence(intervals, fit, at), steps, converged)
+    return Refinement(fit, _evidence(intervals, fit, at), steps, converged)
 
 
 def refine_exact(
@@ -305,7 +239,8 @@ def refine_exact(
         Initial fit, as from `refine`.
     prior : Prior
     rival : float, optional
-        Cost of a fit to which this one is an alternative: it ends where it cannot become as likely.
+        Cost of a fit to which this one is an alternative: it ends where as many steps as are left, each as good as the
+        best of the last few, and a nat more in every sample would leave it behind.
 
     Returns
     -------
@@ -316,25 +251,9 @@ def refine_exact(
     TimeLimitError
         The time limit was reached.
     """
-    found = _refined_exactly(settings, intervals, fit, prior, rival)
-    again = with_lost_intervals_restarted(intervals, found.fit) if found.converged else None
-    if again is None:
-        return found
-    return min(found, _refined_exactly(settings, intervals, again, prior, rival), key=lambda x: x.cost)
-
-
-def _refined_exactly(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, rival: float
-) -> Refinement:
-    """As `refine_exact`, from one start.
-
-    It is given up where as many steps as are left, each as good as the best of the last few, and a nat more in every
-    sample would leave it behind its rival.
-    """
     n_p, least = intervals.n_p, _EXACT * prior.tau
     shared, sizes = fit.shared.copy(), fit.prior.copy()
-    shared[n_p:-1], sizes[n_p:-1] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:-1]
-    sizes[-1] = max(prior.delay, _FREE_DELAY) if prior.delay > _PINNED else prior.delay
+    shared[n_p:], sizes[n_p:] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:]
     tau = _NEARLY_EXACT * prior.tau
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
@@ -347,15 +266,13 @@ def _refined_exactly(
         losses.append(float(moved.noise.negative_log_likelihood(moved.residuals, intervals.known).sum()))
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
         noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
-        sizes = fit.prior.copy()
-        sizes[-1] = _discrepancies(moved, prior, np.diag(solved.var_p), n_p)[-1]
         tau = np.maximum(least, _TIGHTENED * fit.tau)
         jumps = np.clip(_unbroken(fit, solved), _continuity(intervals, least), jumps) if steps == 1 else jumps
         continuity = np.maximum(jumps, _TIGHTENED * fit.continuity_std)
-        updated = replace(moved, noise=noise, prior=sizes, tau=tau, continuity_std=continuity)
+        updated = replace(moved, noise=noise, tau=tau, continuity_std=continuity)
         converged = bool((tau == fit.tau).all()) and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
         fit, at = updated, _linearized(intervals, updated)
-    return Refinement(fit, *_evidence(intervals, fit, at), steps, converged)
+    return Refinement(fit, _evidence(intervals, fit, at), steps, converged)
 
 
 def _is_lost(intervals: ShootingIntervals, losses: Sequence[float], settings: LoDiransacSettings, rival: float) -> bool:
@@ -372,21 +289,21 @@ def _linearized(intervals: ShootingIntervals, fit: Fit) -> NormalEquations:
     return linearize(intervals, fit, weights_of(intervals, fit))
 
 
-def _evidence(intervals: ShootingIntervals, fit: Fit, at: NormalEquations) -> tuple[float, float]:
-    """Negative logarithm of the probability of the measurements by Laplace's method, and standard error of the delay.
+def _evidence(intervals: ShootingIntervals, fit: Fit, at: NormalEquations) -> float:
+    """Negative logarithm of the probability of the measurements by Laplace's method.
 
-    Up to a constant that fits of the same log have in common, given the scales of a fit at its optimum; both are
-    infinite where a rollout diverges.  Freedom costs: a discrepancy whose prior is wide counts against a fit unless it
+    Up to a constant that fits of the same log have in common, given the scales of a fit at its optimum; infinite where
+    a rollout diverges.  Freedom costs: a discrepancy whose prior is wide counts against a fit unless it
     explains the log better.
     """
     loss = fit.noise.negative_log_likelihood(fit.residuals, intervals.known).sum()
     beforehand = cost(intervals, fit, np.zeros_like(fit.residuals))
     if not np.isfinite(loss + beforehand):
-        return np.inf, np.inf
+        return np.inf
     solved = at.system.solve(at.right_z, at.right_s)
     scales = intervals.linked.sum() * np.log(fit.continuity_std).sum() + np.log(innovation_std(intervals, fit)).sum()
     scales += np.log(fit.prior[np.isfinite(fit.prior)]).sum()
-    return float(loss + 0.5 * beforehand + 0.5 * solved.log_det + scales), float(np.sqrt(solved.var_p[-1, -1]))
+    return float(loss + 0.5 * beforehand + 0.5 * solved.log_det + scales)
 
 
 def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
@@ -480,15 +397,11 @@ def _size(expected: FloatArray, now: FloatArray, squares: FloatArray, determined
 
 
 def _discrepancies(fit: Fit, prior: Prior, variance: FloatArray, n_p: int) -> FloatArray:
-    """Sizes of the input gain and bias discrepancies, which have one in common, and of the delay."""
-    sizes = fit.prior.copy()
-    groups = ((slice(n_p, len(sizes) - 1), prior.discrepancy), (slice(len(sizes) - 1, None), prior.delay))
-    for members, size in groups:
-        unit, now = prior.unit[members], fit.prior[members]
-        if len(unit):
-            squares = np.square(fit.shared[members] / unit).sum()
-            determined = (1.0 - variance[members] / np.square(now)).clip(0.0).sum()
-            sizes[members] = unit * _size(np.array(size), now[0] / unit[0], squares, determined)
+    """Prior sizes with those of the input gain and bias discrepancies, which have one in common."""
+    sizes, unit, now = fit.prior.copy(), prior.unit[n_p:], fit.prior[n_p:]
+    squares = np.square(fit.shared[n_p:] / unit).sum()
+    determined = (1.0 - variance[n_p:] / np.square(now)).clip(0.0).sum()
+    sizes[n_p:] = unit * _size(np.array(prior.discrepancy), now[0] / unit[0], squares, determined)
     return sizes
 
 

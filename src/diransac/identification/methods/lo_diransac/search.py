@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import dropwhile
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from diransac.data.input_timing import InputTiming
 from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
-from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
+from diransac.identification.methods.lo_diransac.local_search import LATE, LocalSearch
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
     discrepancy_units,
@@ -21,7 +22,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     fitted_parameters,
     residuals_of_motion,
 )
-from diransac.identification.methods.lo_diransac.recording_errors import delays_of_inputs, lags_of_inputs
+from diransac.identification.methods.lo_diransac.recording_errors import errors_of
 from diransac.identification.methods.lo_diransac.refinement import diverges, make_prior, start
 from diransac.identification.methods.lo_diransac.unmeasured import (
     unmeasured_by_name,
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from diransac.identification.estimate import Competition, LogEstimate
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.local_search import Explanation
+    from diransac.identification.methods.lo_diransac.recording_errors import RecordingError
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
@@ -48,8 +50,6 @@ _ALL_OF_IT = 0.8
 """Fraction of a signal's spread from which on its noise leaves nothing to explain, and of its samples for outliers."""
 _MUCH = 0.1
 """Unexplained part of an acceleration from which on states that nothing measures are doubtful."""
-_SIGNIFICANT, _SMALL_DELAY = 3.0, 0.25
-"""A significant delay: so many standard errors, and so many samples."""
 _TINY = 1e-9
 
 
@@ -82,33 +82,31 @@ class Searched:
     impossible: tuple[str, ...]
     decided: Decided | None = None
 
-    @property
-    def late(self) -> float:
-        """Delay of the inputs, lag included, samples."""
-        intervals = self.likeliest.intervals
-        return float(intervals.delay + intervals.lag + self.likeliest.refinement.fit.shared[-1])
+    @cached_property
+    def common_timing(self) -> RecordingError | None:
+        """Delay and lag of all inputs together, samples, with a standard error; None where no input moves.
+
+        Where the explanation has neither, it is the delay that its residuals suggest.
+        """
+        intervals, fit = self.likeliest.intervals, self.likeliest.refinement.fit
+        sizes = intervals.all_errors.sizes
+        kinds = [x for x in map(intervals.all_inputs, LATE) if x in sizes]
+        found = errors_of(intervals, fit, kinds or [intervals.all_inputs("delay")])
+        whole = sum(sizes[x] for x in kinds)
+        return replace(found[0], size=whole + found[0].size) if found else None
 
     @property
     def is_late(self) -> bool:
-        """True for a significant delay or lag that all inputs have."""
-        intervals, error = self.likeliest.intervals, self.likeliest.refinement.delay_error
-        clear = abs(self.late) > max(_SIGNIFICANT * error, _SMALL_DELAY)
-        own = intervals.all_errors.input_lag if intervals.lag else intervals.all_errors.input_delay
-        return bool(clear and not own.any())
+        """True for a delay or a lag that all inputs have in common, and none of which has another of its own."""
+        intervals = self.likeliest.intervals
+        late = [x for x in intervals.all_errors.kinds if x.of_inputs and x.what in LATE]
+        return bool(late) and all(x == intervals.all_inputs(x.what) for x in late)
 
-    def timing(self, *, forced: bool) -> InputTiming:
-        """Delay or lag of the inputs where it is significant, or forced, and the inputs' own errors."""
-        intervals, fit, counts = self.likeliest.intervals, self.likeliest.refinement.fit, self.is_late or forced
-        errors, (delays, lags) = intervals.all_errors, np.zeros((2, intervals.model.n_u))
-        if errors.input_delay.any():
-            delays = delays_of_inputs(intervals, fit)
-        elif not intervals.lag and counts:
-            delays = delays + self.late
-        if errors.input_lag.any():
-            lags = lags_of_inputs(intervals, fit)
-        elif intervals.lag and counts:
-            lags = lags + max(self.late, LEAST_LAG)
-        return InputTiming.of(delays * intervals.dt, lags * intervals.dt, errors.gain_drift)
+    @property
+    def timing(self) -> InputTiming:
+        """Delays, lags and drifts of the inputs."""
+        errors, dt = self.likeliest.intervals.all_errors, self.likeliest.intervals.dt
+        return InputTiming.of(errors.input_delay * dt, errors.input_lag * dt, errors.gain_drift)
 
     @property
     def explains_nothing(self) -> bool:

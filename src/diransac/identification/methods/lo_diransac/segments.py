@@ -21,7 +21,6 @@ from diransac.identification.multistart import least_squares
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.simulation import GaussNewtonBatch, Simulator
@@ -76,12 +75,6 @@ class ActingInputs:
     def recorded(cls, intervals: ShootingIntervals, hold: str) -> ActingInputs:
         """Inputs that act as they were recorded."""
         return cls(intervals.recorded, hold, InputTiming())
-
-    @classmethod
-    def of_fit(cls, intervals: ShootingIntervals, fit: Fit, timing: InputTiming) -> ActingInputs:
-        """Inputs with the timing of a fit, significant or not, which is named by ``timing``."""
-        values = intervals.inputs + fit.shared[-1] * intervals.moving_inputs[:, intervals.model.n_u :]
-        return cls(values, intervals.hold, timing, fitted=True)
 
 
 @dataclass(frozen=True)

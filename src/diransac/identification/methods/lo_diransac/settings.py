@@ -41,11 +41,10 @@ class LoDiransacSettings:
     delay_range: tuple[float, float] = (-0.03, 0.08)
     input_delay: bool | None = None
     input_lag: bool | None = None
-    max_delay_shifts: int = 3
     sensor_delays: tuple[str, ...] | None = None
     sensor_biases: tuple[str, ...] | None = None
     gain_drifts: tuple[str, ...] | None = None
-    max_sensor_errors: int = 8
+    max_recording_errors: int = 8
     set_points: tuple[str, ...] = ()
     substeps: int = 5
     max_steps: int = 60
@@ -54,9 +53,7 @@ class LoDiransacSettings:
     prior_model_error: float = 1e-3
     prior_discrepancy: float = 0.1
     initial_discrepancy: float = 0.01
-    prior_delay: float = 3e-4
     projection: bool = True
-    prior_inflation: float = 10.0
     sources: tuple[str, ...] = SOURCES
     start: Mapping[str, float] | None = None
     horizon: float | None = None
@@ -125,8 +122,7 @@ _SWITCHES = ("input_delay", "input_lag")
 _NAMES = ("sources", "sensor_delays", "sensor_biases", "gain_drifts", "set_points")
 _MAY_BE_ZERO = (
     "n_samples",
-    "max_delay_shifts",
-    "max_sensor_errors",
+    "max_recording_errors",
     "max_steps",
     "prior_model_error",
     "prior_discrepancy",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["ErrorKind", "ShootingIntervals"]
 
 _DIVERGED = 1e6
-_WELL_CONDITIONED = 1e8
 # Rows times squared unknowns from which on derivatives take longer than threads take to be told (a few milliseconds).
 _WORTH_THREADS = 4e6
 
@@ -47,16 +46,6 @@ class ErrorKind:
     of_inputs: bool = False
 
 
-_FIELDS = {
-    ("delay", False): "delay",
-    ("bias", False): "bias",
-    ("delay", True): "input_delay",
-    ("lag", True): "input_lag",
-    ("drift", True): "gain_drift",
-}
-"""Fields of `RecordingErrors` by kind, and whether it is one of inputs."""
-
-
 @dataclass(frozen=True)
 class RecordingErrors:
     """Systematic errors of the sensors and of the inputs, and what the sensors measured.
@@ -66,28 +55,52 @@ class RecordingErrors:
     measured : (N, n_s) array
     sampled : (N, n_s) bool array
         As recorded.
-    delay : (n_s,) array
-        Samples by which each signal is recorded late.
-    bias : (n_s,) array
-        Constant error of each signal, its unit.
-    input_delay : (n_u,) array
-        Samples by which each input acts later than the others.
-    input_lag : (n_u,) array
-        Samples by which the time constant of each actuator is longer than that of all.
-    gain_drift : (n_u,) array
-        Relative change of each input's gain over a log.
-    kinds : tuple of ErrorKind
-        What of these is estimated.
+    n_inputs : int
+    sizes : mapping from ErrorKind to float, optional
+        Errors that are estimated; those of one signal or input add.
     """
 
     measured: FloatArray
     sampled: BoolArray
-    delay: FloatArray
-    bias: FloatArray
-    input_delay: FloatArray
-    input_lag: FloatArray
-    gain_drift: FloatArray
-    kinds: tuple[ErrorKind, ...]
+    n_inputs: int
+    sizes: Mapping[ErrorKind, float] = field(default_factory=dict)
+
+    @property
+    def kinds(self) -> tuple[ErrorKind, ...]:
+        """Errors that are estimated."""
+        return tuple(self.sizes)
+
+    @property
+    def delay(self) -> FloatArray:
+        """Samples ``(n_s,)`` by which each signal is recorded late."""
+        return self._total("delay", of_inputs=False)
+
+    @property
+    def bias(self) -> FloatArray:
+        """Constant error ``(n_s,)`` of each signal, its unit."""
+        return self._total("bias", of_inputs=False)
+
+    @property
+    def input_delay(self) -> FloatArray:
+        """Samples ``(n_u,)`` after which each input acts."""
+        return self._total("delay", of_inputs=True)
+
+    @property
+    def input_lag(self) -> FloatArray:
+        """Time constant ``(n_u,)`` of each actuator, samples."""
+        return np.maximum(self._total("lag", of_inputs=True), 0.0)
+
+    @property
+    def gain_drift(self) -> FloatArray:
+        """Relative change ``(n_u,)`` of each input's gain over a log."""
+        return self._total("drift", of_inputs=True)
+
+    def _total(self, what: str, *, of_inputs: bool) -> FloatArray:
+        found = np.zeros(self.n_inputs if of_inputs else self.measured.shape[1])
+        for kind, size in self.sizes.items():
+            if kind.what == what and kind.of_inputs == of_inputs:
+                found[list(kind.columns)] += size
+        return found
 
     def plus(self, more: Mapping[ErrorKind, float]) -> RecordingErrors:
         """These errors and others.
@@ -100,10 +113,8 @@ class RecordingErrors:
         -------
         RecordingErrors
         """
-        sizes = {name: getattr(self, name).copy() for name in _FIELDS.values()}
-        for kind, size in more.items():
-            sizes[_FIELDS[kind.what, kind.of_inputs]][list(kind.columns)] += size
-        return replace(self, **sizes, kinds=tuple(dict.fromkeys([*self.kinds, *more])))
+        sizes = {**self.sizes, **{kind: self.sizes.get(kind, 0.0) + x for kind, x in more.items()}}
+        return replace(self, sizes={kind: x for kind, x in sizes.items() if x or kind not in self.sizes})
 
 
 @dataclass(frozen=True)
@@ -137,10 +148,6 @@ class ShootingIntervals:
     hold : str, optional
         Inputs from row to row, one of `HOLDS`.  Only the state after the last row of a log, which nothing
         uses, depends on the inputs of the next log.
-    delay : int, optional
-        Samples by which the inputs act later than they are recorded.
-    lag : float, optional
-        Time constant of a first-order lag of the actuators, samples; 0 without one.
     errors : RecordingErrors, optional
         Errors of which ``measured`` is corrected, and with which the inputs act.
     threads : int, optional
@@ -159,8 +166,6 @@ class ShootingIntervals:
     length: int
     substeps: int
     hold: str = "zero-order"
-    delay: int = 0
-    lag: float = 0.0
     errors: RecordingErrors | None = None
     threads: int = 1
 
@@ -277,8 +282,8 @@ class ShootingIntervals:
 
     @property
     def n_shared(self) -> int:
-        """Number of unknowns that intervals share: parameters, discrepancies, delay."""
-        return self.n_p + self.augmented.n_discrepancies + 1
+        """Number of unknowns that intervals share: parameters and discrepancies."""
+        return self.n_p + self.augmented.n_discrepancies
 
     @cached_property
     def rollouts(self) -> Simulator:
@@ -287,39 +292,21 @@ class ShootingIntervals:
 
     @cached_property
     def inputs(self) -> FloatArray:
-        """Inputs as they act, (N, n_u)."""
-        return self._acting(self.lag)
+        """Inputs ``(N, n_u)`` as they act, after their delays and lags."""
+        errors = self.all_errors
+        timing = errors.input_delay, errors.input_lag, errors.gain_drift
+        n_rows = [int(self.is_logged[rows].sum()) for rows in self.rows_of_logs]
+        logs = zip(self.rows_of_logs, n_rows, strict=True)
+        return np.concatenate([acting_inputs(self.recorded[rows], *timing, self.hold, n) for rows, n in logs])
 
     @cached_property
-    def moving_inputs(self) -> FloatArray:
-        """Inputs, and their change per sample of delay, or of lag where there is one, (N, 2 n_u)."""
-        if self.lag:
-            step = 0.01 * self.lag
-            change = self._acting(self.lag + step) - self._acting(self.lag - step)
-            return np.hstack([self.inputs, change / (2.0 * step)])
-        later = np.zeros_like(self.inputs)
-        for rows in self.rows_of_logs:
-            if rows.stop - rows.start > 1:
-                later[rows] = np.gradient(self.inputs[rows], axis=0)
-        return np.hstack([self.inputs, -later])
+    def later_inputs(self) -> FloatArray:
+        """Change ``(N, n_u)`` of the acting inputs per sample of delay."""
+        return np.concatenate([_differences(-self.inputs[rows]) for rows in self.rows_of_logs])
 
-    def _acting(self, lag: float) -> FloatArray:
-        """Recorded inputs of each log after their delays and a lag, in samples."""
-        errors = self.all_errors
-        lags = np.maximum(lag + errors.input_lag, 0.0)
-        return np.concatenate(
-            [
-                acting_inputs(
-                    self.recorded[rows],
-                    self.delay + errors.input_delay,
-                    lags,
-                    errors.gain_drift,
-                    self.hold,
-                    int(self.is_logged[rows].sum()),
-                )
-                for rows in self.rows_of_logs
-            ]
-        )
+    def all_inputs(self, what: Literal["delay", "bias", "lag", "drift"]) -> ErrorKind:
+        """An error that all inputs that move have in common."""
+        return ErrorKind(tuple(np.flatnonzero(np.ptp(self.recorded, axis=0) > 0.0).tolist()), what, of_inputs=True)
 
     @cached_property
     def rows_of_logs(self) -> list[slice]:
@@ -332,9 +319,7 @@ class ShootingIntervals:
         """Errors of the recordings, none of which may be known."""
         if self.errors is not None:
             return self.errors
-        n_s, n_u = len(self.model.signals), self.recorded.shape[1]
-        none = {name: np.zeros(n_u if of_inputs else n_s) for (_, of_inputs), name in _FIELDS.items()}
-        return RecordingErrors(self.measured, self.sampled, **none, kinds=())
+        return RecordingErrors(self.measured, self.sampled, self.recorded.shape[1])
 
     def corrected(self, more: Mapping[ErrorKind, float], rates: FloatArray) -> ShootingIntervals:
         """The intervals with recordings that are corrected of further errors.
@@ -389,7 +374,7 @@ class ShootingIntervals:
         Parameters
         ----------
         shared : (n_shared,) array
-            Parameters, discrepancies, input delay in samples.
+            Parameters and discrepancies.
         x : (W, n_x) array
             States at the intervals' starts.
         d : (W, n_v) array
@@ -411,7 +396,7 @@ class ShootingIntervals:
         return RolloutBatch(
             parameters,
             x,
-            self.moving_inputs,
+            self.inputs,
             self.dt,
             starts,
             self.length,
@@ -500,19 +485,10 @@ class ShootingIntervals:
         simulator = rollouts(self.augmented.model, names, substeps=self.substeps, hold=self.hold)
         return simulator, slice(None) if seen.all() else np.flatnonzero(seen)
 
-    def origins(self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray) -> FloatArray:
-        """Initial states (n, n_x) for which chosen intervals end in their successors' initial states.
 
-        One Newton step; states are unchanged where it has no solution.
-        """
-        sums = self.gauss_newton(shared, x, d, np.zeros(self.measured.shape), chosen=chosen, normal_matrix=False)
-        jumps, slopes = x[chosen + 1] - sums.final_states, sums.final_slopes[:, :, : x.shape[1]]
-        finite = np.isfinite(jumps).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
-        usable = np.flatnonzero(finite)
-        usable = usable[np.linalg.cond(slopes[usable]) < _WELL_CONDITIONED]
-        found = x[chosen]
-        found[usable] += np.linalg.solve(slopes[usable], jumps[usable][:, :, None])[:, :, 0]
-        return found
+def _differences(values: FloatArray) -> FloatArray:
+    """Central differences from row to row; 0 of a single row."""
+    return np.gradient(values, axis=0) if len(values) > 1 else np.zeros_like(values)
 
 
 def _filled_up(values: FloatArray, more: int) -> FloatArray:

@@ -210,7 +210,7 @@ def _tested(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Estimates (K,), variances (K,) and effects (n, K) of terms with accelerations (W, n_v, K), part by part."""
     prior = fit.prior.copy()
-    prior[intervals.n_p : -1] *= _HELD
+    prior[intervals.n_p :] *= _HELD
     at = linearize(intervals, replace(fit, prior=prior), weights_of(intervals, fit))
     found = [(np.zeros(0), np.zeros(0), np.zeros((intervals.n_p, 0)))]
     for accelerations in parts:
