@@ -1,4 +1,4 @@
-r"""README.md and docs/, run as they are shown.
+r"""README.md, CONTRIBUTING.md and docs/, run as they are shown.
 
 A page runs from top to bottom in a folder of its own, with ``examples/`` inside and the real logs in
 ``../shared/data``:
@@ -27,7 +27,7 @@ from diransac.cli.commands import app
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED = REPOSITORY.parent / "shared"
-PAGES = [page for page in (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))) if page.is_file()]
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 NOT_RUN = {"cd", "git", "make", "pip"}
 NEEDS = {"robots.md": "mujoco", "logs.md": "mcap", "tutorial.md": "mcap"}
 """Package without which a page is not run."""
