@@ -123,6 +123,19 @@ def test_page_marks_every_block_with_a_plain_language(page: Path):
     assert not odd, f"{page.name}: mark blocks with one of {sorted(LANGUAGES)}; text is for what cannot run"
 
 
+def test_pages_are_short_enough_to_be_read():
+    words = {page.name: len(page.read_text().split()) for page in PAGES if page.parent.name != "tables"}
+    assert words["README.md"] < 1_300
+    assert words["method.md"] < 4_000
+    assert sum(words.values()) < 30_000
+
+
+def test_the_version_is_the_same_everywhere():
+    version = re.search(r'^version = "(.+)"$', (REPOSITORY / "pyproject.toml").read_text(), re.MULTILINE)[1]
+    assert f"\nversion: {version}\n" in (REPOSITORY / "CITATION.cff").read_text()
+    assert f"\n## [{version}] - " in (REPOSITORY / "CHANGELOG.md").read_text()
+
+
 def test_blocks_are_found_with_their_lines_and_without_their_indent():
     page = "text\n\n```python\na = 1\n```\n- item\n\n"
     page += "  ```console\n  $ diransac models \\\n      --json  # all\n  servo-axis\n  ```\n"
