@@ -35,7 +35,7 @@ bench: $(ENVIRONMENT)  ## measured figures; each benchmark prints its table
 	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
 
 docs: $(ENVIRONMENT)  ## the pages; --quiet would let warnings pass
-	$(BIN)/mkdocs build --strict --site-dir out/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir out/site
 
 docs-figures: $(ENVIRONMENT)  ## every command behind a number of the pages that has no output yet; many hours
 	$(BIN)/python benchmarks/documented.py --run

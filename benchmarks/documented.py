@@ -21,7 +21,7 @@ TIMES = 20 * 3600.0
 
 def pages() -> list[Path]:
     """Pages of the documentation."""
-    return [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+    return [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 
 
 def commands(page: str) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Least squares and set-points as instruments, where a controller answers forces that the model lacks.
 
 Run it as ``python benchmarks/feedback.py [--regimes "servo gusts fast,arm noisy"] [--seeds 1000:1008]``.  Regimes are
-those below, in which disturbances are strong, and those of regime_flights.py.  docs/method.md has figures.
+those below, in which disturbances are strong, and those of regime_flights.py.  docs/tables/method.md has figures.
 """
 
 import argparse

@@ -2,7 +2,7 @@
 
 Run it as ``python benchmarks/gauntlet.py [--vehicle pendulum] [--scenario clean,bursts] [--methods ols,tls]``;
 The logs are those of the studies that the package brings, ``diransac study run gauntlet``, trial by trial;
-docs/gauntlet.md says what the tables mean, and how a method or a scenario is added.
+docs/benchmarks.md says what the tables mean, and how a method or a scenario is added.
 """
 
 import argparse

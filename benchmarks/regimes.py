@@ -2,7 +2,7 @@
 
 Run it as ``python benchmarks/regimes.py [--regimes "car all measured,rotor noise"] [--seeds 0:20]``.  Reported
 figures are of seeds 0 to 19; whoever develops a method uses seeds from 1000 on, so that those stay unseen.
-docs/gauntlet.md says what the table means.
+docs/tables/regimes.md says what the table means.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""What each effect that the model leaves out does, and how finely rotors are to be integrated: docs/flying.md shows it.
+"""What each effect that the model leaves out does, and how finely rotors are to be integrated: docs/tables/flying.md.
 
 Section IV of Dimmig et al. 2023 mentions this analysis and does not show it: "blade flapping ... negligible", the
 gravitational mass imbalance "small in comparison to the rotational".  Each effect acts alone on the extended plant,

@@ -1,4 +1,4 @@
-r"""README.md and docs/, run as they are shown.
+r"""README.md, CONTRIBUTING.md and docs/, run as they are shown.
 
 A page runs from top to bottom in a folder of its own, with ``examples/`` inside and the real logs in
 ``../shared/data``:
@@ -27,7 +27,7 @@ from diransac.cli.commands import app
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED = REPOSITORY.parent / "shared"
-PAGES = [page for page in (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))) if page.is_file()]
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 NOT_RUN = {"cd", "git", "make", "pip"}
 NEEDS = {"robots.md": "mujoco", "logs.md": "mcap", "tutorial.md": "mcap"}
 """Package without which a page is not run."""
@@ -121,6 +121,19 @@ def test_page_marks_every_block_with_a_plain_language(page: Path):
     found = blocks(page.read_text())
     odd = {f"line {block.line - 1}: {block.info!r}" for block in found if block.info not in LANGUAGES}
     assert not odd, f"{page.name}: mark blocks with one of {sorted(LANGUAGES)}; text is for what cannot run"
+
+
+def test_pages_are_short_enough_to_be_read():
+    words = {page.name: len(page.read_text().split()) for page in PAGES if page.parent.name != "tables"}
+    assert words["README.md"] < 1_300
+    assert words["method.md"] < 4_000
+    assert sum(words.values()) < 30_000
+
+
+def test_the_version_is_the_same_everywhere():
+    version = re.search(r'^version = "(.+)"$', (REPOSITORY / "pyproject.toml").read_text(), re.MULTILINE)[1]
+    assert f"\nversion: {version}\n" in (REPOSITORY / "CITATION.cff").read_text()
+    assert f"\n## [{version}] - " in (REPOSITORY / "CHANGELOG.md").read_text()
 
 
 def test_blocks_are_found_with_their_lines_and_without_their_indent():

@@ -146,7 +146,7 @@ def test_mujoco_writes_no_log_and_prints_no_warning(worked):
 
 
 def test_the_page_names_every_library_that_is_checked_here():
-    page = (Path(__file__).parents[1] / "docs" / "trust.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "shared-files.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| ([^|]+) \|.*\|$", page.partition("## Files beside a log")[2], re.MULTILINE)
     named = {name.split()[0].strip("`") for row in rows[1:] for name in row.split(", ")}
     assert named == {

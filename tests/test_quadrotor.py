@@ -1,6 +1,8 @@
 """The built-in quadrotor against a rigid body with rotors, integrated as a rotation matrix in NumPy."""
 
+import runpy
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -210,3 +212,16 @@ def test_imu_and_attitude_determine_all_parameters_without_a_position():
         assert abs(result.parameters[name] - true) <= 4.0 * result.standard_errors[name], name
     ratio = result.parameters["inertia_x"] / result.parameters["thrust_coefficient"]
     assert ratio == pytest.approx(TRUTH["inertia_x"] / TRUTH["thrust_coefficient"], rel=0.02)
+
+
+def test_the_example_has_the_dynamics_of_the_built_in_quadrotor():
+    own = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "my_quadrotor.py"))["model"]
+    builtin = dr.models.quadrotor("x", arm_length=0.12, speed_unit="rad/s", motor_lag=True)
+    renamed = {"thrust_coefficient": "kT", "torque_coefficient": "kQ"} | {f"inertia_{x}": f"J{x}" for x in "xyz"}
+    truth = {renamed.get(name, name): value for name, value in TRUTH.items()} | {"lag": LAG}
+    biases = {name: 0.0 for name in own.parameters if name not in truth}
+    state = np.array([0.1, 0.2, 0.3, 0.8, 0.0, 0.6, 0.0, 1.0, -2.0, 0.5, 0.3, -0.4, 0.2, 900.0, 950.0, 1000.0, 870.0])
+    commands = np.array([910.0, 940.0, 990.0, 900.0])
+    found = own.dynamics(state, commands, own.parameter_vector({**truth, **biases}))[0].full()
+    expected = builtin.dynamics(state, commands, builtin.parameter_vector({**TRUTH, "motor_time_constant": LAG}))[0]
+    np.testing.assert_allclose(found, expected.full(), rtol=1e-12, atol=1e-12)

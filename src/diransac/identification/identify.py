@@ -88,7 +88,7 @@ def identify(
         value (``Parameter.value``).  The result has it, with a standard error of zero, and names it in ``fixed``.
     priors : mapping of str to (float, float), optional
         Mean and standard deviation of a Gaussian prior of a parameter, in its unit; for a per-log parameter, of the
-        value in each log.  A prior has the weight that the noise of the log gives it: see `docs/method.md`.
+        value in each log.  A prior has the weight that the noise of the log gives it: see `docs/identifiability.md`.
     start : mapping of str to float, optional
         Rough values of some parameters, in their units, from which lo-diransac starts a search by simulation error in
         addition; no more than a start, unlike a prior.

@@ -28,7 +28,7 @@ Effect = Callable[[Symbols, Symbols, Symbols, Symbols, Symbols], Mapping[str, An
 """``effect(q, v, u, p, d)`` gives expressions by name."""
 
 _STEPS_PER_PERIOD = 8
-"""Integration steps per period of the fastest disturbance; docs/flying.md has the convergence."""
+"""Integration steps per period of the fastest disturbance; docs/tables/flying.md has the convergence."""
 
 
 _HIGHEST_FREQUENCY = 1e5

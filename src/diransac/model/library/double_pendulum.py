@@ -14,6 +14,11 @@ def double_pendulum(
 ) -> Model:
     """Model ``M(q) q'' + c(q, q') + g(q) + f(q') = tau`` in nine base parameters.
 
+    ``M11 = J1 + I2 + 2 l1 h2 cos q2 + (n^2 + 1) Ir``, ``M12 = I2 + l1 h2 cos q2 - n Ir``, ``M22 = I2 + n^2 Ir``
+    ``M11 q1'' + M12 q2'' - l1 h2 sin q2 (2 q1' + q2') q2' + g h1 sin q1 + g h2 sin(q1 + q2) + f1 = tau1``
+    ``M12 q1'' + M22 q2'' + l1 h2 sin q2 q1'^2 + g h2 sin(q1 + q2) + f2 = tau2``
+    ``fi = bi qi' + cfi atan(k qi')``
+
     Parameters
     ----------
     upper_length : float
@@ -29,9 +34,9 @@ def double_pendulum(
     -------
     Model
         Coordinates q1 (0 hanging) and q2 (relative to the upper link), rad. Inputs torque1, torque2 at the joints, N m.
-        Parameters inertia1 = I1 + m2 l1^2, moment1 = m1 r1 + m2 l1, inertia2 = I2, moment2 = m2 r2, rotor_inertia = Ir,
-        viscous friction b1, b2 (N m s/rad) and dry friction cf1, cf2 (N m). Masses and I1 are not identifiable
-        separately.
+        Parameters inertia1 J1 = I1 + m2 l1^2, moment1 h1 = m1 r1 + m2 l1, inertia2 I2, moment2 h2 = m2 r2,
+        rotor_inertia Ir, viscous friction b1, b2 (N m s/rad) and dry friction cf1, cf2 (N m). Masses and I1 are not
+        identifiable separately.
 
     References
     ----------

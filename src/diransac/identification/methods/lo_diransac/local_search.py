@@ -288,11 +288,12 @@ class LocalSearch:
         if delay in sought:
             tried = {self._late(intervals, delay, best.projected), round(now + error.size) - now if error else 0.0}
             found += [intervals.with_input_error(delay, x) for x in tried if x]
+        punctual = intervals.with_input_error(delay, -now)
         if lag in sought and lag not in sizes and late > _SHORTEST_LAG:
-            lagging = intervals.with_input_error(delay, -sizes.get(delay, 0.0)).with_input_error(lag, late)
-            found.append(replace(lagging, hold="linear" if free_hold else intervals.hold))
+            hold = "linear" if free_hold else intervals.hold
+            found.append(replace(punctual.with_input_error(lag, late), hold=hold))
         if free_hold and _CONTINUOUS[0] < late < _CONTINUOUS[1]:
-            found += [replace(intervals, hold=hold) for hold in ("linear", "smooth")]
+            found += [replace(punctual, hold=hold) for hold in ("linear", "smooth")]
         return found
 
     def _moved(self, now: Explanation, intervals: ShootingIntervals) -> Explanation:
@@ -381,17 +382,24 @@ class LocalSearch:
         """The exact model from the parameters of a fit, or the best hypothesis; None if both are impossible."""
         intervals, fit = flexible.intervals, flexible.refinement.fit
         projected, found = flexible.projected, list[Explanation]()
+        errors, late = intervals.all_errors.kinds, intervals.all_inputs("delay")
         starts = np.array([projected, self.hypotheses[0]])
         starts = starts[: 1 + bool((np.abs(starts[1] - starts[0]) > _APART * np.abs(starts[0])).any())]
         for p in starts[intervals.layout.admits(starts)]:
             begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
-            is_left = any(x.of_inputs for x in intervals.all_errors.kinds)
             try:
                 refined = refine_exact(self.settings, intervals, begin, self.prior, flexible.cost)
             except np.linalg.LinAlgError:  # simulations by the exact model overflow from here: it is no explanation
                 continue
             exact = Explanation(intervals, refined, exact=True)
-            found.append(self._with_refined_errors(exact) if is_left else exact)
+            found.append(self._with_refined_errors(exact) if any(x.of_inputs for x in errors) else exact)
+            if (
+                refined.converged
+                and found[-1].cost > flexible.cost
+                and late not in errors
+                and late in self._sought(exact)
+            ):
+                found.append(self._with_refined_errors(exact, [late]))
             if found[-1].cost < flexible.cost:
                 break
         return min(found, key=lambda x: x.cost, default=None)

@@ -114,7 +114,7 @@ class RecordingErrors:
         RecordingErrors
         """
         sizes = {**self.sizes, **{kind: self.sizes.get(kind, 0.0) + x for kind, x in more.items()}}
-        return replace(self, sizes={kind: x for kind, x in sizes.items() if x or kind not in self.sizes})
+        return replace(self, sizes={kind: x for kind, x in sizes.items() if x})
 
 
 @dataclass(frozen=True)
