@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.identification.estimate import Finding
+from diransac.identification.methods.lo_diransac.recording_errors import LEAST_DELAY
 from diransac.text_table import duration, number, percent
 
 if TYPE_CHECKING:
@@ -17,9 +18,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
 __all__ = ["findings_of_fit"]
-
-# Delay of an input that is worth a sentence, samples.
-_SMALL_DELAY = 0.1
 
 
 def findings_of_fit(found: Explanation, parts: Parts, acting: ActingInputs | None) -> Iterator[Finding]:
@@ -63,10 +61,10 @@ def _of_recordings(intervals: ShootingIntervals) -> Iterator[Finding]:
     own = {x.what: x != intervals.all_inputs(x.what) for x in errors.kinds if x.of_inputs and x.what != "drift"}
     delays, lags = errors.input_delay * own.get("delay", False), errors.input_lag * own.get("lag", False)
     for name, delay, lag, drift in zip(intervals.model.inputs, delays, lags, errors.gain_drift, strict=True):
-        if abs(delay) > _SMALL_DELAY:
+        if abs(delay) > LEAST_DELAY:
             time, sense = duration(abs(delay) * intervals.dt), "later" if delay > 0.0 else "earlier"
             yield Finding("care", f"{name} acts {time} {sense} than recorded, a delay that the estimate includes.")
-        if lag > _SMALL_DELAY:
+        if lag > LEAST_DELAY:
             time = duration(lag * intervals.dt)
             yield Finding("care", f"{name} acts after a first-order lag of {time}, which the estimate includes.")
         if drift:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
 __all__ = [
+    "LEAST_DELAY",
     "RecordingError",
     "clear_errors",
     "effect_on",
@@ -42,8 +43,11 @@ __all__ = [
     "with_errors",
 ]
 
-# Standard errors from which on an error of a sensor is tried; its least delay, samples; its largest, over the log.
-_CLEAR, _LEAST_DELAY, _LATEST = 3.0, 0.1, 0.1
+LEAST_DELAY = 0.1
+"""Delay, samples, from which on one is tried, and named."""
+
+# Standard errors from which on an error of a sensor is tried; its largest delay, over the log.
+_CLEAR, _LATEST = 3.0, 0.1
 # Groups of which a fit is made at a time.
 _GROUPS = 4
 # Numbers of the sensitivities that are held at a time.
@@ -115,7 +119,7 @@ def clear_errors(
     latest = _LATEST * max(x.stop - x.start for x in intervals.rows_of_logs)
     parts = [tested[k : k + at_a_time] for k in range(0, len(tested), at_a_time)]
     found = [x for part in parts for x in scores.tested(part)]
-    found = [x for x in found if x.kind.what != "delay" or _LEAST_DELAY < abs(x.size) < latest]
+    found = [x for x in found if x.kind.what != "delay" or LEAST_DELAY < abs(x.size) < latest]
     inputs = [x for x in found if x.kind.of_inputs and x.gain > worth and _is_possible(intervals, x)]
     single = [x for x in found if len(x.kind.columns) == 1 and not x.kind.of_inputs and x.ratio > _CLEAR]
     groups = [x for x in found if len(x.kind.columns) > 1 and not x.kind.of_inputs and x.gain > worth]

@@ -22,7 +22,7 @@ from diransac.identification.methods.lo_diransac.projection import (
     fitted_parameters,
     residuals_of_motion,
 )
-from diransac.identification.methods.lo_diransac.recording_errors import errors_of
+from diransac.identification.methods.lo_diransac.recording_errors import LEAST_DELAY, errors_of
 from diransac.identification.methods.lo_diransac.refinement import diverges, make_prior, start
 from diransac.identification.methods.lo_diransac.unmeasured import (
     unmeasured_by_name,
@@ -100,7 +100,9 @@ class Searched:
         """True for a delay or a lag that all inputs have in common, and none of which has another of its own."""
         intervals = self.likeliest.intervals
         late = [x for x in intervals.all_errors.kinds if x.of_inputs and x.what in LATE]
-        return bool(late) and all(x == intervals.all_inputs(x.what) for x in late)
+        common = self.common_timing
+        is_shared = bool(late) and all(x == intervals.all_inputs(x.what) for x in late)
+        return is_shared and common is not None and abs(common.size) > LEAST_DELAY
 
     @property
     def timing(self) -> InputTiming:
