@@ -94,7 +94,7 @@ def test_an_input_that_acts_late_is_said_with_its_delay():
     found = dr.identify(sledge(), log_of(*slide(extra=0.0, lag=6))[0], seed=0)
     assert found.diagnosis.input_delay_significant
     assert found.diagnosis.input_delay == pytest.approx(0.06, abs=1e-3)
-    assert "· Inputs act 60 ms later than recorded" in str(found)
+    assert re.search(r"· Inputs act 60(\.1)? ms later than recorded", str(found))
     punctual = dr.identify(sledge(), log_of(*slide(extra=0.0))[0], seed=0)
     assert not punctual.diagnosis.input_delay_significant
 

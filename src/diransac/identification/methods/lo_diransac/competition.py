@@ -216,6 +216,7 @@ class Contest:
     def add_sources(self, first: Searched | None) -> None:
         """Add a fit's estimates, least squares of all rows, and simulation error, which starts from all of these."""
         sources, dataset = self.settings.sources, self.dataset
+        intervals = self.intervals if first is None else first.corrected(self.intervals)
         holds = [dataset.input_hold] if dataset.input_hold else list(HOLDS)
         actings = [ActingInputs.recorded(self.intervals, hold) for hold in holds]
         if first is not None:
@@ -230,7 +231,7 @@ class Contest:
         if "simulation error" in sources:
             report(self.callback, "simulation error", 0.885)
             found = simulation_error_candidates(
-                self.intervals, self.motion, self._starts(first), actings, self.seed, self.blocks,
+                intervals, self.motion, self._starts(first), actings, self.seed, self.blocks,
                 outliers=self.settings.outliers,
             )  # fmt: skip
             for one, motion in found:
@@ -325,8 +326,9 @@ class Contest:
 
     def second(self, winner: int, notes: tuple[str, ...]) -> Searched | None:
         """A search from an estimate and its simulated motion; None where it fails."""
-        intervals, one, motion = self.intervals, self.candidates[winner], self.origins[winner]
+        one, motion = self.candidates[winner], self.origins[winner]
         assert isinstance(motion, Motion)
+        intervals = one.intervals
         while intervals.length > _SHORT and (parts := fewest_parts(intervals.length)):
             intervals = intervals.split(parts)
         try:

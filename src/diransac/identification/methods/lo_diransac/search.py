@@ -110,6 +110,13 @@ class Searched:
         errors, dt = self.likeliest.intervals.all_errors, self.likeliest.intervals.dt
         return InputTiming.of(errors.input_delay * dt, errors.input_lag * dt, errors.gain_drift)
 
+    def corrected(self, intervals: ShootingIntervals) -> ShootingIntervals:
+        """Intervals of the same logs, corrected of the errors of sensors of the explanation."""
+        own = self.likeliest.intervals
+        sizes = {kind: x for kind, x in own.all_errors.sizes.items() if not kind.of_inputs}
+        errors = replace(own.all_errors, sizes=sizes)
+        return replace(intervals, measured=own.measured, sampled=own.sampled, errors=errors)
+
     @property
     def explains_nothing(self) -> bool:
         """True if the noise of every signal is as large as the signal, or nearly all of its samples are outliers."""
@@ -154,7 +161,7 @@ def likeliest(
 
     Where states that nothing measures are not those of an exact model at once, they may have begun on wrong
     trajectories, for which a resonance that smoothing takes for noise is enough.  A second search begins with the
-    motion of observers, and the likelier explanation counts.
+    motion of observers, and the likelier explanation counts; a third where that has found errors of sensors.
     """
     intervals, motion, notes = whole
     if not unmeasured_states(intervals):
@@ -168,19 +175,20 @@ def likeliest(
         if observed is None:
             raise
         return searched(settings, intervals, observed, notes, seed, dataset, within(callback, 0.87, 0.9))
-    if first.likeliest.exact:
-        return first
+    best, tried = first, None
     try:
-        observed = with_observed_states(intervals, motion)
-        if observed is not None:
-            further = within(callback, 0.87, 0.9)
-            other = searched(settings, intervals, observed, notes, seed, dataset, further)
-            return min(first, other, key=lambda x: x.likeliest.cost)
+        # Observers follow the samples: late ones mislead them, and are followed again once they are corrected.
+        while not best.likeliest.exact and (sensors := best.corrected(intervals)).all_errors.kinds != tried:
+            observed, tried = with_observed_states(sensors, motion), sensors.all_errors.kinds
+            if observed is not None:
+                further = within(callback, 0.87, 0.9)
+                other = searched(settings, sensors, observed, notes, seed, dataset, further)
+                best = min(best, other, key=lambda x: x.likeliest.cost)
     except TimeLimitError:
-        return replace(first, likeliest=replace(first.likeliest, complete=False))
+        return replace(best, likeliest=replace(best.likeliest, complete=False))
     except (IdentificationError, np.linalg.LinAlgError):
-        pass  # the first search stands
-    return first
+        pass  # the search before stands
+    return best
 
 
 def searched(
