@@ -116,7 +116,7 @@ WRONG = {
     "shift": (f"shift = 3\n{ENTRY}", "shift must be a table"),
     "resample": (f'resample = "often"\n{ENTRY}', "resample is 'often'"),
     "absent field": ('[[signals]]\nname = "x"\nfield = "b"', r'has "x" from field "b" .*say optional = true'),
-    "nothing fits": ('[[signals]]\nname = "x"\nfield = "b"\noptional = true', "fits none of its topics"),
+    "nothing fits": ('[[signals]]\nname = "x"\nfield = "b"\noptional = true', "fits none of its columns"),
     "unknown repair": (f'repair = ["glue"]\n{ENTRY}', 'there is no repair "glue"; there are comments'),
 }
 

@@ -40,6 +40,8 @@ class Table:
         Those of the log that was written to the file, as in `Log`.
     is_described : bool
         True with the metadata of a log.
+    elements : tuple of str
+        Names, such as those of joints, for which ``{joint}`` in a mapping stands.
     """
 
     columns: Mapping[str, FloatArray | str]
@@ -48,6 +50,7 @@ class Table:
     history: tuple[dict[str, Any], ...] = ()
     filter: FilterSpecification | None = None
     is_described: bool = False
+    elements: tuple[str, ...] = ()
 
     def with_step(self, step: Mapping[str, Any]) -> Table:
         """The table with one more step in its history."""

@@ -42,7 +42,7 @@ def mapped_table(table: Table, mapping: LogMapping, source: str) -> Table:
             raise LogError(f'{source}: {mapping.source} has its time in "{mapping.time_column}"; found {found}')
         time = columns[mapping.time_column]
         columns["t"] = time if isinstance(time, str) else time * mapping.time_scale
-    entries, notes = mapping.chosen({"": list(columns)}, {}, source)
+    entries, notes = mapping.chosen({"": list(columns)}, {"": table.elements}, source)
     mapped: dict[str, FloatArray | str] = {"t": columns["t"]} if "t" in columns else {}
     units: dict[str, str] = {}
     for entry in entries:
