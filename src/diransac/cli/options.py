@@ -293,6 +293,12 @@ class Preparation:
         str | None,
         _option("--resample", metavar="HZ|median", help="Resample at a uniform rate; median: the clock's usual one."),
     ] = None
+    unmeasured: Annotated[
+        str | None,
+        _option(
+            "--unmeasured", metavar="NAME,...", help="Coordinates that the log lacks although a column is named alike."
+        ),
+    ] = None
     start: Annotated[
         float | None, _option("--from", callback=_moment, metavar="S", help="Leave out what comes before.")
     ] = None
@@ -348,6 +354,7 @@ class Preparation:
             "rename": pairs("--map", self.rename or ()),
             "scale": numbers("--scale", self.scale or ()),
             "resample": _rate(self.resample),
+            "unmeasured": None if self.unmeasured is None else names(self.unmeasured),
             "like": [step for step in like if replaced.get(step["step"]) is None],
         }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,11 @@ from diransac.errors import LogError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from diransac.data.log import Log
+    from diransac.model import Model
+
 __all__ = [
+    "alike",
     "as_column",
     "as_doubles",
     "as_numbers",
@@ -24,6 +29,7 @@ __all__ = [
     "describe_gaps",
     "describe_jitter",
     "numeric_columns",
+    "other_spelling",
     "rows_per_sample",
 ]
 
@@ -31,6 +37,8 @@ __all__ = [
 # In mean intervals: the jitter that is not reported, and the one that is an error; in median intervals: a gap.
 _SILENT_JITTER, _TOLERATED_JITTER, _GAP = 1e-3, 0.2, 1.5
 _ROUNDING = 1e-6
+# Common part of two spellings of one name; names, and letters of each, that are compared.
+_ALIKE, _MOST_COMPARED, _LONGEST_NAME = 0.8, 1000, 100
 # Samples of a signal from which its rate is taken.
 _FEWEST_SAMPLES = 5
 
@@ -91,6 +99,41 @@ def check_names(names: Iterable[object], source: str) -> None:
             raise LogError(f"{source}: {name!r} cannot name a signal; use a text that has no spaces around it")
         if name == "t":
             raise LogError(f'{source}: "t" is the time; give the signal another name')
+
+
+def alike(name: str, others: Iterable[str]) -> str | None:
+    """The other name that is likely to be the same one in another spelling; None without one.
+
+    Parameters
+    ----------
+    name : str
+    others : iterable of str
+        Names that nothing uses.
+
+    Examples
+    --------
+    >>> alike("theta", ["x", "thteta"]), alike("theta", ["Theta", "teta"]), alike("q1", ["q2"]), alike("x", ["z"])
+    ('thteta', 'Theta', None, None)
+    """
+    from difflib import SequenceMatcher
+
+    letters, digits = _letters_and_digits(name)
+    found = [(other, *_letters_and_digits(other)) for other in islice(others, _MOST_COMPARED)]
+    rated = [(SequenceMatcher(None, letters, own).ratio(), other) for other, own, n in found if n == digits and own]
+    near = [pair for pair in rated if pair[0] >= _ALIKE]
+    return max(near, key=lambda pair: pair[0])[1] if near else None
+
+
+def other_spelling(name: str, log: Log, model: Model) -> str | None:
+    """Signal of a log that its model does not have and that is likely to be the named one; None without one."""
+    known = {*model.signals, *model.inputs}
+    return alike(name, [x for x in log.names if x not in known])
+
+
+def _letters_and_digits(name: str) -> tuple[str, str]:
+    """Small letters and digits of a name, and its digits alone."""
+    plain = "".join(x for x in name.lower() if x.isalnum())[:_LONGEST_NAME]
+    return plain, "".join(x for x in plain if x.isdigit())
 
 
 def rows_per_sample(known: npt.NDArray[np.bool_]) -> int:

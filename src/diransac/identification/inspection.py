@@ -13,6 +13,7 @@ from diransac.arrays import FloatArray
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, usable_sensors
+from diransac.data.segment import spelling_notes
 from diransac.errors import IdentificationError, LogError
 from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.evaluation import choose_scoring
@@ -204,7 +205,9 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
     fitness = None if model is None else _fitness(log, model)
     if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
         fitness = dataclasses.replace(fitness, caveat=_caveat(signals, model))
-    return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, log.notes, fitness, events)
+    like = () if model is None else spelling_notes(model, log, (*model.signals, *model.inputs))
+    notes = (*log.notes, *like)
+    return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, notes, fitness, events)
 
 
 def _events(log: Log) -> list[str]:

@@ -76,6 +76,7 @@ def read_log(
     rename: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     resample: float | str | None = None,
+    unmeasured: Iterable[str] | None = None,
     like: Iterable[Mapping[str, Any]] = (),
 ) -> Log:
     """Log of a CSV (plain or gzip), Parquet, NPZ, MAT, HDF5, ULog, MCAP or bag file, Crazyflie's log, LeRobot episode.
@@ -103,6 +104,8 @@ def read_log(
     resample : float or "median", optional
         Rate in Hz for linear interpolation, or ``"median"`` for one row per median interval.  None: the time must be
         even.
+    unmeasured : iterable of str, optional
+        Coordinates that the log lacks although a column has a name like theirs.
     like : iterable of dict, optional
         History of a log of the same recorder, such as ``result.logs[0].preparation``.  Its mapping, names, factors,
         rates, repairs, delays and despiking apply where the arguments above give none.  What the history in the file
@@ -131,7 +134,7 @@ def read_log(
     sample of a slower topic stands in the row nearest to it, and the rows between are NaN.
     """
     path = Path(path)
-    given = _Arguments(mapping, columns, rate, repair, rename, scale, resample, like)
+    given = _Arguments(mapping, columns, rate, repair, rename, scale, resample, unmeasured, like)
     dataset = _dataset(path)
     if dataset is not None:
         files = list(dataset.files)
@@ -199,6 +202,7 @@ class _Arguments:
     rename: Mapping[str, str] | None = None
     scale: Mapping[str, float] | None = None
     resample: float | str | None = None
+    unmeasured: Iterable[str] | None = None
     like: Iterable[Mapping[str, Any]] = ()
 
 
@@ -256,6 +260,9 @@ def _read(opened_with: Callable[..., Table | Recording], source: str, given: _Ar
         from diransac.data.readers.topics import mapped_table
 
         table = mapped_table(table, chosen, source)
+    unmeasured = earlier.unmeasured if given.unmeasured is None else tuple(given.unmeasured)
+    if unmeasured:
+        table = table.with_step({"step": "unmeasured", "signals": list(unmeasured)})
     log = _log(table, earlier.factors(table, given.scale or {}), resample, repairs, source)
     return earlier.prepared(log if chosen is None else _prepared(log, chosen))
 
