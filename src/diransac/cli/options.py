@@ -143,7 +143,9 @@ _LOG_HELP = (
     "the folder of a LeRobot dataset."
 )
 _MODEL = typer.Option(
-    "--model", metavar="NAME|FILE.py[:NAME]|FILE.xml", help="A built-in model, one of yours, or a robot's MJCF or URDF."
+    "--model",
+    metavar="NAME|FILE.py[:NAME]|FILE.xml|MODEL.json",
+    help="Built in, yours, a robot's MJCF or URDF, or a result's; logs are then read as that of the result was.",
 )
 
 LogFile = Annotated[Path, typer.Argument(metavar="LOG|-", help=_LOG_HELP)]
@@ -402,19 +404,19 @@ class Preparation:
         """True where topics are mapped to signals."""
         return self.mapping is not None or bool(self.rename)
 
-    def read_uneven(self, file: Path) -> Log:
+    def read_uneven(self, file: Path, like: Sequence[Mapping[str, Any]] = ()) -> Log:
         """As `read`, but an unevenly sampled log is resampled at its median rate, and of several episodes the first is
         read where none is named, each with a note.
         """
         found = episodes_of(file) if self.episodes is None else ()
         if len(found) > 1:
-            log = replace(self, episodes=str(found[0])).read_uneven(file)
+            log = replace(self, episodes=str(found[0])).read_uneven(file, like)
             said = f"the first of {len(found)} episodes, {found[0]} to {found[-1]}; --episodes names another one"
             return replace(log, notes=(said, *log.notes))
         try:
-            return self.read(file)
+            return self.read(file, like)
         except LogError as error:
             if self.resample is not None:
                 raise
-            log = replace(self, resample="median").read(file)
+            log = replace(self, resample="median").read(file, like)
             return replace(log, notes=(f"resampled, because: {error}", *log.notes))
