@@ -140,13 +140,13 @@ def main() -> None:
             worst = next((x for x in verdicts if x != "usable"), "usable")
             counts[worst] = counts.get(worst, 0) + 1
             if worst != "usable":
-                off = ", ".join(f"{100 * x:.2f} %" for x in errors[-1])
+                off = ", ".join(f"{100 * x:.2g} %" for x in errors[-1])
                 print(f"pair {seed}, {faults(seed)}: {' and '.join(verdicts)}; errors {off}")
                 for finding in (y for x in found if x.verdict != "usable" for y in x.findings):
                     print(f"  {finding}", flush=True)
     n, rms = stop - start, np.sqrt(np.mean(np.square(errors), axis=0))
     print(f"{n} pairs: " + ", ".join(f"{k} {verdict}" for verdict, k in counts.items()))
-    print("RMS errors: " + ", ".join(f"{name} {100 * x:.2f} %" for name, x in zip(TRUTH, rms, strict=True)))
+    print("RMS errors: " + ", ".join(f"{name} {100 * x:.2g} %" for name, x in zip(TRUTH, rms, strict=True)))
     print(f"identification: {np.median(seconds):.1f} s, median")
 
 
