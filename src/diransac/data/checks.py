@@ -37,8 +37,9 @@ __all__ = [
 # In mean intervals: the jitter that is not reported, and the one that is an error; in median intervals: a gap.
 _SILENT_JITTER, _TOLERATED_JITTER, _GAP = 1e-3, 0.2, 1.5
 _ROUNDING = 1e-6
-# Common part of two spellings of one name; names, and letters of each, that are compared.
-_ALIKE, _MOST_COMPARED, _LONGEST_NAME = 0.8, 1000, 100
+# Common part of two spellings of one name, and what counts as that of an abbreviation, of so many letters; names, and
+# letters of each, that are compared.
+_ALIKE, _ABBREVIATED, _SHORT, _MOST_COMPARED, _LONGEST_NAME = 0.8, 0.9, 3, 1000, 100
 # Samples of a signal from which its rate is taken.
 _FEWEST_SAMPLES = 5
 
@@ -115,13 +116,22 @@ def alike(name: str, others: Iterable[str]) -> str | None:
     >>> alike("theta", ["x", "thteta"]), alike("theta", ["Theta", "teta"]), alike("q1", ["q2"]), alike("x", ["z"])
     ('thteta', 'Theta', None, None)
     """
-    from difflib import SequenceMatcher
-
     letters, digits = _letters_and_digits(name)
     found = [(other, *_letters_and_digits(other)) for other in islice(others, _MOST_COMPARED)]
-    rated = [(SequenceMatcher(None, letters, own).ratio(), other) for other, own, n in found if n == digits and own]
+    rated = [
+        (_ABBREVIATED if len(own) >= _SHORT and letters.startswith(own) else _common(letters, own), other)
+        for other, own, n in found
+        if n == digits and own
+    ]
     near = [pair for pair in rated if pair[0] >= _ALIKE]
     return max(near, key=lambda pair: pair[0])[1] if near else None
+
+
+def _common(a: str, b: str) -> float:
+    """Common part of two names."""
+    from difflib import SequenceMatcher
+
+    return SequenceMatcher(None, a, b).ratio()
 
 
 def other_spelling(name: str, log: Log, model: Model) -> str | None:

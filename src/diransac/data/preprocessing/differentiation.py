@@ -205,11 +205,8 @@ def _underivable(log: Log, model: Model, name: str, source: str | None) -> str:
     if source is None:
         why = f'model "{model.name}" has velocities that are not derivatives of its coordinates'
         return f'{log.source}: signal "{name}" is missing and cannot be derived: {why}; found {found}. Give it.'
-    near = other_spelling(source, log, model)
-    also = "" if near is None else f" If {near} is the latter, pass --map {source}={near}."
-    return (
-        f'{log.source}: signal "{name}" is missing, and so is "{source}", its source; found {found}. Give either.{also}'
-    )
+    give = f"Give either, as in --map {source}={other_spelling(source, log, model) or 'COLUMN'}."
+    return f'{log.source}: signal "{name}" is missing, and so is "{source}", its source; found {found}. {give}'
 
 
 def _filtered(log: Log, model: Model) -> list[str]:

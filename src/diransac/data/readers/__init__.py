@@ -49,6 +49,7 @@ _TABLES = {
 _TEXTS = {
     ".csv": "comma_separated:read_csv",
     ".csv.gz": "comma_separated:read_csv_gz",
+    ".tsv": "comma_separated:read_csv",
     ".txt": "comma_separated:read_csv",
 }
 _RECORDINGS = {
@@ -58,6 +59,16 @@ _RECORDINGS = {
     ".bag": "bags:open_bag",
 }
 """Ending -> module of this package, and what opens or reads a file there."""
+_REMEDIES = {
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "export the sheet as CSV"),
+    **dict.fromkeys((".dat", ".asc", ".log", ".prn"), "if it is text, rename it to .txt"),
+    **dict.fromkeys((".json", ".jsonl", ".pkl", ".pickle", ".feather"), "write it as CSV or Parquet"),
+    **dict.fromkeys((".bbl", ".bfl"), "convert it to CSV by Betaflight's blackbox_decode"),
+    **dict.fromkeys((".db3", ".yaml"), "name the folder of the bag"),
+    ".bin": "of ArduPilot's, convert it to CSV by mavlogdump.py",
+    ".npy": "name its columns: np.savez(file, t=..., x=...)",
+}
+"""Ending that is not read -> what to do."""
 _FOLDERS = {"metadata.yaml": "bags:open_bag"}
 """File in a folder -> what opens the folder."""
 _LEROBOT = "meta/info.json"
@@ -245,6 +256,9 @@ def _read(opened_with: Callable[..., Table | Recording], source: str, given: _Ar
         rename = earlier.names(table, _stripped(new_names, table))
         if chosen is None or chosen.time_column is None:
             rename = _with_time(rename, table)
+            table = table.with_time_of(rename.get("t", "t"))
+        else:
+            table = table.with_time_of(chosen.time_column)
     else:
         from diransac.data.readers.topics import is_one_table, table_of_topics, whole_topic
 
@@ -400,7 +414,9 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
         is_crazyflie = file.read(1) == MAGIC
     if is_crazyflie:
         return CrazyflieRecording(_content(path, source), source)
-    raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}')
+    remedy = _REMEDIES.get(path.suffix.lower())
+    also = "" if remedy is None else f"; {remedy}"
+    raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}{also}')
 
 
 def _described(path: Path, read: Table | Recording, source: str) -> Table | Recording:

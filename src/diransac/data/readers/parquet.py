@@ -24,6 +24,8 @@ __all__ = ["is_numeric", "numbers_of", "read_parquet", "scanned"]
 
 _MAGIC = b"PAR1"
 _DEEPEST = 16
+_INDEX = {"__index_level_0__": "timestamp"}
+"""Name that pandas gives to its index, which is that of the rows, where it has none."""
 _FEW = 1000
 """Rows of a column without numbers that are looked at: texts and lists may be of any size."""
 
@@ -39,6 +41,8 @@ def read_parquet(data: bytes, source: str) -> Table:
         numeric = [name for name, kind in schema.items() if is_numeric(kind)]
         frame = pl.read_parquet(io.BytesIO(data), columns=numeric)
         few = lazy.drop(numeric).head(_FEW).collect() if len(numeric) < len(schema) else frame.clear()
+        dated = [name for name, kind in schema.items() if kind in (pl.Datetime, pl.Duration)]
+        times = {name: _seconds(series) for name, series in lazy.select(dated).collect().to_dict().items()}
         metadata = pl.read_parquet_metadata(io.BytesIO(data)).get(KEY)
     named = [split_unit(header) for header in schema]
     check_unique([name for name, _ in named], source)
@@ -47,7 +51,9 @@ def read_parquet(data: bytes, source: str) -> Table:
         name: numbers[header] if header in numbers else _first(few[header])
         for (name, _), header in zip(named, schema, strict=True)
     }
-    table = Table(columns, {name: unit for name, unit in named if unit is not None})
+    named_times = {_INDEX.get(name, name): x for name, x in times.items() if x is not None}
+    units = {name: unit for name, unit in named if unit is not None}
+    table = Table({_INDEX.get(name, name): x for name, x in columns.items()}, units, times=named_times)
     return table if metadata is None else with_metadata(table, metadata, source)
 
 
@@ -88,6 +94,16 @@ def numbers_of(series: pl.Series) -> FloatArray:
     import polars as pl
 
     return series.cast(pl.Float64).fill_null(np.nan).to_numpy().astype(np.float64)
+
+
+def _seconds(series: pl.Series) -> FloatArray | None:
+    """Seconds (n,) since the first of times of the calendar, or seconds of durations; None where one is missing."""
+    import polars as pl
+
+    if series.null_count() or not len(series):
+        return None
+    since = series if series.dtype == pl.Duration else series - series[0]
+    return np.asarray(since.dt.total_nanoseconds().to_numpy() / 1e9)
 
 
 def _first(series: pl.Series) -> str:
