@@ -232,10 +232,17 @@ def check_even(time: FloatArray, source: str) -> None:
     )
 
 
-def check_clock(time: FloatArray, source: str) -> list[str]:
+def check_clock(time: FloatArray, source: str, *, in_file: bool = False) -> list[str]:
     """Sentence about a median interval that suggests another unit than seconds, with the factor to seconds.
 
-    Raises LogError: the interval is longer than 1000 s.
+    Parameters
+    ----------
+    time : (N,) array
+    source : str
+    in_file : bool
+        True for the time of a file that does not say its unit.
+
+    Raises LogError: the interval is longer than 1000 s; of a file, than 1 s.
     """
     dt = float(np.median(np.diff(time)))
     if _SHORTEST <= dt <= _LONGEST * (1.0 + _ROUNDING):
@@ -245,8 +252,9 @@ def check_clock(time: FloatArray, source: str) -> list[str]:
         return [f"{apart}: check the unit of t, and pass --scale t=FACTOR if it is not in seconds"]
     unit, tick = next((unit, tick) for unit, tick, least in _CLOCKS if dt > least)
     finding = f"{apart}: if t is in {unit}, pass --scale t={tick:g}"
-    if dt > _ABSURD:
-        raise LogError(f"{source}: {finding}, or read_log(..., scale={{'t': {tick:g}}})")
+    if dt > _ABSURD or in_file:
+        seconds = "" if dt > _ABSURD else "; if it is in seconds, --scale t=1"
+        raise LogError(f"{source}: {finding}, or read_log(..., scale={{'t': {tick:g}}}){seconds}")
     return [finding]
 
 

@@ -354,7 +354,8 @@ def _log(table: Table, scale: Mapping[str, float], resample: float | str | None,
     ordered = repairs.ordered(Samples(time, signals), "")
     time, signals = ordered.time, dict(ordered.columns)
     rows = in_order(time, source)
-    notes = [*table.notes, *([converted] if converted else []), *check_clock(time[rows], source)]
+    unstated = "t" not in factors and "t" not in table.units and not table.is_described
+    notes = [*table.notes, *([converted] if converted else []), *check_clock(time[rows], source, in_file=unstated)]
     gridded, resample = _gridded(time, signals, resample, repairs, source)
     if repairs.step is not None:
         history.append(repairs.step)
@@ -493,7 +494,8 @@ def _with_clock(table: Table, rate: float | None, source: str) -> Table:
     if "t" in table.columns:
         raise LogError(f"{source}: it has a time column; leave out the rate of {rate:.6g} Hz")
     n = max((len(x) for x in table.columns.values() if not isinstance(x, str)), default=0)
-    clocked = replace(table, columns={"t": np.arange(n) / rate, **table.columns})
+    columns: dict[str, FloatArray | str] = {"t": np.arange(n) / rate, **table.columns}
+    clocked = replace(table, columns=columns, units={**table.units, "t": "s"})
     return clocked.with_step({"step": "clock", "rate": float(rate)})
 
 

@@ -125,7 +125,7 @@ class LerobotDataset:
         step = {"step": "episode", "episode": episode, "format": self._info["codebase_version"]}
         robot = self._info.get("robot_type")
         step |= {"robot": one_line(robot)} if isinstance(robot, str) else {}
-        return Table(timed | columns | left, history=(step,), elements=self.joints)
+        return Table(timed | columns | left, {"t": "s"}, history=(step,), elements=self.joints)
 
     @property
     def listed(self) -> str:

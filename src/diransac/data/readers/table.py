@@ -64,7 +64,8 @@ class Table:
         if name not in self.times:
             return self
         note = f'"{name}" holds times, of which the first is zero'
-        return replace(self, columns={**self.columns, name: self.times[name]}, notes=(*self.notes, note), times={})
+        columns = {**self.columns, name: self.times[name]}
+        return replace(self, columns=columns, units={**self.units, name: "s"}, notes=(*self.notes, note), times={})
 
     def __post_init__(self) -> None:
         columns = {one_line(name): one_line(x) if isinstance(x, str) else x for name, x in self.columns.items()}
