@@ -30,6 +30,7 @@ T = 0.01 * np.arange(300.0)
         ("x", ["X"], "X"),
         ("x", ["z", "y", "xx", "x_ref", "x2"], None),
         ("theta", ["beta", "eta", "zeta", "theta2", "phi"], None),
+        ("FL_hip_joint_torque", ["FL_hip", "des_FL_hip"], None),
         ("q1", ["q2", "q11", "q"], None),
         ("angle_1", ["angle_2"], None),
         ("left", ["right", "height"], None),

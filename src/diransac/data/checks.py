@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
@@ -119,7 +120,7 @@ def alike(name: str, others: Iterable[str]) -> str | None:
     letters, digits = _letters_and_digits(name)
     found = [(other, *_letters_and_digits(other)) for other in islice(others, _MOST_COMPARED)]
     rated = [
-        (_ABBREVIATED if len(own) >= _SHORT and letters.startswith(own) else _common(letters, own), other)
+        (_ABBREVIATED if _abbreviates(other, name) else _common(letters, own), other)
         for other, own, n in found
         if n == digits and own
     ]
@@ -132,6 +133,13 @@ def _common(a: str, b: str) -> float:
     from difflib import SequenceMatcher
 
     return SequenceMatcher(None, a, b).ratio()
+
+
+def _abbreviates(short: str, name: str) -> bool:
+    """True for a name whose words are the beginnings of those of another: ``x_pos``, ``x_position``."""
+    words, whole = (re.findall(r"[a-z]+|\d+", x[:_LONGEST_NAME].lower()) for x in (short, name))
+    begins = len(words) == len(whole) > 0 and all(b.startswith(a) for a, b in zip(words, whole, strict=True))
+    return begins and len(words[-1]) >= _SHORT
 
 
 def other_spelling(name: str, log: Log, model: Model) -> str | None:
