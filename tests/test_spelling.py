@@ -25,6 +25,8 @@ T = 0.01 * np.arange(300.0)
         ("position", ["postion", "velocity"], "postion"),
         ("angle", ["angel"], "angel"),
         ("position", ["axis.position"], "axis.position"),
+        ("force", ["axis.force"], "axis.force"),
+        ("x", ["imu.x"], None),
         ("position", ["Pos", "po", "post"], "Pos"),
         ("x_position", ["x_pos", "y_pos"], "x_pos"),
         ("x", ["X"], "X"),
@@ -84,8 +86,14 @@ def test_an_unmeasured_coordinate_without_such_a_column_stays_one(model):
 
 
 def test_an_input_under_another_spelling_is_named(model):
-    with pytest.raises(dr.LogError, match=r'"force" is missing; .*; if it is Force_N, pass --map force=Force_N\.'):
+    with pytest.raises(dr.LogError, match=r'"force" is missing; .*; by their names, --map force=Force_N\.$'):
         bind_log(model, dr.rename(crane(), {"Force_N": "force"}), pointwise=False)
+
+
+def test_all_columns_that_are_named_otherwise_are_named_at_once(model):
+    log = dr.rename(crane(), {"Force": "force", "Angle": "angle", "X": "x"})
+    with pytest.raises(dr.LogError, match="by their names, --map force=Force,x=X,angle=Angle"):
+        bind_log(model, log, pointwise=False)
 
 
 def test_a_rate_under_another_spelling_is_noted(model):

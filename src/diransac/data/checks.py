@@ -136,7 +136,9 @@ def _common(a: str, b: str) -> float:
 
 
 def _abbreviates(short: str, name: str) -> bool:
-    """True for a name whose words are the beginnings of those of another: ``x_pos``, ``x_position``."""
+    """True for ``x_pos``, whose words are the beginnings of those of ``x_position``, and for ``a.force`` of ``force``."""
+    if len(name) >= _SHORT and short.rpartition(".")[2].lower() == name.lower():
+        return True
     words, whole = (re.findall(r"[a-z]+|\d+", x[:_LONGEST_NAME].lower()) for x in (short, name))
     begins = len(words) == len(whole) > 0 and all(b.startswith(a) for a, b in zip(words, whole, strict=True))
     return begins and len(words[-1]) >= _SHORT

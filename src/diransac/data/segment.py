@@ -352,9 +352,10 @@ def _raise_missing(model: Model, log: Log, name: str) -> None:
         hint = "pass --differentiate to estimate velocities and accelerations, or use lo-diransac, which needs none"
     if name in log.unusable:
         raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; correct the column, or {hint}')
-    found, near = ", ".join(("t", *log.names)), other_spelling(name, log, model)
-    hint = hint if near is None else f"{hint}; if it is {near}, pass --map {name}={near}"
-    raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}.')
+    absent = dict.fromkeys(n for n in (name, *model.inputs, *model.coordinates) if n not in log)
+    pairs = [f"{n}={near}" for n in absent if (near := other_spelling(n, log, model)) is not None]
+    found, also = ", ".join(("t", *log.names)), f"; by their names, --map {','.join(pairs)}" if pairs else ""
+    raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}{also}.')
 
 
 def _check_spelling(model: Model, log: Log) -> None:
