@@ -220,13 +220,7 @@ CONTACTS = (
         "--map t=out.tout,force=out.force",
         "--map t=out.tout,force=out.force,position=out.position.signals.values",
     ),
-    axis(
-        "HDF5 with groups",
-        write_hdf5,
-        "a.h5",
-        "--map force=axis.force",
-        "--map force=axis.force,position=axis.position",
-    ),
+    axis("HDF5 with groups", write_hdf5, "a.h5", "--map force=axis.force,position=axis.position"),
     axis("a folder, a file per signal", lambda: write_folder({x: TABLE[[x]] for x in TABLE}, header=False), "runs"),
     Contact(
         "a folder of runs",
@@ -243,7 +237,12 @@ CONTACTS = (
     axis("a colleague's log, with its history", write_colleague, "log.csv"),
     Contact("a colleague's result, and a log of the recorder", write_colleague, ("validate result.json theirs.csv",)),
     Contact(
-        "the same, every method", write_colleague, ("compare theirs.csv --model result.json --methods lo-diransac",)
+        "the same, compared",
+        write_colleague,
+        tuple(
+            f"compare theirs.csv --methods lo-diransac --model {x}"
+            for x in ("result.json", "servo-axis", "servo-axis --map position=q,force=u --scale position=0.001")
+        ),
     ),
     Contact(
         "MCAP of the tutorial",

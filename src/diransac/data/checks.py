@@ -136,7 +136,7 @@ def _common(a: str, b: str) -> float:
 
 
 def _abbreviates(short: str, name: str) -> bool:
-    """True for ``x_pos``, whose words are the beginnings of those of ``x_position``, and for ``a.force`` of ``force``."""
+    """True for ``x_pos`` of ``x_position``, whose words it begins, and for ``arm.force`` of ``force``."""
     if len(name) >= _SHORT and short.rpartition(".")[2].lower() == name.lower():
         return True
     words, whole = (re.findall(r"[a-z]+|\d+", x[:_LONGEST_NAME].lower()) for x in (short, name))
