@@ -52,6 +52,7 @@ from fuzzing_sizes import (
 )
 from hostile import SETTINGS as BESIDE
 from hostile import URDF
+from lerobot_datasets import write_dataset
 from recordings import flight, write_bag, write_mcap
 from studies import TINY, TINY_TOML
 
@@ -281,6 +282,16 @@ def ros2(part: str, folder: Path) -> Kind:
     return log(name, files.pop(name), changed, "--mapping ros-joint-states", files)
 
 
+def lerobot(part: str, folder: Path) -> Kind:
+    """One file of a LeRobot dataset with two episodes, beside the others."""
+    swum = {name: values[:, None] for name, values in swim(TIME).items()}
+    episodes = [swum, {name: values[:50] for name, values in swum.items()}]
+    made = write_dataset(folder / "data", episodes, version="v3.0", fps=20, names=None)
+    files = {str(path.relative_to(folder)): path.read_bytes() for path in made.rglob("*") if path.is_file()}
+    changed = changed_bytes if part.endswith("parquet") else changed_lines
+    return log(f"data/{part}", files.pop(f"data/{part}"), changed, beside=files)
+
+
 def sizes(name: str, data: bytes, changed) -> Kind:
     """A kind of log that declares any size."""
     return replace(log(name, data, changed), memory=MOST_MEMORY)
@@ -317,6 +328,8 @@ KINDS = {
     "ros 1 bag": (8, lambda folder: log("log.bag", recording("log.bag", folder), options="--mapping ros-joint-states")),
     "ros 2 bag": (8, lambda folder: ros2("db3", folder)),
     "ros 2 metadata": (8, lambda folder: ros2("yaml", folder)),
+    "lerobot": (8, lambda folder: lerobot("data/chunk-000/file-000.parquet", folder)),
+    "lerobot facts": (8, lambda folder: lerobot("meta/info.json", folder)),
     "crazyflie": (8, lambda _: log("log", crazyflie(), options="--map x=fixed.x,thrust=fixed.u")),
     "mapping": (8, lambda _: options("m.toml", MAPPING, f"identify swim.csv {MODEL} --mapping m.toml")),
     "settings": (8, lambda _: options("s.toml", SETTINGS, f"identify swim.csv {SEARCH} --settings s.toml")),

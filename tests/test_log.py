@@ -497,7 +497,18 @@ def test_the_first_line_of_earlier_versions_is_still_read(tmp_path):
 def test_the_footer_of_parquet_has_the_metadata(tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet", reason="NOT CHECKED with pyarrow, which is missing")
     example().write(tmp_path / "a.parquet")
-    assert b"diransac" in parquet.read_metadata(tmp_path / "a.parquet").metadata
+    facts = json.loads(parquet.read_metadata(tmp_path / "a.parquet").metadata[b"diransac"])
+    assert facts["units"] == {"x": "m"}
+
+
+def test_parquet_of_other_tools_and_of_earlier_versions_is_read(tmp_path):
+    """Their metadata have other keys, or none."""
+    columns = pd.DataFrame({"t": [0.0, 0.1, 0.2], "x": [1.0, 2.0, 4.0]})
+    columns.to_parquet(tmp_path / "pandas.parquet")
+    pl.from_pandas(columns).write_parquet(tmp_path / "polars.parquet")
+    for name in ("pandas", "polars"):
+        log = read_log(tmp_path / f"{name}.parquet")
+        assert (log.names, log["x"].tolist(), log.history) == (("x",), [1.0, 2.0, 4.0], ())
 
 
 def test_a_step_that_json_cannot_hold_is_refused(tmp_path):

@@ -116,7 +116,7 @@ WRONG = {
     "shift": (f"shift = 3\n{ENTRY}", "shift must be a table"),
     "resample": (f'resample = "often"\n{ENTRY}', "resample is 'often'"),
     "absent field": ('[[signals]]\nname = "x"\nfield = "b"', r'has "x" from field "b" .*say optional = true'),
-    "nothing fits": ('[[signals]]\nname = "x"\nfield = "b"\noptional = true', "fits none of its topics"),
+    "nothing fits": ('[[signals]]\nname = "x"\nfield = "b"\noptional = true', "fits none of its columns"),
     "unknown repair": (f'repair = ["glue"]\n{ENTRY}', 'there is no repair "glue"; there are comments'),
 }
 
@@ -232,6 +232,8 @@ def broken(kind):
     text = lines(t=T, x=Q, y=TAU)
     if kind == "comments":
         text[5:5] = ["# battery changed", ""]
+    elif kind == "preamble":
+        text[:0] = ["Recorder: bench 3", "Date: 2026-01-03"]
     elif kind == "rows":
         text[-1] = "2.99"
     elif kind == "timestamps":
@@ -253,8 +255,8 @@ def broken(kind):
 
 REFUSED = {
     "comments": "line",
+    "preamble": "line 3 has 3 fields, the header has 1; if the header is line 3, pass --repair preamble",
     "rows": "line 301 has 1 fields",
-    "timestamps": 'the time column "t" is not numeric',
 }
 
 
@@ -276,6 +278,12 @@ def test_a_fault_is_refused_and_repaired_by_name(tmp_path, kind):
             np.testing.assert_allclose(log.time, T[:n], atol=1e-9)
             np.testing.assert_array_equal(log["x"], Q[:n])
             assert np.isnan(log["y"]).sum() == (kind == "cells")
+
+
+def test_times_of_the_calendar_need_no_repair_where_they_are_the_time(tmp_path):
+    log = dr.read_log(written(tmp_path, broken("timestamps"), "a.csv"))
+    np.testing.assert_allclose(log.time, T, atol=1e-9)
+    assert (log.history, log.notes[0]) == ((), '"t" holds times, of which the first is zero')
 
 
 def test_units_are_repaired_to_si(tmp_path):

@@ -1,11 +1,14 @@
 """What a log says of itself needs no option, and a second log of a recorder is read as the first."""
 
+import json
+from csv import DictReader
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import diransac as dr
+from command_line import MODEL, TRUE, run, swim
 from diransac.data.readers import read_log
 
 T = 0.01 * np.arange(200.0)
@@ -122,3 +125,64 @@ def test_a_table_of_a_spreadsheet_with_decimal_commas_needs_no_option(tmp_path):
     np.testing.assert_allclose(log.time, T, atol=1e-12)
     np.testing.assert_allclose(log["x"], X, atol=1e-6)
     assert log.units == {"x": "mm"}
+
+
+# Commands that are given a result ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def raw(tmp_path, monkeypatch):
+    """Two logs of a recorder with names and units of its own, and a result of the first."""
+    monkeypatch.chdir(tmp_path)
+    for name, frequency in (("a.csv", 1.3), ("b.csv", 0.9)):
+        own = swim(T, frequency)
+        columns = (1e3 * T, own["x"], own["x_dot"], own["x_ddot"], own["thrust"] / 12.5)
+        csv(tmp_path / name, "t_ms,pos,vel,acc,current", *columns)
+    done = run("identify", "a.csv", *MODEL, *SIGNALS, "--method", "ols", "-o", "a.json")
+    assert done.exit_code == 0, done.stderr
+    return tmp_path
+
+
+SIGNALS = ["--map", "x=pos,x_dot=vel,x_ddot=acc,thrust=current", "--scale", "thrust=12.5"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["compare", "b.csv", "--methods", "ols,tls", "--report", "page.html"],
+        ["identify", "b.csv", "--method", "ols", "--report", "page.html"],
+        ["cross-validate", "a.csv", "b.csv", "--method", "ols"],
+        ["inspect", "b.csv"],
+    ],
+)
+def test_commands_that_are_given_a_result_read_logs_as_it_was(raw, words):
+    of_result = run(*words, "--model", "a.json", "--json")
+    assert of_result.exit_code == 0, of_result.stderr
+    given = run(*words, *MODEL, *SIGNALS, "--json")
+    found, expected = json.loads(of_result.stdout), json.loads(given.stdout)
+    for one in (found, expected):
+        for method in one.get("methods", {}).values():
+            del method["seconds"]
+    assert found == expected
+    if "--report" in words:
+        assert "12.5" in Path("page.html").read_text()
+
+
+def test_a_fleet_is_read_as_the_log_of_the_result(raw):
+    words = ["--method", "ols", "--each", "--store", "fleet.db", "--json", "--jobs", "1"]
+    done = run("identify", "a.csv", "b.csv", "--model", "a.json", *words)
+    assert done.exit_code == 0, done.stderr
+    assert run("fleet", "export", "fleet.db", "-o", "fleet.csv").exit_code == 0
+    rows = list(DictReader(Path("fleet.csv").read_text().splitlines()))
+    assert [float(row["parameter_mass"]) for row in rows] == pytest.approx([TRUE["mass"]] * 2, rel=1e-6)
+
+
+def test_an_option_prevails_over_the_result(raw):
+    done = run("identify", "b.csv", "--model", "a.json", "--scale", "thrust=25", "--method", "ols", "--json")
+    assert json.loads(done.stdout)["parameters"]["mass"] == pytest.approx(100.0, rel=1e-6)
+
+
+def test_a_model_is_no_other_json(raw):
+    Path("other.json").write_text("{}")
+    done = run("compare", "b.csv", "--model", "other.json")
+    assert (done.exit_code, done.stderr.startswith("error: other.json: ")) == (1, True)

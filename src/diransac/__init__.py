@@ -35,7 +35,7 @@ if TYPE_CHECKING:
         scale,
         shift,
     )
-    from diransac.data.readers import read_log, read_topics
+    from diransac.data.readers import read_log, read_logs, read_topics
     from diransac.flight.closed_loop import fly, fly_batch, tracking_error
     from diransac.flight.corruption import CorruptedLog, corrupt
     from diransac.flight.noise import Noise
@@ -129,6 +129,7 @@ __all__ = [
     "plot_flight",
     "random_waypoints",
     "read_log",
+    "read_logs",
     "read_topics",
     "rename",
     "resample",
@@ -160,7 +161,7 @@ _FOUND_IN = {
         "scale",
         "shift",
     ),
-    "data.readers": ("read_log", "read_topics"),
+    "data.readers": ("read_log", "read_logs", "read_topics"),
     "flight.closed_loop": ("fly", "fly_batch", "tracking_error"),
     "flight.corruption": ("CorruptedLog", "corrupt"),
     "flight.noise": ("Noise",),

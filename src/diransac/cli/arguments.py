@@ -28,6 +28,7 @@ __all__ = [
     "names",
     "numbers",
     "pairs",
+    "preparation_of",
     "prior_pairs",
     "start_values",
     "toml_value",
@@ -325,8 +326,36 @@ def is_description(text: str) -> bool:
     return Path(text).suffix.lower() in (".xml", ".mjcf", ".urdf")
 
 
+def _is_result(text: str) -> bool:
+    """True for the name of a result, ``.json``."""
+    return Path(text).suffix.lower() == ".json"
+
+
+def preparation_of(model: str | None) -> Sequence[Mapping[str, Any]]:
+    """History of the log from which a result was identified, where a model is named by its result; else empty.
+
+    Parameters
+    ----------
+    model : str or None
+
+    Returns
+    -------
+    sequence of dict
+
+    Raises
+    ------
+    ResultError
+        The result cannot be loaded.
+    """
+    if model is None or not _is_result(model):
+        return ()
+    from diransac.identification.result import Result
+
+    return Result.load(model).logs[0].preparation
+
+
 def model_file(text: str) -> Path | None:
-    """The file of ``file.py[:name]``, or of a robot's description; None for a built-in model's name.
+    """The file of ``file.py[:name]``, of a robot's description or of a result; None for a built-in model's name.
 
     Parameters
     ----------
@@ -336,14 +365,14 @@ def model_file(text: str) -> Path | None:
     -------
     Path or None
     """
-    if is_description(text):
+    if is_description(text) or _is_result(text):
         return Path(text)
     found = file_and_name(text, "model")
     return None if found is None else found[0]
 
 
 def load_model(text: str) -> Model:
-    """The built-in model of that name, or the one that ``file.py[:name]`` defines.
+    """The built-in model of that name, the one that ``file.py[:name]`` defines, or that of a result.
 
     Parameters
     ----------
@@ -357,7 +386,13 @@ def load_model(text: str) -> Model:
     ------
     ModelError
         There is no such model, the file cannot be run, or the name is not that of a model.
+    ResultError
+        The result cannot be loaded.
     """
+    if _is_result(text):
+        from diransac.identification.result import Result
+
+        return Result.load(text).model
     found = file_and_name(text, "model")
     if found is None:
         from diransac.model.library import builtin

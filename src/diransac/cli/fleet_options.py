@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -54,6 +55,7 @@ class FleetOptions:
         model: Model,
         method: Method,
         preparation: Preparation,
+        like: Sequence[Mapping[str, Any]],
         report: Path | None,
         arguments: Mapping[str, Any],
         time_limit: float | None,
@@ -76,8 +78,8 @@ class FleetOptions:
                 method,
                 store=self.store,
                 vehicle=self.vehicle,
-                read=preparation.read,
-                configuration={"preparation": prepared},
+                read=partial(preparation.read, like=like),
+                configuration={"preparation": prepared, **({"like": list(like)} if like else {})},
                 time_limit=time_limit,
                 **how,
                 **arguments,

@@ -32,6 +32,7 @@ _NAMES = (
     "compare",
     "validate",
     "predict",
+    "view",
     "cross-validate",
     "inspect",
     "map",

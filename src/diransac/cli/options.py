@@ -22,12 +22,12 @@ from diransac.cli.arguments import (
 )
 from diransac.data import preprocessing
 from diransac.data.log import Log
-from diransac.data.readers import read_log
+from diransac.data.readers import episodes_of, read_log, read_logs
 from diransac.data.readers.repair import REPAIRS
 from diransac.errors import LogError, SettingsError
 from diransac.identification.method import Method
 from diransac.identification.methods import ESTIMATORS, METHODS
-from diransac.limits import LARGEST_TEXT
+from diransac.limits import LARGEST_TEXT, MOST_COUNTED
 from diransac.simulation import HOLDS
 
 __all__ = [
@@ -82,6 +82,21 @@ def _rate(text: str | None) -> str | float | None:
         raise typer.BadParameter(f"--resample: {text!r} is no rate; give a number in Hz, or median") from error
 
 
+def _episodes(text: str) -> list[int]:
+    """Numbers of ``0:10,12``, of which ``0:10`` are the first ten.  Raises typer.BadParameter: it is anything else."""
+    found = list[int]()
+    for part in text.split(","):
+        first, colon, end = part.partition(":")
+        try:
+            start, stop = int(first), int(end) if colon else int(first) + 1
+        except ValueError as error:
+            raise typer.BadParameter(f"--episodes: {part!r} is no episode; give numbers, or START:END") from error
+        if not start < stop <= start + MOST_COUNTED - len(found):
+            raise typer.BadParameter(f"--episodes: {part!r} has no episode, or too many; 0:10 are the first ten")
+        found += range(start, stop)
+    return found
+
+
 def _stretches(text: str) -> list[tuple[float, float]]:
     """Pairs of seconds of ``4.8:5.9,7:8``.  Raises typer.BadParameter: it is anything else."""
     found = []
@@ -124,10 +139,13 @@ def _moment(seconds: float | None) -> float | None:
 
 
 _LOG_HELP = (
-    "CSV(.gz), Parquet, NPZ, MAT or HDF5: time t and one column a signal; ULog, MCAP, bag, Crazyflie: --mapping."
+    "CSV(.gz), Parquet, NPZ, MAT or HDF5: time t and one column a signal; ULog, MCAP, bag, Crazyflie: --mapping; "
+    "the folder of a LeRobot dataset."
 )
 _MODEL = typer.Option(
-    "--model", metavar="NAME|FILE.py[:NAME]|FILE.xml", help="A built-in model, one of yours, or a robot's MJCF or URDF."
+    "--model",
+    metavar="NAME|FILE.py[:NAME]|FILE.xml|MODEL.json",
+    help="Built in, yours, a robot's MJCF or URDF, or a result's; logs are then read as that of the result was.",
 )
 
 LogFile = Annotated[Path, typer.Argument(metavar="LOG|-", help=_LOG_HELP)]
@@ -249,6 +267,10 @@ class Derivation:
 class Preparation:
     """Options of the preparation of a log, applied in this order."""
 
+    episodes: Annotated[
+        str | None,
+        _option("--episodes", metavar="N,START:END,...", help="Of a LeRobot dataset: 0:10 are the first ten."),
+    ] = None
     mapping: Annotated[
         str | None,
         _option("--mapping", metavar="NAME|FILE.toml", help="Topics to signals: a file, or px4-multirotor, ..."),
@@ -273,6 +295,12 @@ class Preparation:
         str | None,
         _option("--resample", metavar="HZ|median", help="Resample at a uniform rate; median: the clock's usual one."),
     ] = None
+    unmeasured: Annotated[
+        str | None,
+        _option(
+            "--unmeasured", metavar="NAME,...", help="Coordinates that the log lacks although a column is named alike."
+        ),
+    ] = None
     start: Annotated[
         float | None, _option("--from", callback=_moment, metavar="S", help="Leave out what comes before.")
     ] = None
@@ -296,29 +324,45 @@ class Preparation:
 
     def read_all(self, files: Sequence[Path], like: Sequence[Mapping[str, Any]] = ()) -> list[Log]:
         """The logs of several files, all prepared alike, and like a log of the same recorder, by its history."""
-        return [self.read(file, like) for file in files]
+        return [log for file in files for log in self._read_each(file, like)]
 
     def read(self, file: Path, like: Sequence[Mapping[str, Any]] = ()) -> Log:
         """The prepared log of a file, like another one of the same recorder, as far as no option says otherwise.
 
-        Raises LogError: it cannot be read or prepared.
+        Raises LogError: it cannot be read or prepared; typer.BadParameter: several episodes are named.
         """
-        rename, scale = pairs("--map", self.rename or ()), numbers("--scale", self.scale or ())
-        delays, rate = numbers("--shift", self.shift or ()), _rate(self.resample)
         if file == Path("-"):
             return self._of_stdin(like)
+        episodes = [None] if self.episodes is None else _episodes(self.episodes)
+        if len(episodes) > 1:
+            raise typer.BadParameter("--episodes: this command takes one log; name one episode")
+        return self._prepared(read_log(file, episode=episodes[0], **self._arguments(like)))
+
+    def _read_each(self, file: Path, like: Sequence[Mapping[str, Any]]) -> list[Log]:
+        """The prepared logs of a file: one, or one per episode."""
+        if file == Path("-"):
+            return [self._of_stdin(like)]
+        episodes = None if self.episodes is None else _episodes(self.episodes)
+        return [self._prepared(log) for log in read_logs(file, episodes=episodes, **self._arguments(like))]
+
+    def _arguments(self, like: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Arguments of `read_log`."""
         replaced = {"despike": self.despike, "shift": self.shift}
-        log = read_log(
-            file,
-            mapping=self.mapping,
-            columns=None if self.columns is None else names(self.columns),
-            rate=self.rate,
-            repair=self.repair,
-            rename=rename,
-            scale=scale,
-            resample=rate,
-            like=[step for step in like if replaced.get(step["step"]) is None],
-        )
+        return {
+            "mapping": self.mapping,
+            "columns": None if self.columns is None else names(self.columns),
+            "rate": self.rate,
+            "repair": self.repair,
+            "rename": pairs("--map", self.rename or ()),
+            "scale": numbers("--scale", self.scale or ()),
+            "resample": _rate(self.resample),
+            "unmeasured": None if self.unmeasured is None else names(self.unmeasured),
+            "like": [step for step in like if replaced.get(step["step"]) is None],
+        }
+
+    def _prepared(self, log: Log) -> Log:
+        """The log after the steps that follow its reading."""
+        delays = numbers("--shift", self.shift or ())
         if self.start is not None or self.stop is not None:
             log = log.between(-inf if self.start is None else self.start, inf if self.stop is None else self.stop)
         if self.events is not None:
@@ -360,12 +404,19 @@ class Preparation:
         """True where topics are mapped to signals."""
         return self.mapping is not None or bool(self.rename)
 
-    def read_uneven(self, file: Path) -> Log:
-        """As `read`, but an unevenly sampled log is resampled at its median rate, with a note."""
+    def read_uneven(self, file: Path, like: Sequence[Mapping[str, Any]] = ()) -> Log:
+        """As `read`, but an unevenly sampled log is resampled at its median rate, and of several episodes the first is
+        read where none is named, each with a note.
+        """
+        found = episodes_of(file) if self.episodes is None else ()
+        if len(found) > 1:
+            log = replace(self, episodes=str(found[0])).read_uneven(file, like)
+            said = f"the first of {len(found)} episodes, {found[0]} to {found[-1]}; --episodes names another one"
+            return replace(log, notes=(said, *log.notes))
         try:
-            return self.read(file)
+            return self.read(file, like)
         except LogError as error:
             if self.resample is not None:
                 raise
-            log = replace(self, resample="median").read(file)
+            log = replace(self, resample="median").read(file, like)
             return replace(log, notes=(f"resampled, because: {error}", *log.notes))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +15,11 @@ from diransac.errors import LogError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from diransac.data.log import Log
+    from diransac.model import Model
+
 __all__ = [
+    "alike",
     "as_column",
     "as_doubles",
     "as_numbers",
@@ -24,6 +30,7 @@ __all__ = [
     "describe_gaps",
     "describe_jitter",
     "numeric_columns",
+    "other_spelling",
     "rows_per_sample",
 ]
 
@@ -31,6 +38,9 @@ __all__ = [
 # In mean intervals: the jitter that is not reported, and the one that is an error; in median intervals: a gap.
 _SILENT_JITTER, _TOLERATED_JITTER, _GAP = 1e-3, 0.2, 1.5
 _ROUNDING = 1e-6
+# Common part of two spellings of one name, and what counts as that of an abbreviation, of so many letters; names, and
+# letters of each, that are compared.
+_ALIKE, _ABBREVIATED, _SHORT, _MOST_COMPARED, _LONGEST_NAME = 0.8, 0.9, 3, 1000, 100
 # Samples of a signal from which its rate is taken.
 _FEWEST_SAMPLES = 5
 
@@ -91,6 +101,59 @@ def check_names(names: Iterable[object], source: str) -> None:
             raise LogError(f"{source}: {name!r} cannot name a signal; use a text that has no spaces around it")
         if name == "t":
             raise LogError(f'{source}: "t" is the time; give the signal another name')
+
+
+def alike(name: str, others: Iterable[str]) -> str | None:
+    """The other name that is likely to be the same one in another spelling; None without one.
+
+    Parameters
+    ----------
+    name : str
+    others : iterable of str
+        Names that nothing uses.
+
+    Examples
+    --------
+    >>> alike("theta", ["x", "thteta"]), alike("theta", ["Theta", "teta"]), alike("q1", ["q2"]), alike("x", ["z"])
+    ('thteta', 'Theta', None, None)
+    """
+    letters, digits = _letters_and_digits(name)
+    found = [(other, *_letters_and_digits(other)) for other in islice(others, _MOST_COMPARED)]
+    rated = [
+        (_ABBREVIATED if _abbreviates(other, name) else _common(letters, own), other)
+        for other, own, n in found
+        if n == digits and own
+    ]
+    near = [pair for pair in rated if pair[0] >= _ALIKE]
+    return max(near, key=lambda pair: pair[0])[1] if near else None
+
+
+def _common(a: str, b: str) -> float:
+    """Common part of two names."""
+    from difflib import SequenceMatcher
+
+    return SequenceMatcher(None, a, b).ratio()
+
+
+def _abbreviates(short: str, name: str) -> bool:
+    """True for ``x_pos`` of ``x_position``, whose words it begins, and for ``arm.force`` of ``force``."""
+    if len(name) >= _SHORT and short.rpartition(".")[2].lower() == name.lower():
+        return True
+    words, whole = (re.findall(r"[a-z]+|\d+", x[:_LONGEST_NAME].lower()) for x in (short, name))
+    begins = len(words) == len(whole) > 0 and all(b.startswith(a) for a, b in zip(words, whole, strict=True))
+    return begins and len(words[-1]) >= _SHORT
+
+
+def other_spelling(name: str, log: Log, model: Model) -> str | None:
+    """Signal of a log that its model does not have and that is likely to be the named one; None without one."""
+    known = {*model.signals, *model.inputs}
+    return alike(name, [x for x in log.names if x not in known])
+
+
+def _letters_and_digits(name: str) -> tuple[str, str]:
+    """Small letters and digits of a name, and its digits alone."""
+    plain = "".join(x for x in name.lower() if x.isalnum())[:_LONGEST_NAME]
+    return plain, "".join(x for x in plain if x.isdigit())
 
 
 def rows_per_sample(known: npt.NDArray[np.bool_]) -> int:
@@ -179,10 +242,17 @@ def check_even(time: FloatArray, source: str) -> None:
     )
 
 
-def check_clock(time: FloatArray, source: str) -> list[str]:
+def check_clock(time: FloatArray, source: str, *, in_file: bool = False) -> list[str]:
     """Sentence about a median interval that suggests another unit than seconds, with the factor to seconds.
 
-    Raises LogError: the interval is longer than 1000 s.
+    Parameters
+    ----------
+    time : (N,) array
+    source : str
+    in_file : bool
+        True for the time of a file that does not say its unit.
+
+    Raises LogError: the interval is longer than 1000 s; of a file, than 1 s.
     """
     dt = float(np.median(np.diff(time)))
     if _SHORTEST <= dt <= _LONGEST * (1.0 + _ROUNDING):
@@ -192,8 +262,9 @@ def check_clock(time: FloatArray, source: str) -> list[str]:
         return [f"{apart}: check the unit of t, and pass --scale t=FACTOR if it is not in seconds"]
     unit, tick = next((unit, tick) for unit, tick, least in _CLOCKS if dt > least)
     finding = f"{apart}: if t is in {unit}, pass --scale t={tick:g}"
-    if dt > _ABSURD:
-        raise LogError(f"{source}: {finding}, or read_log(..., scale={{'t': {tick:g}}})")
+    if dt > _ABSURD or in_file:
+        seconds = "" if dt > _ABSURD else "; if it is in seconds, --scale t=1"
+        raise LogError(f"{source}: {finding}, or read_log(..., scale={{'t': {tick:g}}}){seconds}")
     return [finding]
 
 

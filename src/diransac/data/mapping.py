@@ -64,7 +64,7 @@ _TOP = {"description", "time", "signals", "events", *_STEPS}
 _ANY = "{joint}"
 _FOLDER = Path(__file__).parent / "mappings"
 
-BUILT_IN = ("px4-multirotor", "crazyflie", "ros-joint-states", "ros-odometry-imu")
+BUILT_IN = ("px4-multirotor", "crazyflie", "ros-joint-states", "ros-odometry-imu", "lerobot")
 """Names of the mappings that come with the package."""
 
 
@@ -291,7 +291,8 @@ class LogMapping:
                     f'{source}: {self.source} has "{name}" from {why[1:]}; remove it, or say optional = true'
                 )
         if not found:
-            raise LogError(f"{source}: {self.source} fits none of its topics; found {_some(fields)}")
+            what, there = ("columns", fields[""]) if set(fields) == {""} else ("topics", list(fields))
+            raise LogError(f"{source}: {self.source} fits none of its {what}; found {_some(there)}")
         notes = [f"{self.source}: no {', '.join(n for n in absent if absent[n] == w)}: {w}" for w in _unique(absent)]
         entries = list(dict.fromkeys(found.values()))
         for entry in entries:

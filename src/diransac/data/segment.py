@@ -11,7 +11,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.data import preprocessing
-from diransac.data.checks import rows_per_sample
+from diransac.data.checks import other_spelling, rows_per_sample
 from diransac.data.log import Log
 from diransac.data.preprocessing.continuity import interpolated
 from diransac.errors import LogError, SettingsError
@@ -19,7 +19,7 @@ from diransac.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from diransac.model import Model
 
-__all__ = ["Segment", "bind_log"]
+__all__ = ["Segment", "bind_log", "spelling_notes"]
 
 
 # A line through seven samples bears two outliers, and is short against any motion that is sampled well; the slope that
@@ -221,7 +221,8 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     Raises
     ------
     LogError
-        A signal is missing, all NaN, infinite, too large to square, or of another dimension; too few rows.
+        A signal is missing, all NaN, infinite, too large to square, or of another dimension; too few rows; a coordinate
+        is missing that a column may be in another spelling, and is not said to be unmeasured.
     """
     needed = model.required_signals if pointwise else tuple(model.inputs)
     for name in needed:
@@ -230,6 +231,7 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     signals = tuple(n for n in model.signals if n in log)
     if not signals:
         _raise_missing(model, log, model.signals[0])
+    _check_spelling(model, log)
     used = [n for n in (*signals, *model.inputs) if n in log]
     log.check(used)
     log = preprocessing.continuous(preprocessing.in_units(log, model), model)
@@ -249,6 +251,7 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     notes = (
         *log.notes,
         *_unmeasured_notes(model, log, signals),
+        *spelling_notes(model, log, [n for n in model.signals if n not in model.coordinates]),
         *_row_notes(valid, missing & ~gaps & ~lost, lost & ~gaps, sampled=known.any(axis=1) | gaps),
         *_gap_notes(log, gaps, offset),
     )
@@ -349,8 +352,29 @@ def _raise_missing(model: Model, log: Log, name: str) -> None:
         hint = "pass --differentiate to estimate velocities and accelerations, or use lo-diransac, which needs none"
     if name in log.unusable:
         raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; correct the column, or {hint}')
-    found = ", ".join(("t", *log.names))
-    raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}.')
+    absent = dict.fromkeys(n for n in (name, *model.inputs, *model.coordinates) if n not in log)
+    pairs = [f"{n}={near}" for n in absent if (near := other_spelling(n, log, model)) is not None]
+    found, also = ", ".join(("t", *log.names)), f"; by their names, --map {','.join(pairs)}" if pairs else ""
+    raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}{also}.')
+
+
+def _check_spelling(model: Model, log: Log) -> None:
+    """Raise LogError for a coordinate that the log seems to have under another spelling, and that may be unmeasured."""
+    steps = [step.get("signals") for step in log.history if step.get("step") == "unmeasured"]
+    stated = [name for names in steps if isinstance(names, list) for name in names]
+    for name in model.coordinates:
+        near = None if name in log or name in stated else other_spelling(name, log, model)
+        if near is not None:
+            raise LogError(
+                f'{log.source}: "{name}" is not in it, but "{near}" is, which the model has not. If it is the same, '
+                f"pass --map {name}={near}; if {name} is unmeasured, pass --unmeasured {name}, or leave the column out"
+            )
+
+
+def spelling_notes(model: Model, log: Log, names: Sequence[str]) -> list[str]:
+    """Notes on signals and inputs of these names that the log lacks, and seems to have under another spelling."""
+    found = {name: other_spelling(name, log, model) for name in names if name not in log}
+    return [f'"{near}" is not used; if it is {name}, pass --map {name}={near}' for name, near in found.items() if near]
 
 
 def _known_inputs(model: Model, log: Log) -> tuple[FloatArray, BoolArray, BoolArray]:

@@ -13,6 +13,7 @@ from diransac.arrays import FloatArray
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, usable_sensors
+from diransac.data.segment import spelling_notes
 from diransac.errors import IdentificationError, LogError
 from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.evaluation import choose_scoring
@@ -106,6 +107,8 @@ class Fitness:
         Reason why it cannot be computed, or why parameters are not identifiable.
     caveat : str, optional
         Reason why the estimates are doubtful.
+    bases : mapping of str to str
+        Velocity or acceleration -> the coordinate from which it could be derived, of those that the log lacks.
     """
 
     model: str
@@ -114,6 +117,7 @@ class Fitness:
     excitation: Mapping[str, Excitation]
     reason: str = ""
     caveat: str = ""
+    bases: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -173,7 +177,8 @@ class Inspection:
         if found is None:
             return []
         lines = ["", f"for {found.model}:"]
-        rest = [name for name in found.missing if name not in found.derivable]
+        rest = [found.bases.get(name, name) for name in found.missing if name not in found.derivable]
+        rest = list(dict.fromkeys(rest))
         lines += [f"  missing: {', '.join(rest)}; name columns with --map, or see diransac map"] if rest else []
         lines += [f"  derived with --differentiate: {', '.join(found.derivable)}"] if found.derivable else []
         lines += [f"  {found.reason}"] if found.reason else []
@@ -201,10 +206,12 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
     continuous = preprocessing.unwrap(log) if model is None else preprocessing.continuous(log, model)
     events = {name: float(np.mean(log[name] == 1.0)) for name in _events(log)}
     signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names if name not in events}
-    fitness = None if model is None else _fitness(log, model)
+    fitness = None if model is None else dataclasses.replace(_fitness(log, model), bases=_bases(log, model))
     if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
         fitness = dataclasses.replace(fitness, caveat=_caveat(signals, model))
-    return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, log.notes, fitness, events)
+    like = () if model is None else spelling_notes(model, log, (*model.signals, *model.inputs))
+    notes = (*log.notes, *like)
+    return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, notes, fitness, events)
 
 
 def _events(log: Log) -> list[str]:
@@ -278,6 +285,12 @@ def _fitness(log: Log, model: Model) -> Fitness:
     except (LogError, IdentificationError) as error:
         return Fitness(model.name, missing, derivable, {}, str(error))
     return Fitness(model.name, missing, derivable, excitation, reason)
+
+
+def _bases(log: Log, model: Model) -> dict[str, str]:
+    """Rates by name -> the coordinate that they are derivatives of, where the log lacks it."""
+    chains = [chain for chain in model.chains if chain[0] in model.coordinates and chain[0] not in log]
+    return {name: chain[0] for chain in chains for name in chain[1:]}
 
 
 def _caveat(signals: Mapping[str, SignalFacts], model: Model) -> str:

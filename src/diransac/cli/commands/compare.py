@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from diransac.cli import screen
-from diransac.cli.arguments import model_file
+from diransac.cli.arguments import model_file, preparation_of
 from diransac.cli.group import grouped
 from diransac.cli.options import Derivation, JsonFlag, LogFiles, ModelName, Preparation, Report, Search, known_methods
 from diransac.cli.outputs import PAGE, check_ending, checked, staged
@@ -41,7 +41,7 @@ def _compare(
     checked([report], read)
     check_ending(report, PAGE)
     with staged([report], read) as (page,):
-        plant, logs = robot.load(model), preparation.read_all(files)
+        plant, logs = robot.load(model), preparation.read_all(files, preparation_of(model))
         with time_limited(search.time_limit):
             comparison = compare_methods(plant, logs, wanted, arguments)
         if report:

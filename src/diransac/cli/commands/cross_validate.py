@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from diransac.cli import screen
+from diransac.cli.arguments import preparation_of
 from diransac.cli.group import grouped
 from diransac.cli.options import Derivation, JsonFlag, LogFiles, MethodName, ModelName, Preparation, Search
 from diransac.cli.robot_options import RobotOptions
@@ -33,7 +34,7 @@ def _cross_validate(
 ) -> None:
     """Identify from all logs but one, and predict that one, for each in turn."""
     (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
-    plant, logs = robot.load(model), preparation.read_all(files)
+    plant, logs = robot.load(model), preparation.read_all(files, preparation_of(model))
     arguments = search.arguments() | derived | {"time_limit": search.time_limit}
     with screen.bar(f"{method}, leaving one log out") as progress:
         found = cross_validate(plant, logs, chosen, horizon=horizon, progress=progress, **arguments)

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from diransac.cli import screen
-from diransac.cli.arguments import model_file, start_values
+from diransac.cli.arguments import model_file, preparation_of, start_values
 from diransac.cli.fleet_options import FleetOptions
 from diransac.cli.group import grouped
 from diransac.cli.options import (
@@ -70,7 +70,17 @@ def _identify(
         if output or strict:
             raise typer.BadParameter("--each keeps its results in --store; -o and --strict are of one result")
         arguments = search.arguments() | derived | aims
-        each.run(files, robot.load(model), chosen, preparation, report, arguments, search.time_limit, as_json)
+        each.run(
+            files,
+            robot.load(model),
+            chosen,
+            preparation,
+            preparation_of(model),
+            report,
+            arguments,
+            search.time_limit,
+            as_json,
+        )
         return
     checked([output, report], read)
     check_ending(output, RESULT)
@@ -80,7 +90,7 @@ def _identify(
         raise typer.BadParameter("-o - holds one result; this robot has several limbs, give a file")
     outputs = [of_limb(path, limb) for limb in limbs for path in (output, report)]
     with staged(outputs, read) as drafts:
-        logs = preparation.read_all(files)
+        logs = preparation.read_all(files, preparation_of(model))
         for k, (limb, plant) in enumerate(limbs.items()):
             saved, page = drafts[2 * k : 2 * k + 2]
             with screen.bar(f"{method} {limb}".rstrip()) as progress:

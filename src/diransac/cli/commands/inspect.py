@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from diransac.cli import screen
+from diransac.cli.arguments import preparation_of
 from diransac.cli.group import grouped
 from diransac.cli.options import JsonFlag, LogFile, OptionalModelName, Preparation
 from diransac.cli.robot_options import RobotOptions
@@ -28,8 +29,9 @@ def _inspect(
 ) -> None:
     """Show what a log holds, what is odd about it, and what is missing for a model."""
     plant = None if model is None else robot.load(model)
+    like = preparation_of(model)
     topics = read_topics(file)
-    if topics is None or preparation.names_signals:
-        screen.show(inspect(preparation.read_uneven(file), plant), as_json)
+    if topics is None or preparation.names_signals or any(step["step"] == "map" for step in like):
+        screen.show(inspect(preparation.read_uneven(file, like), plant), as_json)
     else:
         screen.show(Recorded.of(topics, plant), as_json)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
+from diransac.data.checks import other_spelling
 from diransac.data.filters import REACH, FilterSpecification, convolve, half_length, kernels
 from diransac.data.preprocessing.continuity import continuous, unit_quaternions, whole_quaternions
 from diransac.data.preprocessing.steps import in_units
@@ -204,7 +205,8 @@ def _underivable(log: Log, model: Model, name: str, source: str | None) -> str:
     if source is None:
         why = f'model "{model.name}" has velocities that are not derivatives of its coordinates'
         return f'{log.source}: signal "{name}" is missing and cannot be derived: {why}; found {found}. Give it.'
-    return f'{log.source}: signal "{name}" is missing, and so is "{source}", its source; found {found}. Give either.'
+    give = f"Give either, as in --map {source}={other_spelling(source, log, model) or 'COLUMN'}."
+    return f'{log.source}: signal "{name}" is missing, and so is "{source}", its source; found {found}. {give}'
 
 
 def _filtered(log: Log, model: Model) -> list[str]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,17 +26,18 @@ from diransac.data.readers.table import Table, with_metadata
 from diransac.data.readers.time_column import seconds, time_column, unit_of_name
 from diransac.data.units import split_unit
 from diransac.errors import LogError, SettingsError
-from diransac.limits import LARGEST_LOG, LARGEST_RESULT, LARGEST_TEXT, check_ordinary, read_bytes
+from diransac.limits import LARGEST_LOG, LARGEST_RESULT, LARGEST_TEXT, MOST_COUNTED, check_ordinary, read_bytes
 from diransac.plain_text import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from diransac.data.mapping import LogMapping
+    from diransac.data.readers.lerobot import LerobotDataset
     from diransac.data.readers.recording import Recording
     from diransac.data.readers.topics import TopicTable
 
-__all__ = ["read_fields", "read_log", "read_topics"]
+__all__ = ["episodes_of", "read_fields", "read_log", "read_logs", "read_topics"]
 
 _TABLES = {
     ".parquet": "parquet:read_parquet",
@@ -46,6 +49,7 @@ _TABLES = {
 _TEXTS = {
     ".csv": "comma_separated:read_csv",
     ".csv.gz": "comma_separated:read_csv_gz",
+    ".tsv": "comma_separated:read_csv",
     ".txt": "comma_separated:read_csv",
 }
 _RECORDINGS = {
@@ -55,12 +59,27 @@ _RECORDINGS = {
     ".bag": "bags:open_bag",
 }
 """Ending -> module of this package, and what opens or reads a file there."""
+_REMEDIES = {
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "export the sheet as CSV"),
+    **dict.fromkeys((".dat", ".asc", ".log", ".prn"), "if it is text, rename it to .txt"),
+    **dict.fromkeys((".json", ".jsonl", ".pkl", ".pickle", ".feather"), "write it as CSV or Parquet"),
+    **dict.fromkeys((".bbl", ".bfl"), "convert it to CSV by Betaflight's blackbox_decode"),
+    **dict.fromkeys((".db3", ".yaml"), "name the folder of the bag"),
+    ".bin": "of ArduPilot's, convert it to CSV by mavlogdump.py",
+    ".npy": "name its columns: np.savez(file, t=..., x=...)",
+}
+"""Ending that is not read -> what to do."""
+_FOLDERS = {"metadata.yaml": "bags:open_bag"}
+"""File in a folder -> what opens the folder."""
+_LEROBOT = "meta/info.json"
+"""File in a folder of episodes."""
 _ENDINGS = (*_TEXTS, *_TABLES, *_RECORDINGS)
 
 
 def read_log(
     path: str | Path,
     *,
+    episode: int | None = None,
     mapping: str | Path | None = None,
     columns: Sequence[str] | None = None,
     rate: float | None = None,
@@ -68,14 +87,18 @@ def read_log(
     rename: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     resample: float | str | None = None,
+    unmeasured: Iterable[str] | None = None,
     like: Iterable[Mapping[str, Any]] = (),
 ) -> Log:
-    """Log of a CSV (plain or gzip), Parquet, NPZ, MAT, HDF5, ULog, MCAP or bag file, or of a Crazyflie's micro SD log.
+    """Log of a CSV (plain or gzip), Parquet, NPZ, MAT, HDF5, ULog, MCAP or bag file, Crazyflie's log, LeRobot episode.
 
     Parameters
     ----------
     path : str or Path
-        Its ending names the format.  A folder is a ROS 2 bag, or has one CSV file for each group of signals.
+        Its ending names the format.  A folder is a ROS 2 bag, a LeRobot dataset, or has one CSV file for each group of
+        signals.
+    episode : int, optional
+        Of a dataset with several; `read_logs` reads them all.
     mapping : str or Path, optional
         Name of a built-in mapping, or a TOML file, that says which field of which topic is which signal.
     columns : sequence of str, optional
@@ -92,6 +115,8 @@ def read_log(
     resample : float or "median", optional
         Rate in Hz for linear interpolation, or ``"median"`` for one row per median interval.  None: the time must be
         even.
+    unmeasured : iterable of str, optional
+        Coordinates that the log lacks although a column has a name like theirs.
     like : iterable of dict, optional
         History of a log of the same recorder, such as ``result.logs[0].preparation``.  Its mapping, names, factors,
         rates, repairs, delays and despiking apply where the arguments above give none.  What the history in the file
@@ -120,40 +145,139 @@ def read_log(
     sample of a slower topic stands in the row nearest to it, and the rows between are NaN.
     """
     path = Path(path)
-    source = one_line(f'log "{path}"')
-    like = list(like)
+    given = _Arguments(mapping, columns, rate, repair, rename, scale, resample, unmeasured, like)
+    dataset = _dataset(path)
+    if dataset is not None:
+        files = list(dataset.files)
+        if episode is None and len(files) > 1:
+            raise LogError(
+                f"{dataset.source}: it has {dataset.listed}; choose one (episode={files[0]}, --episodes {files[0]}), "
+                "or read them all with read_logs"
+            )
+        return _episode(dataset, files[0] if episode is None else episode, given)
+    if episode is not None:
+        raise LogError(f"{_named(path)}: it is one log without episodes; leave out the episode")
+    return _read(partial(_opened, path, _named(path)), _named(path), given)
+
+
+def read_logs(path: str | Path, *, episodes: Iterable[int] | None = None, **arguments: Any) -> list[Log]:
+    """Logs of a file or folder: one per episode of a LeRobot dataset, else one.
+
+    Parameters
+    ----------
+    path : str or Path
+    episodes : iterable of int, optional
+        Episodes of a dataset, in this order; None: all.
+    **arguments
+        As of `read_log`; they apply to each.
+
+    Returns
+    -------
+    list of Log
+
+    Raises
+    ------
+    LogError, SettingsError
+        As `read_log`; there is no such episode, or one is named twice.
+    """
+    path = Path(path)
+    dataset = _dataset(path)
+    if dataset is None:
+        if episodes is not None:
+            raise LogError(f"{_named(path)}: it is one log without episodes; leave out their numbers")
+        return [read_log(path, **arguments)]
+    given = _Arguments(**{**arguments, "like": list(arguments.get("like", ()))})
+    chosen = list(dataset.files if episodes is None else islice(episodes, MOST_COUNTED))
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise LogError(f"{dataset.source}: the episodes are {chosen!s:.60}; name one or several, each once")
+    return [_episode(dataset, episode, given) for episode in chosen]
+
+
+def episodes_of(path: str | Path) -> tuple[int, ...]:
+    """Episodes of a dataset; none for any other file.
+
+    Raises LogError: the dataset cannot be read.
+    """
+    dataset = _dataset(Path(path))
+    return () if dataset is None else tuple(dataset.files)
+
+
+@dataclass(frozen=True)
+class _Arguments:
+    """Arguments of `read_log`."""
+
+    mapping: str | Path | None = None
+    columns: Sequence[str] | None = None
+    rate: float | None = None
+    repair: bool | str | Iterable[str] | None = None
+    rename: Mapping[str, str] | None = None
+    scale: Mapping[str, float] | None = None
+    resample: float | str | None = None
+    unmeasured: Iterable[str] | None = None
+    like: Iterable[Mapping[str, Any]] = ()
+
+
+def _named(path: Path) -> str:
+    return one_line(f'log "{path}"')
+
+
+def _dataset(path: Path) -> LerobotDataset | None:
+    """A folder of episodes; None for anything else."""
+    if not (path / _LEROBOT).exists():
+        return None
+    from diransac.data.readers.lerobot import LerobotDataset
+
+    return LerobotDataset(path, _named(path))
+
+
+def _episode(dataset: LerobotDataset, episode: int, given: _Arguments) -> Log:
+    if given.columns is not None:
+        raise LogError(f"{dataset.source}: names of columns are those of CSV text without a header; leave them out")
+    source = dataset.source if len(dataset.files) == 1 else f"{dataset.source}, episode {episode}"
+    return _read(lambda _columns, _repairs: dataset.table(episode), source, given)
+
+
+def _read(opened_with: Callable[..., Table | Recording], source: str, given: _Arguments) -> Log:
+    """Log of what is opened with the names of columns and the repairs."""
+    like, new_names = list(given.like), given.rename or {}
     earlier = Reading.of(like)
-    chosen = earlier.mapping if mapping is None else _mapping(mapping)
-    repairs = Repairs.of(_given(earlier.repairs if repair is None else repair, chosen, "repair"))
-    columns = earlier.columns if columns is None else columns
-    opened = _opened(path, source, columns, repairs)
+    chosen = earlier.mapping if given.mapping is None else _mapping(given.mapping)
+    repairs = Repairs.of(_given(earlier.repairs if given.repair is None else given.repair, chosen, "repair"))
+    columns = earlier.columns if given.columns is None else given.columns
+    opened = opened_with(columns, repairs)
     if isinstance(opened, Table):
         done = {step["step"] for step in opened.history}
         earlier = Reading.of(step for step in like if step["step"] not in done)
-        chosen = earlier.mapping if mapping is None else chosen
-    resample = _given(earlier.resample if resample is None else resample, chosen, "resample")
+        chosen = earlier.mapping if given.mapping is None else chosen
+    resample = _given(earlier.resample if given.resample is None else given.resample, chosen, "resample")
     if isinstance(opened, Table):
         opened = opened if columns is None else opened.with_step({"step": "columns", "names": list(columns)})
-        table = repairs.in_si(_with_clock(opened, earlier.rate if rate is None else rate, source))
-        rename = earlier.names(table, _stripped(rename, table))
+        table = repairs.in_si(_with_clock(opened, earlier.rate if given.rate is None else given.rate, source))
+        rename = earlier.names(table, _stripped(new_names, table))
         if chosen is None or chosen.time_column is None:
             rename = _with_time(rename, table)
+            table = table.with_time_of(rename.get("t", "t"))
+        else:
+            table = table.with_time_of(chosen.time_column)
     else:
         from diransac.data.readers.topics import is_one_table, table_of_topics, whole_topic
 
-        rename = {**earlier.rename, **(rename or {})}
+        rename = {**earlier.rename, **new_names}
         if chosen is None and is_one_table(opened, rename):
             table = whole_topic(opened, repairs)
         else:
             table, resample = table_of_topics(opened, chosen, rename, resample, repairs)
-            rename = None
+            rename = {}
     if rename:
         table = _renamed(table, rename, source)
     if chosen is not None and isinstance(opened, Table):
         from diransac.data.readers.topics import mapped_table
 
         table = mapped_table(table, chosen, source)
-    log = _log(table, earlier.factors(table, scale or {}), resample, repairs, source)
+    unmeasured = earlier.unmeasured if given.unmeasured is None else tuple(given.unmeasured)
+    if unmeasured:
+        table = table.with_step({"step": "unmeasured", "signals": list(unmeasured)})
+    log = _log(table, earlier.factors(table, given.scale or {}), resample, repairs, source)
     return earlier.prepared(log if chosen is None else _prepared(log, chosen))
 
 
@@ -163,12 +287,12 @@ def read_topics(path: str | Path) -> TopicTable | None:
     Raises LogError: as `read_log`.
     """
     path = Path(path)
-    is_folder_of_tables = path.is_dir() and not (path / "metadata.yaml").exists()
+    is_folder_of_tables = path.is_dir() and not any((path / marker).exists() for marker in _FOLDERS)
     if is_folder_of_tables or _ending(path) in (*_TEXTS, *_TABLES):
         return None
     from diransac.data.readers.topics import list_topics
 
-    opened = _opened(path, one_line(f'log "{path}"'), None, Repairs())
+    opened = _opened(path, _named(path), None, Repairs())
     return None if isinstance(opened, Table) else list_topics(opened)
 
 
@@ -177,9 +301,11 @@ def read_fields(path: str | Path) -> tuple[dict[str, tuple[str, ...]], dict[str,
 
     Raises LogError: as `read_log`.
     """
-    opened = _opened(Path(path), one_line(f'log "{path}"'), None, Repairs())
+    path = Path(path)
+    dataset = _dataset(path)
+    opened = _opened(path, _named(path), None, Repairs()) if dataset is None else dataset.table(min(dataset.files))
     if isinstance(opened, Table):
-        return {"": tuple(name for name in opened.columns if name != "t")}, {}
+        return {"": tuple(name for name in opened.columns if name != "t")}, {"": opened.elements}
     return dict(opened.fields), opened.elements
 
 
@@ -228,7 +354,8 @@ def _log(table: Table, scale: Mapping[str, float], resample: float | str | None,
     ordered = repairs.ordered(Samples(time, signals), "")
     time, signals = ordered.time, dict(ordered.columns)
     rows = in_order(time, source)
-    notes = [*table.notes, *([converted] if converted else []), *check_clock(time[rows], source)]
+    unstated = "t" not in factors and "t" not in table.units and not table.is_described
+    notes = [*table.notes, *([converted] if converted else []), *check_clock(time[rows], source, in_file=unstated)]
     gridded, resample = _gridded(time, signals, resample, repairs, source)
     if repairs.step is not None:
         history.append(repairs.step)
@@ -288,7 +415,9 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
         is_crazyflie = file.read(1) == MAGIC
     if is_crazyflie:
         return CrazyflieRecording(_content(path, source), source)
-    raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}')
+    remedy = _REMEDIES.get(path.suffix.lower())
+    also = "" if remedy is None else f"; {remedy}"
+    raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}{also}')
 
 
 def _described(path: Path, read: Table | Recording, source: str) -> Table | Recording:
@@ -313,11 +442,14 @@ def _ending(path: Path) -> str | None:
 
 def _opened_folder(path: Path, source: str, repairs: Repairs) -> Table | Recording:
     """A ROS 2 bag, or a table of the CSV files in a folder."""
-    if (path / "metadata.yaml").exists():
-        return _imported(_RECORDINGS[".bag"])(path, source)
+    for marker, place in _FOLDERS.items():
+        if (path / marker).exists():
+            return _imported(place)(path, source)
     files = sorted(x for x in path.iterdir() if x.name.lower().endswith(tuple(_TEXTS)))
     if len(files) < 2:  # one file is a log of its own
-        raise LogError(f"{source}: it is a folder without a bag or several CSV files; name a file in it")
+        raise LogError(
+            f"{source}: it is a folder without a bag, a LeRobot dataset or several CSV files; name a file in it"
+        )
     from diransac.data.readers.comma_separated import joined
 
     return joined([(x.name.split(".")[0], _content(x, f'log "{x}"')) for x in files], source, repairs)
@@ -362,13 +494,14 @@ def _with_clock(table: Table, rate: float | None, source: str) -> Table:
     if "t" in table.columns:
         raise LogError(f"{source}: it has a time column; leave out the rate of {rate:.6g} Hz")
     n = max((len(x) for x in table.columns.values() if not isinstance(x, str)), default=0)
-    clocked = replace(table, columns={"t": np.arange(n) / rate, **table.columns})
+    columns: dict[str, FloatArray | str] = {"t": np.arange(n) / rate, **table.columns}
+    clocked = replace(table, columns=columns, units={**table.units, "t": "s"})
     return clocked.with_step({"step": "clock", "rate": float(rate)})
 
 
-def _stripped(rename: Mapping[str, str] | None, table: Table) -> dict[str, str]:
+def _stripped(rename: Mapping[str, str], table: Table) -> dict[str, str]:
     """New name -> name of a column, without the unit that its header may have."""
-    return {new: split_unit(old)[0] if old not in table.columns else old for new, old in (rename or {}).items()}
+    return {new: split_unit(old)[0] if old not in table.columns else old for new, old in rename.items()}
 
 
 def _with_time(rename: Mapping[str, str], table: Table) -> dict[str, str]:

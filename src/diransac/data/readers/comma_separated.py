@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import gzip
 import io
 import re
 import zlib
+from collections import Counter
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,11 +32,14 @@ __all__ = ["joined", "read_csv", "read_csv_gz"]
 
 _SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
 _FEW_LINES = 20_000
+_SEEN = 20
+"""Lines at the end of a text from which the number of its fields is taken."""
 _CHUNK = 1 << 22
 _COMMENTS = ("#", "%", "//")
 _ISO = re.compile(
     r"(?P<date>(?:19|20|21)\d\d-\d\d-\d\d)[T ](?P<clock>\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)(?P<zone>Z|[+-]\d\d:?\d\d)?"
 )
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 _MISSING = ("", "na", "n/a", "nan", "null", "none")
 
 
@@ -73,12 +79,15 @@ def read_csv(data: bytes, source: str, names: Sequence[str] | None = None, repai
     Raises LogError: the data are not UTF-8 text with a header line and as many fields in every line, or too large.
     """
     repairs = Repairs() if repairs is None else repairs
-    lines = _lines(data, source)
+    lines, notes = _lines(data, source)
     metadata = lines.pop(0).strip('"').removeprefix(COMMENT) if _is_metadata(lines[0]) else None
-    lines = _without_comments(lines, repairs)
+    lines = _without_comments(_with_bare_header(lines) if names is None else lines, repairs)
+    lines, skipped = _without_preamble(lines, repairs)
     if not lines:
         raise LogError(f"{source}: there is no header line after the metadata; give one, and one line per row")
-    line = 1 if metadata is None else 2
+    line = (1 if metadata is None else 2) + skipped
+    if _is_spaced(lines):
+        lines, notes = [",".join(x.split()) for x in lines], [*notes, "fields are separated by spaces"]
     separator = _separator(lines[0])
     check_size(source, len(lines), lines[0].count(separator) + 1)
     if names is None:
@@ -90,13 +99,85 @@ def read_csv(data: bytes, source: str, names: Sequence[str] | None = None, repai
     _check_ragged(lines, line, separator, source)
     if len(lines) == 1:
         raise LogError(f"{source}: there is a header ({', '.join(headers)[:200]}) but no row")
+    headers, first = _with_units(headers, lines[1].split(separator)) if len(lines) > 2 else (headers, 1)
     named = [split_unit(header) for header in headers]
     check_unique([name for name, _ in named if name], source)
-    read = _columns(lines[1:], headers, line + 1, separator, source, repairs)
+    read = _columns(lines[first:], headers, line + first, separator, source, repairs)
     columns = {name: column for (name, _), column in zip(named, read, strict=True) if name}
     units = {name: unit for name, unit in named if unit is not None}
-    table = Table(columns, units, tuple(_notes(named, separator)))
+    times = {name: x.seconds for name, x in columns.items() if isinstance(x, _Times)}
+    plain = {name: x.reason if isinstance(x, _Times) else x for name, x in columns.items()}
+    table = Table(plain, units, (*notes, *_notes(named, separator)), times=times)
     return table if metadata is None else with_metadata(table, metadata, source, "remove its first line")
+
+
+@dataclass(frozen=True)
+class _Times:
+    """A column of times of the calendar: seconds (n,) since the first, and the reason why it is no signal."""
+
+    seconds: FloatArray
+    reason: str
+
+
+def _fields(line: str) -> list[str]:
+    """Fields of a line, between separators or else between spaces."""
+    separated = any(x in line for x in _SEPARATORS)
+    return [x.strip() for x in (line.split(_separator(line)) if separated else line.split())]
+
+
+def _is_row(line: str) -> bool:
+    """True for a line of numbers."""
+    return all(_is_number(x) for x in _fields(line))
+
+
+def _with_bare_header(lines: list[str]) -> list[str]:
+    """Lines in which a header is no comment: the last of the comments above numbers, with as many fields as these."""
+    n = next((k for k, line in enumerate(lines) if not line.startswith(_COMMENTS)), 0)
+    if not 0 < n < len(lines) or not _is_row(lines[n]):
+        return lines
+    header = lines[n - 1].lstrip("#%/ ")
+    if len(_fields(header)) != len(_fields(lines[n])) or _is_row(header):
+        return lines
+    return [*lines[: n - 1], header, *lines[n:]]
+
+
+def _is_spaced(lines: Sequence[str]) -> bool:
+    """True where spaces separate the numbers of the last line, and as many fields of the first."""
+    last = lines[-1].split()
+    return (
+        len(last) > 1
+        and not any(x in line for x in _SEPARATORS for line in (lines[0], lines[-1]))
+        and all(_is_number(x) for x in last)
+        and len(lines[0].split()) == len(last)
+    )
+
+
+def _without_preamble(lines: list[str], repairs: Repairs) -> tuple[list[str], int]:
+    """Lines from the header on, and the number of those above it, where they may be left out."""
+    if "preamble" not in repairs or not lines:
+        return lines, 0
+    n = _lines_above(lines)
+    if n:
+        repairs.record("preamble", f"{n} line{'s' * (n > 1)} above the header left out")
+    return lines[n:], n
+
+
+def _lines_above(lines: Sequence[str]) -> int:
+    """Number of lines above the first that has as many fields as most of the last ones, if it is a header."""
+    separator = _separator(lines[-1]) if any(x in lines[-1] for x in _SEPARATORS) else None
+    width = Counter(len(line.split(separator)) for line in lines[-_SEEN:]).most_common(1)[0][0]
+    found = next((k for k, line in enumerate(lines) if len(line.split(separator)) == width), 0)
+    return 0 if _is_row(lines[found]) else found
+
+
+def _with_units(headers: list[str], below: Sequence[str]) -> tuple[list[str], int]:
+    """Headers with the units of a second line of these, and the number of lines above the first row."""
+    units = [x.strip().strip("[]()") for x in below]
+    known = [split_unit(f"x ({x})")[1] is not None for x in units]
+    if len(units) != len(headers) or any(map(_is_number, units)) or not any(known):
+        return headers, 1
+    pairs = zip(headers, units, strict=True)
+    return [f"{name} [{unit}]" if unit not in ("", "-") else name for name, unit in pairs], 2
 
 
 def joined(files: Sequence[tuple[str, bytes]], source: str, repairs: Repairs) -> Table:
@@ -112,6 +193,11 @@ def joined(files: Sequence[tuple[str, bytes]], source: str, repairs: Repairs) ->
     for name, data in files:
         own = f"{source}, file {name}"
         table = read_csv(data, own, _names_of(name, data, own), repairs)
+        if columns and table.columns.keys() <= columns.keys():
+            raise LogError(
+                f"{source}: its files have the columns {', '.join(table.columns)} each: each is a log of its own. "
+                "Name the files, as in folder/*.csv"
+            )
         check_unique([*columns, *table.columns], source)
         columns |= table.columns
         units |= table.units
@@ -125,9 +211,10 @@ def joined(files: Sequence[tuple[str, bytes]], source: str, repairs: Repairs) ->
 
 def _names_of(name: str, data: bytes, source: str) -> list[str] | None:
     """Names of the columns of a file without a header; None for a file that has one."""
-    first = next((x for x in _text(data, source).split("\n") if x.strip() and not x.startswith(_COMMENTS)), "")
-    fields = first.split(_separator(first))
-    if not all(_is_number(field) for field in fields):
+    lines = _with_bare_header(_text(data, source)[0].split("\n"))
+    first = next((x for x in lines if x.strip() and not x.startswith(_COMMENTS)), "")
+    fields = _fields(first)
+    if not _is_row(first):
         return None
     if len(fields) == 1:
         return ["t" if name.lower() in ("t", "time") else name]
@@ -168,27 +255,39 @@ def _is_metadata(line: str) -> bool:
     return line.lstrip('"').startswith(COMMENT)
 
 
-def _text(data: bytes, source: str) -> str:
-    """Decoded text whose lines are separated by single line feeds."""
+def _decoded(data: bytes, source: str) -> tuple[str, list[str]]:
+    """Text in UTF-8, else in UTF-16 by its mark or in the code of Windows, with a note."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        with suppress(UnicodeDecodeError):
+            return data.decode("utf-16"), ["its text is UTF-16"]
     try:
-        text = data.decode("utf-8-sig")
+        return data.decode("utf-8-sig"), []
     except UnicodeDecodeError as error:
+        with suppress(UnicodeDecodeError):
+            text = data.decode("cp1252")
+            if not _CONTROL.search(text):
+                return text, ["its text is not UTF-8, and is read as that of Windows (1252)"]
         raise LogError(
             f"{source}: it is not UTF-8 text (byte 0x{data[error.start]:02x} at offset {error.start}); save it as UTF-8"
         ) from error
+
+
+def _text(data: bytes, source: str) -> tuple[str, list[str]]:
+    """Decoded text whose lines are separated by single line feeds, and notes on it."""
+    text, notes = _decoded(data, source)
     if "\0" in text:
         raise LogError(f"{source}: it holds binary data, not text")
     text = text.replace("\r\n", "\n").replace("\r", "\n").strip("\n")
     if not text.strip():
         raise LogError(f"{source}: it is empty; give a header line and one line per row")
-    return text
+    return text, notes
 
 
-def _lines(data: bytes, source: str) -> list[str]:
-    """Lines of the text.  Raises LogError: as `_text`, or there are too many."""
-    text = _text(data, source)
+def _lines(data: bytes, source: str) -> tuple[list[str], list[str]]:
+    """Lines of the text, and notes on it.  Raises LogError: as `_text`, or there are too many."""
+    text, notes = _text(data, source)
     check_size(source, text.count("\n"), 1)
-    return text.split("\n")
+    return text.split("\n"), notes
 
 
 def _separator(header: str) -> str:
@@ -231,7 +330,9 @@ def _check_ragged(lines: list[str], first: int, separator: str, source: str) -> 
             which = f"line {number} is blank, the first of {n}" if n > 1 else f"line {number} is blank"
             raise LogError(f"{source}: {which}; remove blank lines")
         if count != expected:
-            raise LogError(f"{source}: line {number} has {count} fields, the header has {expected}")
+            above = _lines_above(lines)
+            hint = f"; if the header is line {first + above}, pass --repair preamble" if above else ""
+            raise LogError(f"{source}: line {number} has {count} fields, the header has {expected}{hint}")
 
 
 def _quoted_counts(lines: list[str], first: int, separator: str, source: str) -> list[int]:
@@ -250,7 +351,7 @@ def _quoted_counts(lines: list[str], first: int, separator: str, source: str) ->
 
 def _columns(
     lines: list[str], headers: Sequence[str], first: int, separator: str, source: str, repairs: Repairs
-) -> Iterable[FloatArray | str]:
+) -> Iterable[FloatArray | str | _Times]:
     """Numbers of every column from line ``first``, or its first field that is no number.
 
     A short file of plain numbers is read without Polars, whose import takes longer.
@@ -278,7 +379,7 @@ def _frame(lines: list[str], n_columns: int, separator: str, source: str) -> pl.
         raise LogError(f"{source}: it cannot be read as CSV ({str(error).splitlines()[0]})") from error
 
 
-def _numbers(fields: pl.Series, first: int, separator: str, name: str, repairs: Repairs) -> FloatArray | str:
+def _numbers(fields: pl.Series, first: int, separator: str, name: str, repairs: Repairs) -> FloatArray | str | _Times:
     """Numbers of a column of text from line ``first``, empty fields as NaN, or the first field that is no number.
 
     Semicolons allow decimal commas.
@@ -291,17 +392,23 @@ def _numbers(fields: pl.Series, first: int, separator: str, name: str, repairs: 
     bad = (numbers.is_null() & text.is_not_null() & ~text.str.to_lowercase().is_in(_MISSING)).to_numpy()
     if bad.any():
         row, n = int(bad.argmax()), int(bad.sum())
-        if "timestamps" in repairs and (seconds := _seconds(text)) is not None:
+        reason = f'is not numeric: line {row + first} holds "{text[row]:.60}"'
+        seconds = _seconds(text)
+        if "timestamps" in repairs and seconds is not None:
             repairs.record("timestamps", f"{name} holds times from {text[0]:.40} on")
             return seconds
+        if seconds is not None:
+            return _Times(seconds, reason)
         if "cells" not in repairs or n > max(1, len(bad) // 100):
-            return f'is not numeric: line {row + first} holds "{text[row]:.60}"'
+            return reason
         repairs.record("cells", f'{name} has {n} field{"s" * (n > 1)} without a number, the first "{text[row]:.30}"')
     return numbers.fill_null(np.nan).to_numpy().astype(np.float64)
 
 
 def _seconds(text: pl.Series) -> FloatArray | None:
     """Seconds (n,) since the first of ISO 8601 times; None where one of them is none."""
+    if not _ISO.fullmatch(text[0] or ""):
+        return None
     matches = [_ISO.fullmatch(x) for x in text.fill_null("")]
     found = [m for m in matches if m is not None]
     if len(found) < len(matches) or not found:

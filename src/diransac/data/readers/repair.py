@@ -20,8 +20,9 @@ __all__ = ["REPAIRS", "Repairs"]
 
 REPAIRS = {
     "comments": "comments and blank lines of CSV text are left out",
+    "preamble": "lines of CSV text above its header are left out",
     "rows": "lines of CSV text with too few or too many fields are left out, up to 1 in 100",
-    "timestamps": "ISO 8601 times become seconds since the first",
+    "timestamps": "columns of ISO 8601 times become seconds since the first",
     "cells": "fields that hold no number are missing samples, up to 1 in 100 of a column",
     "units": "degrees, milliseconds and the like become SI units",
     "sort": "rows are sorted by time",

@@ -33,6 +33,7 @@ class Reading:
     resample : float, optional
     shift : mapping of str to float
     despike : tuple of str
+    unmeasured : tuple of str
     """
 
     mapping: LogMapping | None = None
@@ -45,6 +46,7 @@ class Reading:
     resample: float | None = None
     shift: Mapping[str, float] = field(default_factory=dict)
     despike: tuple[str, ...] = ()
+    unmeasured: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, history: Iterable[Mapping[str, Any]]) -> Reading:
@@ -109,6 +111,7 @@ _ARGUMENTS: dict[str, Any] = {
     "repair": lambda step: {"repairs": tuple(step["repairs"])},
     "resample": lambda step: {"resample": step["rate"]},
     "despike": lambda step: {"despike": tuple(step["replaced"])},
+    "unmeasured": lambda step: {"unmeasured": tuple(step["signals"])},
     "shift": lambda step: {"shift": dict(step["delays"])},
 }
 """Arguments by the name of a step."""

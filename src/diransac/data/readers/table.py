@@ -40,6 +40,10 @@ class Table:
         Those of the log that was written to the file, as in `Log`.
     is_described : bool
         True with the metadata of a log.
+    times : mapping of str to (n,) array
+        Seconds since the first, of columns that hold times of the calendar.
+    elements : tuple of str
+        Names, such as those of joints, for which ``{joint}`` in a mapping stands.
     """
 
     columns: Mapping[str, FloatArray | str]
@@ -48,15 +52,27 @@ class Table:
     history: tuple[dict[str, Any], ...] = ()
     filter: FilterSpecification | None = None
     is_described: bool = False
+    times: Mapping[str, FloatArray] = field(default_factory=dict)
+    elements: tuple[str, ...] = ()
 
     def with_step(self, step: Mapping[str, Any]) -> Table:
         """The table with one more step in its history."""
         return replace(self, history=(*self.history, dict(step)))
 
+    def with_time_of(self, name: str) -> Table:
+        """The table in which a column with times of the calendar is seconds since the first."""
+        if name not in self.times:
+            return self
+        note = f'"{name}" holds times, of which the first is zero'
+        columns = {**self.columns, name: self.times[name]}
+        return replace(self, columns=columns, units={**self.units, name: "s"}, notes=(*self.notes, note), times={})
+
     def __post_init__(self) -> None:
         columns = {one_line(name): one_line(x) if isinstance(x, str) else x for name, x in self.columns.items()}
         units = {one_line(name): one_line(unit) for name, unit in self.units.items()}
-        for key, value in (("columns", columns), ("units", units), ("notes", tuple(map(one_line, self.notes)))):
+        times = {one_line(name): x for name, x in self.times.items()}
+        notes = tuple(map(one_line, self.notes))
+        for key, value in (("columns", columns), ("units", units), ("notes", notes), ("times", times)):
             object.__setattr__(self, key, value)
 
 

@@ -43,8 +43,11 @@ def time_column(table: Table, taken: Container[str]) -> str | None:
     if "t" in table.columns:
         return None
     numeric = [name for name, x in table.columns.items() if isinstance(x, np.ndarray)]
-    found = [name for name in numeric if _NAME.fullmatch(name) and name not in taken]
-    return found[0] if len(found) == 1 else None
+    for kind in (numeric, table.times):
+        found = [name for name in kind if _NAME.fullmatch(name) and name not in taken]
+        if found:
+            return found[0] if len(found) == 1 else None
+    return None
 
 
 def unit_of_name(name: str) -> str | None:
@@ -60,7 +63,8 @@ def seconds(table: Table, factors: Mapping[str, float], source: str) -> tuple[Fl
     """
     if "t" not in table.columns:
         found = ", ".join(table.columns)
-        raise LogError(f'{source}: there is no time column "t"; found {found}. Say which one it is: --map t=NAME')
+        rate = "" if any(map(_NAME.fullmatch, table.columns)) else ", or give the rate of a log without one: --rate HZ"
+        raise LogError(f'{source}: there is no time column "t"; found {found}. Say which one it is: --map t=NAME{rate}')
     time = table.columns["t"]
     if isinstance(time, str):
         raise LogError(f'{source}: the time column "t" {time}')

@@ -42,9 +42,9 @@ def mapped_table(table: Table, mapping: LogMapping, source: str) -> Table:
             raise LogError(f'{source}: {mapping.source} has its time in "{mapping.time_column}"; found {found}')
         time = columns[mapping.time_column]
         columns["t"] = time if isinstance(time, str) else time * mapping.time_scale
-    entries, notes = mapping.chosen({"": list(columns)}, {}, source)
+    entries, notes = mapping.chosen({"": list(columns)}, {"": table.elements}, source)
     mapped: dict[str, FloatArray | str] = {"t": columns["t"]} if "t" in columns else {}
-    units: dict[str, str] = {}
+    units = {"t": "s"} if mapping.time_column is not None else {n: x for n, x in table.units.items() if n == "t"}
     for entry in entries:
         texts = {name: columns[name] for name in entry.needs if isinstance(columns[name], str)}
         for name, why in texts.items():
@@ -69,7 +69,7 @@ def whole_topic(recording: Recording, repairs: Repairs) -> Table:
     """Table of all fields of a recording with one topic."""
     ((topic, fields),) = recording.fields.items()
     samples = repairs.ordered(recording.read({topic: fields}, "header")[topic], topic)
-    return Table({"t": samples.time, **samples.columns, **samples.unusable}, notes=recording.notes)
+    return Table({"t": samples.time, **samples.columns, **samples.unusable}, {"t": "s"}, recording.notes)
 
 
 def table_of_topics(
@@ -124,7 +124,7 @@ def table_of_topics(
     history = (step,) if made.step is None else (step, made.step)
     said = (*recording.notes, *notes, *(made.notes if len(parts) > 1 else ()))
     unusable = {name: why for samples in parts.values() for name, why in samples.unusable.items()}
-    return Table({"t": made.time, **made.signals, **unusable, **flags}, units, said, history), None if len(
+    return Table({"t": made.time, **made.signals, **unusable, **flags}, units | {"t": "s"}, said, history), None if len(
         parts
     ) > 1 else resample
 
