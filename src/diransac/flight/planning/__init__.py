@@ -10,7 +10,7 @@
 | `problem.py` | the nonlinear program of a task, a first guess, the trajectory of a solution |
 | `transcription.py` | the program: index of each unknown, values and exact derivatives |
 | `stage.py` | one stage of it, compiled |
-| `solvers.py`, `snopt.py` | interior-point solvers, SNOPT |
+| `solvers.py` | its solution by IPOPT |
 """
 
 from diransac.flight.planning.experiment import Experiment, design_experiment

@@ -427,8 +427,7 @@ class _Task:
         designed, plain = (rows.trajectory(self.machine, z, self.limits) for z in (best, multisine))
         extremes = self.limited.extremes(motion_of(best, rows.check))
         return Experiment(
-            **{x.name: getattr(designed, x.name) for x in fields(Trajectory) if x.name != "solver"},
-            solver="interior point",
+            **{x.name: getattr(designed, x.name) for x in fields(Trajectory)},
             standard_errors=dict(zip(model.parameters, errors[0], strict=True)),
             multisine_standard_errors=dict(zip(model.parameters, errors[1], strict=True)),
             multisine=plain,

@@ -221,9 +221,7 @@ def stretched_guess(program: Program, unknowns: FloatArray, durations: FloatArra
 
 
 # Solutions -----------------------------------------------------------------------------------------------------------
-def trajectory_of(
-    task: Task, program: Program, unknowns: FloatArray, start: float, limits: Limits, solver: str
-) -> Trajectory:
+def trajectory_of(task: Task, program: Program, unknowns: FloatArray, start: float, limits: Limits) -> Trajectory:
     """Trajectory of a solution at fixed times, each interval integrated from its knot; the last input is repeated."""
     steps, layout = program.numbers.steps, program.layout
     states, inputs = program.split(unknowns)
@@ -237,5 +235,4 @@ def trajectory_of(
         tuple(task.model.inputs),
         limits.by_name(task.model.inputs),
         cost=program.objective(unknowns),
-        solver=solver,
     )
