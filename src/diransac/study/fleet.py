@@ -14,7 +14,6 @@ import json
 import pickle
 import platform
 import re
-import sqlite3
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
@@ -43,40 +42,18 @@ from diransac.model import Model
 from diransac.plain_data import json_data
 from diransac.plain_text import cell
 from diransac.process import single_threaded
-from diransac.study.database import (
-    AGAIN,
-    Database,
-    check_plain,
-    connected_to,
-    damage,
-    is_empty,
-    kept_apart,
-    quoted,
-    transaction,
-    word,
-)
+from diransac.study.database import AGAIN, LARGEST, MOST_LISTED, Database, damage, kept_apart, quoted, transaction, word
 from diransac.study.engine import Progress, distribute, workers_of
 from diransac.study.trials import versions
 from diransac.time_limit import time_limited
 
 __all__ = ["FleetRows", "FleetStatus", "export_fleet", "fleet_status", "identify_each", "read_fleet"]
 
-_LARGEST = 1e150
-"""Of an estimate: statistics of a fleet have its square."""
-
-_APPLICATION = 0x64697266
-"""SQLite's application id: "dirf"."""
-
-_FORMAT = 2
-_TABLES = {"logs", "asked", "configuration"}
 _UNKNOWN = "unknown"
 """Vehicle of a log that names none."""
 
 _INTERNAL = ("own_vehicle", "file_stamp", "file_hash")
 """Columns that are not exported."""
-
-_MANY = 6
-"""Differences that an error message lists."""
 
 
 def identify_each(
@@ -334,30 +311,24 @@ class FleetStore(Database):
         The file is no store of a fleet, or has another configuration.
     """
 
-    MAKER = "diransac identify --each"
+    KIND, MAKER = "a fleet", "diransac identify --each"
+    APPLICATION = 0x64697266  # "dirf"
+    ROWS, TABLES = "logs", frozenset({"logs", "asked", "configuration"})
 
     def __init__(self, path: str | Path, model: Model, wanted: Mapping[str, Any]) -> None:
-        self.path, values = Path(path), json_data(json.dumps(wanted))
-        self._connection = connected_to(self.path, "rwc")
-        try:
-            with transaction(self._connection, self.path):
-                if is_empty(self._connection):
-                    _create(self._connection, model, wanted)
-                self.check()
-            self._compare(values)
-        except BaseException:
-            self._connection.close()
-            raise
+        about = {"model_name": model.name, "units": {name: x.unit for name, x in model.parameters.items()}}
+        is_new = False
 
-    def check(self) -> None:
-        """Raises StudyError: the file is no store of a fleet that this version reads."""
-        application = self._connection.execute("PRAGMA application_id").fetchone()[0]
-        if application != _APPLICATION:
-            raise StudyError(f'"{self.path}" is no store of a fleet; give one of {self.MAKER}, or a new one')
-        number = self._connection.execute("PRAGMA user_version").fetchone()[0]
-        if number != _FORMAT:
-            raise StudyError(f'store "{self.path}" has format {number}, this version reads {_FORMAT}; begin another')
-        check_plain(self._connection, self.path, _TABLES)
+        def schema() -> tuple[str, ...]:
+            nonlocal is_new
+            is_new = True
+            return _schema(model)
+
+        with self._begun(path, schema):
+            if is_new:
+                values = [(key, json.dumps(value)) for key, value in {**wanted, **about}.items()]
+                self._connection.executemany("INSERT INTO configuration VALUES (?, ?)", values)
+            self._compare(json_data(json.dumps(wanted)))
 
     @property
     def configuration(self) -> dict[str, Any]:
@@ -396,23 +367,13 @@ class FleetStore(Database):
         marks = ", ".join("?" * len(batch.logs))
         return {name for (name,) in self.select(f"SELECT log FROM logs WHERE log IN ({marks})", batch.logs)}
 
-    def add(self, rows: Sequence[Mapping[str, Any]]) -> int:
-        """Number of new rows, written in one transaction; rows that are present stay as they are."""
-        before = self._connection.total_changes
-        columns = {column.rstrip(AGAIN): column for _, column, *_ in self.select("PRAGMA table_info(logs)")}
-        with transaction(self._connection, self.path):
-            for row in rows:
-                names, marks = ", ".join(quoted(columns[name]) for name in row), ", ".join("?" * len(row))
-                self._connection.execute(f"INSERT OR IGNORE INTO logs ({names}) VALUES ({marks})", [*row.values()])
-        return self._connection.total_changes - before
-
     def _compare(self, wanted: Mapping[str, Any]) -> None:
         """Raises StudyError: the store has another configuration."""
         kept = {key: value for key, value in self.configuration.items() if key not in _ABOUT}
         differing = [key for key in {**wanted, **kept} if kept.get(key) != wanted.get(key)]
         if differing:
             raise StudyError(
-                f'store "{self.path}" has another {", ".join(differing[:_MANY])}: give the same, or another store'
+                f'store "{self.path}" has another {", ".join(differing[:MOST_LISTED])}: give the same, or another store'
             )
 
 
@@ -430,23 +391,17 @@ def _columns(parameters: Iterable[str]) -> dict[str, str]:
     return dict(zip(names, kept_apart(names), strict=True))
 
 
-def _create(connection: sqlite3.Connection, model: Model, wanted: Mapping[str, Any]) -> None:
-    """Make the tables of a new store."""
+def _schema(model: Model) -> tuple[str, ...]:
+    """Statements that make the tables of a new store."""
     of_parameters = [f"{quoted(column)} REAL" for column in _columns(model.parameters).values()]
-    about = {**wanted, "model_name": model.name, "units": {name: x.unit for name, x in model.parameters.items()}}
-    for statement in (
-        f"PRAGMA application_id = {_APPLICATION}",
-        f"PRAGMA user_version = {_FORMAT}",
+    return (
         "CREATE TABLE logs (log TEXT PRIMARY KEY, own_vehicle TEXT, status TEXT NOT NULL, error TEXT, verdict TEXT, "
         f"findings TEXT, duration REAL, {', '.join(of_parameters)}, fit_error REAL, inlier_fraction REAL, "
         "stop_reason TEXT, file_stamp TEXT, file_hash TEXT, "
         "versions TEXT NOT NULL, seconds REAL NOT NULL, host TEXT NOT NULL)",
         "CREATE TABLE asked (log TEXT PRIMARY KEY, place INTEGER NOT NULL, vehicle TEXT, time TEXT)",
         "CREATE TABLE configuration (key TEXT PRIMARY KEY, value TEXT NOT NULL)",
-    ):
-        connection.execute(statement)
-    values = [(key, json.dumps(value)) for key, value in about.items()]
-    connection.executemany("INSERT INTO configuration VALUES (?, ?)", values)
+    )
 
 
 _ERROR, _ABOUT = "standard_error", ("model_name", "units")
@@ -550,7 +505,7 @@ def read_fleet(store: str | Path) -> FleetRows:
     with damage(Path(store)):
         rows.sort(key=lambda row: (word(row[1]), _moment(row[2]), int(row[3])))
         numbers = np.array([row[5:] for row in rows], np.float64).reshape(len(rows), 2 * len(units))
-        if np.any(np.isfinite(numbers) & (np.abs(numbers) > _LARGEST)):
+        if np.any(np.isfinite(numbers) & (np.abs(numbers) > LARGEST)):
             raise ValueError("the square of an estimate overflows")
         vehicles = np.array([word(row[1]) for row in rows], np.str_)
         return FleetRows(
