@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["draft", "write_bytes", "write_text", "write_with"]
 
-_BEGINNING, _END = ".diransac-", ".part"
 _NAME = re.compile(r"\.diransac-\w{8}\.part")
 
 
@@ -60,7 +59,7 @@ def draft(target: Path) -> Iterator[Path]:
 def _locked_folder(parent: Path) -> tuple[Path, int | None]:
     """A new private folder, and its lock; None where the file system has none."""
     while True:
-        folder = Path(tempfile.mkdtemp(dir=parent, prefix=_BEGINNING, suffix=_END))
+        folder = Path(tempfile.mkdtemp(dir=parent, prefix=".diransac-", suffix=".part"))
         lock = _lock(folder, wait=True)
         if lock is None or folder.exists():  # else another process took it for abandoned before it was locked
             return folder, lock

@@ -13,8 +13,6 @@ from diransac.limits import DEEPEST, LARGEST_RESULT, beyond, read_bytes
 
 __all__ = ["json_data", "read_text", "toml_table"]
 
-_DEEPEST_KEY = 64
-"""Dots in a key of TOML."""
 
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 """One half of a character in JSON's escapes; only pairs of them are text."""
@@ -92,7 +90,8 @@ def toml_table(text: str) -> dict[str, Any]:
     import tomllib
 
     keys = (line.partition("=")[0] for line in text.splitlines())
-    if any(key.count(".") > _DEEPEST_KEY and "," not in key for key in keys):  # tomllib takes their number squared
+    # Dots in a key of TOML.
+    if any(key.count(".") > 64 and "," not in key for key in keys):  # tomllib takes their number squared
         raise ValueError("it is nested too deeply")
     with _bounded():
         found = tomllib.loads(text)

@@ -32,12 +32,6 @@ UNLIMITED_INPUT = 1.0
 FINAL_SECONDS = 1.0
 """Default weights, explained in `tvlqr`; they are not tuned to any plant."""
 
-_HALF_ANGLE = 0.5
-"""Error of a quaternion per error of the attitude, 1/rad."""
-
-_GRID = 1e-6
-"""Tolerance, as a fraction of dt, within which a time counts as that of a row."""
-
 
 # The controller ------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
@@ -132,7 +126,8 @@ class Controller:
         if how not in ("hold", "linear"):
             raise SettingsError(f'how is {how!r}; choose "hold" or "linear"')
         wanted = _checked_time(time)
-        rows = np.maximum(np.searchsorted(self.time, wanted + _GRID * self.dt, side="right") - 1, 0)
+        # Tolerance, as a fraction of dt, within which a time counts as that of a row.
+        rows = np.maximum(np.searchsorted(self.time, wanted + 1e-6 * self.dt, side="right") - 1, 0)
         names = (self.state_names, self.input_names)
         states, gains = self.states[rows], self.gains[rows]
         if how == "linear":
@@ -346,7 +341,8 @@ class _CostMatrices:
     def __init__(self, model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None) -> None:
         errors = np.repeat([COORDINATE_ERROR, VELOCITY_ERROR], [model.n_q, model.n_v])
         for four in model.quaternions:
-            errors[list(four)] *= _HALF_ANGLE
+            # Error of a quaternion per error of the attitude, 1/rad.
+            errors[list(four)] *= 0.5
         weights = errors**-2.0
         if model.n_q:
             weights[len(weights) - len(model.first_order) :] = 0.0

@@ -165,8 +165,6 @@ def inches(axes: Axes) -> tuple[float, float]:
 
 # Inches: height of the title and of a line of the legend, margin around them.
 _TITLE, _LEGEND_LINE, _MARGIN = 0.27, 0.19, 0.16
-# Inches: width of a letter in the legend, and of a sample line with its margins.
-_LETTER, _SAMPLE = 0.075, 0.65
 
 LegendEntry = tuple[str, dict[str, Any]]
 """Label, and style of its line."""
@@ -174,7 +172,8 @@ LegendEntry = tuple[str, dict[str, Any]]
 
 def _columns(entries: Sequence[LegendEntry]) -> int:
     """Number of entries per line of the legend."""
-    widths = [_SAMPLE + _LETTER * len(label) for label, _ in entries]
+    # Inches: width of a letter in the legend, and of a sample line with its margins.
+    widths = [0.65 + 0.075 * len(label) for label, _ in entries]
     return len(entries) if sum(widths) < WIDTH - 0.2 else max(1, int((WIDTH - 0.2) / max(widths)))
 
 
@@ -217,7 +216,6 @@ def draw_heading(figure: Figure, entries: Sequence[LegendEntry], title: str | No
 
 # Files ---------------------------------------------------------------------------------------------------------------
 
-_DOTS_PER_INCH = 200
 _METADATA = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 # The ids of an SVG are hashes with a random salt; a fixed one gives the same file each time.
 _SALT = {"svg.hashsalt": "diransac"}
@@ -252,7 +250,7 @@ def write(figure: Figure, path: Path) -> None:
     """
     ending, memory = check_ending(path), io.BytesIO()  # a full disk is an error of zlib to Matplotlib
     with _literal_texts(figure):
-        figure.savefig(memory, format=ending[1:], dpi=_DOTS_PER_INCH, metadata=_METADATA[ending])
+        figure.savefig(memory, format=ending[1:], dpi=200, metadata=_METADATA[ending])
     try:
         write_bytes(path, memory.getvalue())
     except OSError as error:

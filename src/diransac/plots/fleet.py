@@ -32,8 +32,6 @@ __all__ = ["plot_fleet"]
 _ROW = 1.9
 _MOST_NAMED = len(COLOURS)
 """Vehicles with a colour of their own, those with the largest distances."""
-_MARGIN = 0.15
-"""Free part of a panel beyond the central values."""
 
 
 def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -111,7 +109,8 @@ def _draw_lives(axes: Axes, summary: FleetSummary, parameter: ParameterInFleet, 
     named = y[np.isin(vehicles, list(colours))]
     low, high = np.nanquantile(y, [0.005, 0.995])
     low, high = min(low, *named[np.isfinite(named)], high), max(high, *named[np.isfinite(named)], low)
-    margin = _MARGIN * (high - low or abs(high) or 1.0)
+    # Free part of a panel beyond the central values.
+    margin = 0.15 * (high - low or abs(high) or 1.0)
     axes.set_ylim(low - margin, high + margin)
 
 

@@ -46,8 +46,6 @@ _LEFT, _GAP, _NAME, _BELOW, _CAPTION = 0.42, 0.12, 0.24, 0.42, 0.3
 _MARGIN, _EVERY = 0.3, 3
 _PALE = 0.35
 _DASHES = (0.0, (4.0, 3.0))
-# Largest number of grid lines across a panel.
-_LINES = 5.0
 
 
 def plot_paths(
@@ -196,7 +194,8 @@ def _dress(axes: Axes, box: tuple[Range, Range], first: bool) -> None:
     axes.tick_params(length=0, labelsize=7, labelcolor=MUTED, labelleft=first, pad=2)
     axes.grid(color=RULE, linewidth=0.6)
     axes.set_axisbelow(True)
-    least = extent(box[0]) / _LINES
+    # Largest number of grid lines across a panel.
+    least = extent(box[0]) / 5.0
     decade = 10.0 ** np.floor(np.log10(least))
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MultipleLocator(next(n * decade for n in (1.0, 2.0, 5.0, 10.0) if n * decade >= least)))

@@ -31,7 +31,6 @@ __all__ = ["plot_prediction"]
 _MEASURED: dict[str, Any] = {"color": REFERENCE, "linestyle": "none", "marker": ".", "markersize": 2.5}
 _SIMULATED: dict[str, Any] = {"color": COLOURS[0], "linewidth": 1.3}
 _INPUT: dict[str, Any] = {"color": MUTED, "linewidth": 1.0}
-_MARGIN = 0.06
 
 
 def plot_prediction(
@@ -73,7 +72,7 @@ def plot_prediction(
             if len(finite):
                 bulk = np.quantile(finite, [0.01, 0.99])
                 low, high = min(low, float(bulk[0])), max(high, float(bulk[1]))
-        margin = _MARGIN * (high - low) or 1.0
+        margin = 0.06 * (high - low) or 1.0
         axes.set_ylim(low - margin, high + margin)
     if path is not None:
         write(figure, Path(path))

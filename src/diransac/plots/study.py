@@ -43,12 +43,6 @@ __all__ = ["axis_label", "level_labels", "method_looks", "n_trials", "plot_study
 # Inches: height of a row of panels, of a trajectory's name, of the axis below the panels, of a line of the caption.
 _ROW, _NAME, _AXIS, _LINE = 1.5, 0.24, 0.36, 0.155
 _COLUMNS = 3
-# Methods are side by side within this fraction of the least distance between levels.
-_SPREAD = 0.5
-# Ratio of the largest to the median mean above which the scale is logarithmic; its decades above a linear part.
-_MANY, _DECADES = 20.0, 3
-_TOP = 1e300
-"""Largest value on an axis; Matplotlib adds margins."""
 # Letters per line of a title, and largest difference between its lines.
 _LETTERS, _RAGGED = 92, 12
 
@@ -208,7 +202,9 @@ def _draw_state(axes: Axes, summary: Summary, flights: TrackingErrors, state: st
 def _spans_decades(flights: TrackingErrors) -> bool:
     """True if the means of a state differ so much that a linear scale shows the largest alone."""
     seen = [mean[np.isfinite(mean)] for mean in map(flights.mean, flights.errors)]
-    return any(len(x) and float(x.max()) > _MANY * float(np.median(x)) for x in seen)
+    # Ratio of the largest to the median mean above which the scale is logarithmic; its decades above a linear
+    # part.
+    return any(len(x) and float(x.max()) > 20.0 * float(np.median(x)) for x in seen)
 
 
 # Axes ----------------------------------------------------------------------------------------------------------------
@@ -218,7 +214,8 @@ def _placed(summary: Summary) -> FloatArray:
     least = float(np.diff(positions).min()) if len(positions) > 1 else 1.0
     others = [label for label in summary.methods if label != TRUE]
     beside = {label: (i / (len(others) - 1) - 0.5) if len(others) > 1 else 0.0 for i, label in enumerate(others)}
-    return np.asarray(positions[:, None] + _SPREAD * least * np.array([beside.get(m, 0.0) for m in summary.methods]))
+    # Methods are side by side within this fraction of the least distance between levels.
+    return np.asarray(positions[:, None] + 0.5 * least * np.array([beside.get(m, 0.0) for m in summary.methods]))
 
 
 def _positions(summary: Summary) -> tuple[FloatArray, int]:
@@ -246,7 +243,8 @@ def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool)
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
     largest = float(mean[np.isfinite(mean)].max(initial=0.0))
-    top = min(max(largest, float(np.nan_to_num(highest).max(initial=0.0))), _TOP)
+    # Largest value on an axis; Matplotlib adds margins.
+    top = min(max(largest, float(np.nan_to_num(highest).max(initial=0.0))), 1e300)
     if not largest > 0.0:
         axes.set_ylim(-0.04, 1.0)
         return
@@ -254,7 +252,7 @@ def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool)
     if not logarithmic:
         axes.set_ylim(-0.04 * top, 1.06 * top)
         return
-    first = int(np.floor(np.log10(largest))) - _DECADES
+    first = int(np.floor(np.log10(largest))) - 3
     axes.set_yscale("symlog", linthresh=10.0**first, linscale=0.5)
     decades = 10.0 ** np.arange(first, np.floor(np.log10(top)) + 1)
     axes.yaxis.set_major_locator(FixedLocator([0.0, *decades]))
@@ -309,8 +307,6 @@ def n_trials(summary: Summary) -> str:
 
 
 # Failed trials -------------------------------------------------------------------------------------------------------
-_FAILED = "#b42318"
-"""Colour of failures, as in the report."""
 
 # Inches: height of a row of cells, of the heading, of the margin below; left and right ends of the cells.
 _CELL, _HEADING, _FREE, _LEFT, _RIGHT = 0.19, 0.21, 0.1, 1.75, 8.83
@@ -363,7 +359,8 @@ def _draw_cell(figure: Figure, left: float, top: float, width: float, fraction: 
     figure.add_artist(Rectangle(place, *size, facecolor=SOFT, **look))
     if not fraction > 0.0:
         return
-    figure.add_artist(Rectangle(place, *size, facecolor=_FAILED, alpha=0.12 + 0.6 * fraction, **look))
+    # Colour of failures, as in the report.
+    figure.add_artist(Rectangle(place, *size, facecolor="#b42318", alpha=0.12 + 0.6 * fraction, **look))
     dark = fraction > 0.5
     _write(figure, left + width / 2.0, top + 0.025, _percent(fraction), color="#ffffff" if dark else INK, ha="center")
 

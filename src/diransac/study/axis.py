@@ -15,9 +15,6 @@ from diransac.study.tables import Table, Text, flat, is_number
 
 __all__ = ["AnyAxis", "Axis", "Level", "level_text"]
 
-_EXACT = 2.0**53
-"""Every integer up to this one is a float64."""
-
 
 @dataclass(frozen=True)
 class Level:
@@ -136,7 +133,8 @@ class PathAxis(Axis):
 
     def _at(self, value: float | str) -> Level:
         """The level of a value; a whole number changes its key to an integer, which some keys require."""
-        whole = isinstance(value, float) and value.is_integer() and abs(value) < _EXACT
+        # Every integer up to this one is a float64.
+        whole = isinstance(value, float) and value.is_integer() and abs(value) < 2.0**53
         return Level(level_text(value), value, {self.path: int(value) if whole else value})
 
     def _with(self, levels: Sequence[Level]) -> Self:

@@ -32,12 +32,10 @@ __all__ = [
 PLANNING_TIME_LIMIT = 600.0
 """s per plan: long enough for a solver's limit of iterations to end it first on any machine."""
 
-_SEED_BYTES = 8
-
 
 def derived_seed(*key: str | int) -> int:
     """A seed of 63 bits that depends on the key alone and is the same on every machine."""
-    digest = hashlib.blake2b(json.dumps(key).encode(), digest_size=_SEED_BYTES).digest()
+    digest = hashlib.blake2b(json.dumps(key).encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big") >> 1
 
 

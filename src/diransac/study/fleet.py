@@ -49,12 +49,6 @@ from diransac.time_limit import time_limited
 
 __all__ = ["FleetRows", "FleetStatus", "export_fleet", "fleet_status", "identify_each", "read_fleet"]
 
-_UNKNOWN = "unknown"
-"""Vehicle of a log that names none."""
-
-_INTERNAL = ("own_vehicle", "file_stamp", "file_hash")
-"""Columns that are not exported."""
-
 
 def identify_each(
     model: Model,
@@ -497,10 +491,11 @@ def read_fleet(store: str | Path) -> FleetRows:
             model = word(about["model_name"])
         of_parameters = _columns(units)
         columns = [quoted(of_parameters[f"{kind}_{name}"]) for kind in ("parameter", _ERROR) for name in units]
+        # Vehicle of a log that names none.
         rows = kept.select(
             "SELECT log, coalesce(vehicle, own_vehicle, ?), time, place, verdict, "
             f"{', '.join(columns)} FROM logs JOIN asked USING (log) WHERE status = 'done'",
-            (_UNKNOWN,),
+            ("unknown",),
         )
     with damage(Path(store)):
         rows.sort(key=lambda row: (word(row[1]), _moment(row[2]), int(row[3])))
@@ -539,7 +534,12 @@ def export_fleet(store: str | Path, path: str | Path) -> None:
         There is no such store, or it has values that are neither numbers nor texts.
     """
     with FleetStore.existing(store) as kept:
-        names = [name for _, name, *_ in kept.select("PRAGMA table_info(logs)") if name not in _INTERNAL]
+        # Columns that are not exported.
+        names = [
+            name
+            for _, name, *_ in kept.select("PRAGMA table_info(logs)")
+            if name not in ("own_vehicle", "file_stamp", "file_hash")
+        ]
         columns = ", ".join(map(quoted, names[1:]))
         rows = kept.select(
             f"SELECT log, coalesce(vehicle, own_vehicle), time, {columns} FROM asked LEFT JOIN logs USING (log) "

@@ -87,7 +87,6 @@ _LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _+()/-]*")
 _VARIABLE = ("plant", "data", "noise", "methods", "missions", "control")
 """Tables that an axis may change; the others are the same at every level."""
 
-_NO_ANSWER_CHANGES = ("threads", "batch_size")
 
 _OWN_ESTIMATOR = "default"
 """Word for the estimator that a method chooses."""
@@ -525,7 +524,7 @@ class Study(Table):
         decisive = {name: table[name] for name in ("seed", "plant", "data", "noise", "evaluation")}
         parts = {"study": dict(flat(decisive)) | {path: value for path, value in flat(later) if value != {}}}
         for label, method in table["methods"].items():
-            silent = [f"settings.{name}" for name in _NO_ANSWER_CHANGES]
+            silent = [f"settings.{name}" for name in ("threads", "batch_size")]
             parts[f"methods.{label}"] = {path: value for path, value in flat(method) if path not in silent}
         changes = {level.text: dict(level.changes) or {"changes": "none"} for level in self.axis.levels}
         return parts | {f"levels.{text}": some for text, some in changes.items()}

@@ -33,40 +33,17 @@ __all__ = [
     "resting_pose",
 ]
 
-_DRAWN_SIZES = 0.2, 0.6
-"""Range of the amplitudes of a drawn motion, as of `multisine`."""
-
-_N_POSES = 200
-_SPREAD = 0.8
-"""Fraction of the ranges of the coordinates in which poses are drawn."""
 
 _SHARES = (*(1.0 - 0.002 * 2.0 ** np.arange(9.0)), *0.25 ** np.arange(1.0, 5.0), 0.0)
 """Shares of a motion, one after the other, of which the first that keeps the limits is taken."""
 
-_BISECTIONS = 6
-
-_SAMPLES_PER_SINE = 12
-"""Rows per period of the fastest sine in which the optimisation evaluates the information.
-
-Limits hold in twice as many: forces have products of sines, of twice the frequency.
-"""
 
 _LAST_BARRIER, _BARRIER_FACTOR = 1e-4, 0.3
 """Last barrier parameter, and what it is reduced by: it is the change of the objective per active limit."""
 
-_MERIT_CHANGE = 1e-2
-"""Decrease of the barrier function per unknown, over the barrier parameter, below which that is reduced."""
 
 _FRACTION = 0.99
 """Of the way to a limit that a step may take."""
-
-_BACKTRACKS = 12
-
-_RANK = 1e-6
-"""Size of a direction, relative to the largest, below which no motion shows it; columns have unit length."""
-
-_HIDDEN = 1e-3
-"""Share of a parameter in such directions above which it is not identifiable."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +93,8 @@ class FourierSeries:
 
     def drawn(self, rng: np.random.Generator) -> FloatArray:
         """Coefficients (n_coefficients,) of a sum of sines with random amplitudes and phases about zero."""
-        size = rng.uniform(*_DRAWN_SIZES, self.n_harmonics)
+        # Range of the amplitudes of a drawn motion, as of `multisine`.
+        size = rng.uniform(0.2, 0.6, self.n_harmonics)
         phase = rng.uniform(0.0, 2.0 * np.pi, self.n_harmonics)
         sines, cosines = self._bases
         return np.concatenate([sines.T @ (size * np.cos(phase)), cosines.T @ (size * np.sin(phase)), [0.0]])
@@ -205,7 +183,7 @@ class Limited:
             if fits(share):
                 break
             tried = share
-        for _ in range(_BISECTIONS):
+        for _ in range(6):
             middle = 0.5 * (share + tried)
             share, tried = (middle, tried) if fits(middle) else (share, middle)
         return scaled(share)
@@ -224,8 +202,9 @@ def resting_pose(limited: Limited, lower: FloatArray, upper: FloatArray, rng: np
     bounded = np.isfinite(upper - lower)
     middle, half = np.zeros(len(lower)), np.zeros(len(lower))
     middle[bounded] = 0.5 * (lower + upper)[bounded]
-    half[bounded] = 0.5 * _SPREAD * (upper - lower)[bounded]
-    poses = np.vstack([middle, middle + half * rng.uniform(-1.0, 1.0, (_N_POSES, len(middle)))])
+    # Fraction of the ranges of the coordinates in which poses are drawn.
+    half[bounded] = 0.5 * 0.8 * (upper - lower)[bounded]
+    poses = np.vstack([middle, middle + half * rng.uniform(-1.0, 1.0, (200, len(middle)))])
     rest = np.zeros((3 * len(middle), 1))
     margins = np.empty(len(poses))
     for k, pose in enumerate(poses):
@@ -262,7 +241,9 @@ def drawn_motion(
 
 def grid(series: FourierSeries, density: int = 1) -> FloatArray:
     """Times of a period at which the optimisation evaluates a motion, s; as many times denser."""
-    n = density * _SAMPLES_PER_SINE * series.n_harmonics
+    # Rows per period of the fastest sine in which the optimisation evaluates the information. Limits hold in
+    # twice as many: forces have products of sines, of twice the frequency.
+    n = density * 12 * series.n_harmonics
     return np.linspace(0.0, series.period, n, endpoint=False)
 
 
@@ -292,9 +273,12 @@ class Observed:
         sizes = np.linalg.norm(J, axis=0)
         sizes[sizes == 0.0] = 1.0
         _, strengths, axes = np.linalg.svd(J / sizes, full_matrices=True)
-        n_shown = int((strengths > _RANK * max(strengths[0], 1e-300)).sum())
+        # Size of a direction, relative to the largest, below which no motion shows it; columns have unit
+        # length.
+        n_shown = int((strengths > 1e-6 * max(strengths[0], 1e-300)).sum())
         hidden = np.linalg.norm(axes[n_shown:], axis=0)
-        return cls(function, axes[:n_shown].T / sizes[:, None], hidden < _HIDDEN)
+        # Share of a parameter in such directions above which it is not identifiable.
+        return cls(function, axes[:n_shown].T / sizes[:, None], hidden < 1e-3)
 
     def information(self, x: FloatArray) -> FloatArray:
         """Fisher information (n_r, n_r) of the directions over the rows of a motion (3 n, K)."""
@@ -479,7 +463,9 @@ def best_motion(problem: DesignProblem, search: Search, barrier: float) -> Float
         hessian = _updated(hessian, after, at, multipliers)
         at = after
         merit = at.f - mu * np.log(at.c).sum()
-        if before - merit < _MERIT_CHANGE * mu * len(at.x):
+        # Decrease of the barrier function per unknown, over the barrier parameter, below which that is
+        # reduced.
+        if before - merit < 1e-2 * mu * len(at.x):
             search.converged = mu <= _LAST_BARRIER
             mu, merit = max(_LAST_BARRIER, _BARRIER_FACTOR * mu), np.inf
         before = merit
@@ -497,7 +483,7 @@ def _along(problem: DesignProblem, at: _Point, step: FloatArray, mu: float) -> _
     merit = at.f - mu * np.log(at.c).sum()
     slope = at.gradient @ step - mu * ((at.jacobian @ step) / at.c).sum()
     share = _share_inside(at.c, at.jacobian @ step)
-    for _ in range(_BACKTRACKS):
+    for _ in range(12):
         f, c = problem.values(at.x + share * step)
         if (c > (1.0 - _FRACTION) * at.c).all() and f - mu * np.log(c).sum() <= merit + 1e-4 * share * slope:
             return problem.point(at.x + share * step)

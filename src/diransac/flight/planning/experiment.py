@@ -45,8 +45,6 @@ Outputs: TypeAlias = Callable[..., Mapping[str, Any]]
 _N_DRAWS = 9
 """Plain multisines; the median one is the comparison, and the best one the start of the optimisation."""
 
-_NOISE = 0.01
-"""Default standard deviation of an input's noise, over what the input varies by."""
 
 _FEWEST_HARMONICS = 4
 """With these a period is always long enough for two."""
@@ -56,24 +54,6 @@ _ROOM = 1e-3
 
 _NARROWED = 5e-3
 """Fraction of limits that the optimisation leaves for extremes between its rows."""
-
-_CHECKED_PER_SINE = 64
-"""Rows of the check per period of the fastest sine, at least."""
-
-_BARRIERS = (3e-2, 1e-3, 1e-3, 1e-3)
-"""First barrier parameters of the optimisation, and of those that follow with the times at which limits are exceeded.
-
-They are also the fractions of the limits that the first motions leave.
-"""
-
-_AT_LIMIT = 0.03
-"""Fraction of a range within which an extreme is at the limit."""
-
-_LARGEST_SIZE = 4.0
-"""Amplitude of the sines of a drawn motion over half the range of the coordinate, before limits reduce it."""
-
-_N_RANDOM = 200
-"""Random states in which the derivatives show what any motion can show."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +147,8 @@ class Experiment(Trajectory):
             texts = [f"{number(low, 3)} to {number(high, 3)}" for low, high in (found, limits)]
             width = limits[1] - limits[0]
             near = min(found[0] - limits[0], limits[1] - found[1])
-            at = near < _AT_LIMIT * (0.5 * width if math.isfinite(width) else max(map(abs, found)))
+            # Fraction of a range within which an extreme is at the limit.
+            at = near < 0.03 * (0.5 * width if math.isfinite(width) else max(map(abs, found)))
             rows.append([n, self.units.get(n, ""), *texts, "at a limit" if at else ""])
         return rows
 
@@ -345,7 +326,8 @@ class _Rows:
     @cached_property
     def check_times(self) -> FloatArray:
         """Times at which limits are checked, s: rows, between them, and more often if the fastest sine needs it."""
-        wanted = _CHECKED_PER_SINE * self.series.highest / (2.0 * np.pi)
+        # Rows of the check per period of the fastest sine, at least.
+        wanted = 64 * self.series.highest / (2.0 * np.pi)
         per_row = 2 * math.ceil(max(wanted / self.rate, 1.0) / 2.0 + 0.5)
         return np.arange(per_row * self.n_rows) / (per_row * self.rate)
 
@@ -389,7 +371,9 @@ class _Task:
     def solved(self, search: Search) -> Experiment:
         """The best motion that is found, beside the median of the plain multisines."""
         times, found = grid(self.rows.series, 2), self.draws[-1]
-        for barrier in _BARRIERS:
+        # First barrier parameters of the optimisation, and of those that follow with the times at which
+        # limits are exceeded. They are also the fractions of the limits that the first motions leave.
+        for barrier in (3e-2, 1e-3, 1e-3, 1e-3):
             found = self._optimised(found, times, search, barrier)
             more = self._exceeding(found)
             if not len(more):
@@ -452,7 +436,8 @@ def _task(
     sizes = _sizes(machine.model, pairs, rows.series)
     pose = resting_pose(limited, lower, upper, rng)
     _check_rest(machine.model, limited, pose)
-    draws = [drawn_motion(rows.series, limited, pose, _LARGEST_SIZE * sizes, rng) for _ in range(_N_DRAWS)]
+    # Amplitude of the sines of a drawn motion over half the range of the coordinate, before limits reduce it.
+    draws = [drawn_motion(rows.series, limited, pose, 4.0 * sizes, rng) for _ in range(_N_DRAWS)]
     basis = rows.series.basis(grid(rows.series))
     plain = [motion_of(z, basis) for z in draws]
     sigma = _noise_of(machine, noise, np.hstack(plain))
@@ -533,7 +518,8 @@ def _noise_of(machine: _Machine, noise: Mapping[str, float] | None, motions: Flo
     if noise is None:
         spread = np.array(machine.inputs(motions)).std(axis=1)
         spread = np.where(spread > 0.0, spread, max(spread.max(), 1.0))
-        return dict(zip(model.inputs, (_NOISE * spread).tolist(), strict=True))
+        # Default standard deviation of an input's noise, over what the input varies by.
+        return dict(zip(model.inputs, (0.01 * spread).tolist(), strict=True))
     names = (*model.state, *model.accelerations, *model.inputs)
     for name, value in noise.items():
         if name not in names:
@@ -547,6 +533,5 @@ def _random_motions(pose: FloatArray, sizes: FloatArray, series: FourierSeries, 
     """Random motions (3 n, K) about a pose, of the size and speed of the machine's."""
     w = series.highest
     scale = np.concatenate([sizes, w * sizes, w**2 * sizes])[:, None]
-    return np.concatenate([pose, np.zeros(2 * len(pose))])[:, None] + scale * rng.uniform(
-        -1.0, 1.0, (len(scale), _N_RANDOM)
-    )
+    # Random states in which the derivatives show what any motion can show.
+    return np.concatenate([pose, np.zeros(2 * len(pose))])[:, None] + scale * rng.uniform(-1.0, 1.0, (len(scale), 200))

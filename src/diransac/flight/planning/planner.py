@@ -47,12 +47,6 @@ if TYPE_CHECKING:
 
 __all__ = ["plan"]
 
-_FIRST_ATTEMPTS = 0.4
-"""Fraction of the iterations for every attempt but the last: most plans take a tenth of them."""
-
-_MORE_ROWS = (0, 1, 2, 4, 8)
-"""Rows added to optimal durations in turn until there is a plan on the grid of the inputs."""
-
 
 def plan(
     plant: ModelWithParameters,
@@ -199,7 +193,8 @@ class _Search:
             )
         found = program.split(solution.unknowns)[0][program.layout.waypoint_knots[:-1], -1]
         shortest = np.maximum(np.ceil(found / task.dt - 1e-6), 1).astype(int)
-        for more in _MORE_ROWS:
+        # Rows added to optimal durations in turn until there is a plan on the grid of the inputs.
+        for more in (0, 1, 2, 4, 8):
             rows = tuple(int(k) + more for k in shortest)
             whole = fixed_program(task, rows)
             along = stretched_guess(program, solution.unknowns, task.dt * np.array(rows))
@@ -220,7 +215,8 @@ class _Search:
             attempts.insert(0, (unknowns_of(program, guess), "warm start"))
         attempts.append((straight, "full steps"))
         whole = self.search_limits
-        short = replace(whole, iterations=max(1, round(_FIRST_ATTEMPTS * whole.iterations)))
+        # Fraction of the iterations for every attempt but the last: most plans take a tenth of them.
+        short = replace(whole, iterations=max(1, round(0.4 * whole.iterations)))
         for k, (unknowns, strategy) in enumerate(attempts, start=1):
             solution = interior_point(program, unknowns, whole if k == len(attempts) else short, strategy)
             if solution.success or solution.status == TIME_LIMIT:
@@ -234,17 +230,6 @@ class _Search:
 
 # Infeasible plans ----------------------------------------------------------------------------------------------------
 
-_EXPLANATION_ITERATIONS = 500
-
-_MISS_WEIGHT = 1e4
-"""Penalty on the distance from a waypoint, one over the state's unit squared."""
-
-_MET = 1e-2
-"""Distance within which a waypoint counts as reached, state's unit: the penalty is finite."""
-
-_AT_LIMIT = 1e-3
-"""Fraction of a range, or of a unit, within which a value is at its limit."""
-
 
 def _explanation(task: Task, rows: tuple[int, ...], solution: Solution, limits: SearchLimits) -> str:
     """Sentence on the waypoint that is missed by most, the limits that bind, and what to relax.
@@ -256,7 +241,7 @@ def _explanation(task: Task, rows: tuple[int, ...], solution: Solution, limits: 
         return f"no plan was found within {limits.seconds:g} s; raise time_limit=, or give a guess="
     program = _relaxed(task, rows)
     guess = unknowns_of(program, straight_guess(task, task.dt * np.array(rows)))
-    nearest = interior_point(program, guess, SearchLimits(_EXPLANATION_ITERATIONS, limits.seconds))
+    nearest = interior_point(program, guess, SearchLimits(500, limits.seconds))
     if not nearest.success:
         return (
             f"there is no plan: {solution.summary}, and none was found that may miss its waypoints; "
@@ -287,7 +272,8 @@ def _relaxed(task: Task, rows: tuple[int, ...]) -> Program:
     reference, weights = costs.reference.copy(), costs.weights.copy()
     for knot, waypoint in zip(program.layout.waypoint_knots[1:], task.waypoints[1:], strict=True):
         states = list(waypoint.states)
-        reference[knot, states], weights[knot, states] = waypoint.values, _MISS_WEIGHT
+        # Penalty on the distance from a waypoint, one over the state's unit squared.
+        reference[knot, states], weights[knot, states] = waypoint.values, 1e4
     numbers = replace(program.numbers, costs=replace(costs, reference=reference, weights=weights))
     return Program(program.stage, program.layout, numbers)
 
@@ -296,7 +282,8 @@ def _largest_miss(task: Task, program: Program, unknowns: FloatArray) -> str | N
     """Waypoint state that is missed by most; None where every waypoint is reached."""
     states, names = program.split(unknowns)[0], task.model.state
     ends = np.concatenate([[0.0], np.cumsum(program.numbers.steps.sum(axis=1))])
-    worst, text = _MET, None
+    # Distance within which a waypoint counts as reached, state's unit: the penalty is finite.
+    worst, text = 1e-2, None
     for k, (knot, waypoint) in enumerate(zip(program.layout.waypoint_knots, task.waypoints, strict=True)):
         misses = np.abs(states[knot, list(waypoint.states)] - waypoint.values)
         if len(misses) and misses.max() > worst:
@@ -316,7 +303,8 @@ def _binding(task: Task, program: Program, unknowns: FloatArray) -> str:
         (inputs, task.inputs, tuple(task.model.inputs)),
         (states[1:, : len(task.model.state)], task.states, task.model.state),
     ):
-        slack = _AT_LIMIT * limits.half_ranges
+        # Fraction of a range, or of a unit, within which a value is at its limit.
+        slack = 1e-3 * limits.half_ranges
         at_limit = np.any((values <= limits.lower + slack) | (values >= limits.upper - slack), axis=0)
         names += [known[j] for j in np.flatnonzero(at_limit)]
     return " and ".join(names)

@@ -16,16 +16,9 @@ from diransac.arrays import FloatArray
 
 __all__ = ["Grouping", "base_parameters"]
 
-_DEPENDENT = 1e-4
-"""Share of a column, at most, that is left of it beside the others where it is their combination.
-
-Angles in descriptions are rounded: 1.5708 is a right angle. What such an error shows of a parameter is nothing.
-"""
 _ZERO = 1e-9
 """Size of a column relative to the largest, and of weights between columns of unit length, that is a rounding error."""
 
-_DIGITS = 10
-"""Decimal digits of weights, which are products of lengths in m."""
 _ROWS_PER_PARAMETER = 3
 _LARGEST = (np.pi, 3.0, 10.0, 3.0, 10.0, 15.0)
 """Of random motions: position, velocity, acceleration; angular velocity and acceleration of a base, specific force."""
@@ -88,7 +81,8 @@ def base_parameters(regressor: ca.Function, seed: int = 0) -> Grouping:
     weights = np.linalg.lstsq(Y[:, kept], Y[:, dropped])[0] if kept and dropped else np.zeros((len(kept), len(dropped)))
     weights[np.abs(weights) < _ZERO] = 0.0
     weights *= lengths[list(dropped)] / lengths[kept, None]
-    return Grouping(tuple(kept), dropped, np.round(weights, _DIGITS))
+    # Decimal digits of weights, which are products of lengths in m.
+    return Grouping(tuple(kept), dropped, np.round(weights, 10))
 
 
 def _independent_columns(Y: FloatArray) -> list[int]:
@@ -98,7 +92,10 @@ def _independent_columns(Y: FloatArray) -> list[int]:
         rest = column - basis @ (basis.T @ column)
         rest = rest - basis @ (basis.T @ rest)
         size = float(np.linalg.norm(rest))
-        if size > _DEPENDENT:
+        # Share of a column, at most, that is left of it beside the others where it is their combination.
+        # Angles in descriptions are rounded: 1.5708 is a right angle. What such an error shows of a parameter
+        # is nothing.
+        if size > 1e-4:
             kept.append(k)
             basis = np.column_stack([basis, rest / size])
     return kept

@@ -31,8 +31,6 @@ CHUNKS_PER_THREAD = 4
 _PATIENCE = 0.2
 """Longest time, s, for which signals are not noticed, where the work can be interrupted."""
 
-_FIRST_BLOCKS = 8
-"""Blocks of a loop that are run before their time is known."""
 
 PASSES = ("sroa", "simplify_cfg", "loop_rotate")
 """Optimisation passes: variables into registers, tidying. LLVM's default list takes 3 times as long, for no gain."""
@@ -205,10 +203,6 @@ def _optimise(module: LLVM, machine: LLVM) -> None:
             passes.run(function, builder)
 
 
-_MOST_DIGITS = 6
-"""Of a number of threads."""
-
-
 def default_threads() -> int:
     """Default number of threads: `DIRANSAC_THREADS`, else one in a worker process, else all available cores.
 
@@ -221,7 +215,8 @@ def default_threads() -> int:
     """
     asked = os.environ.get("DIRANSAC_THREADS", "")
     if asked:
-        if not asked.isdecimal() or len(asked) > _MOST_DIGITS or int(asked) < 1:
+        # Of a number of threads.
+        if not asked.isdecimal() or len(asked) > 6 or int(asked) < 1:
             raise SettingsError(f"DIRANSAC_THREADS is {asked!r:.40}; give a positive whole number, or unset it.")
         return int(asked)
     from multiprocessing import parent_process
@@ -261,7 +256,8 @@ def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: in
 
 def _run_some(loop: Callable[[int, int], None], first: int, end: int, stopped: Event) -> None:
     """Call a loop for blocks first .. end - 1, a part of a second at a time, until it is stopped."""
-    at_a_time = _FIRST_BLOCKS
+    # Blocks of a loop that are run before their time is known.
+    at_a_time = 8
     while first < end and not stopped.is_set():
         begin, last = time.monotonic(), min(first + at_a_time, end)
         loop(first, last)
