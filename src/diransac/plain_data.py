@@ -9,9 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from diransac.limits import DEEPEST, LARGEST_RESULT, beyond, read_bytes
+from diransac.errors import SettingsError
+from diransac.limits import DEEPEST, LARGEST_RESULT, LARGEST_TABLE, beyond, read_bytes
 
-__all__ = ["json_data", "read_text", "toml_table"]
+__all__ = ["json_data", "read_text", "toml_file", "toml_table"]
 
 
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
@@ -97,6 +98,16 @@ def toml_table(text: str) -> dict[str, Any]:
         found = tomllib.loads(text)
     _check_depth(found)
     return found
+
+
+def toml_file(path: Path, what: str) -> dict[str, Any]:
+    """Table of a TOML file.  Raises SettingsError: it cannot be read, or is none; ``what`` begins the sentence."""
+    try:
+        return toml_table(read_text(path, LARGEST_TABLE))
+    except OSError as error:
+        raise SettingsError(f'{what} "{path}" cannot be read: {error.strerror}') from error
+    except ValueError as error:
+        raise SettingsError(f'{what} "{path}" is not TOML: {error}') from error
 
 
 @contextmanager

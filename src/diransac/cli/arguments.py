@@ -9,13 +9,12 @@ from typing import Any
 
 import typer
 
-from diransac.errors import ModelError, SettingsError
+from diransac.errors import ModelError
 from diransac.identification.method import Method
 from diransac.identification.methods import WITH_ESTIMATOR, configured, estimator_named, setting_names
 from diransac.identification.settings import Settings, nearest_names
-from diransac.limits import LARGEST_TABLE
 from diransac.model import Model
-from diransac.plain_data import read_text, toml_table
+from diransac.plain_data import toml_file, toml_table
 from diransac.user_files import definitions, file_and_name
 
 __all__ = [
@@ -212,7 +211,11 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, An
     typer.BadParameter
         An assignment is not ``key=value``.
     """
-    table = {} if file is None else {key.replace("-", "_"): value for key, value in _read_toml(file).items()}
+    table = (
+        {}
+        if file is None
+        else {key.replace("-", "_"): value for key, value in toml_file(file, "settings file").items()}
+    )
     for text in assignments:
         key, equals, value = text.partition("=")
         keys = [part.strip() for part in key.split(".")]
@@ -260,15 +263,6 @@ def load_methods(names: Sequence[str], settings: Mapping[str, Any], estimator: s
         )
         for name in names
     ]
-
-
-def _read_toml(file: Path) -> dict[str, Any]:
-    try:
-        return toml_table(read_text(file, LARGEST_TABLE))
-    except OSError as error:
-        raise SettingsError(f'settings file "{file}" cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise SettingsError(f'settings file "{file}" is not TOML: {error}') from error
 
 
 def _assign(table: dict[str, Any], keys: Sequence[str], value: object) -> None:

@@ -68,13 +68,10 @@ def plot_estimates(store: str | Path, path: str | Path | None = None, *, title: 
     0.2 %, a second row has the errors relative to the latter. A trial without an estimate has an infinite error. The
     method ``true`` has a mark where its parameters are not the pseudo-true ones.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     summary = summarise(store)
     figure = _drawn(summary, title_of(summary) if title is None else title)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 def evaluates_parameters(store: str | Path) -> bool:

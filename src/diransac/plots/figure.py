@@ -221,10 +221,10 @@ _METADATA = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"Creat
 _SALT = {"svg.hashsalt": "diransac"}
 
 
-def check_ending(path: Path) -> str:
-    """Lower-case ending of a figure's file.  Raises SettingsError: it is unknown."""
-    ending = path.suffix.lower()
-    if ending not in _METADATA:
+def check_ending(path: str | Path | None) -> str:
+    """Lower-case ending of a figure's file, if there is to be one.  Raises SettingsError: it is unknown."""
+    ending = "" if path is None else Path(path).suffix.lower()
+    if path is not None and ending not in _METADATA:
         raise SettingsError(f'cannot write "{path}": its ending is not known; use one of {", ".join(_METADATA)}')
     return ending
 
@@ -243,11 +243,13 @@ def _literal_texts(figure: Figure, **settings: Any) -> Iterator[None]:
         yield
 
 
-def write(figure: Figure, path: Path) -> None:
-    """Write the figure in the format of the file's ending, completely or not at all.
+def write(figure: Figure, path: str | Path | None) -> Figure:
+    """The figure itself, written in the format of the file's ending, completely or not at all; None writes none.
 
     Raises SettingsError: the ending is unknown, or the file cannot be written.
     """
+    if path is None:
+        return figure
     ending, memory = check_ending(path), io.BytesIO()  # a full disk is an error of zlib to Matplotlib
     with _literal_texts(figure):
         figure.savefig(memory, format=ending[1:], dpi=200, metadata=_METADATA[ending])
@@ -255,6 +257,7 @@ def write(figure: Figure, path: Path) -> None:
         write_bytes(path, memory.getvalue())
     except OSError as error:
         raise SettingsError(f'cannot write "{path}": {error.strerror or error}') from error
+    return figure
 
 
 def svg(figure: Figure) -> str:

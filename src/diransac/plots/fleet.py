@@ -57,8 +57,7 @@ def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: 
     SettingsError
         The file cannot be written.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     colours = _colours(summary)
     text = f"{summary.rows.model}: {summary.n_vehicles} vehicles" if title is None else title
     entries: list[LegendEntry] = [("fleet", {"color": REFERENCE, "marker": ".", "linestyle": ""})]
@@ -77,9 +76,7 @@ def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: 
         if last:
             over_life.set_xlabel("log of the vehicle", fontsize=8, color=INK)
             by_vehicle.set_xlabel("vehicle, sorted by value", fontsize=8, color=INK)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 def _colours(summary: FleetSummary) -> dict[str, str]:

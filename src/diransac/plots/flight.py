@@ -79,8 +79,7 @@ def plot_flight(
     a diverging flight leaves the others readable: a triangle marks where it leaves a panel, a cross its last finite
     value. The same flights give the same file, byte for byte. pyplot and its settings are not touched.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     flights = _flights(trajectory, log)
     states, inputs = flights[0].reference.state_names, flights[0].reference.input_names
     entries, box = _legend_entries(flights), _path_box(flights)
@@ -92,9 +91,7 @@ def plot_flight(
     if path_panel is not None and box is not None:
         _draw_path(path_panel, flights, box)
     draw_heading(figure, entries, title)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 # Heading -------------------------------------------------------------------------------------------------------------

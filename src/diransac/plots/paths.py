@@ -82,8 +82,7 @@ def plot_paths(
     references of the flights, which each method planned with what it had identified. The panels cover the true path and
     a margin; below each are the numbers of flights that leave it and of failed trials.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     summary = summarise(store)
     chosen = _chosen(levels_with_paths(store), level)
     flown, planned = (
@@ -91,9 +90,7 @@ def plot_paths(
         for which in (False, True)
     )
     figure = _drawn(summary, chosen, flown, planned, title_of(summary) if title is None else title)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 def levels_with_paths(store: str | Path) -> list[str]:

@@ -54,8 +54,7 @@ def plot_prediction(
     SettingsError
         The ending is unknown, or the file cannot be written.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     entries = [("simulated", _SIMULATED), ("measured", _MEASURED)]
     figure, panels, _ = flight_panels(states, inputs, None, header_height(entries, None))
     draw_heading(figure, entries, None)
@@ -74,9 +73,7 @@ def plot_prediction(
                 low, high = min(low, float(bulk[0])), max(high, float(bulk[1]))
         margin = 0.06 * (high - low) or 1.0
         axes.set_ylim(low - margin, high + margin)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 def _range(values: FloatArray) -> tuple[float, float]:

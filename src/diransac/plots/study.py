@@ -92,17 +92,14 @@ def plot_study(store: str | Path, path: str | Path | None = None, *, title: str 
     logarithmic above. Levels that are words are rows, with a panel per coordinate on a logarithmic axis: marks are
     medians over all trials, lines end at the largest value.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     summary = summarise(store)
     if not summary.flights:
         raise SettingsError(
             "the study has no trajectories to evaluate; draw its parameter errors with study plot --parameters"
         )
     figure = _drawn(summary, title_of(summary) if title is None else title)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 def _drawn(summary: Summary, title: str) -> Figure:
