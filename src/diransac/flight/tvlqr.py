@@ -104,38 +104,16 @@ class Controller:
         nowhere = np.full(self.inputs.shape[1], np.inf)
         return replace(self, u_min=-nowhere, u_max=nowhere)
 
-    def law(self) -> LinearFeedback:
-        """Feedback law for simulations, row by row."""
-        return LinearFeedback(self.inputs, self.states, self.gains, self.u_min, self.u_max)
+    def at(self, time: npt.ArrayLike) -> Controller:
+        """Controller on another time grid (n_rows,), s, evenly spaced, at least 2 rows: each takes the last row before.
 
-    def at(self, time: npt.ArrayLike, how: str = "hold") -> Controller:
-        """Controller on another time grid; constant before its first and after its last row.
-
-        Parameters
-        ----------
-        time : (n_rows,) array
-            s, evenly spaced, at least 2 rows.
-        how : {"hold", "linear"}
-            ``"hold"`` takes the last row; ``"linear"`` interpolates states and gains. Inputs are held in both.
-
-        Raises
-        ------
-        SettingsError
-            ``how`` is unknown, or the time is not evenly spaced.
+        Raises SettingsError: the time is not evenly spaced.
         """
-        if how not in ("hold", "linear"):
-            raise SettingsError(f'how is {how!r}; choose "hold" or "linear"')
         wanted = _checked_time(time)
         # Tolerance, as a fraction of dt, within which a time counts as that of a row.
         rows = np.maximum(np.searchsorted(self.time, wanted + 1e-6 * self.dt, side="right") - 1, 0)
-        names = (self.state_names, self.input_names)
-        states, gains = self.states[rows], self.gains[rows]
-        if how == "linear":
-            after = np.minimum(rows + 1, len(self) - 1)
-            share = np.clip((wanted - self.time[rows]) / self.dt, 0.0, 1.0)
-            states = states + share[:, None] * (self.states[after] - states)
-            gains = gains + share[:, None, None] * (self.gains[after] - gains)
-        return Controller(wanted, states, self.inputs[rows], gains, self.u_min, self.u_max, *names)
+        arrays = (self.states[rows], self.inputs[rows], self.gains[rows], self.u_min, self.u_max)
+        return Controller(wanted, *arrays, self.state_names, self.input_names)
 
     def __reduce__(self) -> tuple[object, ...]:
         arrays = (self.time, self.states, self.inputs, self.gains, self.u_min, self.u_max)

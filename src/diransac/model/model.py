@@ -403,20 +403,7 @@ class Model:
         if len(kept) == len(self.sensors):
             return self
         needed = {n for name in kept for n in self.sensor_arguments[name]}
-        parameters = [n for n in self.parameters if n in needed or n not in self.sensor_parameters]
-        q, v, a, u, p = self._symbols()
-        own = [symbol for n, symbol in zip(self.parameters, ca.vertsplit(p), strict=True) if n in parameters]
-        symbols = [q, v, a, u, ca.vertcat(*own)]
-        data = {k: x for k, x in self.to_dict().items() if k not in ("checksum", "sensors", "measurement")}
-        data["parameters"] = {n: data["parameters"][n] for n in parameters}
-        written = ca.Function("residual", symbols, [self.residual(q, v, a, u, p)], list("qvaup"), ["r"])
-        data["residual"] = expressions.stored(self._label, written)
-        if kept and self.measurement is not None:
-            y = self.measurement(q, v, a, u, p)[[list(self.sensors).index(n) for n in kept]]
-            data["sensors"] = {n: self.sensors[n] for n in kept}
-            written = ca.Function("measurement", symbols, [y], list("qvaup"), ["y"])
-            data["measurement"] = expressions.stored(self._label, written)
-        return Model.from_dict({**data, "checksum": _checksum(data)})
+        return self._with_constants({n: 0.0 for n in self.sensor_parameters if n not in needed}, kept)
 
     def sensors_of(self, arguments: Callable[..., Sequence[ca.SX]]) -> dict[str, Sensor]:
         """The sensors for another model, of whose symbols ``arguments(q, v, a, u, p)`` returns this model's vectors."""
@@ -518,8 +505,10 @@ class Model:
         ModelError
             No parameter is left, or the equations with these constants are not those of a model.
         """
-        if not values:
-            return self
+        return self._with_constants(values, self.sensors) if values else self
+
+    def _with_constants(self, values: Mapping[str, float], sensors: Collection[str]) -> Model:
+        """The model with constants in place of some parameters, and with some of its sensors."""
 
         def arguments(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[ca.SX]:
             own = ca.vertcat(*(values[n] if n in values else p[n] for n in self.parameters))
@@ -542,7 +531,7 @@ class Model:
             velocities=self.velocities_of_motion if has_kinematics else None,
             kinematics=kinematics if has_kinematics else None,
             first_order=self.first_order,
-            sensors=self.sensors_of(arguments),
+            sensors={n: x for n, x in self.sensors_of(arguments).items() if n in sensors},
             description=self.description,
         )
 
@@ -617,7 +606,7 @@ class Model:
             "coordinates": self.coordinates,
             "velocities": None if self.kinematics is None else self.velocities_of_motion,
             "inputs": self.inputs,
-            "parameters": {n: _parameter_to_dict(x) for n, x in self.parameters.items()},
+            "parameters": {n: x.to_dict() for n, x in self.parameters.items()},
             "residual": self._equations_data["residual"],
             "kinematics": self._equations_data["kinematics"],
             **({"first_order": self.first_order} if self.first_order else {}),
@@ -650,7 +639,7 @@ class Model:
             raise ResultError("the stored model is damaged: its checksum does not match; identify again")
         if not isinstance(data["name"], str) or not isinstance(data["description"], str):
             raise TypeError("name or description")
-        parameters = {n: _parameter_from_dict(x) for n, x in data["parameters"].items()}
+        parameters = {n: Parameter.from_dict(x) for n, x in data["parameters"].items()}
         units = (data["coordinates"], data["inputs"], parameters, data["velocities"], data.get("first_order", {}))
         model._name_signals(data["name"], *units, data["description"], data.get("sensors", {}))
         has_kinematics, has_sensors = data["kinematics"] is not None, data.get("measurement") is not None
@@ -686,29 +675,6 @@ def _per_second(unit: str, order: int = 1) -> str:
     if tail == "s":
         return f"{head}/s^{order + 1}"
     return f"{head}/({tail} {power})"
-
-
-def _parameter_to_dict(parameter: Parameter) -> dict[str, Any]:
-    def finite(x: float) -> float | None:
-        return float(x) if np.isfinite(x) else None
-
-    lower, upper = finite(parameter.lower), finite(parameter.upper)
-    stored = {"unit": parameter.unit, "lower": lower, "upper": upper, "positive": parameter.positive}
-    own_values = {"per_log": True} if parameter.per_log else {}
-    nominal = {} if parameter.value is None else {"value": float(parameter.value)}
-    combination = {"combination": [list(x) for x in parameter.combination]} if parameter.combination else {}
-    return {**stored, **own_values, **nominal, **combination}
-
-
-def _parameter_from_dict(data: Mapping[str, Any]) -> Parameter:
-    """Raises KeyError, TypeError, ValueError, ModelError: the data are not those of a parameter."""
-    unit, positive, own_values, nominal = data["unit"], data["positive"], data.get("per_log", False), data.get("value")
-    if not isinstance(unit, str) or not isinstance(positive, bool) or not isinstance(own_values, bool):
-        raise TypeError(f"parameter {data!r:.60}")
-    lower = -np.inf if data["lower"] is None else float(data["lower"])
-    upper = np.inf if data["upper"] is None else float(data["upper"])
-    combination = tuple((str(name), float(weight)) for name, weight in data.get("combination", ()))
-    return Parameter(unit, lower, upper, positive, own_values, None if nominal is None else float(nominal), combination)
 
 
 def _checksum(data: Mapping[str, Any]) -> str:
