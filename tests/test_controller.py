@@ -9,7 +9,7 @@ import pytest
 import diransac as dr
 from diransac.errors import ModelError, SettingsError
 from diransac.model.plant import Plant
-from diransac.simulation import LinearFeedback, RolloutBatch, rollouts
+from diransac.simulation import RolloutBatch, rollouts
 from steering import PENDULUM, ROTORCRAFT, moving, resting
 
 LIMITS = {"thrust": (0.0, 6.0), "moment": (-0.5, 0.5)}
@@ -50,9 +50,8 @@ def test_the_law_is_the_clipped_feedback_of_every_row():
     controller = dr.tvlqr(ROTORCRAFT, moving("rotorcraft", 200), limits=LIMITS)
     start = controller.states[0] + [1.0, -1.0, 0.5, 0.0, 0.0, 0.0]
     engine = rollouts(ROTORCRAFT.model)
-    law = LinearFeedback(*(getattr(controller, x) for x in ("inputs", "states", "gains", "u_min", "u_max")))
     batch = RolloutBatch([list(ROTORCRAFT.parameters.values())], start, controller.inputs, controller.dt)
-    flown = engine.fly(batch, law)
+    flown = engine.fly(batch, controller.law())
     errors = flown.signals[0, :, :6] - controller.states
     wanted = controller.inputs - np.einsum("kui,ki->ku", controller.gains, errors)
     expected = np.clip(wanted, [0.0, -0.5], [6.0, 0.5])

@@ -104,6 +104,10 @@ class Controller:
         nowhere = np.full(self.inputs.shape[1], np.inf)
         return replace(self, u_min=-nowhere, u_max=nowhere)
 
+    def law(self) -> LinearFeedback:
+        """Feedback law for simulations, row by row."""
+        return LinearFeedback(self.inputs, self.states, self.gains, self.u_min, self.u_max)
+
     def at(self, time: npt.ArrayLike) -> Controller:
         """Controller on another time grid (n_rows,), s, evenly spaced, at least 2 rows: each takes the last row before.
 

@@ -37,7 +37,7 @@ from diransac.identification.methods import (
 from diransac.identification.settings import MOST_SUBSTEPS, Settings
 from diransac.model import Model
 from diransac.model.plant import ModelWithParameters
-from diransac.study.axis import AnyAxis
+from diransac.study.axis import Axis
 from diransac.study.plants import PlantChoice
 from diransac.study.tables import (
     RANDOM,
@@ -396,7 +396,7 @@ class Study(Table):
     evaluation: Criteria
     missions: Missions = Missions.from_dict({})
     control: ControlChoice = ControlChoice.from_dict({})
-    axis: AnyAxis
+    axis: Axis
 
     @model_validator(mode="after")
     def _can_be_flown(self) -> Self:

@@ -222,10 +222,10 @@ class Scan(_Compiled):
         """Machine code for lanes with rows of their own, or with the same ones."""
 
         def emit() -> Value:
-            from diransac.simulation.compiler.outputs import ScanOutput
+            from diransac.simulation.compiler.outputs import SignalOutput
             from diransac.simulation.compiler.time_loop import emit_time_loop, inputs_from_log
 
-            return emit_time_loop(self._specification(), ScanOutput, inputs_from_log, windows=windows)
+            return emit_time_loop(self._specification(), SignalOutput, inputs_from_log, windows=windows)
 
         return self._variant("scan", windows, emit, ARGUMENTS.values())
 
