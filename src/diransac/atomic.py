@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["draft", "write_bytes", "write_text", "write_with"]
 
-_NAME = re.compile(r"\.diransac-\w{8}\.part")
-
 
 @contextmanager
 def draft(target: Path) -> Iterator[Path]:
@@ -87,7 +85,7 @@ def _remove_abandoned(parent: Path) -> None:
         return
     with suppress(OSError):
         for entry in list(os.scandir(parent)):
-            if _NAME.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False):
+            if re.fullmatch(r"\.diransac-\w{8}\.part", entry.name) and entry.is_dir(follow_symlinks=False):
                 if entry.stat(follow_symlinks=False).st_uid != os.geteuid():
                     continue
                 lock = _lock(Path(entry.path), wait=False)

@@ -15,10 +15,6 @@ from diransac.limits import DEEPEST, LARGEST_RESULT, LARGEST_TABLE, beyond, read
 __all__ = ["json_data", "read_text", "toml_file", "toml_table"]
 
 
-_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
-"""One half of a character in JSON's escapes; only pairs of them are text."""
-
-
 def read_text(path: str | Path, largest: int = LARGEST_RESULT) -> str:
     """Text of a file.
 
@@ -52,7 +48,8 @@ def json_data(text: str | bytes) -> Any:
     with _bounded():
         found = json.loads(text, parse_constant=_refused)
         _check_depth(found)
-        if _SURROGATE.search(text if isinstance(text, str) else text.decode("latin-1")):
+        # One half of a character in JSON's escapes; only pairs of them are text.
+        if re.search(r"\\u[dD][89a-fA-F]", text if isinstance(text, str) else text.decode("latin-1")):
             _check_encodable(found)
         return found
 

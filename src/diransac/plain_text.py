@@ -18,12 +18,10 @@ from collections.abc import Callable
 
 __all__ = ["cell", "comment", "identifier", "is_one_line", "literal", "one_line", "printable"]
 
-_LONGEST_COMMENT, _LONGEST_IDENTIFIER = 2000, 60
+_LONGEST_COMMENT = 2000
 _LONGEST_CELL = 32_766
 """Letters that spreadsheets read in a cell, of which one may be a ``'``; Python reads four times as many."""
 
-_SPLIT = (("\\", "_"), ("??", "? ?"), ("*/", "* /"), ("/*", "/ *"), ('"""', "'''"))
-"""Texts that continue a line of C, end its comment, or end a docstring, and what is written for them."""
 
 _RESERVED = {
     *re.findall(
@@ -110,7 +108,8 @@ def comment(text: str) -> str:
     if len(text) > _LONGEST_COMMENT:
         text = f"{text[:_LONGEST_COMMENT]} ..."
     plain = text if text.isprintable() else _escaped(text, lambda _: "_")
-    for harmful, harmless in _SPLIT:
+    # Texts that continue a line of C, end its comment, or end a docstring, and what is written for them.
+    for harmful, harmless in (("\\", "_"), ("??", "? ?"), ("*/", "* /"), ("/*", "/ *"), ('"""', "'''")):
         while harmful in plain:
             plain = plain.replace(harmful, harmless)
     return plain
@@ -152,7 +151,7 @@ def identifier(text: str) -> str:
     >>> identifier("left wheel"), identifier("9 switches!"), identifier("double"), identifier("")
     ('left_wheel', 'model_9_switches', 'model_double', 'model')
     """
-    name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")[:_LONGEST_IDENTIFIER].rstrip("_")
+    name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")[:60].rstrip("_")
     if name and not name[0].isdigit() and name.lower() not in _RESERVED:
         return name
     return f"model_{name}".rstrip("_")

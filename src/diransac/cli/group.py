@@ -24,9 +24,6 @@ __all__ = ["Group", "grouped"]
 UsageError: type[Any] = typer.BadParameter.__mro__[1]
 
 
-_PLAIN, _CHECKED = (str, Path, int, float), ("click_type", "min", "max")
-"""Kinds of arguments that are converted by a call, and what makes Typer check or convert an argument otherwise."""
-
 _NAMES = (
     "identify",
     "compare",
@@ -162,8 +159,10 @@ class _Conversion:
             return () if several else None
         kind, about = param.type_descriptor.annotation, param.type_descriptor.parameter_info
         kind = next(iter(get_args(kind)), None) if several else kind
-        convert = getattr(about, "parser", None) or (kind if kind in _PLAIN else None)
-        if convert and not any(getattr(about, name, None) is not None for name in _CHECKED):
+        # Kinds of arguments that are converted by a call, and what makes Typer check or convert an argument
+        # otherwise.
+        convert = getattr(about, "parser", None) or (kind if kind in (str, Path, int, float) else None)
+        if convert and not any(getattr(about, name, None) is not None for name in ("click_type", "min", "max")):
             with suppress(ValueError):
                 return [convert(x) for x in value] if several else convert(value)
         return self.make().coerce(value, param=param, ctx=ctx)

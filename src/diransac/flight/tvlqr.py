@@ -26,12 +26,6 @@ Weights: TypeAlias = "npt.ArrayLike | Mapping[str, float]"
 InputLimits: TypeAlias = Mapping[str, tuple[float, float]]
 """Name of an input -> smallest and largest value."""
 
-COORDINATE_ERROR = 0.5
-VELOCITY_ERROR = 1.0
-UNLIMITED_INPUT = 1.0
-FINAL_SECONDS = 1.0
-"""Default weights, explained in `tvlqr`; they are not tuned to any plant."""
-
 
 # The controller ------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
@@ -321,7 +315,8 @@ class _CostMatrices:
     """Matrices Q, Qf and R."""
 
     def __init__(self, model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None) -> None:
-        errors = np.repeat([COORDINATE_ERROR, VELOCITY_ERROR], [model.n_q, model.n_v])
+        # Default weights, explained in `tvlqr`; they are not tuned to any plant.
+        errors = np.repeat([0.5, 1.0], [model.n_q, model.n_v])
         for four in model.quaternions:
             # Error of a quaternion per error of the attitude, 1/rad.
             errors[list(four)] *= 0.5
@@ -329,7 +324,7 @@ class _CostMatrices:
         if model.n_q:
             weights[len(weights) - len(model.first_order) :] = 0.0
         self.Q = _matrix("Q", weights if Q is None else Q, model.state)
-        self.Qf = FINAL_SECONDS * self.Q if Qf is None else _matrix("Qf", Qf, model.state)
+        self.Qf = self.Q if Qf is None else _matrix("Qf", Qf, model.state)
         self._R = None if R is None else _matrix("R", R, tuple(model.inputs))
         if self._R is not None and np.linalg.eigvalsh(self._R).min(initial=np.inf) <= 0:
             found = self._R.tolist()
@@ -338,7 +333,7 @@ class _CostMatrices:
     def R(self, low: FloatArray, high: FloatArray) -> FloatArray:
         """R as given; by default full use of each input within these limits costs 1."""
         half = (high - low) / 2
-        use = np.where(np.isfinite(half) & (half > 0), half, UNLIMITED_INPUT)
+        use = np.where(np.isfinite(half) & (half > 0), half, 1.0)
         return np.diag(use**-2.0) if self._R is None else self._R
 
 

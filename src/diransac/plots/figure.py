@@ -217,8 +217,6 @@ def draw_heading(figure: Figure, entries: Sequence[LegendEntry], title: str | No
 # Files ---------------------------------------------------------------------------------------------------------------
 
 _METADATA = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-# The ids of an SVG are hashes with a random salt; a fixed one gives the same file each time.
-_SALT = {"svg.hashsalt": "diransac"}
 
 
 def check_ending(path: str | Path | None) -> str:
@@ -238,7 +236,8 @@ def _literal_texts(figure: Figure, **settings: Any) -> Iterator[None]:
     for text in figure.findobj(Text):
         text.set_parse_math(False)
         text.set_text(printable(text.get_text()))
-    with rc_context({**_SALT, "text.parse_math": False, **settings}), warnings.catch_warnings():
+    # The ids of an SVG are hashes with a random salt; a fixed one gives the same file each time.
+    with rc_context({"svg.hashsalt": "diransac", "text.parse_math": False, **settings}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from font", category=UserWarning)
         yield
 

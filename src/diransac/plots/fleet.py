@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 __all__ = ["plot_fleet"]
 
 _ROW = 1.9
-_MOST_NAMED = len(COLOURS)
-"""Vehicles with a colour of their own, those with the largest distances."""
 
 
 def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -82,7 +80,8 @@ def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: 
 def _colours(summary: FleetSummary) -> dict[str, str]:
     """Colour of each vehicle with a finding, as far as there are colours."""
     found = sorted(summary.findings, key=lambda x: -x.distance)
-    named = list(dict.fromkeys(x.vehicle for x in found))[:_MOST_NAMED]
+    # Vehicles with a colour of their own, those with the largest distances.
+    named = list(dict.fromkeys(x.vehicle for x in found))[: len(COLOURS)]
     return dict(zip(named, COLOURS, strict=False))
 
 

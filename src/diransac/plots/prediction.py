@@ -30,7 +30,6 @@ __all__ = ["plot_prediction"]
 
 _MEASURED: dict[str, Any] = {"color": REFERENCE, "linestyle": "none", "marker": ".", "markersize": 2.5}
 _SIMULATED: dict[str, Any] = {"color": COLOURS[0], "linewidth": 1.3}
-_INPUT: dict[str, Any] = {"color": MUTED, "linewidth": 1.0}
 
 
 def plot_prediction(
@@ -61,7 +60,7 @@ def plot_prediction(
     for name, axes in panels.items():
         name_panel(axes, name, simulated.units.get(name, ""))
         if name in inputs:
-            axes.plot(simulated.time, simulated[name], **_INPUT)
+            axes.plot(simulated.time, simulated[name], color=MUTED, linewidth=1.0)
             continue
         axes.plot(simulated.time, simulated[name], zorder=3, **_SIMULATED)
         low, high = _range(simulated[name])

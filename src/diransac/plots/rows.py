@@ -12,6 +12,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.plots.figure import INK, MUTED, PAPER, RULE, SOFT, WIDTH
 from diransac.study.summary import TrackingErrors
+from diransac.text_table import superscript
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,8 +37,6 @@ _METHOD, _FREE, _LEAST = 0.044, 0.075, 0.24
 _APART, _NEAR = 0.5, 0.32
 # Largest number of decades of an axis, and the distance of the places beyond its ends, in decades.
 _DECADES, _ROOM = 6, 0.6
-_WORST: dict[str, Any] = {"linewidth": 1.0, "alpha": 0.45, "solid_capstyle": "butt"}
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,7 @@ def draw_rows(
 def _mark(axes: Axes, x: float, end: float, y: float, look: Mapping[str, Any], *, hollow: bool) -> None:
     """Draw a method's mark, and the line to its largest value."""
     colour = look["color"]
-    axes.plot([x, end], [y, y], color=colour, **_WORST, zorder=2.2)
+    axes.plot([x, end], [y, y], color=colour, linewidth=1.0, alpha=0.45, solid_capstyle="butt", zorder=2.2)
     face = PAPER if hollow else colour
     axes.plot([x], [y], **{**look, "markerfacecolor": face, "markeredgewidth": 0.8 if hollow else 0.3}, zorder=2.5)
 
@@ -223,7 +222,7 @@ def _decade(power: int) -> str:
 
 def _power(power: int) -> str:
     """``0.1``, ``1``, ``10``, and ``10⁻³`` or ``10³`` further out."""
-    return _decade(power) if abs(power) < 2 else f"10{str(power).translate(_SUPERSCRIPTS)}"
+    return _decade(power) if abs(power) < 2 else f"10{superscript(power)}"
 
 
 # Tracking errors -----------------------------------------------------------------------------------------------------

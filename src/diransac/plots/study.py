@@ -32,6 +32,7 @@ from diransac.plots.figure import (
 from diransac.plots.rows import as_marks, draw_flight_rows, flight_rows_height
 from diransac.study.specification import TRUE
 from diransac.study.summary import Summary, TrackingErrors, summarise
+from diransac.text_table import superscript
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,7 +50,6 @@ _LETTERS, _RAGGED = 92, 12
 # The fifth colour is too close to the first where lines cross.
 _COLOURS = (*COLOURS[:4], INK, COLOURS[5], "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _CAPTION = (
     "Mean of the RMS tracking error and one standard deviation, over {trials}; a dash is the median, for which "
     "a failed trial",
@@ -57,7 +57,6 @@ _CAPTION = (
     "are then hollow.",
 )
 _CAPTION_OF_ROWS = ("Marks are medians of the RMS tracking error over {trials} of a level, lines end at the largest.",)
-_NONE = "none: no flight (no plan, or one that diverged), counted as an infinite error."
 
 
 def plot_study(store: str | Path, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -124,7 +123,10 @@ def _drawn(summary: Summary, title: str) -> Figure:
 def _caption(summary: Summary) -> list[str]:
     """Lines of the caption."""
     some_failed = any(flights.failed.any() for flights in summary.flights.values())
-    of_rows = [*_CAPTION_OF_ROWS, _NONE if some_failed else ""]
+    of_rows = [
+        *_CAPTION_OF_ROWS,
+        "none: no flight (no plan, or one that diverged), counted as an infinite error." if some_failed else "",
+    ]
     lines = [*(_CAPTION if summary.is_numeric else of_rows), summary.remark]
     return [line.format(trials=n_trials(summary)) for line in lines if line]
 
@@ -260,7 +262,7 @@ def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool)
 def _tick(y: float) -> str:
     """``0.01``, ``5×10⁻⁵``, ``10⁶``."""
     mantissa, _, exponent = f"{y:.6g}".partition("e")
-    power = f"10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if exponent else ""
+    power = f"10{superscript(int(exponent))}" if exponent else ""
     return mantissa.replace("-", "−") if not power else power if mantissa == "1" else f"{mantissa}×{power}"
 
 
@@ -285,8 +287,8 @@ def method_looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
 def axis_label(summary: Summary) -> str:
     """Name of the axis with its unit, ``mass imbalance, 10⁻⁵ kg``."""
     _, exponent = _positions(summary)
-    power = f"10{str(exponent).translate(_SUPERSCRIPTS)}" if exponent else ""
-    unit = re.sub(r"\^(-?\d+)", lambda found: found[1].translate(_SUPERSCRIPTS), summary.unit)
+    power = f"10{superscript(exponent)}" if exponent else ""
+    unit = re.sub(r"\^(-?\d+)", lambda found: superscript(found[1]), summary.unit)
     return f"{summary.axis}, {power} {unit}".rstrip(" ,").replace(",  ", ", ")
 
 

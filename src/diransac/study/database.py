@@ -39,8 +39,6 @@ MOST_LISTED = 6
 _TIMEOUT = 120.0
 """s to wait while another process writes, and that one query may take."""
 
-_ANOTHER_JOURNAL = bytes.fromhex("d9d505f920a163d7")
-"""Last bytes of a journal of several databases, which names a file that is deleted when it is rolled back."""
 
 _DAMAGE = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, EOFError,
            NotImplementedError, zipfile.BadZipFile, zlib.error)  # fmt: skip
@@ -252,7 +250,8 @@ def roll_back(path: Path) -> None:
         except sqlite3.Error as error:
             if error.sqlite_errorname != "SQLITE_READONLY_ROLLBACK":
                 return  # said when the store is read
-    if journal.read_bytes().endswith(_ANOTHER_JOURNAL):
+    # Last bytes of a journal of several databases, which names a file that is deleted when it is rolled back.
+    if journal.read_bytes().endswith(bytes.fromhex("d9d505f920a163d7")):
         raise StudyError(f'store "{path}" has a journal that diransac does not write; give the store without it')
     with closing(connected_to(path, "rw")) as connection, reported(path):
         connection.execute("SELECT count(*) FROM sqlite_master")

@@ -42,8 +42,6 @@ DOUBLE_PENDULUM: Mapping[str, float] = MappingProxyType(
 PENDULUM: Mapping[str, float] = MappingProxyType({"mass": 0.5, "length": 0.6, "friction": 0.05})
 """kg, m, N m s/rad."""
 
-MAGNET_PITCH = 0.024
-"""m, period of the cogging force."""
 
 RIPPLES = 126
 """Periods of a motor's torque per turn of its joint: 21 pole pairs behind a gear of 6."""
@@ -57,7 +55,8 @@ def servo_axis(cogging: float = 0.0, parameters: Mapping[str, float] = SERVO_AXI
     model = builtin("servo-axis")
 
     def magnets(q: Symbols, _v: Symbols, _u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:
-        return {"position": d.cogging * cos(2 * pi * q.position / MAGNET_PITCH + d.phase)}
+        # m, period of the cogging force.
+        return {"position": d.cogging * cos(2 * pi * q.position / 0.024 + d.phase)}
 
     cogs = Disturbance(
         model,

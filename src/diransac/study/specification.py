@@ -83,7 +83,6 @@ def planned_path(mission: str) -> str:
     return f"{mission} planned"
 
 
-_LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _+()/-]*")
 _VARIABLE = ("plant", "data", "noise", "methods", "missions", "control")
 """Tables that an axis may change; the others are the same at every level."""
 
@@ -299,7 +298,7 @@ def _method(label: str, table: object) -> MethodChoice:
     if isinstance(table, MethodChoice):
         return table
     place = f"methods.{label}"
-    if not _LABEL.fullmatch(label):
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9 _+()/-]*", label):
         raise SettingsError(f'methods: the label "{label}" has other characters than letters, digits and _ + - ( ) /')
     named = {"method": label, **table} if isinstance(table, Mapping) else table
     found = _MethodTable.model_validate(named, context={"place": place})

@@ -34,10 +34,6 @@ __all__ = [
 ]
 
 
-_SHARES = (*(1.0 - 0.002 * 2.0 ** np.arange(9.0)), *0.25 ** np.arange(1.0, 5.0), 0.0)
-"""Shares of a motion, one after the other, of which the first that keeps the limits is taken."""
-
-
 _LAST_BARRIER, _BARRIER_FACTOR = 1e-4, 0.3
 """Last barrier parameter, and what it is reduced by: it is the change of the objective per active limit."""
 
@@ -179,7 +175,8 @@ class Limited:
         tried = 1.0
         if fits(tried):
             return scaled(tried)
-        for share in _SHARES:  # not by bisection alone: limits of forces may hold, fail and hold again
+        # Shares one after the other, not by bisection alone: limits of forces may hold, fail and hold again.
+        for share in (*(1.0 - 0.002 * 2.0 ** np.arange(9.0)), *0.25 ** np.arange(1.0, 5.0), 0.0):
             if fits(share):
                 break
             tried = share

@@ -19,10 +19,6 @@ __all__ = ["Grouping", "base_parameters"]
 _ZERO = 1e-9
 """Size of a column relative to the largest, and of weights between columns of unit length, that is a rounding error."""
 
-_ROWS_PER_PARAMETER = 3
-_LARGEST = (np.pi, 3.0, 10.0, 3.0, 10.0, 15.0)
-"""Of random motions: position, velocity, acceleration; angular velocity and acceleration of a base, specific force."""
-
 
 @dataclass(frozen=True)
 class Grouping:
@@ -68,9 +64,14 @@ def base_parameters(regressor: ca.Function, seed: int = 0) -> Grouping:
     """
     n, n_x = regressor.size1_in(0), regressor.size2_out(0)
     rng = np.random.default_rng(seed)
-    n_points = _ROWS_PER_PARAMETER * n_x // n + 10
+    n_points = 3 * n_x // n + 10
     sizes = [regressor.size1_in(k) for k in range(regressor.n_in())]
-    motion = [rng.uniform(-x, x, (size, n_points)) for x, size in zip(_LARGEST, sizes, strict=False)]
+    # Of random motions: position, velocity, acceleration; angular velocity and acceleration of a base, specific
+    # force.
+    motion = [
+        rng.uniform(-x, x, (size, n_points))
+        for x, size in zip((np.pi, 3.0, 10.0, 3.0, 10.0, 15.0), sizes, strict=False)
+    ]
     stacked = np.hsplit(np.array(ca.densify(regressor(*motion))), n_points)
     Y = np.vstack(stacked)
     lengths = np.linalg.norm(Y, axis=0)

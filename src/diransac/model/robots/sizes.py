@@ -17,8 +17,6 @@ from diransac.limits import LARGEST_TABLE, MOST_CELLS, MOST_ELEMENTS, beyond, ch
 
 __all__ = ["check_description"]
 
-_LARGEST = 64 * LARGEST_TABLE
-
 
 def check_description(path: Path, label: str) -> None:
     """Raise ModelError where a description, or a file that it includes, is no ordinary file or describes too much.
@@ -57,7 +55,7 @@ class _Counts:
 
     def read(self, path: Path, copies: float) -> None:
         """Count what a file has, so many times.  Raises ModelError, OSError, ValueError: as `check_description`."""
-        content, stack = read_bytes(path, _LARGEST), [copies]
+        content, stack = read_bytes(path, 64 * LARGEST_TABLE), [copies]
         parser = expat.ParserCreate()
 
         def start(name: str, attributes: Mapping[str, str]) -> None:

@@ -26,7 +26,6 @@ __all__ = ["LANES", "MachineCode", "Part", "Target", "compile_function", "defaul
 LANES = 8
 """Lanes of a vector, on every processor: results do not depend on the width of its registers."""
 
-CHUNKS_PER_THREAD = 4
 
 _PATIENCE = 0.2
 """Longest time, s, for which signals are not noticed, where the work can be interrupted."""
@@ -35,9 +34,6 @@ _PATIENCE = 0.2
 PASSES = ("sroa", "simplify_cfg", "loop_rotate")
 """Optimisation passes: variables into registers, tidying. LLVM's default list takes 3 times as long, for no gain."""
 
-CODE_GENERATION = 1
-"""LLVM's level of code generation. From 2 on, instructions are scheduled again after registers are allocated, in a time
-quadratic in the length of a block: up to 1.7 times the compilation, for the same bits and no measurable speed."""
 
 LLVM: TypeAlias = Any
 """An object of llvmlite, which has no type annotations."""
@@ -140,7 +136,10 @@ def compile_function(
 def _machine(target: Target) -> LLVM:
     """LLVM's code generator for a processor."""
     triple = _binding().Target.from_default_triple()
-    return triple.create_target_machine(cpu=target.cpu, features=target.features, opt=CODE_GENERATION)
+    # LLVM's level of code generation. From 2 on, instructions are scheduled again after registers are allocated,
+    # in a time quadratic in the length of a block: up to 1.7 times the compilation, for the same bits and no
+    # measurable speed.
+    return triple.create_target_machine(cpu=target.cpu, features=target.features, opt=1)
 
 
 def _object_code(emit: Callable[[], LLVM], key: str, machine: LLVM) -> bytes:
@@ -242,7 +241,7 @@ def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: in
         return
     from concurrent.futures import Future, wait
 
-    edges = np.linspace(0, n_blocks, min(n_blocks, threads * CHUNKS_PER_THREAD) + 1).astype(int).tolist()
+    edges = np.linspace(0, n_blocks, min(n_blocks, threads * 4) + 1).astype(int).tolist()
     pool, stopped, parts = _pool(os.getpid(), threads), Event(), list[Future[None]]()
     try:
         for first, end in pairwise(edges):
