@@ -14,7 +14,7 @@ from diransac.plots.figure import INK, MUTED, WIDTH, check_ending, draw_heading,
 from diransac.plots.rows import LogAxis, MarkRow, as_marks, draw_rows, name_rows, names_width, row_height
 from diransac.plots.study import axis_label, level_labels, method_looks, n_trials, title_of
 from diransac.study.database import damage
-from diransac.study.specification import TRUE
+from diransac.study.method_choice import TRUE
 from diransac.study.store import Store
 from diransac.study.summary import ParameterErrors, Summary, summarise
 

@@ -26,8 +26,8 @@ from diransac.plots.figure import (
     write,
 )
 from diransac.plots.study import method_looks, title_of
+from diransac.study.method_choice import TRUE
 from diransac.study.reading import paths
-from diransac.study.specification import TRUE
 from diransac.study.store import Store
 from diransac.study.summary import Summary, summarise
 

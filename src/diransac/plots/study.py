@@ -30,7 +30,7 @@ from diransac.plots.figure import (
     write,
 )
 from diransac.plots.rows import as_marks, draw_flight_rows, flight_rows_height
-from diransac.study.specification import TRUE
+from diransac.study.method_choice import TRUE
 from diransac.study.summary import Summary, TrackingErrors, summarise
 from diransac.text_table import superscript
 

@@ -40,7 +40,8 @@ from diransac.study.data import (
     trial_seed,
 )
 from diransac.study.library import load
-from diransac.study.specification import TRUE, ControlChoice, Study, planned_path
+from diransac.study.method_choice import TRUE
+from diransac.study.specification import ControlChoice, Study, planned_path
 
 __all__ = ["STAGES", "run_trials", "versions"]
 

@@ -16,17 +16,18 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import PlanningError, SettingsError
 from diransac.flight.planning.excitation import (
-    DesignProblem,
     FourierSeries,
+    Limit,
     Limited,
     Observed,
-    Search,
-    best_motion,
+    check_rest,
     drawn_motion,
     grid,
     motion_of,
+    ranges_of,
     resting_pose,
 )
+from diransac.flight.planning.optimisation import DesignProblem, Search, best_motion
 from diransac.flight.planning.trajectories import check_numbers, inverse_dynamics
 from diransac.flight.trajectory import Trajectory
 from diransac.process import single_threaded
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Experiment", "design_experiment"]
 
-Limit: TypeAlias = float | tuple[float, float]
 Outputs: TypeAlias = Callable[..., Mapping[str, Any]]
 
 _N_DRAWS = 9
@@ -430,12 +430,12 @@ def _task(
     rng: np.random.Generator,
 ) -> _Task:
     """Task of a design.  Raises SettingsError, PlanningError: as `design_experiment`."""
-    pairs = _pairs(limits, machine.model)
+    pairs = ranges_of(limits, machine.model)
     limited, unlimited = machine.limited(pairs), (-np.inf, np.inf)
     lower, upper = np.array([pairs.get(n, unlimited) for n in machine.model.coordinates]).T
     sizes = _sizes(machine.model, pairs, rows.series)
     pose = resting_pose(limited, lower, upper, rng)
-    _check_rest(machine.model, limited, pose)
+    check_rest(machine.model, limited, pose)
     # Amplitude of the sines of a drawn motion over half the range of the coordinate, before limits reduce it.
     draws = [drawn_motion(rows.series, limited, pose, 4.0 * sizes, rng) for _ in range(_N_DRAWS)]
     basis = rows.series.basis(grid(rows.series))
@@ -463,31 +463,6 @@ def _series(duration: float, frequency: float, harmonics: int) -> FourierSeries:
     return FourierSeries(duration / n_periods, int(cycles / n_periods))
 
 
-def _pairs(limits: Mapping[str, Limit], model: Model) -> dict[str, tuple[float, float]]:
-    """Range of each limited quantity.
-
-    Raises SettingsError: a limit is no range, a motion with it cannot rest, or a coordinate has no limit.
-    """
-    found = {}
-    moving = (*model.velocities, *model.accelerations)
-    for name, given in limits.items():
-        try:
-            pair = np.asarray(given if isinstance(given, tuple | list) else (-given, given), np.float64)
-        except (TypeError, ValueError):
-            pair = np.zeros(0)
-        if pair.shape != (2,) or not pair[0] < pair[1] or not np.isfinite(pair).any():
-            raise SettingsError(f'limits: "{name}" is {given!r:.60}; give a positive number, or (lowest, highest)')
-        if name in model.coordinates and not np.isfinite(pair).all():
-            raise SettingsError(f'limits: "{name}" is {given!r:.60}; give a coordinate two finite limits, or none')
-        if name in moving and not pair[0] < 0.0 < pair[1]:
-            raise SettingsError(f'limits: "{name}" is {given!r:.60}; the motion is at rest at both ends: include zero')
-        found[name] = (float(pair[0]), float(pair[1]))
-    for q, v in zip(model.coordinates, model.velocities, strict=False):
-        if q not in found and v not in found:
-            raise SettingsError(f'limits: neither "{q}" nor "{v}" has one; give one of them')
-    return found
-
-
 def _sizes(model: Model, limits: Mapping[str, tuple[float, float]], series: FourierSeries) -> FloatArray:
     """Size of each coordinate's motion (n,): half its range, or what a slow sine reaches at the largest velocity."""
     slow = 2.0 * np.pi / series.period
@@ -496,20 +471,6 @@ def _sizes(model: Model, limits: Mapping[str, tuple[float, float]], series: Four
         low, high = limits[q] if q in limits else (x / slow for x in limits[v])
         sizes.append(0.5 * (high - low))
     return np.array(sizes)
-
-
-def _check_rest(model: Model, limited: Limited, pose: FloatArray) -> None:
-    """Raise PlanningError if a limit is exceeded at rest in the best pose."""
-    rest = np.concatenate([pose, np.zeros(2 * len(pose))])[:, None]
-    margins = limited.margin(rest)
-    if not (margins > 0.0).all():
-        worst = limited.names[int(np.argmin(margins))]
-        value = limited.extremes(rest)[worst][0]
-        where = ", ".join(f"{n} = {x:.3g}" for n, x in zip(model.coordinates, pose, strict=True))
-        raise PlanningError(
-            f"no pose was found in which the machine rests within its limits: nearest, at {where}, {worst} is "
-            f"{value:.4g}; widen its limits, or check the parameters"
-        )
 
 
 def _noise_of(machine: _Machine, noise: Mapping[str, float] | None, motions: FloatArray) -> dict[str, float]:
