@@ -44,14 +44,6 @@ def printable(text: str) -> str:
     Control characters are also those that reorder, hide or join what stands beside them, and halves of characters.
     The form is that of JSON.
 
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
-
     Examples
     --------
     >>> printable("a\x1b[2Jb\x9b\u202e")
@@ -61,25 +53,12 @@ def printable(text: str) -> str:
 
 
 def is_one_line(value: object) -> bool:
-    """True for a text without line breaks.
-
-    Parameters
-    ----------
-    value : object
-    """
+    """True for a text without line breaks."""
     return isinstance(value, str) and "\n" not in value
 
 
 def one_line(text: str) -> str:
     r"""Text for a part of a printed line, which it cannot end: a line break is written as ``\u000a``.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
 
     Examples
     --------
@@ -91,14 +70,6 @@ def one_line(text: str) -> str:
 
 def comment(text: str) -> str:
     r"""One line of a comment: what could end or continue it is split or replaced by ``_``, a long text is cut.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
 
     Examples
     --------
@@ -118,14 +89,6 @@ def comment(text: str) -> str:
 def literal(text: str) -> str:
     r"""String in double quotes, which Python, YAML and TOML read as the text; halves of characters become U+FFFD.
 
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
-
     Examples
     --------
     >>> literal('5"' + chr(0x9B)) == r'"5\"\u009b"'
@@ -137,14 +100,6 @@ def literal(text: str) -> str:
 
 def identifier(text: str) -> str:
     """Name of ASCII letters, digits and underscores, which is no word of C, C++, Python or CasADi.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
 
     Examples
     --------
@@ -161,14 +116,6 @@ def cell(text: str) -> str:
     """Text of a cell that no spreadsheet takes for a formula: one that begins like a formula has a ``'`` before it.
 
     A longer text than spreadsheets read is cut.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
 
     Examples
     --------

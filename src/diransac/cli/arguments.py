@@ -46,10 +46,6 @@ def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
     texts : sequence of str
         Pairs, separated by commas.
 
-    Returns
-    -------
-    dict of str to str
-
     Raises
     ------
     typer.BadParameter
@@ -67,16 +63,7 @@ def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
 
 
 def names(text: str) -> list[str]:
-    """``"a, b"`` as a list.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    list of str
-    """
+    """``"a, b"`` as a list."""
     return [name for name in (part.strip() for part in text.split(",")) if name]
 
 
@@ -89,10 +76,6 @@ def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
         Name of the option in messages.
     texts : sequence of str
         Pairs, separated by commas.
-
-    Returns
-    -------
-    dict of str to float
 
     Raises
     ------
@@ -115,10 +98,6 @@ def fixed_parameters(option: str, texts: Sequence[str]) -> dict[str, float | Non
         Name of the option in messages.
     texts : sequence of str
         Items, separated by commas.
-
-    Returns
-    -------
-    dict of str to float or None
 
     Raises
     ------
@@ -143,10 +122,6 @@ def start_values(option: str, text: str | None) -> dict[str, float] | None:
     option : str
         Name of the option in messages.
     text : str or None
-
-    Returns
-    -------
-    dict of str to float, or None
 
     Raises
     ------
@@ -200,10 +175,6 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, An
     assignments : sequence of str
         As ``sample_size=50`` or ``inlier_thresholds.x_dot=0.5``.
 
-    Returns
-    -------
-    dict of str to object
-
     Raises
     ------
     SettingsError
@@ -234,10 +205,6 @@ def load_methods(names: Sequence[str], settings: Mapping[str, Any], estimator: s
     settings : mapping of str to object
     estimator : str, optional
         Name of the estimator inside the RANSAC methods.
-
-    Returns
-    -------
-    list of Method
 
     Raises
     ------
@@ -275,16 +242,7 @@ def _assign(table: dict[str, Any], keys: Sequence[str], value: object) -> None:
 
 
 def toml_value(text: str) -> object:
-    """A TOML value; a bare word is itself.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    object
-    """
+    """A TOML value; a bare word is itself."""
     for candidate in (text, text.lower(), f"[{text}]" if "," in text else text):
         try:
             return toml_table(f"value = {candidate}")["value"]
@@ -306,30 +264,12 @@ def _none_where_meant(key: str, value: object) -> object:
 
 
 def is_description(text: str) -> bool:
-    """True for the name of a robot's description, ``.xml``, ``.mjcf`` or ``.urdf``.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    bool
-    """
+    """True for the name of a robot's description, ``.xml``, ``.mjcf`` or ``.urdf``."""
     return Path(text).suffix.lower() in (".xml", ".mjcf", ".urdf")
 
 
 def model_file(text: str) -> Path | None:
-    """The file of ``file.py[:name]``, or of a robot's description; None for a built-in model's name.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    Path or None
-    """
+    """The file of ``file.py[:name]``, or of a robot's description; None for a built-in model's name."""
     if is_description(text):
         return Path(text)
     found = file_and_name(text, "model")
@@ -338,14 +278,6 @@ def model_file(text: str) -> Path | None:
 
 def load_model(text: str) -> Model:
     """The built-in model of that name, or the one that ``file.py[:name]`` defines.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    Model
 
     Raises
     ------

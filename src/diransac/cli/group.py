@@ -181,16 +181,7 @@ def _say(message: str, code: int, *more: str) -> int:
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command in which each field of a dataclass parameter is an option.
-
-    Parameters
-    ----------
-    command : callable
-
-    Returns
-    -------
-    callable
-    """
+    """A command in which each field of a dataclass parameter is an option."""
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, Any] = {
         n: p.annotation for n, p in signature.parameters.items() if dataclasses.is_dataclass(p.annotation)

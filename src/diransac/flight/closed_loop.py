@@ -107,10 +107,6 @@ def fly_batch(
     threads : int, optional
         Number of vectors simulated at once; the number of cores by default. It changes no result.
 
-    Returns
-    -------
-    list of Log
-
     Raises
     ------
     SettingsError
@@ -165,10 +161,6 @@ def tracking_error(trajectory: Trajectory, log: Log) -> dict[str, float]:
     log : Log
         The flight. Rows before the start and after the end of the trajectory are ignored; between rows of the
         trajectory the reference is interpolated.
-
-    Returns
-    -------
-    dict of str to float
 
     Raises
     ------

@@ -208,14 +208,7 @@ def _number(
 
 @dataclass(frozen=True)
 class Draws:
-    """Random numbers for the rows of a log, by effect and signal.
-
-    Parameters
-    ----------
-    seed : any integer
-    n_rows : number of rows that are drawn
-    skipped : rows at the start that are drawn and discarded
-    """
+    """Random numbers for the rows of a log, by effect and signal."""
 
     seed: int
     n_rows: int

@@ -168,10 +168,6 @@ def tvlqr(
         Smallest and largest value of each input, to which the law is clipped; the trajectory's by default. The gains do
         not depend on them if R is given.
 
-    Returns
-    -------
-    Controller
-
     Raises
     ------
     SettingsError
@@ -225,10 +221,6 @@ def tvlqr_batch(
         As in `tvlqr`, for all.
     threads : int
         Number of vectors of eight controllers computed at once. It changes no result.
-
-    Returns
-    -------
-    list of Controller
 
     Raises
     ------

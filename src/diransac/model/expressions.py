@@ -132,10 +132,6 @@ def stored(label: str, function: ca.Function) -> dict[str, Any]:
     function : casadi.Function
         Its arguments and results are columns.
 
-    Returns
-    -------
-    dict
-
     Raises
     ------
     ModelError
@@ -193,10 +189,6 @@ def restored(name: str, data: object, arguments: Mapping[str, int], results: Map
         Decoded JSON, from any source.
     arguments, results : mapping of str to int
         Sizes that the function must have.
-
-    Returns
-    -------
-    casadi.Function
 
     Raises
     ------

@@ -75,10 +75,6 @@ def empty_figure(height: float) -> Figure:
     """Figure without panels.
 
     Matplotlib, which is imported here first, would take settings from ``matplotlibrc`` in the working directory.
-
-    Parameters
-    ----------
-    height : inches
     """
     beside = Path("matplotlibrc").exists() and "matplotlib" not in sys.modules
     with chdir(Path(__file__).parent) if beside else nullcontext():

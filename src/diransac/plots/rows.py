@@ -58,15 +58,7 @@ class MarkRow:
 
 @dataclass(frozen=True)
 class LogAxis:
-    """Logarithmic axis with places beyond its ends for values that are too small, too large or infinite.
-
-    Parameters
-    ----------
-    least : power of ten below which values are too small
-    low, high : powers of ten at the ends of the axis
-    exceeded : whether a value is larger
-    endless : whether a value is infinite
-    """
+    """Logarithmic axis with places beyond its ends for values that are too small, too large or infinite."""
 
     least: int
     low: int

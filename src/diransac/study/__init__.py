@@ -1,7 +1,7 @@
 """Studies: grids of Monte-Carlo trials from a TOML file, run on any executor, kept in a store that can be resumed.
 
-In comes a study file, or a fleet of logs; out comes a store, one SQLite file, and its summary.  Begin with `run_study` in
-`run.py`, and `run_trials` in `trials.py`, the work of a worker.
+In comes a study file, or a fleet of logs; out comes a store, one SQLite file, and its summary.  Begin with `run.py`,
+and `trials.py`, the work of a worker.
 
 | file | contents |
 |---|---|

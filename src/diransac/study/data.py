@@ -86,14 +86,7 @@ def trial_data(study: Study | Mapping[str, Any] | str | Path, level: str | float
 
 
 def trial_data_batch(study: Study, level: str, trials: Sequence[int]) -> list[TrialData | Exception]:
-    """The data of each trial at a level, or the error that prevented them.
-
-    Parameters
-    ----------
-    study : at that level
-    level : its text
-    trials : numbers
-    """
+    """The data of each trial at a level, or the error that prevented them."""
     seeds = [trial_seed(study, level, trial) for trial in trials]
     found: list[TrialData | Exception] = []
     with single_threaded():  # the same sums within a study's run and outside

@@ -84,10 +84,6 @@ def identify_each(
     **arguments
         Of `identify`, such as ``seed`` and ``differentiate``.
 
-    Returns
-    -------
-    FleetStatus
-
     Raises
     ------
     SettingsError

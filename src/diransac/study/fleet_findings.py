@@ -225,10 +225,6 @@ def summarise_fleet(store: str | Path | FleetRows, *, level: float = 0.01) -> Fl
         Probability that a fleet without any gives an outlier, and that it gives a change or drift, by Bonferroni's
         inequality over parameters, vehicles and places.
 
-    Returns
-    -------
-    FleetSummary
-
     Raises
     ------
     StudyError

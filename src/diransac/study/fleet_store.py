@@ -30,12 +30,6 @@ ERROR, _ABOUT = "standard_error", ("model_name", "units")
 class FleetStore(Database):
     """An open store of a fleet.
 
-    Parameters
-    ----------
-    path : of the file, which is made if it does not exist
-    model : its parameters are columns
-    wanted : values that determine rows
-
     Raises
     ------
     StudyError

@@ -136,14 +136,7 @@ _CURRENT = 0.02
 def rotorcraft_in_gusts(
     gusts: float = 0.0, moment_gusts: float = 0.0, parameters: Mapping[str, float] = TABLE_I
 ) -> Plant:
-    """The planar rotorcraft in gusts of 0.1 to 2.6 Hz.
-
-    Parameters
-    ----------
-    gusts : RMS of the force along each axis, N
-    moment_gusts : RMS of the moment, N m
-    parameters : of the model
-    """
+    """The planar rotorcraft in gusts of 0.1 to 2.6 Hz."""
     model = builtin("planar-rotorcraft")
 
     def air(_q: Symbols, _v: Symbols, _u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:

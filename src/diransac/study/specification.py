@@ -146,10 +146,6 @@ def _trajectory_arguments(
 class Missions(Table):
     """The trajectories that estimates are evaluated on, the table ``[missions]``: a table of arguments for each.
 
-    Parameters
-    ----------
-    square, star, sine : arguments of the function of that name, by name, defaults included
-
     Raises
     ------
     SettingsError

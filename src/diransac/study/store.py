@@ -36,11 +36,6 @@ _PLANTS = "plants"
 class Store(Database):
     """An open store.
 
-    Parameters
-    ----------
-    path : of the file, which is made if it does not exist
-    study : its levels, methods and trials are added to those that the store was asked for
-
     Raises
     ------
     StudyError

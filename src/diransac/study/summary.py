@@ -113,12 +113,7 @@ class ParameterErrors:
         return _over_trials(errors, ~np.isnan(errors), np.max)
 
     def coverage(self, *, disturbed: bool) -> list[tuple[int, int]]:
-        """Number of intervals that contain the pseudo-true parameter, and number of intervals, by method.
-
-        Parameters
-        ----------
-        disturbed : count the levels whose plant has a disturbance, or the others
-        """
+        """Number of intervals that contain the pseudo-true parameter, and number of intervals, by method."""
         some = np.array([one[self.disturbed == disturbed] for one in self.covered.values()])
         held, there = np.nansum(some, axis=(0, 1, 3)), (~np.isnan(some)).sum(axis=(0, 1, 3))
         return [(int(a), int(n)) for a, n in zip(held, there, strict=True)]

@@ -57,10 +57,6 @@ def base_parameters(regressor: ca.Function, seed: int = 0) -> Grouping:
         ``(q, v, a) -> Y (n, n_x)``, or ``(q, v, a, w, dw, f) -> Y`` with the motion of a base.
     seed : int, optional
         Seed of the random motions.
-
-    Returns
-    -------
-    Grouping
     """
     n, n_x = regressor.size1_in(0), regressor.size2_out(0)
     rng = np.random.default_rng(seed)

@@ -176,10 +176,6 @@ def parsed(path: str | Path) -> Any:
     path : str or Path
         MJCF or URDF.
 
-    Returns
-    -------
-    mujoco.MjSpec
-
     Raises
     ------
     ModelError
@@ -206,10 +202,6 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
     base : str, optional
         A body with a free joint: "held" in the pose of the file, or "measured", so that its motion is known. None:
         there is none.
-
-    Returns
-    -------
-    Description
 
     Raises
     ------
