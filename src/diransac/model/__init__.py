@@ -5,7 +5,8 @@ as CasADi functions, which everything else takes.  Begin with `model.py`.
 
 | file | contents |
 |---|---|
-| `model.py`, `parameter.py`, `sensors.py` | `Model`; `Parameter`; `Sensor`, and those of common instruments |
+| `model.py`, `signals.py` | `Model`; its names, units and sizes |
+| `parameter.py`, `sensors.py` | `Parameter`; `Sensor`, and those of common instruments |
 | `derivation.py`, `expressions.py` | checks and symbolic parts of equations; expression graphs as plain data |
 | `plant.py` | `Plant`, a model with parameters, and `Disturbance` |
 | `parts.py` | independent parts of a model, such as limbs |
