@@ -1,7 +1,7 @@
 """What Drake offers for the same work, for `flight.py`: plan the square, and build finite-horizon LQR along it.
 
 The rotorcraft is a `SymbolicVectorSystem`, which Drake differentiates without Python.  Everything raises ImportError
-where Drake is absent: it comes with ``pip install .[snopt]``.
+where Drake is absent: it comes with ``pip install .[drake]``.
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Planning, steering and flying, each against Drake's fastest way to do the same work: the whole table in one run.
 
-Run it as ``python benchmarks/flight.py [--repetitions N]``.  Drake comes with ``pip install .[snopt]``; without it its
+Run it as ``python benchmarks/flight.py [--repetitions N]``.  Drake comes with ``pip install .[drake]``; without it its
 rows are left out, and that is said.  A row is a ratio of medians of repetitions that took turns; every repetition plans
 for a new parameter vector, from the plan for the nominal one.  The square is the package's, but for its corners' times
 on whole tenths of a second, because Drake's `DirectTranscription` has one step for all intervals.
@@ -58,14 +58,14 @@ def corner_times() -> Array:
     return STEP * np.concatenate([[0.0], np.cumsum(np.rint(lengths / MEAN_SPEED / STEP))])
 
 
-def plan(plant: dr.Plant, guess: dr.Trajectory | None = None, solver: str = "ipopt") -> dr.Trajectory:
+def plan(plant: dr.Plant, guess: dr.Trajectory | None = None) -> dr.Trajectory:
     """The square."""
     times = corner_times()
     route = {name: partial(np.interp, xp=times, fp=[place[j] for place in PLANES]) for j, name in enumerate(("x", "z"))}
     return dr.plan(
         plant, waypoints=[{"x": x, "z": z} for x, z in PLANES], times=times.tolist(), reference=route,
         state_weights={"x": ROUTE_WEIGHT, "z": ROUTE_WEIGHT}, input_limits=ROTORCRAFT_LIMITS,
-        input_limit_fraction=INPUT_LIMIT_FRACTION, guess=guess, solver=solver,
+        input_limit_fraction=INPUT_LIMIT_FRACTION, guess=guess,
     )  # fmt: skip
 
 
@@ -106,15 +106,11 @@ def ways_of_drake(guess: dr.Trajectory) -> dict[str, Callable[[Array], float]]:
     def way(program: Callable[..., Any], solver: str, tolerance: float | None, parameters: Array) -> float:
         return drake_ways.solved(program(square, parameters), start, solver, tolerance)
 
-    def by_our_stages(parameters: Array) -> float:
-        return float(plan(plant_of(parameters), guess, "snopt").cost or 0.0)
-
     return {
         "DirectTranscription, SNOPT": partial(way, drake_ways.transcription, "SNOPT", None),
         "DirectTranscription, SNOPT to 1e-4": partial(way, drake_ways.transcription, "SNOPT", 1e-4),
         "DirectTranscription, IPOPT to 1e-4": partial(way, drake_ways.transcription, "IPOPT", 1e-4),
         "DirectCollocation, SNOPT to 1e-4": partial(way, drake_ways.collocation, "SNOPT", 1e-4),
-        "MathematicalProgram of our compiled segments, SNOPT": by_our_stages,
     }
 
 
@@ -132,7 +128,7 @@ def compare_planning(nominal: dr.Trajectory, repetitions: int) -> None:
         row(
             "(a) plan a square, warm",
             None,
-            note=f"{1e3 * found['ours']:.3g} ms; Drake is left out: pip install .[snopt]",
+            note=f"{1e3 * found['ours']:.3g} ms; Drake is left out: pip install .[drake]",
         )
         return
     ways = {"ours": ours, **ways_of_drake(nominal)}
@@ -180,7 +176,7 @@ def compare_steering(nominal: dr.Trajectory, repetitions: int) -> None:
     except ImportError:
         calls = {name: call for name, call in calls.items() if name.startswith("ours")}
         found = in_turns(calls, repetitions)
-        row("(b) TVLQR on it", None, note=f"{1e3 * found['ours']:.3g} ms; Drake is left out: pip install .[snopt]")
+        row("(b) TVLQR on it", None, note=f"{1e3 * found['ours']:.3g} ms; Drake is left out: pip install .[drake]")
     else:
         exact = 2 * first_gain_at_rate(nominal, 20) - first_gain_at_rate(nominal, 10)
         own = dr.tvlqr(NOMINAL, nominal).gains[0]

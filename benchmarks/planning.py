@@ -1,16 +1,13 @@
-"""How fast plans are made, and whether three solvers find the same: the paper's square, star and sine.
+"""How fast plans are made: the paper's square, star and sine.
 
-Run it as ``python benchmarks/planning.py [--without-snopt]``.  SNOPT comes with ``pip install diransac[snopt]``; where
-it is absent its rows are left out, which is said.  Times are medians of 15 solves that take turns, SNOPT's of one;
-`again` starts from the straight way, `near` from the solution for parameters that are 2 % off.  The last rows show what
-one Runge-Kutta step an interval instead of ten would save, and where its inputs lead in a simulation at 100 Hz.
+Times are medians of 15 solves that take turns; `again` starts from the straight way, `near` from the solution for
+parameters that are 2 % off.  The last rows show what one Runge-Kutta step an interval instead of ten would save, and
+where its inputs lead in a simulation at 100 Hz.
 """
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from importlib.util import find_spec
 from typing import Any
 from unittest.mock import patch
 
@@ -23,7 +20,6 @@ from diransac.simulation import RolloutBatch, rollouts
 
 FLIGHTS: dict[str, Callable[..., dr.Trajectory]] = {"square": dr.square, "star": dr.star, "sine": dr.sine}
 REPETITIONS = 15
-LONG = 300.0
 PLANT = dr.Plant(dr.models.planar_rotorcraft(), dr.models.TABLE_I)
 NEIGHBOUR = dr.Plant(PLANT.model, {name: 1.02 * value for name, value in PLANT.parameters.items()})
 
@@ -44,26 +40,11 @@ def medians(calls: dict[str, Callable[[], Any]], repetitions: int) -> dict[str, 
     return {name: float(np.median(values)) for name, values in taken.items()}
 
 
-def compare(name: str, snopt: bool) -> None:
-    """Print a row for each solver: agreement with IPOPT, and times."""
-    flight = FLIGHTS[name]
-    names = ("ipopt", "fatrop")
-    every = (*names, *["snopt"] * snopt)
-    first = {solver: seconds(lambda s=solver: flight(PLANT, solver=s, time_limit=LONG)) for solver in every}
-    guess = flight(NEIGHBOUR)
-    again = medians({s: lambda s=s: flight(PLANT, solver=s) for s in names}, REPETITIONS)
-    near = medians({s: lambda s=s: flight(PLANT, solver=s, guess=guess) for s in names}, REPETITIONS)
-    if snopt:
-        again["snopt"] = first["snopt"][0]
-        near["snopt"] = seconds(lambda: flight(PLANT, solver="snopt", guess=guess, time_limit=LONG))[0]
-    best = first["ipopt"][1]
-    for solver, (_, found) in first.items():
-        print(
-            f"{name:<8}{solver:<8}{found.cost / best.cost - 1:>12.1e}{np.abs(found.states - best.states).max():>12.1e}"
-            f"{1e3 * again[solver]:>11.0f}{again[solver] / again['ipopt']:>8.2f}"
-            f"{1e3 * near[solver]:>11.0f}{near[solver] / near['ipopt']:>8.2f}",
-            flush=True,
-        )
+def compare(name: str) -> None:
+    """Print times of a plan from scratch, and from the plan for other parameters."""
+    flight, guess = FLIGHTS[name], FLIGHTS[name](NEIGHBOUR)
+    taken = medians({"again": lambda: flight(PLANT), "near": lambda: flight(PLANT, guess=guess)}, REPETITIONS)
+    print(f"{name:<8}{1e3 * taken['again']:>11.0f}{1e3 * taken['near']:>11.0f}", flush=True)
 
 
 def coarse(name: str) -> None:
@@ -79,8 +60,8 @@ def coarse(name: str) -> None:
     knots = np.concatenate([[0], np.cumsum(counts)])
     guess[program.layout.states], guess[program.layout.inputs] = states[knots], inputs[knots[:-1]]
     calls = {
-        "one": lambda: solvers.interior_point("fatrop", program, guess, solvers.SearchLimits(200, 60.0)),
-        "ten": lambda: solvers.interior_point("fatrop", fine, guess, solvers.SearchLimits(200, 60.0)),
+        "one": lambda: solvers.interior_point(program, guess, solvers.SearchLimits(200, 60.0)),
+        "ten": lambda: solvers.interior_point(fine, guess, solvers.SearchLimits(200, 60.0)),
     }
     outcome = calls["one"]()
     flown_inputs = np.repeat(program.split(outcome.unknowns)[1], counts, axis=0)
@@ -96,18 +77,12 @@ def coarse(name: str) -> None:
 
 
 def main() -> None:
-    """Print both tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--without-snopt", action="store_true", help="leave out SNOPT, which takes minutes")
-    snopt = not parser.parse_args().without_snopt
-    if snopt and find_spec("pydrake") is None:
-        print("SNOPT is absent (pip install 'diransac[snopt]'): its rows are left out")
-        snopt = False
+    """Print the table, and what shorter steps cost."""
     taken = seconds(lambda: dr.square(PLANT))[0]
     print(f"the first plan of a model, which compiles it: {taken:.1f} s\n")
-    print(f"{'':<8}{'solver':<8}{'cost':>12}{'states':>12}{'again, ms':>11}{'ratio':>8}{'near, ms':>11}{'ratio':>8}")
+    print(f"{'':<8}{'again, ms':>11}{'near, ms':>11}")
     for name in FLIGHTS:
-        compare(name, snopt)
+        compare(name)
     print()
     for name in FLIGHTS:
         coarse(name)

@@ -56,12 +56,11 @@ MODULES = (
     "pickle", "struct", "socket", "logging", "sitecustomize", "usercustomize",
 )  # fmt: skip
 LIBRARIES = (
-    "libcasadi_nlpsol_ipopt.so", "libcasadi_nlpsol_fatrop.so", "libipopt.so.3", "libhsl.so", "libcoinhsl.so",
+    "libcasadi_nlpsol_ipopt.so", "libipopt.so.3", "libhsl.so", "libcoinhsl.so",
     "libllvmlite.so", "libmujoco.so", "libgomp.so.1", "plugin/libh5.so", "mujoco_plugin/libplugin.so",
 )  # fmt: skip
 SETTINGS = {
     "ipopt.opt": "output_file ran-ipopt\nprint_level 5\nlinear_solver ma27\nhsllib ./libhsl.so\n",
-    "fatrop.opt": "print_level 5\n",
     "matplotlibrc": "figure.dpi: 7\nbackend: module://pickle\ntext.usetex: True\n",
     "dask.yaml": "planted: true\n",
     "distributed.yaml": "planted: true\n",

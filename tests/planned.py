@@ -23,11 +23,11 @@ def rotorcraft(**changes):
     return dr.Plant(ROTORCRAFT.model, {**ROTORCRAFT.parameters, **changes})
 
 
-def across(plant, solver="ipopt", **options):
+def across(plant, **options):
     """From rest to rest, 2 m to the right and 1 m up, past a point on the way; segments of uneven length."""
     way = [{}, {"x": 0.7, "z": 1.0}, {"x": 2.0, "z": 1.0}]
     chosen = {"times": [0.0, 0.83, 2.16], "input_limits": LIMITS} | options
-    return dr.plan(plant, waypoints=way, solver=solver, **chosen)
+    return dr.plan(plant, waypoints=way, **chosen)
 
 
 def defects(step, trajectory):

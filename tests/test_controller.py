@@ -78,13 +78,12 @@ def test_a_controller_of_parts_that_do_not_fit_is_refused(change, message):
 
 
 # Another time grid ---------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("how", ["hold", "linear"])
-def test_a_controller_on_its_own_time_is_itself(how):
+def test_a_controller_on_its_own_time_is_itself():
     """Also where that time was summed up in another way, and lies before it by a rounding error."""
     controller = controller_of(300)
     summed = np.cumsum(np.full(300, controller.dt)) - controller.dt
     assert (summed < controller.time).any()
-    again = controller.at(summed, how)
+    again = controller.at(summed)
     np.testing.assert_allclose(again.gains, controller.gains, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(again.states, controller.states, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(again.inputs, controller.inputs)
@@ -97,22 +96,9 @@ def test_rows_are_held_to_the_next_on_a_finer_grid():
         np.testing.assert_array_equal(getattr(fine, name), np.repeat(getattr(controller, name), 4, axis=0))
 
 
-def test_states_and_gains_are_linear_between_rows_if_asked_and_inputs_are_held():
+def test_a_controller_stays_what_it_is_before_its_start_and_after_its_end():
     controller = controller_of()
-    time = np.linspace(0.003, 0.48, 400)
-    fine = controller.at(time, "linear")
-    for name in ("gains", "states"):
-        columns = getattr(controller, name).reshape(50, -1).T
-        expected = np.column_stack([np.interp(time, controller.time, column) for column in columns])
-        np.testing.assert_allclose(getattr(fine, name).reshape(400, -1), expected, rtol=1e-12, atol=1e-12)
-    np.testing.assert_array_equal(fine.inputs, controller.inputs[np.floor(time / controller.dt + 1e-9).astype(int)])
-    np.testing.assert_array_equal(fine.u_max, controller.u_max)
-
-
-@pytest.mark.parametrize("how", ["hold", "linear"])
-def test_a_controller_stays_what_it_is_before_its_start_and_after_its_end(how):
-    controller = controller_of()
-    wide = controller.at([-1.0, 0.0, 1.0, 2.0], how)
+    wide = controller.at([-1.0, 0.0, 1.0, 2.0])
     rows = [0, 0, 49, 49]
     for name in ("gains", "states", "inputs"):
         np.testing.assert_array_equal(getattr(wide, name), getattr(controller, name)[rows])
@@ -120,8 +106,6 @@ def test_a_controller_stays_what_it_is_before_its_start_and_after_its_end(how):
 
 def test_a_time_grid_that_makes_no_sense_is_refused():
     controller = controller_of()
-    with pytest.raises(SettingsError, match="how is 'cubic'; choose \"hold\""):
-        controller.at(controller.time, "cubic")
     for time in ([0.3, 0.2], [0.0, 0.1, 0.3], [0.1], [[0.0, 0.1]], [0.0, np.nan]):
         with pytest.raises(SettingsError, match="time must increase evenly"):
             controller.at(time)

@@ -32,9 +32,8 @@ def main():
     found = {}
     model = dr.Model("m", {"s": "m"}, {"f": "N"}, {"m": dr.Parameter("kg")}, lambda q, v, a, u, p: [p.m * a.s - u.f])
     plant, way, limits = dr.Plant(model, {"m": 1.0}), [{"s": 0.0}, {"s": 1.0}], {"f": (-9.0, 9.0)}
-    for solver in ("ipopt", "fatrop"):
-        flight = dr.plan(plant, waypoints=way, times=[0.0, 2.0], input_limits=limits, solver=solver)
-        found[solver] = round(float(flight.states[-1, 0]), 6)
+    flight = dr.plan(plant, waypoints=way, times=[0.0, 2.0], input_limits=limits)
+    found["ipopt"] = round(float(flight.states[-1, 0]), 6)
     try:
         found["mujoco"] = list(dr.models.robot("arm.urdf", unknown=("damping",)).parameters)
     except dr.ModelError as error:
@@ -126,9 +125,9 @@ def test_no_planted_code_runs_in_a_command_or_in_its_workers(worked):
     assert not [name for name in new if name.startswith(RAN)]
 
 
-def test_ipopt_and_fatrop_read_no_options_and_load_no_library(worked):
+def test_ipopt_reads_no_options_and_loads_no_library(worked):
     found, printed, new = worked
-    assert found["ipopt"] == found["fatrop"] == 1.0
+    assert found["ipopt"] == 1.0
     assert new == {"out.png", "fleet.db"}
     assert printed == []
 
@@ -151,7 +150,7 @@ def test_the_page_names_every_library_that_is_checked_here():
     named = {name.split()[0].strip("`") for row in rows[1:] for name in row.split(", ")}
     assert named == {
         "IPOPT", "Matplotlib", "MuJoCo", "Python", "CasADi", "HDF5", "Dask", "NumPy", "SciPy", "Polars",
-        "llvmlite", "FATROP", "SQLite", "diransac",
+        "llvmlite", "SQLite", "diransac",
     }  # fmt: skip
 
 

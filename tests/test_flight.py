@@ -135,11 +135,9 @@ def test_a_pickled_plant_and_controller_fly_the_same():
 def test_a_controller_may_run_at_another_rate():
     slow = wiggle(30, 0.1)
     controller = tvlqr(TRUE, slow)
-    held, smooth = (fly(TRUE, slow, controller, dt=0.01, gains=gains) for gains in ("hold", "linear"))
-    assert len(held) == len(smooth) == 291
+    held = fly(TRUE, slow, controller, dt=0.01)
+    assert len(held) == 291
     assert held.dt == pytest.approx(0.01)
-    # Inputs are held alike; a reference that is held as well lags by up to 0.1 s, an interpolated one does not.
-    assert tracking_error(slow, smooth)["z"] < 0.2 * tracking_error(slow, held)["z"]
     same = fly(TRUE, slow, controller)
     np.testing.assert_array_equal(same.time, slow.time)
 

@@ -1,7 +1,6 @@
 """What cannot be planned is refused in a sentence, what is interrupted stops, and nothing prints."""
 
 import signal
-import sys
 import threading
 import time
 
@@ -97,13 +96,6 @@ def test_time_and_iterations_that_run_out_are_said():
         across(ROTORCRAFT, max_iterations=1)
 
 
-def test_snopt_that_is_absent_is_named_with_its_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pydrake", None)
-    monkeypatch.setitem(sys.modules, "pydrake.solvers", None)
-    with pytest.raises(PlanningError, match=r"pip install 'diransac\[snopt\]'"):
-        across(ROTORCRAFT, "snopt")
-
-
 # ---------------------------------------------------------------------- arguments that make no sense
 
 TWO = [{}, {"y": 1.0}]
@@ -129,7 +121,6 @@ SENSELESS = {
     "limits upside down": ({"waypoints": TWO, "input_limits": {"force": (1, 0)}}, "must be .lowest, highest."),
     "waypoint out of limits": ({"waypoints": TWO, "state_limits": {"y": (0, 0.5)}}, "move the waypoint or the limits"),
     "no share": ({"waypoints": TWO, "input_limit_fraction": 0.0}, "above 0 and at most 1"),
-    "unknown solver": ({"waypoints": TWO, "solver": "best"}, "choose one of ipopt, fatrop, snopt"),
     "negative time weight": ({"waypoints": TWO, "time_weight": -1.0}, "time_weight"),
     "unknown trim": ({"waypoints": TWO, "trim": {"push": 1.0}}, 'there is no input "push"'),
     "no iterations": ({"waypoints": TWO, "max_iterations": 0}, "max_iterations"),
@@ -171,13 +162,12 @@ def test_flights_need_x_and_z(flight):
 # ---------------------------------------------------------------------- silence, and being stopped
 
 
-@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
-def test_nothing_is_printed(solver, capfd):
-    across(ROTORCRAFT, solver, times=None)
+def test_nothing_is_printed(capfd):
+    across(ROTORCRAFT, times=None)
     with pytest.raises(PlanningError):
-        across(ROTORCRAFT, solver, times=[0.0, 0.3, 0.6])
+        across(ROTORCRAFT, times=[0.0, 0.3, 0.6])
     with pytest.raises(PlanningError):
-        across(ROTORCRAFT, solver, time_limit=0.0)
+        across(ROTORCRAFT, time_limit=0.0)
     assert capfd.readouterr() == ("", "")
 
 
@@ -190,10 +180,7 @@ def interruptible():
 
 
 @pytest.mark.usefixtures("interruptible")
-@pytest.mark.parametrize("solver", ["ipopt", "fatrop", "snopt"])
-def test_an_interrupt_stops_the_search(solver, monkeypatch, capfd):
-    if solver == "snopt":
-        pytest.importorskip("pydrake", reason="SNOPT NOT CHECKED: pip install 'diransac[snopt]'")
+def test_an_interrupt_stops_the_search(monkeypatch, capfd):
     plain, calls = Program.constraints, []
 
     def interrupted(self, *arguments):
@@ -205,10 +192,10 @@ def test_an_interrupt_stops_the_search(solver, monkeypatch, capfd):
     with monkeypatch.context() as patch:
         patch.setattr(Program, "constraints", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            across(ROTORCRAFT, solver)
+            across(ROTORCRAFT)
     assert len(calls) == 3
     assert capfd.readouterr() == ("", "")
-    assert across(ROTORCRAFT, solver).cost > 0  # and the next plan is made as if nothing had been
+    assert across(ROTORCRAFT).cost > 0  # and the next plan is made as if nothing had been
 
 
 def test_an_error_in_the_midst_of_a_search_is_not_swallowed(monkeypatch):

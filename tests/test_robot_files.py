@@ -285,7 +285,7 @@ def test_a_result_with_impossible_bodies_says_so(described):
 
 
 def test_drake_reads_the_estimated_robot(described):
-    drake = pytest.importorskip("pydrake.all", reason="DRAKE DOES NOT READ ROBOTS: pip install 'diransac[snopt]'")
+    drake = pytest.importorskip("pydrake.all", reason="DRAKE DOES NOT READ ROBOTS: pip install 'diransac[drake]'")
     path = described(robots.urdf())
     model = models.robot(path, bodies="all")
     text, _ = calibrated(path, model.parameters, nominal(model), np.diag((0.01 * nominal(model)) ** 2 + 1e-12))

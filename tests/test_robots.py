@@ -118,7 +118,7 @@ def test_forces_are_those_of_pinocchio(described, kind, seed):
 @pytest.mark.parametrize("kind", ["panda-like", "quadruped", "six-axes", "tree"])
 def test_forces_are_those_of_drake(described, kind):
     """With damping, which Drake counts among a machine's own forces; armatures are left out."""
-    drake = pytest.importorskip("pydrake.all", reason="DRAKE NOT COMPARED: pip install 'diransac[snopt]'")
+    drake = pytest.importorskip("pydrake.all", reason="DRAKE NOT COMPARED: pip install 'diransac[drake]'")
     path = described(ROBOTS[kind](0))
     plant, model = drake.MultibodyPlant(0.0), dr.models.robot(path)
     drake.Parser(plant).AddModels(str(path))

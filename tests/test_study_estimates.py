@@ -241,7 +241,7 @@ def test_facts_of_a_plants_file_are_kept_and_the_file_is_not_run_for_them(of_a_u
     connection.close()
     ran = Path("ran")
     Path("own.py").write_text(f"open({str(ran.absolute())!r}, 'x')\n")
-    with pytest.raises(dr.StudyError, match="repeat the study run command"):
+    with pytest.raises(dr.StudyError, match="is damaged: KeyError"):
         summarise(of_a_users_plant)
     assert not ran.exists()
     Path("own.py").write_text(OWN_PLANT)

@@ -141,57 +141,6 @@ def test_fewer_trials_take_nothing_away(store: Path):
     assert (status(store).asked, len(rows(store))) == (12, 3)
 
 
-# Format 1 -------------------------------------------------------------------------------------------------------------
-FAULTY = {
-    "noise": {"outlier_probability": 0.1, "stuck_probability": 0.02, "correlated": True, "first_row": "corrupted"},
-    "plant": {"kind": "extended-rotorcraft", "rotor_phase": "random"},
-    "data": {"trajectory": "random-waypoints", "seed": "random"},
-    "evaluation": {"trajectories": [], "parameters": True},
-    "axis": {"name": "fault", "levels": {"calm": {}, "stuck": {"noise.stuck_length": 5.0, "noise.correlated": False}}},
-}
-OLD_NAMES = {
-    "noise.stuck_probability": ("noise.freeze_probability", {}),
-    "noise.stuck_length": ("noise.freeze_length", {}),
-    "noise.correlated": ("noise.runs", {"true": "together", "false": "independent"}),
-    "noise.first_row": ("noise.first_row", {'"corrupted"': "hit"}),
-    "plant.rotor_phase": ("plant.rotor_phase", {'"random"': "any"}),
-    "data.trajectory": ("data.trajectory", {'"random-waypoints"': "places"}),
-    "data.seed": ("data.seed", {'"random"': "any"}),
-}
-
-
-def write_as_format_1(path: Path) -> None:
-    """Give a store the names that its format had first."""
-    connection = sqlite3.connect(path)
-    for name in ("mass", "inertia", "drag"):
-        connection.execute(f"ALTER TABLE trials RENAME COLUMN pseudo_true_{name} TO best_{name}")
-    for key, (old, values) in OLD_NAMES.items():
-        connection.execute("UPDATE configuration SET key = ? WHERE key = ?", (old, key))
-        for value, before in values.items():
-            change = "UPDATE configuration SET value = ? WHERE key = ? AND value = ?"
-            connection.execute(change, (json.dumps(before), old, value))
-    connection.execute("PRAGMA user_version = 1")
-    connection.commit()
-    connection.close()
-
-
-def test_a_store_of_format_1_is_read_as_it_is_and_resumed_under_the_new_names(tmp_path: Path):
-    path, study = tmp_path / "a.db", load(tiny(**FAULTY))
-    with Store(path, study) as kept:
-        kept.add([row("calm", pseudo_true_mass=0.3)])
-    before = rows(path)
-    write_as_format_1(path)
-    assert rows(path)["calm", 0, "ols"]["best_mass"] == 0.3
-    unread = path.read_bytes()
-    assert read(path)["pseudo_true_mass"].to_list() == [0.3]
-    assert path.read_bytes() == unread
-    with Store(path, study) as kept:
-        assert kept.finished("calm", [0]) == {("calm", 0, "ols")}
-    assert rows(path) == before
-    with pytest.raises(dr.StudyError, match=r"noise\.stuck_probability is 0\.02 in the store, 0.5 was asked for"):
-        Store(path, load(study, {"noise.stuck_probability": 0.5}))
-
-
 # What is no store -----------------------------------------------------------------------------------------------------
 def test_a_file_that_is_no_database_is_refused_and_stays(tmp_path: Path):
     (tmp_path / "a.db").write_text("a note to myself " * 100)
@@ -214,9 +163,9 @@ def test_a_database_of_somebody_else_is_refused_and_stays(tmp_path: Path):
 
 def test_a_store_of_another_format_is_refused(store: Path):
     connection = sqlite3.connect(store)
-    connection.execute("PRAGMA user_version = 9")
+    connection.execute("PRAGMA user_version = 1")
     connection.close()
-    with pytest.raises(dr.StudyError, match="has format 9, this version reads 1 to 2"):
+    with pytest.raises(dr.StudyError, match="has format 1, this version reads 2; begin another"):
         read(store)
 
 

@@ -197,12 +197,11 @@ _FOUND_IN = {
     "study": ("Study", "run_study"),
 }
 _LATER = {name: module for module, names in _FOUND_IN.items() for name in names}
-_SUBMODULES = ("simulation", "study")
 
 
 def __getattr__(name: str) -> Any:
     """Module or object of the public interface, imported on first access."""
-    if name in _SUBMODULES:
+    if name in ("simulation", "study"):
         return importlib.import_module(f"diransac.{name}")
     if name not in _LATER:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["draft", "write_bytes", "write_text", "write_with"]
 
-_BEGINNING, _END = ".diransac-", ".part"
-_NAME = re.compile(r"\.diransac-\w{8}\.part")
-
 
 @contextmanager
 def draft(target: Path) -> Iterator[Path]:
@@ -60,7 +57,7 @@ def draft(target: Path) -> Iterator[Path]:
 def _locked_folder(parent: Path) -> tuple[Path, int | None]:
     """A new private folder, and its lock; None where the file system has none."""
     while True:
-        folder = Path(tempfile.mkdtemp(dir=parent, prefix=_BEGINNING, suffix=_END))
+        folder = Path(tempfile.mkdtemp(dir=parent, prefix=".diransac-", suffix=".part"))
         lock = _lock(folder, wait=True)
         if lock is None or folder.exists():  # else another process took it for abandoned before it was locked
             return folder, lock
@@ -88,7 +85,7 @@ def _remove_abandoned(parent: Path) -> None:
         return
     with suppress(OSError):
         for entry in list(os.scandir(parent)):
-            if _NAME.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False):
+            if re.fullmatch(r"\.diransac-\w{8}\.part", entry.name) and entry.is_dir(follow_symlinks=False):
                 if entry.stat(follow_symlinks=False).st_uid != os.geteuid():
                     continue
                 lock = _lock(Path(entry.path), wait=False)

@@ -9,15 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from diransac.limits import DEEPEST, LARGEST_RESULT, beyond, read_bytes
+from diransac.errors import SettingsError
+from diransac.limits import DEEPEST, LARGEST_RESULT, LARGEST_TABLE, beyond, read_bytes
 
-__all__ = ["json_data", "read_text", "toml_table"]
-
-_DEEPEST_KEY = 64
-"""Dots in a key of TOML."""
-
-_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
-"""One half of a character in JSON's escapes; only pairs of them are text."""
+__all__ = ["json_data", "read_text", "toml_file", "toml_table"]
 
 
 def read_text(path: str | Path, largest: int = LARGEST_RESULT) -> str:
@@ -53,7 +48,8 @@ def json_data(text: str | bytes) -> Any:
     with _bounded():
         found = json.loads(text, parse_constant=_refused)
         _check_depth(found)
-        if _SURROGATE.search(text if isinstance(text, str) else text.decode("latin-1")):
+        # One half of a character in JSON's escapes; only pairs of them are text.
+        if re.search(r"\\u[dD][89a-fA-F]", text if isinstance(text, str) else text.decode("latin-1")):
             _check_encodable(found)
         return found
 
@@ -92,12 +88,23 @@ def toml_table(text: str) -> dict[str, Any]:
     import tomllib
 
     keys = (line.partition("=")[0] for line in text.splitlines())
-    if any(key.count(".") > _DEEPEST_KEY and "," not in key for key in keys):  # tomllib takes their number squared
+    # Dots in a key of TOML.
+    if any(key.count(".") > 64 and "," not in key for key in keys):  # tomllib takes their number squared
         raise ValueError("it is nested too deeply")
     with _bounded():
         found = tomllib.loads(text)
     _check_depth(found)
     return found
+
+
+def toml_file(path: Path, what: str) -> dict[str, Any]:
+    """Table of a TOML file.  Raises SettingsError: it cannot be read, or is none; ``what`` begins the sentence."""
+    try:
+        return toml_table(read_text(path, LARGEST_TABLE))
+    except OSError as error:
+        raise SettingsError(f'{what} "{path}" cannot be read: {error.strerror}') from error
+    except ValueError as error:
+        raise SettingsError(f'{what} "{path}" is not TOML: {error}') from error
 
 
 @contextmanager

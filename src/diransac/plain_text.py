@@ -18,12 +18,10 @@ from collections.abc import Callable
 
 __all__ = ["cell", "comment", "identifier", "is_one_line", "literal", "one_line", "printable"]
 
-_LONGEST_COMMENT, _LONGEST_IDENTIFIER = 2000, 60
+_LONGEST_COMMENT = 2000
 _LONGEST_CELL = 32_766
 """Letters that spreadsheets read in a cell, of which one may be a ``'``; Python reads four times as many."""
 
-_SPLIT = (("\\", "_"), ("??", "? ?"), ("*/", "* /"), ("/*", "/ *"), ('"""', "'''"))
-"""Texts that continue a line of C, end its comment, or end a docstring, and what is written for them."""
 
 _RESERVED = {
     *re.findall(
@@ -46,14 +44,6 @@ def printable(text: str) -> str:
     Control characters are also those that reorder, hide or join what stands beside them, and halves of characters.
     The form is that of JSON.
 
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
-
     Examples
     --------
     >>> printable("a\x1b[2Jb\x9b\u202e")
@@ -63,25 +53,12 @@ def printable(text: str) -> str:
 
 
 def is_one_line(value: object) -> bool:
-    """True for a text without line breaks.
-
-    Parameters
-    ----------
-    value : object
-    """
+    """True for a text without line breaks."""
     return isinstance(value, str) and "\n" not in value
 
 
 def one_line(text: str) -> str:
     r"""Text for a part of a printed line, which it cannot end: a line break is written as ``\u000a``.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
 
     Examples
     --------
@@ -94,14 +71,6 @@ def one_line(text: str) -> str:
 def comment(text: str) -> str:
     r"""One line of a comment: what could end or continue it is split or replaced by ``_``, a long text is cut.
 
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
-
     Examples
     --------
     >>> comment("N*m/rad ??/ 2*/ end\\")
@@ -110,7 +79,8 @@ def comment(text: str) -> str:
     if len(text) > _LONGEST_COMMENT:
         text = f"{text[:_LONGEST_COMMENT]} ..."
     plain = text if text.isprintable() else _escaped(text, lambda _: "_")
-    for harmful, harmless in _SPLIT:
+    # Texts that continue a line of C, end its comment, or end a docstring, and what is written for them.
+    for harmful, harmless in (("\\", "_"), ("??", "? ?"), ("*/", "* /"), ("/*", "/ *"), ('"""', "'''")):
         while harmful in plain:
             plain = plain.replace(harmful, harmless)
     return plain
@@ -118,14 +88,6 @@ def comment(text: str) -> str:
 
 def literal(text: str) -> str:
     r"""String in double quotes, which Python, YAML and TOML read as the text; halves of characters become U+FFFD.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
 
     Examples
     --------
@@ -139,20 +101,12 @@ def literal(text: str) -> str:
 def identifier(text: str) -> str:
     """Name of ASCII letters, digits and underscores, which is no word of C, C++, Python or CasADi.
 
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
-
     Examples
     --------
     >>> identifier("left wheel"), identifier("9 switches!"), identifier("double"), identifier("")
     ('left_wheel', 'model_9_switches', 'model_double', 'model')
     """
-    name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")[:_LONGEST_IDENTIFIER].rstrip("_")
+    name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")[:60].rstrip("_")
     if name and not name[0].isdigit() and name.lower() not in _RESERVED:
         return name
     return f"model_{name}".rstrip("_")
@@ -162,14 +116,6 @@ def cell(text: str) -> str:
     """Text of a cell that no spreadsheet takes for a formula: one that begins like a formula has a ``'`` before it.
 
     A longer text than spreadsheets read is cut.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
 
     Examples
     --------

@@ -23,10 +23,6 @@ class _Setting:
     """Context in which a setting of the process holds; the last context to end undoes it, whichever began.
 
     Threads that each restored their own earlier value would restore each other's.
-
-    Parameters
-    ----------
-    begin : makes the setting, and returns what undoes it
     """
 
     def __init__(self, begin: Callable[[], Callable[[], object]]) -> None:

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 
 from diransac.plain_text import one_line
 
-__all__ = ["aligned", "duration", "listed", "number", "percent", "plural", "share", "telling_digits"]
+__all__ = ["aligned", "duration", "listed", "number", "percent", "plural", "share", "superscript", "telling_digits"]
 
 _LEAST_PERCENT = 0.01
-_TIMES = 3.0
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -34,8 +32,13 @@ def number(x: float, digits: int = 4) -> str:
     if math.isinf(x):
         return "∞" if x > 0 else "−∞"
     mantissa, _, exponent = f"{x:.{digits}g}".partition("e")
-    power = f"×10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if exponent else ""
+    power = f"×10{superscript(int(exponent))}" if exponent else ""
     return mantissa.replace("-", "−") + power
+
+
+def superscript(exponent: int | str) -> str:
+    """A whole number as an exponent: ``⁻³``."""
+    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def duration(seconds: float) -> str:
@@ -57,7 +60,7 @@ def percent(fraction: float) -> str:
 
 def share(x: float, whole: str) -> str:
     """A ratio to a whole: ``2 % of its range``, ``19 times its range``."""
-    if math.isfinite(x) and x >= _TIMES:
+    if math.isfinite(x) and x >= 3.0:
         return f"{number(x, 2)} times {whole}"
     return f"{percent(x)} of {whole}"
 

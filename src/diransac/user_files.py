@@ -23,13 +23,12 @@ __all__ = ["blaming", "definitions", "file_and_name", "in_words", "leave_stdout"
 _ALONE = threading.RLock()
 """Held without output, and while users' code runs, which may run more of it: threads share stdout and stderr."""
 
-_FILE = re.compile(r"([^\0\n]+\.py)(?::(\w+))?")
 _STDOUT, _STDERR = 1, 2
 
 
 def file_and_name(text: str, default: str) -> tuple[Path, str] | None:
     """File and name of ``file.py[:name]``, with ``default`` for an absent name; None for text of another form."""
-    match = _FILE.fullmatch(text)
+    match = re.fullmatch(r"([^\0\n]+\.py)(?::(\w+))?", text)
     return None if match is None else (Path(match[1]), match[2] or default)
 
 

@@ -15,15 +15,14 @@ __all__ = ["INTERRUPTED", "main"]
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
-_ALLOCATIONS = 10_000
-"""New objects between two garbage collections: those of imported modules live as long as the process of a command."""
-
 
 def main() -> None:
     """Run the command line of this process, and end the process with its exit code."""
     sys.excepthook = _show_traceback if "--debug" in sys.argv else _report_internal_error
     warnings.showwarning = _show_warning
-    gc.set_threshold(_ALLOCATIONS)
+    # New objects between two garbage collections: those of imported modules live as long as the process of a
+    # command.
+    gc.set_threshold(10_000)
     from diransac.cli.commands import app
     from diransac.user_files import leave_stdout
 

@@ -9,13 +9,12 @@ from typing import Any
 
 import typer
 
-from diransac.errors import ModelError, SettingsError
+from diransac.errors import ModelError
 from diransac.identification.method import Method
 from diransac.identification.methods import WITH_ESTIMATOR, configured, estimator_named, setting_names
 from diransac.identification.settings import Settings, nearest_names
-from diransac.limits import LARGEST_TABLE
 from diransac.model import Model
-from diransac.plain_data import read_text, toml_table
+from diransac.plain_data import toml_file, toml_table
 from diransac.user_files import definitions, file_and_name
 
 __all__ = [
@@ -48,10 +47,6 @@ def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
     texts : sequence of str
         Pairs, separated by commas.
 
-    Returns
-    -------
-    dict of str to str
-
     Raises
     ------
     typer.BadParameter
@@ -69,16 +64,7 @@ def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
 
 
 def names(text: str) -> list[str]:
-    """``"a, b"`` as a list.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    list of str
-    """
+    """``"a, b"`` as a list."""
     return [name for name in (part.strip() for part in text.split(",")) if name]
 
 
@@ -91,10 +77,6 @@ def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
         Name of the option in messages.
     texts : sequence of str
         Pairs, separated by commas.
-
-    Returns
-    -------
-    dict of str to float
 
     Raises
     ------
@@ -117,10 +99,6 @@ def fixed_parameters(option: str, texts: Sequence[str]) -> dict[str, float | Non
         Name of the option in messages.
     texts : sequence of str
         Items, separated by commas.
-
-    Returns
-    -------
-    dict of str to float or None
 
     Raises
     ------
@@ -145,10 +123,6 @@ def start_values(option: str, text: str | None) -> dict[str, float] | None:
     option : str
         Name of the option in messages.
     text : str or None
-
-    Returns
-    -------
-    dict of str to float, or None
 
     Raises
     ------
@@ -202,10 +176,6 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, An
     assignments : sequence of str
         As ``sample_size=50`` or ``inlier_thresholds.x_dot=0.5``.
 
-    Returns
-    -------
-    dict of str to object
-
     Raises
     ------
     SettingsError
@@ -213,7 +183,11 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, An
     typer.BadParameter
         An assignment is not ``key=value``.
     """
-    table = {} if file is None else {key.replace("-", "_"): value for key, value in _read_toml(file).items()}
+    table = (
+        {}
+        if file is None
+        else {key.replace("-", "_"): value for key, value in toml_file(file, "settings file").items()}
+    )
     for text in assignments:
         key, equals, value = text.partition("=")
         keys = [part.strip() for part in key.split(".")]
@@ -232,10 +206,6 @@ def load_methods(names: Sequence[str], settings: Mapping[str, Any], estimator: s
     settings : mapping of str to object
     estimator : str, optional
         Name of the estimator inside the RANSAC methods.
-
-    Returns
-    -------
-    list of Method
 
     Raises
     ------
@@ -263,15 +233,6 @@ def load_methods(names: Sequence[str], settings: Mapping[str, Any], estimator: s
     ]
 
 
-def _read_toml(file: Path) -> dict[str, Any]:
-    try:
-        return toml_table(read_text(file, LARGEST_TABLE))
-    except OSError as error:
-        raise SettingsError(f'settings file "{file}" cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise SettingsError(f'settings file "{file}" is not TOML: {error}') from error
-
-
 def _assign(table: dict[str, Any], keys: Sequence[str], value: object) -> None:
     """``table[a][b] = value`` for keys a, b; what is no mapping on the way becomes one."""
     *path, last = keys
@@ -282,16 +243,7 @@ def _assign(table: dict[str, Any], keys: Sequence[str], value: object) -> None:
 
 
 def toml_value(text: str) -> object:
-    """A TOML value; a bare word is itself.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    object
-    """
+    """A TOML value; a bare word is itself."""
     for candidate in (text, text.lower(), f"[{text}]" if "," in text else text):
         try:
             return toml_table(f"value = {candidate}")["value"]
@@ -313,16 +265,7 @@ def _none_where_meant(key: str, value: object) -> object:
 
 
 def is_description(text: str) -> bool:
-    """True for the name of a robot's description, ``.xml``, ``.mjcf`` or ``.urdf``.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    bool
-    """
+    """True for the name of a robot's description, ``.xml``, ``.mjcf`` or ``.urdf``."""
     return Path(text).suffix.lower() in (".xml", ".mjcf", ".urdf")
 
 
@@ -355,16 +298,7 @@ def preparation_of(model: str | None) -> Sequence[Mapping[str, Any]]:
 
 
 def model_file(text: str) -> Path | None:
-    """The file of ``file.py[:name]``, of a robot's description or of a result; None for a built-in model's name.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    Path or None
-    """
+    """The file of ``file.py[:name]``, of a robot's description or of a result; None for a built-in model's name."""
     if is_description(text) or _is_result(text):
         return Path(text)
     found = file_and_name(text, "model")
@@ -373,14 +307,6 @@ def model_file(text: str) -> Path | None:
 
 def load_model(text: str) -> Model:
     """The built-in model of that name, the one that ``file.py[:name]`` defines, or that of a result.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    Model
 
     Raises
     ------

@@ -10,8 +10,7 @@ from typing import Any
 
 from diransac.errors import SettingsError
 from diransac.identification.settings import nearest_names
-from diransac.limits import LARGEST_TABLE
-from diransac.plain_data import read_text, toml_table
+from diransac.plain_data import toml_file
 
 __all__ = ["config_defaults"]
 
@@ -42,7 +41,7 @@ def config_defaults(file: Path, commands: Mapping[str, Any]) -> dict[str, Any]:
     SettingsError
         The file cannot be read, no command has an option of that name, or a value is of another type.
     """
-    table, found = _read(file), dict[str, Any]()
+    table, found = toml_file(file, "configuration"), dict[str, Any]()
     leaves = dict(_leaves(commands))
     known = {key: None for command in leaves.values() for key in _parameters(command, arguments=False)}
     shared = {key: x for key, x in table.items() if key in known or key not in commands}
@@ -69,15 +68,6 @@ def config_defaults(file: Path, commands: Mapping[str, Any]) -> dict[str, Any]:
             parameter = everything[key]
             place[parameter.name] = _words(value, parameter, f'configuration "{file}": {key}')
     return found
-
-
-def _read(file: Path) -> dict[str, Any]:
-    try:
-        return toml_table(read_text(file, LARGEST_TABLE))
-    except OSError as error:
-        raise SettingsError(f'configuration "{file}" cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise SettingsError(f'configuration "{file}" is not TOML: {error}') from error
 
 
 def _leaves(commands: Mapping[str, Any]) -> list[tuple[tuple[str, ...], Any]]:

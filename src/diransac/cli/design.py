@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["DesignOptions", "DesignedModel", "Designs", "designed", "source_of"]
 
-_AXES = ("_x", "_y", "_z")
-"""Endings of the names of positions of bodies."""
 
 DesignedModel = Annotated[
     str,
@@ -119,7 +117,8 @@ def _places(machine: UnsaturatedRobot, limits: Iterable[str]) -> dict[str, str]:
     found = {}
     for limit in limits:
         name, moved = machine.bodies.get(limit[:-2], ("", frozenset[str]()))
-        if not name or limit[-2:] not in _AXES:
+        # Endings of the names of positions of bodies.
+        if not name or limit[-2:] not in ("_x", "_y", "_z"):
             continue
         limbs = [limb for limb, own in machine.limbs.items() if moved <= set(own.coordinates)]
         if not limbs:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, TypeAlias, TypeVar, get_type_hints
 
 import typer
 
@@ -30,6 +30,8 @@ __all__ = [
     "TrajectoryArgument",
     "TrajectoryOption",
 ]
+
+T = TypeVar("T")
 
 SHAPES = ("star", "square", "sine")
 EXTENDED = "extended-rotorcraft"
@@ -110,69 +112,70 @@ FlightPicture = Annotated[
 FlightSeed = Annotated[int, typer.Option("--seed", min=0, help="Seed of flight and noise.")]
 
 
-def _plant_option(*names: str, **about: Any) -> Any:
-    """Option in the panel of the plant."""
-    return typer.Option(*names, rich_help_panel="Plant", **about)
+# Plant and noise ------------------------------------------------------------------------------------------------------
+Options: TypeAlias = Mapping[str, tuple[Any, str, str, Mapping[str, Any]]]
+"""Field -> kind of its value, name of its option where it is not the field's, help, and what else Typer takes."""
 
 
-@dataclass(frozen=True)
+def _options(panel: str, options: Options) -> Callable[[type[T]], type[T]]:
+    """Make a class a dataclass whose fields are options of a panel of the help; None where not given."""
+
+    def made(group: type[T]) -> type[T]:
+        group.__annotations__ = {}
+        for name, (kind, option, text, about) in options.items():
+            declared = typer.Option(*([option] if option else []), rich_help_panel=panel, help=text, **about)
+            group.__annotations__[name] = Annotated[kind | None if kind is not Any else Any, declared]
+            setattr(group, name, None)
+        return dataclass(frozen=True)(group)
+
+    return made
+
+
+def _given(group: Any) -> dict[str, Any]:
+    """Options that are given, by field."""
+    return {f.name: value for f in fields(group) if (value := getattr(group, f.name)) is not None}
+
+
+def _word(*choices: str) -> dict[str, Any]:
+    """One of some words, by default the first."""
+    return {"metavar": "|".join(choices), "callback": _one_of(*choices), "show_default": choices[0]}
+
+
+_PROBABILITY = {"min": 0.0, "max": 1.0, "metavar": "P"}
+_LENGTH = {"min": 1.0, "metavar": "ROWS", "show_default": "10"}
+
+
+def _size(unit: str, **about: Any) -> dict[str, Any]:
+    """A number from 0, in a unit."""
+    return {"min": 0.0, "metavar": unit, **about}
+
+
+def _number(unit: str) -> dict[str, Any]:
+    """A finite number, in a unit."""
+    return {"metavar": unit, "callback": _finite}
+
+
+_PLANT: Options = {
+    "plant": (str, "", "Plant with disturbances; the model itself by default.",
+              {"metavar": EXTENDED, "callback": _one_of(EXTENDED)}),
+    "assignments": (list[str], "--parameter",
+                    "True parameter, repeatable; by default Table I for the planar rotorcraft.",
+                    {"metavar": "NAME=VALUE"}),
+    "aerodynamic_imbalance": (float, "", "Aerodynamic imbalance of each rotor; Table II: 1.0e-6 to 1.8e-6.",
+                              _number("M4")),
+    "mass_imbalance": (float, "", "Mass imbalance of each rotor; Table II: 6e-5 to 1.4e-4.", _number("KG")),
+    "convention": (str, "", "Imbalance as forces and torques, or added to accelerations as in eq. (20).",
+                   _word("physical", "printed")),
+    "phase": (str, "", "Rotor phase: integrated speed, or as in eq. (14).", _word("integrated", "instantaneous")),
+    "blade_flapping": (float, "", "Tilt of the rotor disc per unit of advance ratio.", _number("RAD")),
+    "rotor_phase": (Any, "", "Initial rotor phase; any: drawn with the seed.",
+                    {"parser": _angle, "metavar": "RAD|any", "show_default": "0"}),
+}  # fmt: skip
+
+
+@_options("Plant", _PLANT)
 class PlantOptions:
     """Plant: the model's equations, or these with disturbances."""
-
-    plant: Annotated[
-        str | None,
-        _plant_option(
-            metavar=EXTENDED,
-            callback=_one_of(EXTENDED),
-            help="Plant with disturbances; the model itself by default.",
-        ),
-    ] = None
-    assignments: Annotated[
-        list[str] | None,
-        _plant_option(
-            "--parameter",
-            metavar="NAME=VALUE",
-            help="True parameter, repeatable; by default Table I for the planar rotorcraft.",
-        ),
-    ] = None
-    aerodynamic_imbalance: Annotated[
-        float | None,
-        _plant_option(
-            metavar="M4", callback=_finite, help="Aerodynamic imbalance of each rotor; Table II: 1.0e-6 to 1.8e-6."
-        ),
-    ] = None
-    mass_imbalance: Annotated[
-        float | None,
-        _plant_option(metavar="KG", callback=_finite, help="Mass imbalance of each rotor; Table II: 6e-5 to 1.4e-4."),
-    ] = None
-    convention: Annotated[
-        str | None,
-        _plant_option(
-            metavar="physical|printed",
-            callback=_one_of("physical", "printed"),
-            show_default="physical",
-            help="Imbalance as forces and torques, or added to accelerations as in eq. (20).",
-        ),
-    ] = None
-    phase: Annotated[
-        str | None,
-        _plant_option(
-            metavar="integrated|instantaneous",
-            callback=_one_of("integrated", "instantaneous"),
-            show_default="integrated",
-            help="Rotor phase: integrated speed, or as in eq. (14).",
-        ),
-    ] = None
-    blade_flapping: Annotated[
-        float | None,
-        _plant_option(metavar="RAD", callback=_finite, help="Tilt of the rotor disc per unit of advance ratio."),
-    ] = None
-    rotor_phase: Annotated[
-        Any,
-        _plant_option(
-            parser=_angle, metavar="RAD|any", show_default="0", help="Initial rotor phase; any: drawn with the seed."
-        ),
-    ] = None
 
     def of(self, model: Model) -> Plant:
         """Plant with disturbances, if requested, else the model with its true parameters.
@@ -180,22 +183,16 @@ class PlantOptions:
         Raises ModelError: a parameter is unknown, outside its bounds, or missing where Table I has none.
         Raises typer.BadParameter: disturbances without a plant that has them.
         """
-        given = numbers("--parameter", self.assignments or ())
-        disturbances = self._disturbances()
-        if self.plant is None and disturbances:
-            option = next(iter(disturbances)).replace("_", "-")
-            raise typer.BadParameter(f"--{option} needs --plant {EXTENDED}; give both")
-        if self.plant is None:
+        disturbances = _given(self)
+        given = numbers("--parameter", disturbances.pop("assignments", ()))
+        if disturbances.pop("plant", None) is None:
+            for option in disturbances:
+                raise typer.BadParameter(f"--{option.replace('_', '-')} needs --plant {EXTENDED}; give both")
             return Plant(model, _true_parameters(model, given))
         parameters = _true_parameters(planar_rotorcraft(), given)
         if disturbances.get("rotor_phase") == "any":
             disturbances["rotor_phase"] = None
         return extended_rotorcraft(parameters=parameters, **disturbances)
-
-    def _disturbances(self) -> dict[str, Any]:
-        """Given arguments of `extended_rotorcraft`, by name."""
-        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("plant", "assignments")}
-        return {name: value for name, value in own.items() if value is not None}
 
 
 def same_equations(a: Model, b: Model) -> bool:
@@ -222,130 +219,46 @@ def _true_parameters(model: Model, given: Mapping[str, float]) -> dict[str, floa
     return values
 
 
-def _noise_option(*names: str, **about: Any) -> Any:
-    """Option in the panel of noise and faults."""
-    return typer.Option(*names, rich_help_panel="Noise and faults of the log", **about)
+_NOISE: Options = {
+    "outlier_probability": (float, "--outliers", "Probability of an outlier per sample; with --magnitude.",
+                            _PROBABILITY),
+    "outlier_magnitude": (float, "--magnitude", "Outliers add uniform(-A, A).", _size("A")),
+    "outliers": (str, "--outliers-hit", "Each signal by itself, or all signals of a row.", _word("signals", "rows")),
+    "acceleration_std": (float, "--acceleration-noise", "Standard deviation.", _size("M/S2")),
+    "rate_std": (float, "--rate-noise", "Standard deviation.", _size("RAD/S")),
+    "angular_acceleration_std": (float, "--angular-acceleration-noise", "Standard deviation.",
+                                 _size("RAD/S2", show_default="--rate-noise over the sampling time")),
+    "integrated": (str, "--integrated-noise", "Noise of velocities and positions.", _word("white", "random-walk")),
+    "first_row": (str, "", "First row: without noise and faults, or like the others.", _word("clean", "corrupted")),
+    "burst_probability": (float, "--bursts",
+                          "Probability per sample that a burst of outliers starts; with --magnitude.",
+                          _PROBABILITY),
+    "burst_length": (float, "--burst-length", "Mean length of bursts.", _LENGTH),
+    "stuck_probability": (float, "--stuck", "Probability per sample that a run of repeated values starts.",
+                          _PROBABILITY),
+    "stuck_length": (float, "--stuck-length", "Mean length of these runs.", _LENGTH),
+    "dropout_probability": (float, "--dropouts", "Probability per sample that a run of missing values starts.",
+                            _PROBABILITY),
+    "dropout_length": (float, "--dropout-length", "Mean length of these runs.", _LENGTH),
+    "correlated": (bool, "--correlated", "Bursts, stuck values and dropouts occur in the same rows of all signals.",
+                   {"show_default": False}),
+    "leverage_probability": (float, "--leverage",
+                             "Probability of a one-sided offset per sample where --leverage-signal is large.",
+                             _PROBABILITY),
+    "leverage_offset": (float, "", "One-sided offsets are uniform(0, A).", _number("A")),
+    "leverage_signal": (str, "", "Signal that selects the rows of one-sided offsets, such as thrust.",
+                        {"metavar": "NAME"}),
+    "leverage_quantile": (float, "--leverage-quantile", "Quantile above which it is large.",
+                          {**_PROBABILITY, "show_default": "0.7"}),
+    "delay": (float, "", "Delay of the signals after the inputs.", _size("S")),
+    "quantisation": (Any, "", "Quantisation step: fraction of the range, or steps by signal.",
+                     {"parser": _steps, "metavar": "STEP|NAME=STEP,..."}),
+}  # fmt: skip
 
 
-def _probability(*names: str, **about: Any) -> Any:
-    """Option with a value from 0 to 1."""
-    return _noise_option(*names, min=0.0, max=1.0, metavar="P", **about)
-
-
-def _length(*names: str, **about: Any) -> Any:
-    """Option with a mean length in rows."""
-    return _noise_option(*names, min=1.0, metavar="ROWS", **about)
-
-
-@dataclass(frozen=True)
+@_options("Noise and faults of the log", _NOISE)
 class NoiseOptions:
     """Noise and faults of the log: the fields of `Noise` as options."""
-
-    outlier_probability: Annotated[
-        float | None, _probability("--outliers", help="Probability of an outlier per sample; with --magnitude.")
-    ] = None
-    outlier_magnitude: Annotated[
-        float | None, _noise_option("--magnitude", min=0.0, metavar="A", help="Outliers add uniform(-A, A).")
-    ] = None
-    outliers: Annotated[
-        str | None,
-        _noise_option(
-            "--outliers-hit",
-            metavar="signals|rows",
-            callback=_one_of("signals", "rows"),
-            show_default="signals",
-            help="Each signal by itself, or all signals of a row.",
-        ),
-    ] = None
-    acceleration_std: Annotated[
-        float | None, _noise_option("--acceleration-noise", min=0.0, metavar="M/S2", help="Standard deviation.")
-    ] = None
-    rate_std: Annotated[
-        float | None, _noise_option("--rate-noise", min=0.0, metavar="RAD/S", help="Standard deviation.")
-    ] = None
-    angular_acceleration_std: Annotated[
-        float | None,
-        _noise_option(
-            "--angular-acceleration-noise",
-            min=0.0,
-            metavar="RAD/S2",
-            show_default="--rate-noise over the sampling time",
-            help="Standard deviation.",
-        ),
-    ] = None
-    integrated: Annotated[
-        str | None,
-        _noise_option(
-            "--integrated-noise",
-            metavar="white|random-walk",
-            callback=_one_of("white", "random-walk"),
-            show_default="white",
-            help="Noise of velocities and positions.",
-        ),
-    ] = None
-    first_row: Annotated[
-        str | None,
-        _noise_option(
-            metavar="clean|corrupted",
-            callback=_one_of("clean", "corrupted"),
-            show_default="clean",
-            help="First row: without noise and faults, or like the others.",
-        ),
-    ] = None
-    burst_probability: Annotated[
-        float | None,
-        _probability("--bursts", help="Probability per sample that a burst of outliers starts; with --magnitude."),
-    ] = None
-    burst_length: Annotated[
-        float | None, _length("--burst-length", show_default="10", help="Mean length of bursts.")
-    ] = None
-    stuck_probability: Annotated[
-        float | None, _probability("--stuck", help="Probability per sample that a run of repeated values starts.")
-    ] = None
-    stuck_length: Annotated[
-        float | None, _length("--stuck-length", show_default="10", help="Mean length of these runs.")
-    ] = None
-    dropout_probability: Annotated[
-        float | None, _probability("--dropouts", help="Probability per sample that a run of missing values starts.")
-    ] = None
-    dropout_length: Annotated[
-        float | None, _length("--dropout-length", show_default="10", help="Mean length of these runs.")
-    ] = None
-    correlated: Annotated[
-        bool | None,
-        _noise_option(
-            "--correlated",
-            help="Bursts, stuck values and dropouts occur in the same rows of all signals.",
-            show_default=False,
-        ),
-    ] = None
-    leverage_probability: Annotated[
-        float | None,
-        _probability(
-            "--leverage", help="Probability of a one-sided offset per sample where --leverage-signal is large."
-        ),
-    ] = None
-    leverage_offset: Annotated[
-        float | None, _noise_option(metavar="A", callback=_finite, help="One-sided offsets are uniform(0, A).")
-    ] = None
-    leverage_signal: Annotated[
-        str | None,
-        _noise_option(metavar="NAME", help="Signal that selects the rows of one-sided offsets, such as thrust."),
-    ] = None
-    leverage_quantile: Annotated[
-        float | None, _probability("--leverage-quantile", show_default="0.7", help="Quantile above which it is large.")
-    ] = None
-    delay: Annotated[
-        float | None, _noise_option(min=0.0, metavar="S", help="Delay of the signals after the inputs.")
-    ] = None
-    quantisation: Annotated[
-        Any,
-        _noise_option(
-            parser=_steps,
-            metavar="STEP|NAME=STEP,...",
-            help="Quantisation step: fraction of the range, or steps by signal.",
-        ),
-    ] = None
 
     def noise(self) -> Noise:
         """Noise of these options.
@@ -353,7 +266,7 @@ class NoiseOptions:
         Raises SettingsError: a value has no meaning.
         Raises typer.BadParameter: an option lacks another one that it needs.
         """
-        given = {f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None}
+        given = _given(self)
         for name, others in _NEEDED.items():
             if name in given and not any(other in given for other in others):
                 wanted = " or ".join(map(_option_of, others))

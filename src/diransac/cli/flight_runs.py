@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from diransac.cli.flight_options import SHAPES, same_equations
+from diransac.cli.flight_options import same_equations
 from diransac.data.log import Log
 from diransac.errors import DiransacError, PlanningError, SettingsError
 from diransac.flight.closed_loop import fly, tracking_error
@@ -24,8 +24,6 @@ from diransac.model.plant import ModelWithParameters, Plant
 from diransac.text_table import aligned
 
 __all__ = ["FlightTest", "SimulatedFlight", "TrackedFlight", "fly_identified", "simulate_flight"]
-
-_PLANNERS = dict(zip(SHAPES, (star, square, sine), strict=True))
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ def _flown(shape: str, known: ModelWithParameters, plant: Plant, seed: int) -> T
     Raises PlanningError: there is no plan or no controller, or the flight diverges.
     Raises SettingsError: the plant has other states or inputs than the known model.
     """
-    trajectory = _PLANNERS[shape](known)
+    trajectory = {"star": star, "square": square, "sine": sine}[shape](known)
     controller = tvlqr(known, trajectory)
     log = fly(plant, trajectory, controller, seed=seed)
     errors = tracking_error(trajectory, log)

@@ -24,9 +24,6 @@ __all__ = ["Group", "grouped"]
 UsageError: type[Any] = typer.BadParameter.__mro__[1]
 
 
-_PLAIN, _CHECKED = (str, Path, int, float), ("click_type", "min", "max")
-"""Kinds of arguments that are converted by a call, and what makes Typer check or convert an argument otherwise."""
-
 _NAMES = (
     "identify",
     "compare",
@@ -163,8 +160,10 @@ class _Conversion:
             return () if several else None
         kind, about = param.type_descriptor.annotation, param.type_descriptor.parameter_info
         kind = next(iter(get_args(kind)), None) if several else kind
-        convert = getattr(about, "parser", None) or (kind if kind in _PLAIN else None)
-        if convert and not any(getattr(about, name, None) is not None for name in _CHECKED):
+        # Kinds of arguments that are converted by a call, and what makes Typer check or convert an argument
+        # otherwise.
+        convert = getattr(about, "parser", None) or (kind if kind in (str, Path, int, float) else None)
+        if convert and not any(getattr(about, name, None) is not None for name in ("click_type", "min", "max")):
             with suppress(ValueError):
                 return [convert(x) for x in value] if several else convert(value)
         return self.make().coerce(value, param=param, ctx=ctx)
@@ -183,16 +182,7 @@ def _say(message: str, code: int, *more: str) -> int:
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command in which each field of a dataclass parameter is an option.
-
-    Parameters
-    ----------
-    command : callable
-
-    Returns
-    -------
-    callable
-    """
+    """A command in which each field of a dataclass parameter is an option."""
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, Any] = {
         n: p.annotation for n, p in signature.parameters.items() if dataclasses.is_dataclass(p.annotation)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, isnan
 from pathlib import Path
@@ -51,25 +51,18 @@ __all__ = [
 ]
 
 
-def known_method(name: str) -> str:
-    """The name itself.  Raises typer.BadParameter: there is no method of that name."""
-    if name not in METHODS:
-        raise typer.BadParameter(f"there is no method {name!r}; there are {', '.join(METHODS)}")
-    return name
+def _known(what: str, choices: Collection[str]) -> Callable[[Any], Any]:
+    """Callback that accepts None and one of some names."""
+
+    def check(name: str | None) -> str | None:
+        if name is not None and name not in choices:
+            raise typer.BadParameter(f"there is no {what} {name!r}; there are {', '.join(choices)}")
+        return name
+
+    return check
 
 
-def _known_hold(name: str | None) -> str | None:
-    """The name itself.  Raises typer.BadParameter: there is no hold of that name."""
-    if name is not None and name not in HOLDS:
-        raise typer.BadParameter(f"there is no hold {name!r}; there are {', '.join(HOLDS)}")
-    return name
-
-
-def _known_estimator(name: str | None) -> str | None:
-    """The name itself.  Raises typer.BadParameter: there is no estimator of that name."""
-    if name is not None and name not in ESTIMATORS:
-        raise typer.BadParameter(f"there is no estimator {name!r}; there are {', '.join(ESTIMATORS)}")
-    return name
+known_method: Callable[[str], str] = _known("method", METHODS)
 
 
 def _rate(text: str | None) -> str | float | None:
@@ -192,7 +185,7 @@ class Search:
     estimator: Annotated[
         str | None,
         typer.Option(
-            callback=_known_estimator,
+            callback=_known("estimator", ESTIMATORS),
             metavar="|".join(ESTIMATORS),
             help="Least squares of the samples of diransac and i-diransac.",
         ),
@@ -202,7 +195,7 @@ class Search:
         str | None,
         typer.Option(
             "--input-hold",
-            callback=_known_hold,
+            callback=_known("hold", HOLDS),
             metavar="|".join(HOLDS),
             help="Inputs between samples: held, or interpolated linearly or smoothly.",
         ),

@@ -1,5 +1,7 @@
 """Identified models as files for other programs: C, Python, CasADi and YAML.
 
+In comes a `PortableModel`, which `Result.export` makes; out comes a file.  Begin with `formats.py`.
+
 | file | contents |
 |---|---|
 | `portable.py` | `PortableModel`: what is written of a model, and its description in words |

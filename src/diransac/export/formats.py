@@ -257,10 +257,6 @@ def casadi_function(model: PortableModel) -> ca.Function:
 # ---------------------------------------------------------------------- YAML
 
 
-_LONGEST_KEY = 1000
-"""Characters of a key that needs no mark; YAML has 1024."""
-
-
 def yaml_document(model: PortableModel) -> str:
     """Names, units, estimates, covariance and draws of the parameters, and the timing of the inputs, as YAML 1.2."""
     units, values = model.model.units, model.parameters
@@ -305,7 +301,8 @@ def _yaml(mapping: dict[str, Any], indent: str) -> Iterator[str]:
     """Lines of a mapping in block style; lists in flow style."""
     for key, value in mapping.items():
         name = literal(key)
-        begin = f"{name}:" if len(name) <= _LONGEST_KEY else f"? {name}\n{indent}:"
+        # Characters of a key that needs no mark; YAML has 1024.
+        begin = f"{name}:" if len(name) <= 1000 else f"? {name}\n{indent}:"
         if isinstance(value, dict) and value:
             yield f"{indent}{begin}"
             yield from _yaml(value, indent + "  ")

@@ -18,9 +18,6 @@ from diransac.simulation.compiler.graph import Graph, Instruction, read_graph
 
 __all__ = ["PYTHON", "C", "Dialect", "statements"]
 
-_LONGEST = 70
-"""Characters of an intermediate result that is written where it is used."""
-
 
 @dataclass(frozen=True)
 class Dialect:
@@ -172,7 +169,8 @@ def _assignments(
     for position in needed:
         instruction = graph.instructions[position]
         text, is_atom = _text(instruction, arguments, dialect, texts), instruction.operation in ("CONST", "INPUT")
-        if is_atom or (uses[position] == 1 and len(text) <= _LONGEST):
+        # Characters of an intermediate result that is written where it is used.
+        if is_atom or (uses[position] == 1 and len(text) <= 70):
             texts[position] = text if is_atom or dialect.is_call(instruction.operation) else f"({text})"
         else:
             texts[position] = f"w{n_defined}"

@@ -31,7 +31,6 @@ def fly(
     *,
     initial_state: Mapping[str, float] | None = None,
     dt: float | None = None,
-    gains: str = "hold",
     substeps: int | None = None,
     seed: int = 0,
 ) -> Log:
@@ -48,9 +47,8 @@ def fly(
     initial_state : mapping of str to float, optional
         States by name that differ from the start of the trajectory.
     dt : float, optional
-        Sampling time of the controller, s; the trajectory's by default.
-    gains : {"hold", "linear"}
-        Gains of a controller on another time grid: those of the last row, or interpolated.
+        Sampling time of the controller, s; the trajectory's by default. A controller on another time grid has the
+        reference and gains of its last row.
     substeps : int, optional
         Integration steps (RK4) per sample; by default as many as the plant's disturbances need.
     seed : int
@@ -75,11 +73,11 @@ def fly(
     start = _start(plant, trajectory, initial_state or {})
     if dt is not None:
         n_steps = round((trajectory.time[-1] - trajectory.time[0]) / _positive("dt", dt))
-        steering = controller.at(trajectory.time[0] + dt * np.arange(n_steps + 1), how=gains)
+        steering = controller.at(trajectory.time[0] + dt * np.arange(n_steps + 1))
     elif _same_instants(controller.time, trajectory.time):
         steering = controller
     else:
-        steering = controller.at(trajectory.time, how=gains)
+        steering = controller.at(trajectory.time)
     return fly_batch([plant], [steering], start[None], substeps=substeps, seeds=[seed], threads=1)[0]
 
 
@@ -108,10 +106,6 @@ def fly_batch(
         One per flight, as in `fly`.
     threads : int, optional
         Number of vectors simulated at once; the number of cores by default. It changes no result.
-
-    Returns
-    -------
-    list of Log
 
     Raises
     ------
@@ -167,10 +161,6 @@ def tracking_error(trajectory: Trajectory, log: Log) -> dict[str, float]:
     log : Log
         The flight. Rows before the start and after the end of the trajectory are ignored; between rows of the
         trajectory the reference is interpolated.
-
-    Returns
-    -------
-    dict of str to float
 
     Raises
     ------

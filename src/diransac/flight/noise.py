@@ -208,14 +208,7 @@ def _number(
 
 @dataclass(frozen=True)
 class Draws:
-    """Random numbers for the rows of a log, by effect and signal.
-
-    Parameters
-    ----------
-    seed : any integer
-    n_rows : number of rows that are drawn
-    skipped : rows at the start that are drawn and discarded
-    """
+    """Random numbers for the rows of a log, by effect and signal."""
 
     seed: int
     n_rows: int
@@ -317,9 +310,6 @@ def _stem(name: str) -> str:
 
 # Quantisation and faults ---------------------------------------------------------------------------------------------
 
-_STREAMS = {"stuck": "freeze"}
-"""Fault -> key of its random stream where it is not the name; keys determine the numbers of a seed."""
-
 
 def quantised(values: FloatArray, name: str, noise: Noise) -> FloatArray:
     """Samples (N,) rounded to multiples of the signal's step, if it has one."""
@@ -363,6 +353,7 @@ def with_faults(values: FloatArray, name: str, noise: Noise, draws: Draws, eligi
 
 def _runs(fault: str, name: str, noise: Noise, draws: Draws) -> BoolArray:
     """Rows (N,) in runs of a fault: burst, stuck or dropout."""
-    stream = _STREAMS.get(fault, fault)
+    # Fault -> key of its random stream where it is not the name; keys determine the numbers of a seed.
+    stream = {"stuck": "freeze"}.get(fault, fault)
     signal = "" if noise.correlated else name
     return draws.runs(stream, signal, getattr(noise, f"{fault}_probability"), getattr(noise, f"{fault}_length"))

@@ -32,8 +32,6 @@ class Trajectory:
         Limits of the inputs, which a controller applies too.
     cost : float, optional
         Minimum found by the planner; None without a planner.
-    solver : str, optional
-        Solver of the planner; None without one.
 
     Raises
     ------
@@ -52,7 +50,6 @@ class Trajectory:
     input_names: tuple[str, ...] = ()
     input_limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     cost: float | None = None
-    solver: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("time", "states", "inputs"):
@@ -107,4 +104,4 @@ class Trajectory:
 
     def __reduce__(self) -> tuple[object, ...]:
         names = (self.state_names, self.input_names, dict(self.input_limits))
-        return (Trajectory, (self.time, self.states, self.inputs, *names, self.cost, self.solver))
+        return (Trajectory, (self.time, self.states, self.inputs, *names, self.cost))

@@ -26,18 +26,6 @@ Weights: TypeAlias = "npt.ArrayLike | Mapping[str, float]"
 InputLimits: TypeAlias = Mapping[str, tuple[float, float]]
 """Name of an input -> smallest and largest value."""
 
-COORDINATE_ERROR = 0.5
-VELOCITY_ERROR = 1.0
-UNLIMITED_INPUT = 1.0
-FINAL_SECONDS = 1.0
-"""Default weights, explained in `tvlqr`; they are not tuned to any plant."""
-
-_HALF_ANGLE = 0.5
-"""Error of a quaternion per error of the attitude, 1/rad."""
-
-_GRID = 1e-6
-"""Tolerance, as a fraction of dt, within which a time counts as that of a row."""
-
 
 # The controller ------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
@@ -114,33 +102,16 @@ class Controller:
         """Feedback law for simulations, row by row."""
         return LinearFeedback(self.inputs, self.states, self.gains, self.u_min, self.u_max)
 
-    def at(self, time: npt.ArrayLike, how: str = "hold") -> Controller:
-        """Controller on another time grid; constant before its first and after its last row.
+    def at(self, time: npt.ArrayLike) -> Controller:
+        """Controller on another time grid (n_rows,), s, evenly spaced, at least 2 rows: each takes the last row before.
 
-        Parameters
-        ----------
-        time : (n_rows,) array
-            s, evenly spaced, at least 2 rows.
-        how : {"hold", "linear"}
-            ``"hold"`` takes the last row; ``"linear"`` interpolates states and gains. Inputs are held in both.
-
-        Raises
-        ------
-        SettingsError
-            ``how`` is unknown, or the time is not evenly spaced.
+        Raises SettingsError: the time is not evenly spaced.
         """
-        if how not in ("hold", "linear"):
-            raise SettingsError(f'how is {how!r}; choose "hold" or "linear"')
         wanted = _checked_time(time)
-        rows = np.maximum(np.searchsorted(self.time, wanted + _GRID * self.dt, side="right") - 1, 0)
-        names = (self.state_names, self.input_names)
-        states, gains = self.states[rows], self.gains[rows]
-        if how == "linear":
-            after = np.minimum(rows + 1, len(self) - 1)
-            share = np.clip((wanted - self.time[rows]) / self.dt, 0.0, 1.0)
-            states = states + share[:, None] * (self.states[after] - states)
-            gains = gains + share[:, None, None] * (self.gains[after] - gains)
-        return Controller(wanted, states, self.inputs[rows], gains, self.u_min, self.u_max, *names)
+        # Tolerance, as a fraction of dt, within which a time counts as that of a row.
+        rows = np.maximum(np.searchsorted(self.time, wanted + 1e-6 * self.dt, side="right") - 1, 0)
+        arrays = (self.states[rows], self.inputs[rows], self.gains[rows], self.u_min, self.u_max)
+        return Controller(wanted, *arrays, self.state_names, self.input_names)
 
     def __reduce__(self) -> tuple[object, ...]:
         arrays = (self.time, self.states, self.inputs, self.gains, self.u_min, self.u_max)
@@ -197,10 +168,6 @@ def tvlqr(
         Smallest and largest value of each input, to which the law is clipped; the trajectory's by default. The gains do
         not depend on them if R is given.
 
-    Returns
-    -------
-    Controller
-
     Raises
     ------
     SettingsError
@@ -254,10 +221,6 @@ def tvlqr_batch(
         As in `tvlqr`, for all.
     threads : int
         Number of vectors of eight controllers computed at once. It changes no result.
-
-    Returns
-    -------
-    list of Controller
 
     Raises
     ------
@@ -344,14 +307,16 @@ class _CostMatrices:
     """Matrices Q, Qf and R."""
 
     def __init__(self, model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None) -> None:
-        errors = np.repeat([COORDINATE_ERROR, VELOCITY_ERROR], [model.n_q, model.n_v])
+        # Default weights, explained in `tvlqr`; they are not tuned to any plant.
+        errors = np.repeat([0.5, 1.0], [model.n_q, model.n_v])
         for four in model.quaternions:
-            errors[list(four)] *= _HALF_ANGLE
+            # Error of a quaternion per error of the attitude, 1/rad.
+            errors[list(four)] *= 0.5
         weights = errors**-2.0
         if model.n_q:
             weights[len(weights) - len(model.first_order) :] = 0.0
         self.Q = _matrix("Q", weights if Q is None else Q, model.state)
-        self.Qf = FINAL_SECONDS * self.Q if Qf is None else _matrix("Qf", Qf, model.state)
+        self.Qf = self.Q if Qf is None else _matrix("Qf", Qf, model.state)
         self._R = None if R is None else _matrix("R", R, tuple(model.inputs))
         if self._R is not None and np.linalg.eigvalsh(self._R).min(initial=np.inf) <= 0:
             found = self._R.tolist()
@@ -360,7 +325,7 @@ class _CostMatrices:
     def R(self, low: FloatArray, high: FloatArray) -> FloatArray:
         """R as given; by default full use of each input within these limits costs 1."""
         half = (high - low) / 2
-        use = np.where(np.isfinite(half) & (half > 0), half, UNLIMITED_INPUT)
+        use = np.where(np.isfinite(half) & (half > 0), half, 1.0)
         return np.diag(use**-2.0) if self._R is None else self._R
 
 

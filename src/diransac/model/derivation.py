@@ -28,7 +28,6 @@ __all__ = ["Probe", "Symbols"]
 
 
 _N_POINTS = 40
-_SINGULAR = 1e-10
 _TOLERANCE = 1e-8
 _NEAR_NOMINAL = 1e-3
 _ARGUMENTS = "qvaup"
@@ -312,7 +311,7 @@ def mass_matrix_sign(label: str, probe: Probe, mass_matrix: ca.Function, acceler
     scaled = M / np.where(rows > 0.0, rows, 1.0)
     columns = np.abs(scaled).max(axis=1, keepdims=True, initial=0.0)
     _, values, vectors = np.linalg.svd(scaled / np.where(columns > 0.0, columns, 1.0))
-    if len(M) == 0 or (values[:, -1] <= _SINGULAR * values[:, 0]).all():
+    if len(M) == 0 or (values[:, -1] <= 1e-10 * values[:, 0]).all():
         loose = np.abs(vectors[:, -1]).max(axis=0, initial=0.0) > 1e-6
         names = [x for x, l in zip(accelerations, loose, strict=True) if l] or list(accelerations)
         raise ModelError(

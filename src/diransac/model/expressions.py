@@ -28,14 +28,7 @@ from diransac.limits import MOST_OPERATIONS, beyond
 __all__ = ["Step", "check_size", "has_nan", "printed", "restored", "steps", "stored"]
 
 _VERSION = 1
-_LONGEST = 80
-"""Characters of the longest line of data."""
 
-_MOST_DIGITS = 12
-"""Digits of the largest index; longer ones are refused before they are converted."""
-
-_DEEPEST_TEXT = 150
-"""Nested operations of a printed expression; deeper ones are printed in several pieces."""
 
 # fmt: off
 _UNARY = (
@@ -139,10 +132,6 @@ def stored(label: str, function: ca.Function) -> dict[str, Any]:
     function : casadi.Function
         Its arguments and results are columns.
 
-    Returns
-    -------
-    dict
-
     Raises
     ------
     ModelError
@@ -201,10 +190,6 @@ def restored(name: str, data: object, arguments: Mapping[str, int], results: Map
     arguments, results : mapping of str to int
         Sizes that the function must have.
 
-    Returns
-    -------
-    casadi.Function
-
     Raises
     ------
     ResultError
@@ -236,7 +221,8 @@ def _checked(data: object, arguments: Mapping[str, int], results: Mapping[str, i
         raise ResultError("the stored equations are damaged: results are of another size; identify again")
     if not isinstance(lines, list) or len(lines) > MOST_OPERATIONS:
         raise ResultError(f"the stored equations are no list of up to {MOST_OPERATIONS} operations; identify again")
-    if not all(isinstance(line, str) and len(line) <= _LONGEST and line.isascii() for line in lines):
+    # Characters of the longest line of data.
+    if not all(isinstance(line, str) and len(line) <= 80 and line.isascii() for line in lines):
         raise ResultError("the stored equations are damaged: an operation is no short text; identify again")
     return lines
 
@@ -263,7 +249,8 @@ def _value(line: str, values: Sequence[ca.SX], elements: Mapping[str, Sequence[c
 
 
 def _index(text: str) -> int:
-    if not text.isdigit() or len(text) > _MOST_DIGITS:
+    # Digits of the largest index; longer ones are refused before they are converted.
+    if not text.isdigit() or len(text) > 12:
         raise ValueError(text)
     return int(text)
 
@@ -320,7 +307,8 @@ def printed(
         else:
             apply = ca.SX.unary if len(operands) == 1 else ca.SX.binary
             value = apply(_CODES[step.operation], *operands)
-        if depth > _DEEPEST_TEXT and step.operation != "output":
+        # Nested operations of a printed expression; deeper ones are printed in several pieces.
+        if depth > 150 and step.operation != "output":
             part = f"#{first + len(parts)}"
             parts.append(f"{part} = {value}")
             value, depth = ca.SX.sym(part), 0

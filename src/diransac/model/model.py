@@ -23,12 +23,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray
 from diransac.errors import ModelError, ResultError
 from diransac.model import derivation, expressions
 from diransac.model.derivation import Probe, Symbols
 from diransac.model.parameter import Parameter
 from diransac.model.sensors import Sensor, with_parameters_of
+from diransac.model.signals import Signals
 
 __all__ = ["Model"]
 
@@ -36,7 +37,7 @@ Equations = Callable[[Symbols, Symbols, Symbols, Symbols, Symbols], Sequence[Any
 Kinematics = Callable[[Symbols, Symbols], Sequence[Any]]
 
 
-class Model:
+class Model(Signals):
     """A dynamical model with named, unit-carrying signals and parameters.
 
     Parameters
@@ -112,132 +113,6 @@ class Model:
             results["measurement"] = ca.vertcat(*outputs)
         self._restore(self._written((q, v, a, u, p), results))
 
-    # ------------------------------------------------------------------ names and sizes
-
-    def _name_signals(
-        self,
-        name: str,
-        coordinates: Mapping[str, str],
-        inputs: Mapping[str, str],
-        parameters: Mapping[str, Parameter],
-        velocities: Mapping[str, str] | None,
-        first_order: Mapping[str, str],
-        description: str,
-        sensors: Mapping[str, str],
-    ) -> None:
-        derivation.check_texts({"name": name, "description": description})
-        self.name, self.description, self.sensors = name, description, dict(sensors)
-        units = {"coordinates": coordinates, "inputs": inputs, "velocities": velocities or {}}
-        derivation.check_groups(self._label, {**units, "first_order": first_order, "sensors": sensors}, parameters)
-        self.coordinates, self.inputs, self.parameters = dict(coordinates), dict(inputs), dict(parameters)
-        self.first_order = dict(first_order)
-        if velocities is None:
-            of_motion = {f"{q}_dot": _per_second(unit) for q, unit in coordinates.items()}
-            accelerations = {f"{q}_ddot": _per_second(unit, 2) for q, unit in coordinates.items()}
-        else:
-            of_motion = dict(velocities)
-            accelerations = {f"{v}_dot": _per_second(unit) for v, unit in velocities.items()}
-        rates = {f"{s}_dot": _per_second(unit) for s, unit in first_order.items()}
-        groups = (coordinates, of_motion, first_order, accelerations, rates, inputs, parameters, sensors)
-        derivation.check_names(self._label, groups)
-        self.velocities, self.accelerations = {**of_motion, **self.first_order}, {**accelerations, **rates}
-
-    @property
-    def _label(self) -> str:
-        return f'model "{self.name}"'
-
-    @property
-    def n_q(self) -> int:
-        """Number of coordinates."""
-        return len(self.coordinates)
-
-    @property
-    def n_v(self) -> int:
-        """Number of velocities, states of first order included, and of accelerations."""
-        return len(self.velocities)
-
-    @property
-    def n_u(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
-
-    @property
-    def n_p(self) -> int:
-        """Number of parameters."""
-        return len(self.parameters)
-
-    @property
-    def state(self) -> tuple[str, ...]:
-        """Names of the state ``x = [q; v]``."""
-        return (*self.coordinates, *self.velocities)
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """Names of the simulated signals: coordinates, velocities, accelerations, sensors."""
-        return (*self.state, *self.accelerations, *self.sensors)
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Unit of every signal and input by name."""
-        return {**self.coordinates, **self.velocities, **self.accelerations, **self.sensors, **self.inputs}
-
-    @property
-    def argument_sizes(self) -> dict[str, int]:
-        """Number of elements of the arguments q, v, a, u and p."""
-        return {"q": self.n_q, "v": self.n_v, "a": self.n_v, "u": self.n_u, "p": self.n_p}
-
-    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
-        q, v, a, u, p = (ca.vertcat(*(ca.SX.sym(n) for n in names)) for names in self._groups)
-        return q, v, a, u, p
-
-    @property
-    def _groups(self) -> tuple[Mapping[str, Any], ...]:
-        """Names behind the arguments q, v, a, u and p."""
-        return (self.coordinates, self.velocities, self.accelerations, self.inputs, self.parameters)
-
-    @property
-    def rate_names(self) -> tuple[str, ...]:
-        """Names of velocities and accelerations in the equations: ``theta``, not ``theta_dot``."""
-        of_motion = self.coordinates if self._velocities_are_derivatives else self.velocities_of_motion
-        return (*of_motion, *self.first_order)
-
-    @property
-    def velocities_of_motion(self) -> dict[str, str]:
-        """Velocities by name, without the states of first order, which follow them."""
-        return {name: unit for name, unit in self.velocities.items() if name not in self.first_order}
-
-    @property
-    def chains(self) -> tuple[tuple[str, ...], ...]:
-        """Signals of which each is the derivative of the one before, ordered by the last: ``(x, x_dot, x_ddot)``.
-
-        Coordinates of a model with kinematics, whose derivatives are no signals, come first, alone.
-        """
-        pairs = tuple(zip(self.velocities, self.accelerations, strict=True))
-        if self.kinematics is not None:
-            return (*((q,) for q in self.coordinates), *pairs)
-        n = self.n_q
-        return (*((q, *pair) for q, pair in zip(self.coordinates, pairs[:n], strict=True)), *pairs[n:])
-
-    def named(self, *vectors: ca.SX) -> tuple[Symbols, ...]:
-        """The arguments of the equations: the vectors q, v, a, u and p, or the first few, with named components."""
-        names = {
-            "coordinates": self.coordinates,
-            "velocities": self.rate_names,
-            "accelerations": self.rate_names,
-            "inputs": self.inputs,
-            "parameters": self.parameters,
-        }
-        return tuple(
-            Symbols(self._label, kind, dict(zip(names[kind], ca.vertsplit(x), strict=True)))
-            for kind, x in zip(names, vectors, strict=False)
-        )
-
-    @property
-    def _velocities_are_derivatives(self) -> bool:
-        return list(self.velocities_of_motion) == [f"{q}_dot" for q in self.coordinates]
-
-    # ------------------------------------------------------------------ equations
-
     def _written(self, symbols: Sequence[ca.SX], results: Mapping[str, ca.SX | None]) -> dict[str, Any]:
         """Equations as data by name, checked; None for those that the model lacks."""
         written: dict[str, Any] = {}
@@ -279,9 +154,6 @@ class Model:
         self.residual: ca.Function = made["residual"]
         self.kinematics: ca.Function | None = made["kinematics"]
         self.measurement: ca.Function | None = made["measurement"]
-        self._check()
-
-    def _check(self) -> None:
         self._probe = Probe(self.residual, self._bounds)
         self._mass_matrix, self._bias = derivation.affine_in_acceleration(self._label, self._probe, self.accelerations)
         self._definite = derivation.mass_matrix_sign(self._label, self._probe, self._mass_matrix, self.accelerations)
@@ -362,7 +234,10 @@ class Model:
             return ()
         symbols = self._symbols()
         slopes = ca.jacobian(self.measurement(*symbols), symbols[4])
-        return tuple(n for k, n in enumerate(self.sensors) if any(map(_is_constant, ca.horzsplit(slopes[k, :]))))
+        rows = (ca.horzsplit(slopes[k, :]) for k in range(len(self.sensors)))
+        return tuple(
+            n for n, row in zip(self.sensors, rows, strict=True) if any(x.is_constant() and float(x) for x in row)
+        )
 
     @cached_property
     def affine_sensors(self) -> tuple[str, ...]:
@@ -403,20 +278,7 @@ class Model:
         if len(kept) == len(self.sensors):
             return self
         needed = {n for name in kept for n in self.sensor_arguments[name]}
-        parameters = [n for n in self.parameters if n in needed or n not in self.sensor_parameters]
-        q, v, a, u, p = self._symbols()
-        own = [symbol for n, symbol in zip(self.parameters, ca.vertsplit(p), strict=True) if n in parameters]
-        symbols = [q, v, a, u, ca.vertcat(*own)]
-        data = {k: x for k, x in self.to_dict().items() if k not in ("checksum", "sensors", "measurement")}
-        data["parameters"] = {n: data["parameters"][n] for n in parameters}
-        written = ca.Function("residual", symbols, [self.residual(q, v, a, u, p)], list("qvaup"), ["r"])
-        data["residual"] = expressions.stored(self._label, written)
-        if kept and self.measurement is not None:
-            y = self.measurement(q, v, a, u, p)[[list(self.sensors).index(n) for n in kept]]
-            data["sensors"] = {n: self.sensors[n] for n in kept}
-            written = ca.Function("measurement", symbols, [y], list("qvaup"), ["y"])
-            data["measurement"] = expressions.stored(self._label, written)
-        return Model.from_dict({**data, "checksum": _checksum(data)})
+        return self._with_constants({n: 0.0 for n in self.sensor_parameters if n not in needed}, kept)
 
     def sensors_of(self, arguments: Callable[..., Sequence[ca.SX]]) -> dict[str, Sensor]:
         """The sensors for another model, of whose symbols ``arguments(q, v, a, u, p)`` returns this model's vectors."""
@@ -441,10 +303,7 @@ class Model:
     def regressor(self) -> ca.Function:
         """Function ``(q, v, a, u) -> (W (r, n_p), b (r))`` with ``W p = b`` for every solution, eqs. (1) and (5).
 
-        Raises
-        ------
-        ModelError
-            The residuals are not affine in the parameters that the message names.
+        Raises ModelError: the residuals are not affine in the parameters that the message names.
         """
         if self.nonlinear_parameters:
             raise ModelError(
@@ -490,10 +349,7 @@ class Model:
     def force_response(self) -> ca.Function:
         """Function ``(q, v, u, p, f) -> M^-1 f (n_v)``, the accelerations by generalised forces: ``M a + c = f``.
 
-        Raises
-        ------
-        ModelError
-            ``M`` is not symmetric and definite, so the residuals are not a balance of forces.
+        Raises ModelError: ``M`` is not symmetric and definite, so the residuals are not a balance of forces.
         """
         if self._definite == 0:
             raise ModelError(
@@ -506,20 +362,14 @@ class Model:
         return ca.Function("force_response", [q, v, u, p, f], [ca.densify(a)], list("qvupf"), ["a"])
 
     def with_fixed(self, values: Mapping[str, float]) -> Model:
-        """The model with some of its parameters replaced by constants in the equations.
+        """The model with constants in the equations in place of some parameters, each value in its unit.
 
-        Parameters
-        ----------
-        values : mapping of str to float
-            Value of each of these parameters in its unit.
-
-        Raises
-        ------
-        ModelError
-            No parameter is left, or the equations with these constants are not those of a model.
+        Raises ModelError: no parameter is left, or the equations with these constants are not those of a model.
         """
-        if not values:
-            return self
+        return self._with_constants(values, self.sensors) if values else self
+
+    def _with_constants(self, values: Mapping[str, float], sensors: Collection[str]) -> Model:
+        """The model with constants in place of some parameters, and with some of its sensors."""
 
         def arguments(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[ca.SX]:
             own = ca.vertcat(*(values[n] if n in values else p[n] for n in self.parameters))
@@ -542,7 +392,7 @@ class Model:
             velocities=self.velocities_of_motion if has_kinematics else None,
             kinematics=kinematics if has_kinematics else None,
             first_order=self.first_order,
-            sensors=self.sensors_of(arguments),
+            sensors={n: x for n, x in self.sensors_of(arguments).items() if n in sensors},
             description=self.description,
         )
 
@@ -576,24 +426,6 @@ class Model:
                 n_parts += len(parts)
         return tuple(texts)
 
-    def parameter_vector(self, parameters: Mapping[str, float]) -> FloatArray:
-        """Values ``(n_p,)`` in the model's order.
-
-        Raises
-        ------
-        ModelError
-            A name is missing or unknown, or its value is not finite.
-        """
-        if set(parameters) != set(self.parameters):
-            raise ModelError(
-                f"{self._label}: parameters are {', '.join(self.parameters)}; found {', '.join(map(str, parameters))}"
-            )
-        values = np.array([parameters[n] for n in self.parameters], dtype=float)
-        if not np.isfinite(values).all():
-            bad = [n for n, x in zip(self.parameters, values, strict=True) if not np.isfinite(x)]
-            raise ModelError(f"{self._label}: parameter {bad[0]} is {parameters[bad[0]]}; give a finite number")
-        return values
-
     # ------------------------------------------------------------------ identity and storage
 
     @cached_property
@@ -617,7 +449,7 @@ class Model:
             "coordinates": self.coordinates,
             "velocities": None if self.kinematics is None else self.velocities_of_motion,
             "inputs": self.inputs,
-            "parameters": {n: _parameter_to_dict(x) for n, x in self.parameters.items()},
+            "parameters": {n: x.to_dict() for n, x in self.parameters.items()},
             "residual": self._equations_data["residual"],
             "kinematics": self._equations_data["kinematics"],
             **({"first_order": self.first_order} if self.first_order else {}),
@@ -628,13 +460,7 @@ class Model:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Model:
-        """The model that `to_dict` wrote.
-
-        Raises
-        ------
-        ResultError
-            The data are damaged.
-        """
+        """The model that `to_dict` wrote.  Raises ResultError: the data are damaged."""
         try:
             return cls._from_checked(data)
         except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, RuntimeError, ModelError) as error:
@@ -650,7 +476,7 @@ class Model:
             raise ResultError("the stored model is damaged: its checksum does not match; identify again")
         if not isinstance(data["name"], str) or not isinstance(data["description"], str):
             raise TypeError("name or description")
-        parameters = {n: _parameter_from_dict(x) for n, x in data["parameters"].items()}
+        parameters = {n: Parameter.from_dict(x) for n, x in data["parameters"].items()}
         units = (data["coordinates"], data["inputs"], parameters, data["velocities"], data.get("first_order", {}))
         model._name_signals(data["name"], *units, data["description"], data.get("sensors", {}))
         has_kinematics, has_sensors = data["kinematics"] is not None, data.get("measurement") is not None
@@ -668,47 +494,6 @@ class Model:
         first_order = f", first_order={list(self.first_order)}" if self.first_order else ""
         names = f"coordinates={list(self.coordinates)}{first_order}, parameters={list(self.parameters)}"
         return f"Model({self.name!r}, {names})"
-
-
-def _is_constant(slope: ca.SX) -> bool:
-    """True for an expression without symbols that is not zero."""
-    return bool(slope.is_constant() and float(slope) != 0.0)
-
-
-def _per_second(unit: str, order: int = 1) -> str:
-    """``m -> m/s``, ``m -> m/s^2``; a unit that has a divisor already gets it multiplied."""
-    power = "s" if order == 1 else f"s^{order}"
-    if unit in ("", "1"):
-        return f"1/{power}"
-    head, slash, tail = unit.partition("/")
-    if not slash:
-        return f"{unit}/{power}"
-    if tail == "s":
-        return f"{head}/s^{order + 1}"
-    return f"{head}/({tail} {power})"
-
-
-def _parameter_to_dict(parameter: Parameter) -> dict[str, Any]:
-    def finite(x: float) -> float | None:
-        return float(x) if np.isfinite(x) else None
-
-    lower, upper = finite(parameter.lower), finite(parameter.upper)
-    stored = {"unit": parameter.unit, "lower": lower, "upper": upper, "positive": parameter.positive}
-    own_values = {"per_log": True} if parameter.per_log else {}
-    nominal = {} if parameter.value is None else {"value": float(parameter.value)}
-    combination = {"combination": [list(x) for x in parameter.combination]} if parameter.combination else {}
-    return {**stored, **own_values, **nominal, **combination}
-
-
-def _parameter_from_dict(data: Mapping[str, Any]) -> Parameter:
-    """Raises KeyError, TypeError, ValueError, ModelError: the data are not those of a parameter."""
-    unit, positive, own_values, nominal = data["unit"], data["positive"], data.get("per_log", False), data.get("value")
-    if not isinstance(unit, str) or not isinstance(positive, bool) or not isinstance(own_values, bool):
-        raise TypeError(f"parameter {data!r:.60}")
-    lower = -np.inf if data["lower"] is None else float(data["lower"])
-    upper = np.inf if data["upper"] is None else float(data["upper"])
-    combination = tuple((str(name), float(weight)) for name, weight in data.get("combination", ()))
-    return Parameter(unit, lower, upper, positive, own_values, None if nominal is None else float(nominal), combination)
 
 
 def _checksum(data: Mapping[str, Any]) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -67,3 +69,32 @@ class Parameter:
         x = np.asarray(values, dtype=float)
         inside = np.isfinite(x) & (x >= self.lower) & (x <= self.upper)
         return np.asarray(inside & (x > 0.0) if self.positive else inside)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as JSON data, which `from_dict` reads; those with defaults that came later only if they differ."""
+
+        def finite(x: float) -> float | None:
+            return float(x) if np.isfinite(x) else None
+
+        stored = {
+            "unit": self.unit,
+            "lower": finite(self.lower),
+            "upper": finite(self.upper),
+            "positive": self.positive,
+        }
+        own_values = {"per_log": True} if self.per_log else {}
+        nominal = {} if self.value is None else {"value": float(self.value)}
+        combination = {"combination": [list(x) for x in self.combination]} if self.combination else {}
+        return {**stored, **own_values, **nominal, **combination}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Parameter:
+        """Raises KeyError, TypeError, ValueError, ModelError: the data are not those of a parameter."""
+        unit, positive, own_values = data["unit"], data["positive"], data.get("per_log", False)
+        if not isinstance(unit, str) or not isinstance(positive, bool) or not isinstance(own_values, bool):
+            raise TypeError(f"parameter {data!r:.60}")
+        lower = -np.inf if data["lower"] is None else float(data["lower"])
+        upper = np.inf if data["upper"] is None else float(data["upper"])
+        value = None if data.get("value") is None else float(data["value"])
+        combination = tuple((str(name), float(weight)) for name, weight in data.get("combination", ()))
+        return cls(unit, lower, upper, positive, own_values, value, combination)

@@ -23,10 +23,6 @@ def independent_parts(model: Model) -> dict[str, Model]:
 
     Equations belong to one part if they share a state or a parameter, also by others; they may share inputs.
 
-    Parameters
-    ----------
-    model : Model
-
     Returns
     -------
     dict of str to Model

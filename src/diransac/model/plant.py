@@ -27,9 +27,6 @@ __all__ = ["Disturbance", "DisturbedModel", "ModelWithParameters", "Plant", "as_
 Effect = Callable[[Symbols, Symbols, Symbols, Symbols, Symbols], Mapping[str, Any]]
 """``effect(q, v, u, p, d)`` gives expressions by name."""
 
-_STEPS_PER_PERIOD = 8
-"""Integration steps per period of the fastest disturbance; docs/tables/flying.md has the convergence."""
-
 
 _HIGHEST_FREQUENCY = 1e5
 """Hz, of effects that simulations may resolve: 8000 integration steps per sample at 100 Hz."""
@@ -390,7 +387,8 @@ class Plant:
     def substeps(self, dt: float) -> int:
         """Integration steps per sample of dt (s) that resolve every disturbance."""
         fastest = max((one.highest_frequency for one in self.disturbances), default=0.0)
-        return max(1, int(np.ceil(_STEPS_PER_PERIOD * fastest * dt)))
+        # Integration steps per period of the fastest disturbance; docs/flying.md has the convergence.
+        return max(1, int(np.ceil(8 * fastest * dt)))
 
 
 def check_possible(model: Model, parameters: Mapping[str, float]) -> None:

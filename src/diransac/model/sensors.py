@@ -132,10 +132,6 @@ def accelerometer(
         Whether each axis has a bias (``acc_bias_x``, m/s^2) and a scale factor (``acc_scale_x``) as parameters.
     name : str, optional
         Beginning of the names: columns are ``acc_x``, ..., after the names of the axes.
-
-    Returns
-    -------
-    dict of str to Sensor
     """
     n = _dimension("accelerometer", position)
     names = _axes("accelerometer", axes, position)
@@ -187,10 +183,6 @@ def gyroscope(
         Whether each axis has a bias (``gyro_bias_wx``, rad/s) and a scale factor (``gyro_scale_wx``) as parameters.
     name : str, optional
         Name of the column in the plane; beginning of the names ``gyro_wx``, ... in three dimensions.
-
-    Returns
-    -------
-    dict of str to Sensor
     """
     if isinstance(rates, str):
         return {name: _calibrated("rad/s", lambda at: at.v[rates], name, "", bias, scale)}
@@ -230,10 +222,6 @@ def encoder(
         Whether the zero (``<name>_bias``, in the column's unit) and a scale factor (``<name>_scale``) are parameters.
     name : str, optional
         Name of the column; ``<coordinate>_encoder`` by default.
-
-    Returns
-    -------
-    dict of str to Sensor
     """
     for label, value in (("counts", 1.0 if counts is None else counts), ("ratio", ratio)):
         if not (np.isfinite(value) and value):
@@ -270,10 +258,6 @@ def magnetometer(
         of an estimated field, a common scale is not identifiable.
     name : str, optional
         Beginning of the names of columns, ``mag_x``, ...
-
-    Returns
-    -------
-    dict of str to Sensor
     """
     n = _dimension("magnetometer", axes)
     B, fields = _estimated(field, [f"{name}_field_{x}" for x in axes], unit, "field")
@@ -308,10 +292,6 @@ def range_to(
         Whether a bias (``range_bias``) and a scale factor (``range_scale``) are parameters.
     name : str, optional
         Name of the column.
-
-    Returns
-    -------
-    dict of str to Sensor
     """
     _dimension("range_to", position)
     aim, points = _estimated(point, [f"{name}_point_{x}" for x in position], unit, "point")

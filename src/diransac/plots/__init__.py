@@ -1,14 +1,16 @@
 """Figures of flights and studies. Matplotlib is imported when the first figure is drawn.
 
+In come logs, or a store; out comes a figure, and a file that is the same byte for byte each time.  Begin with
+`figure.py`, which all others draw with.
+
 | file | content |
 |---|---|
+| `figure.py` | colours, panels, heading, files |
 | `flight.py` | `plot_flight`: path, states and inputs of flights |
 | `prediction.py` | simulated signals beside the measured ones |
-| `study.py` | tracking errors and failures of a study, by level and method |
-| `estimates.py` | parameter errors of a study |
-| `paths.py` | flown paths of a study |
+| `study.py`, `estimates.py`, `paths.py` | tracking errors and failures, parameter errors, and flown paths of a study |
+| `fleet.py` | parameters of a fleet |
 | `rows.py` | rows of marks on a logarithmic axis, for levels that are words |
-| `figure.py` | colours, panels, heading, files |
 """
 
 from diransac.plots.flight import plot_flight

@@ -14,7 +14,7 @@ from diransac.plots.figure import INK, MUTED, WIDTH, check_ending, draw_heading,
 from diransac.plots.rows import LogAxis, MarkRow, as_marks, draw_rows, name_rows, names_width, row_height
 from diransac.plots.study import axis_label, level_labels, method_looks, n_trials, title_of
 from diransac.study.database import damage
-from diransac.study.specification import TRUE
+from diransac.study.method_choice import TRUE
 from diransac.study.store import Store
 from diransac.study.summary import ParameterErrors, Summary, summarise
 
@@ -27,7 +27,6 @@ __all__ = ["LEAST", "evaluates_parameters", "methods_and_errors", "plot_estimate
 LEAST = -3
 """Power of ten, %, below which errors are not resolved."""
 
-_TO_TRUE = "relative to the true ones"
 
 # Inches: name of the panel with the values above its rows, values below, a line of the caption.
 _ABOVE, _BELOW, _LINE = 0.42, 0.3, 0.155
@@ -36,7 +35,6 @@ _CAPTION = (
     "parameters, the best of the",
     "model in that flight; where those differ from the true ones, a second row has the errors relative to the latter.",
 )
-_NONE = " none: no estimate, counted as an infinite error."
 
 
 def plot_estimates(store: str | Path, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -70,13 +68,10 @@ def plot_estimates(store: str | Path, path: str | Path | None = None, *, title: 
     0.2 %, a second row has the errors relative to the latter. A trial without an estimate has an infinite error. The
     method ``true`` has a mark where its parameters are not the pseudo-true ones.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     summary = summarise(store)
     figure = _drawn(summary, title_of(summary) if title is None else title)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 def evaluates_parameters(store: str | Path) -> bool:
@@ -108,7 +103,7 @@ def methods_and_errors(summary: Summary, parameter: str | None = None) -> tuple[
     for i, name in enumerate(level_labels(summary)):
         rows.append(_row(name, best[i, kept], is_true & ~estimates.differs[i]))
         if estimates.differs[i]:
-            rows.append(_row(_TO_TRUE, own[i, kept], is_true, quiet=True))
+            rows.append(_row("relative to the true ones", own[i, kept], is_true, quiet=True))
     return [summary.methods[k] for k in kept], rows
 
 
@@ -144,5 +139,8 @@ def _drawn(summary: Summary, title: str) -> Figure:
 def _caption(summary: Summary, scale: LogAxis) -> list[str]:
     """Lines of the caption."""
     first, second = _CAPTION
-    lines = [first.format(trials=n_trials(summary)), second + _NONE * scale.endless]
+    lines = [
+        first.format(trials=n_trials(summary)),
+        second + " none: no estimate, counted as an infinite error." * scale.endless,
+    ]
     return [*lines, summary.remark] if summary.remark else lines

@@ -75,10 +75,6 @@ def empty_figure(height: float) -> Figure:
     """Figure without panels.
 
     Matplotlib, which is imported here first, would take settings from ``matplotlibrc`` in the working directory.
-
-    Parameters
-    ----------
-    height : inches
     """
     beside = Path("matplotlibrc").exists() and "matplotlib" not in sys.modules
     with chdir(Path(__file__).parent) if beside else nullcontext():
@@ -165,8 +161,6 @@ def inches(axes: Axes) -> tuple[float, float]:
 
 # Inches: height of the title and of a line of the legend, margin around them.
 _TITLE, _LEGEND_LINE, _MARGIN = 0.27, 0.19, 0.16
-# Inches: width of a letter in the legend, and of a sample line with its margins.
-_LETTER, _SAMPLE = 0.075, 0.65
 
 LegendEntry = tuple[str, dict[str, Any]]
 """Label, and style of its line."""
@@ -174,7 +168,8 @@ LegendEntry = tuple[str, dict[str, Any]]
 
 def _columns(entries: Sequence[LegendEntry]) -> int:
     """Number of entries per line of the legend."""
-    widths = [_SAMPLE + _LETTER * len(label) for label, _ in entries]
+    # Inches: width of a letter in the legend, and of a sample line with its margins.
+    widths = [0.65 + 0.075 * len(label) for label, _ in entries]
     return len(entries) if sum(widths) < WIDTH - 0.2 else max(1, int((WIDTH - 0.2) / max(widths)))
 
 
@@ -217,16 +212,13 @@ def draw_heading(figure: Figure, entries: Sequence[LegendEntry], title: str | No
 
 # Files ---------------------------------------------------------------------------------------------------------------
 
-_DOTS_PER_INCH = 200
 _METADATA = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-# The ids of an SVG are hashes with a random salt; a fixed one gives the same file each time.
-_SALT = {"svg.hashsalt": "diransac"}
 
 
-def check_ending(path: Path) -> str:
-    """Lower-case ending of a figure's file.  Raises SettingsError: it is unknown."""
-    ending = path.suffix.lower()
-    if ending not in _METADATA:
+def check_ending(path: str | Path | None) -> str:
+    """Lower-case ending of a figure's file, if there is to be one.  Raises SettingsError: it is unknown."""
+    ending = "" if path is None else Path(path).suffix.lower()
+    if path is not None and ending not in _METADATA:
         raise SettingsError(f'cannot write "{path}": its ending is not known; use one of {", ".join(_METADATA)}')
     return ending
 
@@ -240,23 +232,27 @@ def _literal_texts(figure: Figure, **settings: Any) -> Iterator[None]:
     for text in figure.findobj(Text):
         text.set_parse_math(False)
         text.set_text(printable(text.get_text()))
-    with rc_context({**_SALT, "text.parse_math": False, **settings}), warnings.catch_warnings():
+    # The ids of an SVG are hashes with a random salt; a fixed one gives the same file each time.
+    with rc_context({"svg.hashsalt": "diransac", "text.parse_math": False, **settings}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from font", category=UserWarning)
         yield
 
 
-def write(figure: Figure, path: Path) -> None:
-    """Write the figure in the format of the file's ending, completely or not at all.
+def write(figure: Figure, path: str | Path | None) -> Figure:
+    """The figure itself, written in the format of the file's ending, completely or not at all; None writes none.
 
     Raises SettingsError: the ending is unknown, or the file cannot be written.
     """
+    if path is None:
+        return figure
     ending, memory = check_ending(path), io.BytesIO()  # a full disk is an error of zlib to Matplotlib
     with _literal_texts(figure):
-        figure.savefig(memory, format=ending[1:], dpi=_DOTS_PER_INCH, metadata=_METADATA[ending])
+        figure.savefig(memory, format=ending[1:], dpi=200, metadata=_METADATA[ending])
     try:
         write_bytes(path, memory.getvalue())
     except OSError as error:
         raise SettingsError(f'cannot write "{path}": {error.strerror or error}') from error
+    return figure
 
 
 def svg(figure: Figure) -> str:

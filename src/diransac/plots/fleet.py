@@ -30,10 +30,6 @@ if TYPE_CHECKING:
 __all__ = ["plot_fleet"]
 
 _ROW = 1.9
-_MOST_NAMED = len(COLOURS)
-"""Vehicles with a colour of their own, those with the largest distances."""
-_MARGIN = 0.15
-"""Free part of a panel beyond the central values."""
 
 
 def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -59,8 +55,7 @@ def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: 
     SettingsError
         The file cannot be written.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     colours = _colours(summary)
     text = f"{summary.rows.model}: {summary.n_vehicles} vehicles" if title is None else title
     entries: list[LegendEntry] = [("fleet", {"color": REFERENCE, "marker": ".", "linestyle": ""})]
@@ -79,15 +74,14 @@ def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: 
         if last:
             over_life.set_xlabel("log of the vehicle", fontsize=8, color=INK)
             by_vehicle.set_xlabel("vehicle, sorted by value", fontsize=8, color=INK)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 def _colours(summary: FleetSummary) -> dict[str, str]:
     """Colour of each vehicle with a finding, as far as there are colours."""
     found = sorted(summary.findings, key=lambda x: -x.distance)
-    named = list(dict.fromkeys(x.vehicle for x in found))[:_MOST_NAMED]
+    # Vehicles with a colour of their own, those with the largest distances.
+    named = list(dict.fromkeys(x.vehicle for x in found))[: len(COLOURS)]
     return dict(zip(named, COLOURS, strict=False))
 
 
@@ -111,7 +105,8 @@ def _draw_lives(axes: Axes, summary: FleetSummary, parameter: ParameterInFleet, 
     named = y[np.isin(vehicles, list(colours))]
     low, high = np.nanquantile(y, [0.005, 0.995])
     low, high = min(low, *named[np.isfinite(named)], high), max(high, *named[np.isfinite(named)], low)
-    margin = _MARGIN * (high - low or abs(high) or 1.0)
+    # Free part of a panel beyond the central values.
+    margin = 0.15 * (high - low or abs(high) or 1.0)
     axes.set_ylim(low - margin, high + margin)
 
 

@@ -79,8 +79,7 @@ def plot_flight(
     a diverging flight leaves the others readable: a triangle marks where it leaves a panel, a cross its last finite
     value. The same flights give the same file, byte for byte. pyplot and its settings are not touched.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     flights = _flights(trajectory, log)
     states, inputs = flights[0].reference.state_names, flights[0].reference.input_names
     entries, box = _legend_entries(flights), _path_box(flights)
@@ -92,9 +91,7 @@ def plot_flight(
     if path_panel is not None and box is not None:
         _draw_path(path_panel, flights, box)
     draw_heading(figure, entries, title)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 # Heading -------------------------------------------------------------------------------------------------------------
@@ -118,9 +115,6 @@ def _legend_entries(flights: Sequence[FlightCurve]) -> list[LegendEntry]:
 
 # Of the range of an axis: margin, and distance up to which a line is drawn; least aspect ratio of a path.
 _MARGIN, _FARTHEST, _LEAST_BREADTH = 0.06, 20.0, 0.15
-# Quantile and factor of a flight's usual distance from its reference, its largest widening of an axis, and the ratio
-# below which the extent of the reference is negligible; see `_reach`.
-_USUAL_SHARE, _USUAL_FACTOR, _WIDENING, _NEGLIGIBLE = 0.2, 5.0, 5.0, 1e-4
 
 
 @dataclass(frozen=True)
@@ -199,9 +193,11 @@ def _reach(planned: FloatArray, flown: Sequence[FloatArray]) -> float:
     unless they are constant but for rounding.
     """
     size = float(np.ptp(planned))
-    off = [float(np.quantile(np.abs(values - np.median(planned)), _USUAL_SHARE)) for values in flown]
-    usual = _USUAL_FACTOR * min(off, default=0.0)
-    return usual if size < _NEGLIGIBLE * usual else max(size, min(usual, _WIDENING * size))
+    # Quantile and factor of a flight's usual distance from its reference, its largest widening of an axis, and
+    # the ratio below which the extent of the reference is negligible; see `_reach`.
+    off = [float(np.quantile(np.abs(values - np.median(planned)), 0.2)) for values in flown]
+    usual = 5.0 * min(off, default=0.0)
+    return usual if size < 1e-4 * usual else max(size, min(usual, 5.0 * size))
 
 
 def _path_box(flights: Sequence[FlightCurve]) -> tuple[Range, Range] | None:
@@ -247,8 +243,6 @@ def _last_finite(values: FloatArray) -> int | None:
 # Panels --------------------------------------------------------------------------------------------------------------
 
 _LIMIT_STYLE: dict[str, Any] = {"color": MUTED, "linewidth": 0.9, "linestyle": (0.0, (1.0, 2.0))}
-# Number of attitudes; inches: length of each arm of a bar, least distance between grid lines of the path.
-_ATTITUDES, _ARM, _GRID = 20, 0.085, 0.6
 
 
 def _style(flight: FlightCurve) -> dict[str, Any]:
@@ -350,11 +344,11 @@ def _draw_path(axes: Axes, flights: Sequence[FlightCurve], needed: tuple[Range, 
         axes.plot(x, z, **_style(flight), zorder=2.5)
         _mark_path_end(axes, flight, box)
     if len(flights) == 1 and "theta" in flights[0].reference.state_names:
-        _draw_attitudes(axes, flights[0], box, reach=_ARM * scale)
+        _draw_attitudes(axes, flights[0], box, reach=0.085 * scale)
     _mark_start(axes, flights[0].reference, box)
     axes.set(xlim=box[0], ylim=box[1], aspect="equal")
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MultipleLocator(_round_step(_GRID * scale)))
+        axis.set_major_locator(MultipleLocator(_round_step(0.6 * scale)))
     unit = _unit("x", flights)
     axes.xaxis.set_major_formatter(f"{{x:g}} {unit}" if unit else "{x:g}")
     name_panel(axes, "path", f"z over x, {unit}" if unit else "z over x")
@@ -395,7 +389,8 @@ def _draw_attitudes(axes: Axes, flight: FlightCurve, box: tuple[Range, Range], r
     """Draw the body's x axis as a bar and its z axis as a tick at evenly spaced times."""
     from matplotlib.collections import LineCollection
 
-    rows = np.linspace(0, len(flight.log) - 1, _ATTITUDES).astype(int)
+    # Number of attitudes; inches: length of each arm of a bar, least distance between grid lines of the path.
+    rows = np.linspace(0, len(flight.log) - 1, 20).astype(int)
     x, z, theta = (flight.log[name][rows] for name in ("x", "z", "theta"))
     seen = (x > box[0][0]) & (x < box[0][1]) & (z > box[1][0]) & (z < box[1][1]) & np.isfinite(theta)
     centre = np.column_stack([x, z])[seen]

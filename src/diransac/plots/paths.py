@@ -26,8 +26,8 @@ from diransac.plots.figure import (
     write,
 )
 from diransac.plots.study import method_looks, title_of
+from diransac.study.method_choice import TRUE
 from diransac.study.reading import paths
-from diransac.study.specification import TRUE
 from diransac.study.store import Store
 from diransac.study.summary import Summary, summarise
 
@@ -46,8 +46,6 @@ _LEFT, _GAP, _NAME, _BELOW, _CAPTION = 0.42, 0.12, 0.24, 0.42, 0.3
 _MARGIN, _EVERY = 0.3, 3
 _PALE = 0.35
 _DASHES = (0.0, (4.0, 3.0))
-# Largest number of grid lines across a panel.
-_LINES = 5.0
 
 
 def plot_paths(
@@ -84,8 +82,7 @@ def plot_paths(
     references of the flights, which each method planned with what it had identified. The panels cover the true path and
     a margin; below each are the numbers of flights that leave it and of failed trials.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     summary = summarise(store)
     chosen = _chosen(levels_with_paths(store), level)
     flown, planned = (
@@ -93,9 +90,7 @@ def plot_paths(
         for which in (False, True)
     )
     figure = _drawn(summary, chosen, flown, planned, title_of(summary) if title is None else title)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 def levels_with_paths(store: str | Path) -> list[str]:
@@ -196,7 +191,8 @@ def _dress(axes: Axes, box: tuple[Range, Range], first: bool) -> None:
     axes.tick_params(length=0, labelsize=7, labelcolor=MUTED, labelleft=first, pad=2)
     axes.grid(color=RULE, linewidth=0.6)
     axes.set_axisbelow(True)
-    least = extent(box[0]) / _LINES
+    # Largest number of grid lines across a panel.
+    least = extent(box[0]) / 5.0
     decade = 10.0 ** np.floor(np.log10(least))
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MultipleLocator(next(n * decade for n in (1.0, 2.0, 5.0, 10.0) if n * decade >= least)))

@@ -30,8 +30,6 @@ __all__ = ["plot_prediction"]
 
 _MEASURED: dict[str, Any] = {"color": REFERENCE, "linestyle": "none", "marker": ".", "markersize": 2.5}
 _SIMULATED: dict[str, Any] = {"color": COLOURS[0], "linewidth": 1.3}
-_INPUT: dict[str, Any] = {"color": MUTED, "linewidth": 1.0}
-_MARGIN = 0.06
 
 
 def plot_prediction(
@@ -55,15 +53,14 @@ def plot_prediction(
     SettingsError
         The ending is unknown, or the file cannot be written.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     entries = [("simulated", _SIMULATED), ("measured", _MEASURED)]
     figure, panels, _ = flight_panels(states, inputs, None, header_height(entries, None))
     draw_heading(figure, entries, None)
     for name, axes in panels.items():
         name_panel(axes, name, simulated.units.get(name, ""))
         if name in inputs:
-            axes.plot(simulated.time, simulated[name], **_INPUT)
+            axes.plot(simulated.time, simulated[name], color=MUTED, linewidth=1.0)
             continue
         axes.plot(simulated.time, simulated[name], zorder=3, **_SIMULATED)
         low, high = _range(simulated[name])
@@ -73,11 +70,9 @@ def plot_prediction(
             if len(finite):
                 bulk = np.quantile(finite, [0.01, 0.99])
                 low, high = min(low, float(bulk[0])), max(high, float(bulk[1]))
-        margin = _MARGIN * (high - low) or 1.0
+        margin = 0.06 * (high - low) or 1.0
         axes.set_ylim(low - margin, high + margin)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 def _range(values: FloatArray) -> tuple[float, float]:

@@ -12,6 +12,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.plots.figure import INK, MUTED, PAPER, RULE, SOFT, WIDTH
 from diransac.study.summary import TrackingErrors
+from diransac.text_table import superscript
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,14 +35,8 @@ Looks = Mapping[str, Mapping[str, Any]]
 # Inches: height of a row per method, its margin, its least height; least distances of labelled decades and of labels.
 _METHOD, _FREE, _LEAST = 0.044, 0.075, 0.24
 _APART, _NEAR = 0.5, 0.32
-# Width of a letter of a row's name, inches; letters per line.
-_LETTER, _LETTERS = 0.059, 40
-# Inches: distance of the heading above the rows' names.
-_HEADING = 0.05
 # Largest number of decades of an axis, and the distance of the places beyond its ends, in decades.
 _DECADES, _ROOM = 6, 0.6
-_WORST: dict[str, Any] = {"linewidth": 1.0, "alpha": 0.45, "solid_capstyle": "butt"}
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
@@ -63,15 +58,7 @@ class MarkRow:
 
 @dataclass(frozen=True)
 class LogAxis:
-    """Logarithmic axis with places beyond its ends for values that are too small, too large or infinite.
-
-    Parameters
-    ----------
-    least : power of ten below which values are too small
-    low, high : powers of ten at the ends of the axis
-    exceeded : whether a value is larger
-    endless : whether a value is infinite
-    """
+    """Logarithmic axis with places beyond its ends for values that are too small, too large or infinite."""
 
     least: int
     low: int
@@ -170,7 +157,7 @@ def draw_rows(
 def _mark(axes: Axes, x: float, end: float, y: float, look: Mapping[str, Any], *, hollow: bool) -> None:
     """Draw a method's mark, and the line to its largest value."""
     colour = look["color"]
-    axes.plot([x, end], [y, y], color=colour, **_WORST, zorder=2.2)
+    axes.plot([x, end], [y, y], color=colour, linewidth=1.0, alpha=0.45, solid_capstyle="butt", zorder=2.2)
     face = PAPER if hollow else colour
     axes.plot([x], [y], **{**look, "markerfacecolor": face, "markeredgewidth": 0.8 if hollow else 0.3}, zorder=2.5)
 
@@ -190,7 +177,8 @@ def _shade(axes: Axes, rows: Sequence[MarkRow], scale: LogAxis) -> None:
 
 def names_width(names: Sequence[str], heading: str) -> float:
     """Width of the names of rows and their heading with margins, inches."""
-    return 0.25 + _LETTER * max(len(line) for name in (*names, heading) for line in _lines(name))
+    # Width of a letter of a row's name, inches; letters per line.
+    return 0.25 + 0.059 * max(len(line) for name in (*names, heading) for line in _lines(name))
 
 
 def name_rows(
@@ -205,7 +193,8 @@ def name_rows(
     """
     left, top = place
     above: dict[str, Any] = {"fontsize": 7.5, "color": MUTED, "va": "bottom", "ha": "right"}
-    y = 1.0 - (top - _HEADING) / figure.get_figheight()
+    # Inches: distance of the heading above the rows' names.
+    y = 1.0 - (top - 0.05) / figure.get_figheight()
     figure.text((left - 0.1) / WIDTH, y, "\n".join(_lines(heading)), **above)
     for i, row in enumerate(rows):
         y = 1.0 - (top + (i + 0.5) * row_height(n_methods)) / figure.get_figheight()
@@ -215,7 +204,7 @@ def name_rows(
 
 def _lines(name: str) -> list[str]:
     """Name wrapped into lines."""
-    return wrap(name, _LETTERS) or [name]
+    return wrap(name, 40) or [name]
 
 
 def _decade(power: int) -> str:
@@ -225,15 +214,13 @@ def _decade(power: int) -> str:
 
 def _power(power: int) -> str:
     """``0.1``, ``1``, ``10``, and ``10⁻³`` or ``10³`` further out."""
-    return _decade(power) if abs(power) < 2 else f"10{str(power).translate(_SUPERSCRIPTS)}"
+    return _decade(power) if abs(power) < 2 else f"10{superscript(power)}"
 
 
 # Tracking errors -----------------------------------------------------------------------------------------------------
 _COLUMNS = 3
 # Inches: between panels, name of a panel with the values above its rows, values below them.
 _GAP, _ABOVE, _BELOW = 0.26, 0.42, 0.3
-_LEAST_ERROR = -3
-"""Power of ten, m or rad, below which errors are not resolved."""
 
 
 def flight_rows_height(flights: TrackingErrors, n_levels: int, n_methods: int) -> float:
@@ -271,7 +258,8 @@ def draw_flight_rows(
         figure.text((left + width - _GAP) / WIDTH, y, units[state], fontsize=7.5, color=MUTED, va="top", ha="right")
         if column == 0:
             name_rows(figure, (left, above + _ABOVE), rows, len(looks), axis)
-        draw_rows(figure, (left, above + _ABOVE, width - _GAP), rows, looks, LogAxis.of(rows, _LEAST_ERROR))
+        # Power of ten, m or rad, below which errors are not resolved.
+        draw_rows(figure, (left, above + _ABOVE, width - _GAP), rows, looks, LogAxis.of(rows, -3))
 
 
 def _coordinates(states: Iterable[str]) -> list[str]:

@@ -30,8 +30,9 @@ from diransac.plots.figure import (
     write,
 )
 from diransac.plots.rows import as_marks, draw_flight_rows, flight_rows_height
-from diransac.study.specification import TRUE
+from diransac.study.method_choice import TRUE
 from diransac.study.summary import Summary, TrackingErrors, summarise
+from diransac.text_table import superscript
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,19 +44,12 @@ __all__ = ["axis_label", "level_labels", "method_looks", "n_trials", "plot_study
 # Inches: height of a row of panels, of a trajectory's name, of the axis below the panels, of a line of the caption.
 _ROW, _NAME, _AXIS, _LINE = 1.5, 0.24, 0.36, 0.155
 _COLUMNS = 3
-# Methods are side by side within this fraction of the least distance between levels.
-_SPREAD = 0.5
-# Ratio of the largest to the median mean above which the scale is logarithmic; its decades above a linear part.
-_MANY, _DECADES = 20.0, 3
-_TOP = 1e300
-"""Largest value on an axis; Matplotlib adds margins."""
 # Letters per line of a title, and largest difference between its lines.
 _LETTERS, _RAGGED = 92, 12
 
 # The fifth colour is too close to the first where lines cross.
 _COLOURS = (*COLOURS[:4], INK, COLOURS[5], "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _CAPTION = (
     "Mean of the RMS tracking error and one standard deviation, over {trials}; a dash is the median, for which "
     "a failed trial",
@@ -63,7 +57,6 @@ _CAPTION = (
     "are then hollow.",
 )
 _CAPTION_OF_ROWS = ("Marks are medians of the RMS tracking error over {trials} of a level, lines end at the largest.",)
-_NONE = "none: no flight (no plan, or one that diverged), counted as an infinite error."
 
 
 def plot_study(store: str | Path, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -98,17 +91,14 @@ def plot_study(store: str | Path, path: str | Path | None = None, *, title: str 
     logarithmic above. Levels that are words are rows, with a panel per coordinate on a logarithmic axis: marks are
     medians over all trials, lines end at the largest value.
     """
-    if path is not None:
-        check_ending(Path(path))
+    check_ending(path)
     summary = summarise(store)
     if not summary.flights:
         raise SettingsError(
             "the study has no trajectories to evaluate; draw its parameter errors with study plot --parameters"
         )
     figure = _drawn(summary, title_of(summary) if title is None else title)
-    if path is not None:
-        write(figure, Path(path))
-    return figure
+    return write(figure, path)
 
 
 def _drawn(summary: Summary, title: str) -> Figure:
@@ -133,7 +123,10 @@ def _drawn(summary: Summary, title: str) -> Figure:
 def _caption(summary: Summary) -> list[str]:
     """Lines of the caption."""
     some_failed = any(flights.failed.any() for flights in summary.flights.values())
-    of_rows = [*_CAPTION_OF_ROWS, _NONE if some_failed else ""]
+    of_rows = [
+        *_CAPTION_OF_ROWS,
+        "none: no flight (no plan, or one that diverged), counted as an infinite error." if some_failed else "",
+    ]
     lines = [*(_CAPTION if summary.is_numeric else of_rows), summary.remark]
     return [line.format(trials=n_trials(summary)) for line in lines if line]
 
@@ -208,7 +201,9 @@ def _draw_state(axes: Axes, summary: Summary, flights: TrackingErrors, state: st
 def _spans_decades(flights: TrackingErrors) -> bool:
     """True if the means of a state differ so much that a linear scale shows the largest alone."""
     seen = [mean[np.isfinite(mean)] for mean in map(flights.mean, flights.errors)]
-    return any(len(x) and float(x.max()) > _MANY * float(np.median(x)) for x in seen)
+    # Ratio of the largest to the median mean above which the scale is logarithmic; its decades above a linear
+    # part.
+    return any(len(x) and float(x.max()) > 20.0 * float(np.median(x)) for x in seen)
 
 
 # Axes ----------------------------------------------------------------------------------------------------------------
@@ -218,7 +213,8 @@ def _placed(summary: Summary) -> FloatArray:
     least = float(np.diff(positions).min()) if len(positions) > 1 else 1.0
     others = [label for label in summary.methods if label != TRUE]
     beside = {label: (i / (len(others) - 1) - 0.5) if len(others) > 1 else 0.0 for i, label in enumerate(others)}
-    return np.asarray(positions[:, None] + _SPREAD * least * np.array([beside.get(m, 0.0) for m in summary.methods]))
+    # Methods are side by side within this fraction of the least distance between levels.
+    return np.asarray(positions[:, None] + 0.5 * least * np.array([beside.get(m, 0.0) for m in summary.methods]))
 
 
 def _positions(summary: Summary) -> tuple[FloatArray, int]:
@@ -246,7 +242,8 @@ def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool)
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
     largest = float(mean[np.isfinite(mean)].max(initial=0.0))
-    top = min(max(largest, float(np.nan_to_num(highest).max(initial=0.0))), _TOP)
+    # Largest value on an axis; Matplotlib adds margins.
+    top = min(max(largest, float(np.nan_to_num(highest).max(initial=0.0))), 1e300)
     if not largest > 0.0:
         axes.set_ylim(-0.04, 1.0)
         return
@@ -254,7 +251,7 @@ def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool)
     if not logarithmic:
         axes.set_ylim(-0.04 * top, 1.06 * top)
         return
-    first = int(np.floor(np.log10(largest))) - _DECADES
+    first = int(np.floor(np.log10(largest))) - 3
     axes.set_yscale("symlog", linthresh=10.0**first, linscale=0.5)
     decades = 10.0 ** np.arange(first, np.floor(np.log10(top)) + 1)
     axes.yaxis.set_major_locator(FixedLocator([0.0, *decades]))
@@ -265,7 +262,7 @@ def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool)
 def _tick(y: float) -> str:
     """``0.01``, ``5×10⁻⁵``, ``10⁶``."""
     mantissa, _, exponent = f"{y:.6g}".partition("e")
-    power = f"10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if exponent else ""
+    power = f"10{superscript(int(exponent))}" if exponent else ""
     return mantissa.replace("-", "−") if not power else power if mantissa == "1" else f"{mantissa}×{power}"
 
 
@@ -290,8 +287,8 @@ def method_looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
 def axis_label(summary: Summary) -> str:
     """Name of the axis with its unit, ``mass imbalance, 10⁻⁵ kg``."""
     _, exponent = _positions(summary)
-    power = f"10{str(exponent).translate(_SUPERSCRIPTS)}" if exponent else ""
-    unit = re.sub(r"\^(-?\d+)", lambda found: found[1].translate(_SUPERSCRIPTS), summary.unit)
+    power = f"10{superscript(exponent)}" if exponent else ""
+    unit = re.sub(r"\^(-?\d+)", lambda found: superscript(found[1]), summary.unit)
     return f"{summary.axis}, {power} {unit}".rstrip(" ,").replace(",  ", ", ")
 
 
@@ -309,8 +306,6 @@ def n_trials(summary: Summary) -> str:
 
 
 # Failed trials -------------------------------------------------------------------------------------------------------
-_FAILED = "#b42318"
-"""Colour of failures, as in the report."""
 
 # Inches: height of a row of cells, of the heading, of the margin below; left and right ends of the cells.
 _CELL, _HEADING, _FREE, _LEFT, _RIGHT = 0.19, 0.21, 0.1, 1.75, 8.83
@@ -363,7 +358,8 @@ def _draw_cell(figure: Figure, left: float, top: float, width: float, fraction: 
     figure.add_artist(Rectangle(place, *size, facecolor=SOFT, **look))
     if not fraction > 0.0:
         return
-    figure.add_artist(Rectangle(place, *size, facecolor=_FAILED, alpha=0.12 + 0.6 * fraction, **look))
+    # Colour of failures, as in the report.
+    figure.add_artist(Rectangle(place, *size, facecolor="#b42318", alpha=0.12 + 0.6 * fraction, **look))
     dark = fraction > 0.5
     _write(figure, left + width / 2.0, top + 0.025, _percent(fraction), color="#ffffff" if dark else INK, ha="center")
 

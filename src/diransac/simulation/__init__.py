@@ -1,5 +1,8 @@
 """Batches of rollouts of a model: scored against a log, differentiated, or under feedback.
 
+In come a model and arrays of lanes (`RolloutBatch`); out come scores, Gauss-Newton sums, errors or signals of each.
+Begin with `batch.py`, then `Rollouts` in `rollouts.py`.
+
 Observation `j` is the state at `t_j`; then the input `u_j` is held to `t_{j+1}`, or interpolated linearly to `u_{j+1}`;
 the acceleration at `t_j` is the one under `u_j`.
 

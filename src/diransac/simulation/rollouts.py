@@ -197,7 +197,8 @@ class Rollouts(Simulator):
         if lanes.n_lanes <= LANES:  # one vector reads rows of its own as fast: one machine code less
             lanes = lanes.with_windows()
         series = np.empty((lanes.n_lanes, lanes.n_rows, len(self._model.signals)))
-        self._run("SignalOutput", batch, lanes, {"series": series}, threads)
+        final = np.empty((lanes.n_lanes, len(self._model.state)))
+        self._run("SignalOutput", batch, lanes, {"series": series, "final": final}, threads)
         return series
 
     def gauss_newton(

@@ -28,16 +28,9 @@ __all__ = [
     "PlantFacts", "covers", "differ", "is_disturbed", "mean_accelerations", "pseudo_true_parameters", "relative_errors",
 ]  # fmt: skip
 
-_ROUNDING = 1e-6
-"""Tolerance of `covers`, relative to the parameter. Without noise, intervals are points."""
-
-_VISIBLE = 2e-3
-"""Relative difference up to which pseudo-true and true parameters are taken for the same."""
 
 _N_PHASES = 8
 """Phases that a vibration is averaged over; harmonics up to the seventh cancel exactly."""
-
-_PHASE = "phase"
 
 
 @dataclass(frozen=True)
@@ -140,14 +133,16 @@ def covers(low: npt.ArrayLike, high: npt.ArrayLike, pseudo_true: npt.ArrayLike) 
     The tolerance is one millionth of the parameter.
     """
     a, b, p = (np.asarray(one, dtype=float) for one in (low, high, pseudo_true))
-    slack = _ROUNDING * np.abs(p)
+    # Tolerance of `covers`, relative to the parameter. Without noise, intervals are points.
+    slack = 1e-6 * np.abs(p)
     known = np.isfinite(a) & np.isfinite(b) & np.isfinite(p)
     return np.where(known, (a - slack <= p) & (p <= b + slack), np.nan)
 
 
 def differ(pseudo_true: npt.ArrayLike, true: npt.ArrayLike) -> BoolArray:
     """True where pseudo-true and true parameters differ by more than 0.2 %."""
-    return relative_errors(pseudo_true, true) > _VISIBLE
+    # Relative difference up to which pseudo-true and true parameters are taken for the same.
+    return relative_errors(pseudo_true, true) > 2e-3
 
 
 def is_disturbed(plant: Plant) -> bool:
@@ -157,4 +152,4 @@ def is_disturbed(plant: Plant) -> bool:
 
 def _is_phase(state: str) -> bool:
     """True for a disturbance's state ``<disturbance>.phase...``."""
-    return state.rpartition(".")[2].startswith(_PHASE)
+    return state.rpartition(".")[2].startswith("phase")

@@ -32,12 +32,10 @@ __all__ = [
 PLANNING_TIME_LIMIT = 600.0
 """s per plan: long enough for a solver's limit of iterations to end it first on any machine."""
 
-_SEED_BYTES = 8
-
 
 def derived_seed(*key: str | int) -> int:
     """A seed of 63 bits that depends on the key alone and is the same on every machine."""
-    digest = hashlib.blake2b(json.dumps(key).encode(), digest_size=_SEED_BYTES).digest()
+    digest = hashlib.blake2b(json.dumps(key).encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big") >> 1
 
 
@@ -88,14 +86,7 @@ def trial_data(study: Study | Mapping[str, Any] | str | Path, level: str | float
 
 
 def trial_data_batch(study: Study, level: str, trials: Sequence[int]) -> list[TrialData | Exception]:
-    """The data of each trial at a level, or the error that prevented them.
-
-    Parameters
-    ----------
-    study : at that level
-    level : its text
-    trials : numbers
-    """
+    """The data of each trial at a level, or the error that prevented them."""
     seeds = [trial_seed(study, level, trial) for trial in trials]
     found: list[TrialData | Exception] = []
     with single_threaded():  # the same sums within a study's run and outside

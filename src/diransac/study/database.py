@@ -6,13 +6,13 @@ have a time limit, every value is checked, and none of them names code that read
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import time
 import zipfile
 import zlib
-from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -23,53 +23,42 @@ from diransac.errors import StudyError
 from diransac.plain_text import one_line
 
 __all__ = [
-    "AGAIN",
-    "Database",
-    "check_plain",
-    "connected_to",
-    "copied",
-    "damage",
-    "is_empty",
-    "kept_apart",
-    "quoted",
-    "reported",
-    "roll_back",
-    "transaction",
-    "word",
-]
+    "AGAIN", "LARGEST", "MOST_LISTED", "Database", "connected_to", "damage", "kept_apart", "quoted", "reported",
+    "roll_back", "transaction", "word",
+]  # fmt: skip
 
 AGAIN = "~"
 """Mark of a column whose name another one has in other case."""
 
-_LOCK_TIMEOUT = 120.0
-"""s to wait while another process writes."""
+LARGEST = 1e150
+"""Of a number in a row: statistics have its square."""
 
-_READ_TIMEOUT = 120.0
-"""s that one query may take."""
+MOST_LISTED = 6
+"""Differences that an error message lists."""
 
-_ANOTHER_JOURNAL = bytes.fromhex("d9d505f920a163d7")
-"""Last bytes of a journal of several databases, which names a file that is deleted when it is rolled back."""
+_TIMEOUT = 120.0
+"""s to wait while another process writes, and that one query may take."""
 
-_HEADER = b"SQLite format 3\0"
-_MODES = slice(18, 20)
-"""Bytes of a file's header that are 1 with a rollback journal, and 2 with a write-ahead log."""
-
-_LARGEST_VALUE = 64 * 2**20
-"""Bytes of the largest value in a store."""
-
-_FULL = ("SQLITE_FULL", "SQLITE_IOERR")
-"""Names of SQLite's errors where the disk is full, or a file may not grow."""
 
 _DAMAGE = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, EOFError,
            NotImplementedError, zipfile.BadZipFile, zlib.error)  # fmt: skip
 """Errors of values that a store of diransac never holds."""
 
 
-class Database(ABC):
+class Database:
     """An open file; a context that closes it."""
 
+    KIND: ClassVar[str]
     MAKER: ClassVar[str]
-    """Command that makes such a file."""
+    """Subject of the file, and command that makes it."""
+
+    APPLICATION: ClassVar[int]
+    FORMAT = 2
+    """SQLite's application id and user version."""
+
+    ROWS: ClassVar[str]
+    TABLES: ClassVar[AbstractSet[str]]
+    """Table of the rows, and names of all tables."""
 
     path: Path
     _connection: sqlite3.Connection
@@ -91,9 +80,67 @@ class Database(ABC):
             raise
         return store
 
-    @abstractmethod
+    @contextmanager
+    def _begun(self, path: str | Path, schema: Callable[[], Iterable[str]]) -> Iterator[None]:
+        """Open a file for writing, in one transaction; statements of a schema make the tables of a new one.
+
+        Raises StudyError: the file is no store that this version reads.
+        """
+        self.path = Path(path)
+        self._connection = connected_to(self.path, "rwc")
+        try:
+            with transaction(self._connection, self.path):
+                # A file without tables is new, or the process that made it was killed at once.
+                if not self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+                    numbers = f"PRAGMA application_id = {self.APPLICATION}", f"PRAGMA user_version = {self.FORMAT}"
+                    for statement in (*numbers, *schema()):
+                        self._connection.execute(statement)
+                self.check()
+                yield
+        except BaseException:
+            self._connection.close()
+            raise
+
     def check(self) -> None:
-        """Raises StudyError: the file is no store that this version reads."""
+        """Raises StudyError: the file is no store that this version reads, or has what runs when it is read."""
+        select = self._connection.execute
+        if select("PRAGMA application_id").fetchone()[0] != self.APPLICATION:
+            raise StudyError(f'"{self.path}" is no store of {self.KIND}; give one of {self.MAKER}, or a new one')
+        number = select("PRAGMA user_version").fetchone()[0]
+        if number != self.FORMAT:
+            raise StudyError(
+                f'store "{self.path}" has format {number}, this version reads {self.FORMAT}; begin another'
+            )
+        tables = set()
+        for kind, name, sql in select("SELECT type, name, sql FROM sqlite_master").fetchall():
+            is_plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE ")
+            if not is_plain and (kind != "index" or sql is not None):
+                raise StudyError(
+                    f'store "{self.path}" has {kind} "{name!s:.40}", which diransac never makes; give another'
+                )
+            if is_plain:
+                tables.add(name)
+        if not tables >= self.TABLES:
+            missing = ", ".join(sorted(self.TABLES - tables))
+            raise StudyError(f'store "{self.path}" is damaged: it has no {missing}; begin a new one')
+
+    @property
+    def columns(self) -> dict[str, tuple[str, str]]:
+        """Name in a row -> column and its SQL type."""
+        found = self.select(f"PRAGMA table_info({self.ROWS})")
+        return {column.rstrip(AGAIN): (column, kind) for _, column, kind, *_ in found}
+
+    def add(self, rows: Sequence[Mapping[str, Any]]) -> int:
+        """Number of new rows, written in one transaction; rows that are present stay as they are."""
+        before = self._connection.total_changes
+        columns = {name: column for name, (column, _) in self.columns.items()}
+        with transaction(self._connection, self.path):
+            for row in rows:
+                names = ", ".join(quoted(columns.get(name, name)) for name in row)
+                marks = ", ".join("?" * len(row))
+                values = [json.dumps(value) if isinstance(value, Mapping) else value for value in row.values()]
+                self._connection.execute(f"INSERT OR IGNORE INTO {self.ROWS} ({names}) VALUES ({marks})", values)
+        return self._connection.total_changes - before
 
     def __enter__(self) -> Self:
         return self
@@ -103,7 +150,7 @@ class Database(ABC):
 
     def select(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Rows of a query."""
-        end = time.monotonic() + _READ_TIMEOUT
+        end = time.monotonic() + _TIMEOUT
         self._connection.set_progress_handler(lambda: time.monotonic() > end, 100_000)
         with reported(self.path):
             return self._connection.execute(query, values).fetchall()
@@ -141,8 +188,8 @@ def connected_to(path: Path, mode: str) -> sqlite3.Connection:
         raise StudyError(f'store "{path}" cannot be opened: the folder "{path.parent}" does not exist; make it first')
     try:
         uri = f"{path.absolute().as_uri()}?mode={mode}"
-        connection = sqlite3.connect(uri, timeout=_LOCK_TIMEOUT, isolation_level=None, uri=True)
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST_VALUE)
+        connection = sqlite3.connect(uri, timeout=_TIMEOUT, isolation_level=None, uri=True)
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 64 * 2**20)
         connection.execute("PRAGMA trusted_schema = OFF")
         connection.execute("PRAGMA cell_size_check = ON")
         return connection
@@ -156,10 +203,11 @@ def _has_write_ahead_log(path: Path) -> bool:
     """True for a database in this mode; False also for a file that is missing or cannot be read."""
     try:
         with path.open("rb") as file:
-            header = file.read(_MODES.stop)
+            header = file.read(20)
     except OSError:
         return False
-    return header.startswith(_HEADER) and 2 in header[_MODES]
+    # Its last two bytes are 1 with a rollback journal.
+    return header.startswith(b"SQLite format 3\0") and 2 in header[18:]
 
 
 @contextmanager
@@ -168,7 +216,7 @@ def reported(path: Path) -> Iterator[None]:
     try:
         yield
     except (sqlite3.Error, UnicodeError) as error:
-        is_full = getattr(error, "sqlite_errorname", "").startswith(_FULL)
+        is_full = getattr(error, "sqlite_errorname", "").startswith(("SQLITE_FULL", "SQLITE_IOERR"))
         advice = "is the disk full? Rows that it has are kept" if is_full else "give a store of diransac, or a new file"
         raise StudyError(f'store "{path}": {error}; {advice}') from error
 
@@ -202,37 +250,11 @@ def roll_back(path: Path) -> None:
         except sqlite3.Error as error:
             if error.sqlite_errorname != "SQLITE_READONLY_ROLLBACK":
                 return  # said when the store is read
-    if journal.read_bytes().endswith(_ANOTHER_JOURNAL):
+    # Last bytes of a journal of several databases, which names a file that is deleted when it is rolled back.
+    if journal.read_bytes().endswith(bytes.fromhex("d9d505f920a163d7")):
         raise StudyError(f'store "{path}" has a journal that diransac does not write; give the store without it')
     with closing(connected_to(path, "rw")) as connection, reported(path):
         connection.execute("SELECT count(*) FROM sqlite_master")
-
-
-def check_plain(connection: sqlite3.Connection, path: Path, needed: AbstractSet[str]) -> None:
-    """Raises StudyError: tables are missing, or there are views, triggers or virtual tables, which run when read."""
-    tables = set()
-    for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
-        is_plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE ")
-        if not is_plain and (kind != "index" or sql is not None):
-            raise StudyError(f'store "{path}" has {kind} "{name!s:.40}", which diransac never makes; give another')
-        if is_plain:
-            tables.add(name)
-    if not tables >= needed:
-        missing = ", ".join(sorted(needed - tables))
-        raise StudyError(f'store "{path}" is damaged: it has no {missing}; begin a new one')
-
-
-def copied(connection: sqlite3.Connection) -> sqlite3.Connection:
-    """A copy of a database in memory, which may be changed."""
-    copy = sqlite3.connect(":memory:", isolation_level=None)
-    connection.backup(copy)
-    connection.close()
-    return copy
-
-
-def is_empty(connection: sqlite3.Connection) -> bool:
-    """True for a file without tables: it is new, or the process that made it was killed at once."""
-    return not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
 
 
 def kept_apart(names: Iterable[str]) -> list[str]:

@@ -151,11 +151,6 @@ class _Work:
 
 
 # Workers --------------------------------------------------------------------------------------------------------------
-_AHEAD = 2
-"""Tasks per worker that are handed out: one that runs and one that waits."""
-
-_AHEAD_OF_OTHERS = 64
-"""Tasks that are handed to an executor of unknown size."""
 
 
 class Workers(Protocol):
@@ -184,9 +179,11 @@ def workers_of(executor: Executor | None, jobs: int | None, tasks: int | None) -
             raise SettingsError(
                 "jobs is the number of processes on this machine, but an executor is given; give one of them"
             )
-        return Given(executor, tasks or _AHEAD_OF_OTHERS)
+        # Tasks that are handed to an executor of unknown size.
+        return Given(executor, tasks or 64)
     jobs = default_threads() if jobs is None else jobs
-    return Processes(jobs, tasks or _AHEAD * jobs)
+    # Tasks per worker that are handed out: one that runs and one that waits.
+    return Processes(jobs, tasks or 2 * jobs)
 
 
 class Given:

@@ -1,27 +1,17 @@
-"""A fleet of logs: one identification per log, on the workers of studies, kept as rows of one SQLite file.
-
-| table | contents |
-|---|---|
-| ``logs`` | one row per log that was identified, or failed, with the file's size, time and hash |
-| ``asked`` | logs that were asked for, with vehicle and order |
-| ``configuration`` | the values that determine rows, as JSON; only the same values may add rows |
-"""
+"""A fleet of logs: one identification per log, on the workers of studies, kept as rows of one SQLite file."""
 
 from __future__ import annotations
 
 import csv
-import json
 import pickle
 import platform
 import re
-import sqlite3
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from hashlib import sha256
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -38,45 +28,16 @@ from diransac.identification.method import Method
 from diransac.identification.methods import DEFAULT
 from diransac.identification.result import Result
 from diransac.identification.settings import EXECUTION, Settings
-from diransac.limits import check_ordinary
 from diransac.model import Model
-from diransac.plain_data import json_data
 from diransac.plain_text import cell
 from diransac.process import single_threaded
-from diransac.study.database import (
-    AGAIN,
-    Database,
-    check_plain,
-    connected_to,
-    damage,
-    is_empty,
-    kept_apart,
-    quoted,
-    transaction,
-    word,
-)
+from diransac.study.database import AGAIN, LARGEST, damage, quoted, word
 from diransac.study.engine import Progress, distribute, workers_of
+from diransac.study.fleet_store import ERROR, FleetStore, columns_of, marks_of
 from diransac.study.trials import versions
 from diransac.time_limit import time_limited
 
 __all__ = ["FleetRows", "FleetStatus", "export_fleet", "fleet_status", "identify_each", "read_fleet"]
-
-_LARGEST = 1e150
-"""Of an estimate: statistics of a fleet have its square."""
-
-_APPLICATION = 0x64697266
-"""SQLite's application id: "dirf"."""
-
-_FORMAT = 2
-_TABLES = {"logs", "asked", "configuration"}
-_UNKNOWN = "unknown"
-"""Vehicle of a log that names none."""
-
-_INTERNAL = ("own_vehicle", "file_stamp", "file_hash")
-"""Columns that are not exported."""
-
-_MANY = 6
-"""Differences that an error message lists."""
 
 
 def identify_each(
@@ -122,10 +83,6 @@ def identify_each(
         Logs that a worker identifies before it hands over rows.
     **arguments
         Of `identify`, such as ``seed`` and ``differentiate``.
-
-    Returns
-    -------
-    FleetStatus
 
     Raises
     ------
@@ -261,7 +218,7 @@ def _row(
     arguments: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The row of one log."""
-    begin, row = time.perf_counter(), dict[str, Any](log=name, status="done", error=None, **_content(Path(name)))
+    begin, row = time.perf_counter(), dict[str, Any](log=name, status="done", error=None, **marks_of(Path(name)))
     try:
         log = read(Path(name))
         row |= {"own_vehicle": _identity(log), "duration": float(log.time[-1] - log.time[0])}
@@ -270,36 +227,6 @@ def _row(
         known = isinstance(error, DiransacError | OSError)
         row |= {"status": "failed", "error": str(error) if known else f"{type(error).__name__}: {error}"}
     return {**row, "versions": versions(), "seconds": time.perf_counter() - begin, "host": platform.node()}
-
-
-def _content(path: Path) -> dict[str, str | None]:
-    """Marks of a file, or of a folder with all of its files: of sizes and times, and of contents; None without it."""
-    try:
-        return {"file_stamp": _stamp(path), "file_hash": _hash(path)}
-    except OSError:
-        return {"file_stamp": None, "file_hash": None}
-
-
-def _stamp(path: Path) -> str:
-    """Sizes and times of the files of a log.  Raises OSError: it cannot be read."""
-    about = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in _files(path)]
-    return sha256(repr(about).encode()).hexdigest()
-
-
-def _hash(path: Path) -> str:
-    """Contents of the files of a log.  Raises OSError: it cannot be read."""
-    found = sha256()
-    for file in _files(path):
-        found.update(repr((file.name, file.stat().st_size)).encode())
-        check_ordinary(file)
-        with file.open("rb") as data:
-            while block := data.read(2**20):
-                found.update(block)
-    return found.hexdigest()
-
-
-def _files(path: Path) -> list[Path]:
-    return sorted(x for x in path.rglob("*") if x.is_file()) if path.is_dir() else [path]
 
 
 def _identity(log: Log) -> str | None:
@@ -316,141 +243,6 @@ def _figures(result: Result) -> dict[str, Any]:
     finite = {name: float(x) if np.isfinite(x) else None for name, x in values.items()}
     against = "; ".join(finding for finding in result.findings if finding.level == "bad")
     return {**finite, "verdict": result.verdict, "stop_reason": result.stop_reason, "findings": against or None}
-
-
-# Store ---------------------------------------------------------------------------------------------------------------
-class FleetStore(Database):
-    """An open store of a fleet.
-
-    Parameters
-    ----------
-    path : of the file, which is made if it does not exist
-    model : its parameters are columns
-    wanted : values that determine rows
-
-    Raises
-    ------
-    StudyError
-        The file is no store of a fleet, or has another configuration.
-    """
-
-    MAKER = "diransac identify --each"
-
-    def __init__(self, path: str | Path, model: Model, wanted: Mapping[str, Any]) -> None:
-        self.path, values = Path(path), json_data(json.dumps(wanted))
-        self._connection = connected_to(self.path, "rwc")
-        try:
-            with transaction(self._connection, self.path):
-                if is_empty(self._connection):
-                    _create(self._connection, model, wanted)
-                self.check()
-            self._compare(values)
-        except BaseException:
-            self._connection.close()
-            raise
-
-    def check(self) -> None:
-        """Raises StudyError: the file is no store of a fleet that this version reads."""
-        application = self._connection.execute("PRAGMA application_id").fetchone()[0]
-        if application != _APPLICATION:
-            raise StudyError(f'"{self.path}" is no store of a fleet; give one of {self.MAKER}, or a new one')
-        number = self._connection.execute("PRAGMA user_version").fetchone()[0]
-        if number != _FORMAT:
-            raise StudyError(f'store "{self.path}" has format {number}, this version reads {_FORMAT}; begin another')
-        check_plain(self._connection, self.path, _TABLES)
-
-    @property
-    def configuration(self) -> dict[str, Any]:
-        """Values that determine rows, and the units of the parameters."""
-        rows = self.select("SELECT key, value FROM configuration")
-        with damage(self.path):
-            return {word(key): json_data(value) for key, value in rows}
-
-    def ask_for(self, logs: Iterable[tuple[str, int, str | None, str | None]]) -> None:
-        """Add logs after those that are known, or give all known ones another order; each has a vehicle and time."""
-        rows = sorted(logs, key=lambda row: row[1])
-        with transaction(self._connection, self.path):
-            known = dict(self._connection.execute("SELECT log, place FROM asked").fetchall())
-            if known.keys() <= {name for name, *_ in rows}:
-                places = {name: k for k, (name, *_) in enumerate(rows)}
-            else:
-                new = [name for name, *_ in rows if name not in known]
-                places = known | {name: k for k, name in enumerate(new, max(known.values()) + 1)}
-            placed = [(name, places[name], vehicle, moment) for name, _, vehicle, moment in rows]
-            self._connection.executemany("INSERT OR REPLACE INTO asked VALUES (?, ?, ?, ?)", placed)
-
-    def forget_changed(self, logs: Iterable[str]) -> None:
-        """Delete the rows of logs whose files differ from those that were read; files that are not here stay."""
-        rows = self.select("SELECT log, file_stamp, file_hash FROM logs")
-        kept = {name: (stamp, content) for name, stamp, content in rows}
-        changed = [(name,) for name in logs if name in kept and _differs(Path(name), *kept[name])]
-        with transaction(self._connection, self.path):
-            self._connection.executemany("DELETE FROM logs WHERE log = ?", changed)
-
-    def finished(self) -> set[str]:
-        """Names of the logs whose rows are present."""
-        return {name for (name,) in self.select("SELECT log FROM logs")}
-
-    def finished_in(self, batch: _Batch) -> set[str]:
-        """Names of the logs of a batch whose rows are present."""
-        marks = ", ".join("?" * len(batch.logs))
-        return {name for (name,) in self.select(f"SELECT log FROM logs WHERE log IN ({marks})", batch.logs)}
-
-    def add(self, rows: Sequence[Mapping[str, Any]]) -> int:
-        """Number of new rows, written in one transaction; rows that are present stay as they are."""
-        before = self._connection.total_changes
-        columns = {column.rstrip(AGAIN): column for _, column, *_ in self.select("PRAGMA table_info(logs)")}
-        with transaction(self._connection, self.path):
-            for row in rows:
-                names, marks = ", ".join(quoted(columns[name]) for name in row), ", ".join("?" * len(row))
-                self._connection.execute(f"INSERT OR IGNORE INTO logs ({names}) VALUES ({marks})", [*row.values()])
-        return self._connection.total_changes - before
-
-    def _compare(self, wanted: Mapping[str, Any]) -> None:
-        """Raises StudyError: the store has another configuration."""
-        kept = {key: value for key, value in self.configuration.items() if key not in _ABOUT}
-        differing = [key for key in {**wanted, **kept} if kept.get(key) != wanted.get(key)]
-        if differing:
-            raise StudyError(
-                f'store "{self.path}" has another {", ".join(differing[:_MANY])}: give the same, or another store'
-            )
-
-
-def _differs(path: Path, stamp: str | None, content: str | None) -> bool:
-    """True if a file is here and is not the one with these marks."""
-    try:
-        return path.exists() and _stamp(path) != stamp and _hash(path) != content
-    except OSError:
-        return False
-
-
-def _columns(parameters: Iterable[str]) -> dict[str, str]:
-    """Columns of the parameters and of their standard errors, by name."""
-    names = [f"{kind}_{name}" for name in parameters for kind in ("parameter", _ERROR)]
-    return dict(zip(names, kept_apart(names), strict=True))
-
-
-def _create(connection: sqlite3.Connection, model: Model, wanted: Mapping[str, Any]) -> None:
-    """Make the tables of a new store."""
-    of_parameters = [f"{quoted(column)} REAL" for column in _columns(model.parameters).values()]
-    about = {**wanted, "model_name": model.name, "units": {name: x.unit for name, x in model.parameters.items()}}
-    for statement in (
-        f"PRAGMA application_id = {_APPLICATION}",
-        f"PRAGMA user_version = {_FORMAT}",
-        "CREATE TABLE logs (log TEXT PRIMARY KEY, own_vehicle TEXT, status TEXT NOT NULL, error TEXT, verdict TEXT, "
-        f"findings TEXT, duration REAL, {', '.join(of_parameters)}, fit_error REAL, inlier_fraction REAL, "
-        "stop_reason TEXT, file_stamp TEXT, file_hash TEXT, "
-        "versions TEXT NOT NULL, seconds REAL NOT NULL, host TEXT NOT NULL)",
-        "CREATE TABLE asked (log TEXT PRIMARY KEY, place INTEGER NOT NULL, vehicle TEXT, time TEXT)",
-        "CREATE TABLE configuration (key TEXT PRIMARY KEY, value TEXT NOT NULL)",
-    ):
-        connection.execute(statement)
-    values = [(key, json.dumps(value)) for key, value in about.items()]
-    connection.executemany("INSERT INTO configuration VALUES (?, ?)", values)
-
-
-_ERROR, _ABOUT = "standard_error", ("model_name", "units")
-"""Beginning of a column; keys of the configuration on which no row depends."""
 
 
 # Reading -------------------------------------------------------------------------------------------------------------
@@ -540,17 +332,18 @@ def read_fleet(store: str | Path) -> FleetRows:
         with damage(kept.path):
             units = {word(name): word(unit) for name, unit in about["units"].items()}
             model = word(about["model_name"])
-        of_parameters = _columns(units)
-        columns = [quoted(of_parameters[f"{kind}_{name}"]) for kind in ("parameter", _ERROR) for name in units]
+        of_parameters = columns_of(units)
+        columns = [quoted(of_parameters[f"{kind}_{name}"]) for kind in ("parameter", ERROR) for name in units]
+        # Vehicle of a log that names none.
         rows = kept.select(
             "SELECT log, coalesce(vehicle, own_vehicle, ?), time, place, verdict, "
             f"{', '.join(columns)} FROM logs JOIN asked USING (log) WHERE status = 'done'",
-            (_UNKNOWN,),
+            ("unknown",),
         )
     with damage(Path(store)):
         rows.sort(key=lambda row: (word(row[1]), _moment(row[2]), int(row[3])))
         numbers = np.array([row[5:] for row in rows], np.float64).reshape(len(rows), 2 * len(units))
-        if np.any(np.isfinite(numbers) & (np.abs(numbers) > _LARGEST)):
+        if np.any(np.isfinite(numbers) & (np.abs(numbers) > LARGEST)):
             raise ValueError("the square of an estimate overflows")
         vehicles = np.array([word(row[1]) for row in rows], np.str_)
         return FleetRows(
@@ -584,7 +377,12 @@ def export_fleet(store: str | Path, path: str | Path) -> None:
         There is no such store, or it has values that are neither numbers nor texts.
     """
     with FleetStore.existing(store) as kept:
-        names = [name for _, name, *_ in kept.select("PRAGMA table_info(logs)") if name not in _INTERNAL]
+        # Columns that are not exported.
+        names = [
+            name
+            for _, name, *_ in kept.select("PRAGMA table_info(logs)")
+            if name not in ("own_vehicle", "file_stamp", "file_hash")
+        ]
         columns = ", ".join(map(quoted, names[1:]))
         rows = kept.select(
             f"SELECT log, coalesce(vehicle, own_vehicle), time, {columns} FROM asked LEFT JOIN logs USING (log) "

@@ -37,22 +37,10 @@ _HUBER = 1.345
 _EFFICIENCY = 0.95
 _MEDIAN_OF_CHI2 = 0.454936
 """Median of a squared standard normal variable."""
-_MEDIAN_EFFICIENCY = 0.37
-"""Efficiency of a scale by the median of absolute deviations."""
-_CUT, _CUT_CONSISTENCY = 3.0, 0.97334
-"""Standardised distance of vehicles that the scale among them leaves out; mean of chi^2_1 below its square."""
-_REWEIGHTED_EFFICIENCY = 0.5
-"""Share of the vehicles that count as degrees of freedom of that scale.
-
-By simulation of normal vehicles: with it, a fleet of 12 to 200 has an outlier with at most the nominal 1 % or 0.33 %,
-one of 8 with 1.2 and 0.6 %.  The scale's own efficiency is 0.7 to 0.8.
-"""
 _SHORTEST = 3
 """Logs on either side of a change."""
 _FEWEST_VEHICLES = 8
 """Vehicles that are compared with each other; fewer are not."""
-_MOST_SPLITS = 400
-"""Places at which a change is looked for in one stretch of logs."""
 _UNRELIABLE = "do not rely on this"
 
 
@@ -237,10 +225,6 @@ def summarise_fleet(store: str | Path | FleetRows, *, level: float = 0.01) -> Fl
         Probability that a fleet without any gives an outlier, and that it gives a change or drift, by Bonferroni's
         inequality over parameters, vehicles and places.
 
-    Returns
-    -------
-    FleetSummary
-
     Raises
     ------
     StudyError
@@ -298,7 +282,8 @@ def _assessed(
     within = scale_beyond(differences, np.concatenate([x.variances[1:] + x.variances[:-1] for x in lives])) / 2**0.5
     tests = max(1, sum(len(life.values) for life in lives))
     # Successive differences are correlated: two thirds of them count.
-    limit = _limit(level / tests, _MEDIAN_EFFICIENCY * len(differences) * 2.0 / 3.0)
+    # Efficiency of a scale by the median of absolute deviations.
+    limit = _limit(level / tests, 0.37 * len(differences) * 2.0 / 3.0)
     found = list[Change | Drift]()
     begins = np.empty((n, 2))
     for k, life in enumerate(lives):
@@ -307,7 +292,10 @@ def _assessed(
     values, variances = begins.T
     mean, between = _centre(values, variances)
     distances = np.abs(values - mean[0]) / np.sqrt(variances + between**2 + mean[1])
-    far = _limit(level / n, _REWEIGHTED_EFFICIENCY * (n - 1)) if n >= _FEWEST_VEHICLES else np.inf
+    # Share of the vehicles that count as degrees of freedom of that scale. By simulation of normal vehicles: with
+    # it, a fleet of 12 to 200 has an outlier with at most the nominal 1 % or 0.33 %, one of 8 with 1.2 and 0.6 %.
+    # The scale's own efficiency is 0.7 to 0.8.
+    far = _limit(level / n, 0.5 * (n - 1)) if n >= _FEWEST_VEHICLES else np.inf
     outliers = [
         VehicleOutlier(lives[k].vehicle, name, float(values[k]), mean[0], float(distances[k]), unit)
         for k in np.flatnonzero(distances > far).tolist()
@@ -327,10 +315,11 @@ def _centre(values: FloatArray, variances: FloatArray) -> tuple[tuple[float, flo
     for _ in range(10):  # a fixed point: the mean moves by less than its standard error after the first
         between = scale_beyond(values - mean[0], variances)
         mean = huber_mean(values, variances + between**2)
-    near = np.abs(values - mean[0]) <= _CUT * np.sqrt(variances + between**2)
+    # Standardised distance of vehicles that the scale among them leaves out; mean of chi^2_1 below its square.
+    near = np.abs(values - mean[0]) <= 3.0 * np.sqrt(variances + between**2)
     n = int(near.sum())
     if n > 1:
-        target = _CUT_CONSISTENCY * (n - 1) / n
+        target = 0.97334 * (n - 1) / n
         between = scale_beyond(values[near] - values[near].mean(), variances[near], np.mean, target)
     return huber_mean(values, variances + between**2), between
 
@@ -412,7 +401,8 @@ def _splits(values: FloatArray, variances: FloatArray, limit: float, start: int 
     n = len(values)
     if n < 2 * _SHORTEST:
         return
-    places = np.unique(np.linspace(_SHORTEST, n - _SHORTEST, min(_MOST_SPLITS, n)).astype(int))
+    # Places at which a change is looked for in one stretch of logs.
+    places = np.unique(np.linspace(_SHORTEST, n - _SHORTEST, min(400, n)).astype(int))
     before = np.arange(n) < places[:, None]
     (a, of_a), (b, of_b) = (_huber_means(values, variances, side) for side in (before, ~before))
     distances = np.abs(a - b) / np.sqrt(of_a + of_b)

@@ -42,8 +42,6 @@ DOUBLE_PENDULUM: Mapping[str, float] = MappingProxyType(
 PENDULUM: Mapping[str, float] = MappingProxyType({"mass": 0.5, "length": 0.6, "friction": 0.05})
 """kg, m, N m s/rad."""
 
-MAGNET_PITCH = 0.024
-"""m, period of the cogging force."""
 
 RIPPLES = 126
 """Periods of a motor's torque per turn of its joint: 21 pole pairs behind a gear of 6."""
@@ -57,7 +55,8 @@ def servo_axis(cogging: float = 0.0, parameters: Mapping[str, float] = SERVO_AXI
     model = builtin("servo-axis")
 
     def magnets(q: Symbols, _v: Symbols, _u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:
-        return {"position": d.cogging * cos(2 * pi * q.position / MAGNET_PITCH + d.phase)}
+        # m, period of the cogging force.
+        return {"position": d.cogging * cos(2 * pi * q.position / 0.024 + d.phase)}
 
     cogs = Disturbance(
         model,
@@ -137,14 +136,7 @@ _CURRENT = 0.02
 def rotorcraft_in_gusts(
     gusts: float = 0.0, moment_gusts: float = 0.0, parameters: Mapping[str, float] = TABLE_I
 ) -> Plant:
-    """The planar rotorcraft in gusts of 0.1 to 2.6 Hz.
-
-    Parameters
-    ----------
-    gusts : RMS of the force along each axis, N
-    moment_gusts : RMS of the moment, N m
-    parameters : of the model
-    """
+    """The planar rotorcraft in gusts of 0.1 to 2.6 Hz."""
     model = builtin("planar-rotorcraft")
 
     def air(_q: Symbols, _v: Symbols, _u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:

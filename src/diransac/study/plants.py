@@ -24,7 +24,7 @@ from diransac.study.machines import double_pendulum, pendulum, rotorcraft_in_gus
 from diransac.study.tables import RANDOM, FunctionTable, Text, check_signature, function_arguments
 from diransac.user_files import blaming, definitions, file_and_name, running
 
-__all__ = ["PlantChoice", "is_builtin"]
+__all__ = ["PlantChoice"]
 
 
 def _undisturbed(parameters: Mapping[str, float] = TABLE_I) -> Plant:
@@ -42,11 +42,6 @@ _KINDS: dict[str, Callable[..., Plant]] = {
     "underwater-vehicle": underwater_vehicle,
 }
 _DEFAULT_NAME = "plant"
-
-
-def is_builtin(kind: object) -> bool:
-    """True for a kind of plant that is not a user's file."""
-    return isinstance(kind, str) and kind in _KINDS
 
 
 class PlantChoice(FunctionTable):

@@ -18,7 +18,7 @@ from diransac.atomic import write_bytes
 from diransac.errors import SettingsError, StudyError
 from diransac.plain_data import json_data
 from diransac.plain_text import cell
-from diransac.study.database import damage, quoted, word
+from diransac.study.database import LARGEST, damage, quoted, word
 from diransac.study.specification import planned_path
 from diransac.study.store import Store, whole
 from diransac.text_table import aligned
@@ -27,13 +27,6 @@ if TYPE_CHECKING:
     import polars as pl
 
 __all__ = ["Status", "TrialCounts", "about", "export", "paths", "read", "status"]
-
-_NEEDED = ("level", "trial", "method", "status", "seed", "versions", "seconds", "host")
-_LARGEST = 1e150
-_LARGEST_PATH = 64 * 2**20
-"""Bytes of the longest flown path."""
-
-_KINDS: dict[str, type] = {"TEXT": str, "INTEGER": int, "REAL": float}
 
 
 # Rows -------------------------------------------------------------------------------------------
@@ -65,7 +58,8 @@ def read(store: str | Path) -> pl.DataFrame:
             "ORDER BY (SELECT min(rowid) FROM cells WHERE level = t.level), t.trial, c.rowid"
         )
     with damage(Path(store)):
-        schema = {name: _KINDS[kind] for name, (_, kind) in columns.items()}
+        kinds: dict[str, type] = {"TEXT": str, "INTEGER": int, "REAL": float}
+        schema = {name: kinds[kind] for name, (_, kind) in columns.items()}
         by_name = {name: [row[k] for row in rows] for k, name in enumerate(schema)}
         seconds = _checked(by_name, schema)
         frame = pl.DataFrame({**by_name, "seconds": seconds}, schema={**schema, "seconds": str})
@@ -78,7 +72,7 @@ def _checked(columns: Mapping[str, Sequence[Any]], schema: Mapping[str, type]) -
 
     Raises LookupError, TypeError, ValueError: a value is not of its column's kind.
     """
-    for name in _NEEDED:
+    for name in ("level", "trial", "method", "status", "seed", "versions", "seconds", "host"):
         if any(value is None for value in columns[name]):
             raise ValueError(f"a row has no {name}")
     for name, kind in schema.items():
@@ -101,7 +95,7 @@ def _checked(columns: Mapping[str, Sequence[Any]], schema: Mapping[str, type]) -
 def _check_squares(name: str, values: Sequence[float | None]) -> None:
     """Raises ValueError: the square of a number overflows."""
     for value in values:
-        if value is not None and _LARGEST < abs(value) < math.inf:
+        if value is not None and LARGEST < abs(value) < math.inf:
             raise ValueError(f"{name} is {value!r:.40}")
 
 
@@ -149,7 +143,7 @@ def paths(
 def _unpacked(packed: bytes, trajectory: str) -> npt.NDArray[np.float32] | None:
     """Flown path (K, n_q) of a trajectory; None if there is none.  Raises ValueError: it is damaged, or too large."""
     with zipfile.ZipFile(io.BytesIO(packed)) as archive:
-        if any(entry.file_size > _LARGEST_PATH for entry in archive.infolist()):
+        if any(entry.file_size > 64 * 2**20 for entry in archive.infolist()):
             raise ValueError("a flown path is too large")
     with np.load(io.BytesIO(packed), allow_pickle=False) as flown:
         if trajectory not in flown:

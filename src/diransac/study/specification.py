@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import (
@@ -25,19 +23,11 @@ from diransac.flight.planning import multisine, random_waypoints, sine, square, 
 from diransac.flight.planning.trajectories import MAX_DURATION, check_fully_actuated, check_plane
 from diransac.flight.trajectory import Trajectory
 from diransac.flight.tvlqr import Controller, check_weights
-from diransac.identification.method import Method
-from diransac.identification.methods import (
-    ESTIMATORS,
-    METHODS,
-    WITH_ESTIMATOR,
-    default_options,
-    estimator_named,
-    factory,
-)
-from diransac.identification.settings import MOST_SUBSTEPS, Settings
+from diransac.identification.settings import MOST_SUBSTEPS
 from diransac.model import Model
 from diransac.model.plant import ModelWithParameters
-from diransac.study.axis import AnyAxis
+from diransac.study.axis import Axis
+from diransac.study.method_choice import MethodChoice, methods_of
 from diransac.study.plants import PlantChoice
 from diransac.study.tables import (
     RANDOM,
@@ -58,14 +48,9 @@ from diransac.study.tables import (
 )
 
 __all__ = [
-    "MISSIONS", "TRAJECTORIES", "TRUE", "ControlChoice", "Criteria", "FlightChoice", "MethodChoice", "Missions",
+    "MISSIONS", "TRAJECTORIES", "ControlChoice", "Criteria", "FlightChoice", "Missions",
     "Study", "planned_path",
 ]  # fmt: skip
-
-TRUE = "true"
-"""Method that identifies nothing: its parameters are the plant's own."""
-
-PRESETS = {"default": Settings, "table-iv": Settings.table_iv}
 
 MISSIONS: dict[str, Callable[..., Trajectory]] = {"square": square, "star": star, "sine": sine}
 """Trajectories that identified models are evaluated on."""
@@ -83,14 +68,8 @@ def planned_path(mission: str) -> str:
     return f"{mission} planned"
 
 
-_LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _+()/-]*")
 _VARIABLE = ("plant", "data", "noise", "methods", "missions", "control")
 """Tables that an axis may change; the others are the same at every level."""
-
-_NO_ANSWER_CHANGES = ("threads", "batch_size")
-
-_OWN_ESTIMATOR = "default"
-"""Word for the estimator that a method chooses."""
 
 
 # Tables of a study ----------------------------------------------------------------------------------------------------
@@ -167,10 +146,6 @@ def _trajectory_arguments(
 class Missions(Table):
     """The trajectories that estimates are evaluated on, the table ``[missions]``: a table of arguments for each.
 
-    Parameters
-    ----------
-    square, star, sine : arguments of the function of that name, by name, defaults included
-
     Raises
     ------
     SettingsError
@@ -228,92 +203,6 @@ class ControlChoice(Table):
     def limited(self, controller: Controller) -> Controller:
         """The controller itself, or without limits."""
         return controller if self.clip else controller.unclipped()
-
-
-@dataclass(frozen=True)
-class MethodChoice:
-    """A method of identification with its settings.
-
-    Parameters
-    ----------
-    method : one of `diransac.METHODS`, or ``true``
-    settings : of the search and the evaluation
-    options : the method's own settings that differ from their defaults, such as those of `diransac.LoDiransac`
-    estimator : of the samples of a RANSAC method, one of `ESTIMATORS`, or ``default``
-    """
-
-    method: str
-    settings: Settings
-    options: Mapping[str, Any] = field(default_factory=dict)
-    estimator: str = _OWN_ESTIMATOR
-
-    def __post_init__(self) -> None:
-        if self.method != TRUE:
-            self.object()
-
-    def object(self) -> Method:
-        """The method with its settings, on one thread.
-
-        Raises
-        ------
-        SettingsError
-            The method has no such setting, or a value has no meaning.
-        """
-        own = default_options(self.method)
-        unknown = [name for name in self.options if name not in own]
-        if unknown:
-            raise SettingsError(f'there is no option "{unknown[0]}"; there are {", ".join(own) or "none"}')
-        inside = {}
-        if self.estimator != _OWN_ESTIMATOR:
-            if self.method not in WITH_ESTIMATOR:
-                raise SettingsError(f"estimator serves {', '.join(WITH_ESTIMATOR)}, not {self.method}")
-            inside["estimator"] = estimator_named(self.estimator)
-        return factory(self.method)(replace(self.settings, threads=1), **self.options, **inside)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The table of the method in a study file, with all of its settings and no preset."""
-        options = {"options": dict(self.options)} if self.options else {}
-        inside = {} if self.estimator == _OWN_ESTIMATOR else {"estimator": self.estimator}
-        return {"method": self.method, "settings": self.settings.to_dict(), **options, **inside}
-
-
-class _MethodTable(Table):
-    """A table of ``[methods]``: ``settings`` are laid over those of ``preset``."""
-
-    method: Annotated[Text, OneOf((TRUE, *METHODS))]
-    preset: Annotated[Text, OneOf(PRESETS)] = "default"
-    settings: dict[str, Any] = Field({}, description="a table")
-    options: dict[str, Any] = Field({}, description="a table")
-    estimator: Annotated[Text, OneOf((_OWN_ESTIMATOR, *ESTIMATORS))] = _OWN_ESTIMATOR
-
-
-def _methods(tables: object) -> object:
-    """The methods of a study by label, which is the default of ``method``."""
-    if not isinstance(tables, Mapping):
-        return tables
-    if not tables:
-        raise SettingsError(f"methods is empty; there are {TRUE}, {', '.join(METHODS)}")
-    return {label: _method(label, table) for label, table in tables.items()}
-
-
-def _method(label: str, table: object) -> MethodChoice:
-    if isinstance(table, MethodChoice):
-        return table
-    place = f"methods.{label}"
-    if not _LABEL.fullmatch(label):
-        raise SettingsError(f'methods: the label "{label}" has other characters than letters, digits and _ + - ( ) /')
-    named = {"method": label, **table} if isinstance(table, Mapping) else table
-    found = _MethodTable.model_validate(named, context={"place": place})
-    # TOML has no None; "none" is a value of refit itself.
-    given = {name: None if x == "none" and name != "refit" else x for name, x in found.settings.items()}
-    try:
-        settings = Settings.from_dict({**PRESETS[found.preset]().to_dict(), **given})
-    except SettingsError as error:
-        raise SettingsError(f"{place}.settings: {error}") from error
-    try:
-        return MethodChoice(found.method, settings, found.options, found.estimator)
-    except SettingsError as error:
-        raise SettingsError(f"{place}: {error}") from error
 
 
 def _noise(table: object) -> Noise:
@@ -392,12 +281,13 @@ class Study(Table):
     plant: PlantChoice
     noise: Annotated[Noise, PlainValidator(_noise), PlainSerializer(dataclasses.asdict)] = Noise()
     methods: Annotated[
-        dict[str, Annotated[InstanceOf[MethodChoice], PlainSerializer(MethodChoice.to_dict)]], BeforeValidator(_methods)
+        dict[str, Annotated[InstanceOf[MethodChoice], PlainSerializer(MethodChoice.to_dict)]],
+        BeforeValidator(methods_of),
     ]
     evaluation: Criteria
     missions: Missions = Missions.from_dict({})
     control: ControlChoice = ControlChoice.from_dict({})
-    axis: AnyAxis
+    axis: Axis
 
     @model_validator(mode="after")
     def _can_be_flown(self) -> Self:
@@ -525,7 +415,7 @@ class Study(Table):
         decisive = {name: table[name] for name in ("seed", "plant", "data", "noise", "evaluation")}
         parts = {"study": dict(flat(decisive)) | {path: value for path, value in flat(later) if value != {}}}
         for label, method in table["methods"].items():
-            silent = [f"settings.{name}" for name in _NO_ANSWER_CHANGES]
+            silent = [f"settings.{name}" for name in ("threads", "batch_size")]
             parts[f"methods.{label}"] = {path: value for path, value in flat(method) if path not in silent}
         changes = {level.text: dict(level.changes) or {"changes": "none"} for level in self.axis.levels}
         return parts | {f"levels.{text}": some for text, some in changes.items()}

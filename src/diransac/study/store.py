@@ -10,15 +10,11 @@
 The file has a rollback journal: a write-ahead log needs shared memory, which network file systems lack. Every write is
 one transaction, so that a killed process leaves all of it or nothing. Values that may differ between equal runs are in
 the columns ``seconds`` and ``host`` only.
-
-A store may come from anyone: it is opened for reading without the right to write, its tables must be tables, queries
-have a time limit, every value is checked, and none of them names code that reading would run.
 """
 
 from __future__ import annotations
 
 import json
-import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -28,58 +24,17 @@ from diransac.errors import StudyError
 from diransac.limits import MOST_COUNTED
 from diransac.plain_data import json_data
 from diransac.study.assessment import PlantFacts
-from diransac.study.database import (
-    AGAIN,
-    Database,
-    check_plain,
-    connected_to,
-    copied,
-    damage,
-    is_empty,
-    kept_apart,
-    quoted,
-    transaction,
-    word,
-)
+from diransac.study.database import MOST_LISTED, Database, damage, kept_apart, quoted, word
 from diransac.study.specification import Study
 
 __all__ = ["Store", "whole"]
 
-_APPLICATION = 0x6469726E
-"""SQLite's application id: "dirn"."""
-
-_FORMAT = 2
-_TABLES = {"trials", "cells", "configuration", "about"}
-_RENAMED_KEYS = {
-    "noise.freeze_probability": "noise.stuck_probability",
-    "noise.freeze_length": "noise.stuck_length",
-    "noise.runs": "noise.correlated",
-}
-_RENAMED_VALUES = {
-    ("data.trajectory", "places"): "random-waypoints",
-    ("data.trajectory", "sines"): "multisine",
-    ("data.seed", "any"): "random",
-    ("plant.rotor_phase", "any"): "random",
-    ("noise.runs", "independent"): False,
-    ("noise.runs", "together"): True,
-    ("noise.first_row", "hit"): "corrupted",
-}
-"""Keys and values of format 1, and what they are in format 2."""
-
 _PLANTS = "plants"
 """Key of the properties of plants, among names."""
-
-_MANY = 6
-"""Differences that an error message lists; it counts the others."""
 
 
 class Store(Database):
     """An open store.
-
-    Parameters
-    ----------
-    path : of the file, which is made if it does not exist
-    study : its levels, methods and trials are added to those that the store was asked for
 
     Raises
     ------
@@ -87,31 +42,13 @@ class Store(Database):
         The file is no store, or has another configuration; the message lists the keys that differ.
     """
 
-    MAKER = "diransac study run NAME"
+    KIND, MAKER = "a study", "diransac study run NAME"
+    APPLICATION = 0x6469726E  # "dirn"
+    ROWS, TABLES = "trials", frozenset({"trials", "cells", "configuration", "about"})
 
     def __init__(self, path: str | Path, study: Study) -> None:
-        self.path = Path(path)
-        self._connection = connected_to(self.path, "rwc")
-        try:
-            with transaction(self._connection, self.path):
-                if is_empty(self._connection):
-                    _create(self._connection, study)
-                else:
-                    _format(self._connection, self.path)
-                    check_plain(self._connection, self.path, _TABLES)
-                _upgrade(self._connection, self.path)
-                self._ask_for(study)
-        except BaseException:
-            self._connection.close()
-            raise
-
-    def check(self) -> None:
-        """Raises StudyError: the file is no store that this version reads; one of an earlier format is upgraded."""
-        number = _format(self._connection, self.path)
-        check_plain(self._connection, self.path, _TABLES)
-        if number != _FORMAT:
-            self._connection = copied(self._connection)
-            _upgrade(self._connection, self.path)
+        with self._begun(path, lambda: _schema(study)):
+            self._ask_for(study)
 
     def finished(self, level: str, trials: Sequence[int]) -> set[tuple[str, int, str]]:
         """Level, trial and method of the rows of these trials that are present."""
@@ -121,24 +58,6 @@ class Store(Database):
     def finished_in(self, batch: Any) -> set[tuple[str, int, str]]:
         """As `finished`, of a batch with a level and trials."""
         return self.finished(batch.level, batch.trials)
-
-    def add(self, rows: Sequence[Mapping[str, Any]]) -> int:
-        """Number of new rows, written in one transaction; rows that are present stay as they are."""
-        before = self._connection.total_changes
-        columns = {name: column for name, (column, _) in self.columns.items()}
-        with transaction(self._connection, self.path):
-            for row in rows:
-                names = ", ".join(quoted(columns.get(name, name)) for name in row)
-                marks = ", ".join("?" * len(row))
-                values = [json.dumps(value) if isinstance(value, Mapping) else value for value in row.values()]
-                self._connection.execute(f"INSERT OR IGNORE INTO trials ({names}) VALUES ({marks})", values)
-        return self._connection.total_changes - before
-
-    @property
-    def columns(self) -> dict[str, tuple[str, str]]:
-        """Name in a row -> column and its SQL type."""
-        found = self.select("PRAGMA table_info(trials)")
-        return {column.rstrip(AGAIN): (column, kind) for _, column, kind, *_ in found}
 
     @property
     def about(self) -> dict[str, Any]:
@@ -150,7 +69,7 @@ class Store(Database):
 
     @property
     def plants(self) -> dict[str, PlantFacts]:
-        """Properties of the plant of each level; absent in old stores until they are written to again."""
+        """Properties of the plant of each level."""
         rows = self.select("SELECT value FROM about WHERE key = ?", (_PLANTS,))
         with damage(self.path):
             facts = [pair for (value,) in rows for pair in json_data(value).items()]
@@ -179,9 +98,9 @@ class Store(Database):
         kept = self.configuration
         differences = list(_differences(kept, wanted))
         if differences:
-            more = f"; and {len(differences) - _MANY} more" if len(differences) > _MANY else ""
+            more = f"; and {len(differences) - MOST_LISTED} more" if len(differences) > MOST_LISTED else ""
             raise StudyError(
-                f'store "{self.path}" has another configuration: {"; ".join(differences[:_MANY])}{more}. '
+                f'store "{self.path}" has another configuration: {"; ".join(differences[:MOST_LISTED])}{more}. '
                 "Use another store, or the same values"
             )
         new = [(part, key, json.dumps(x)) for part in wanted if part not in kept for key, x in wanted[part].items()]
@@ -218,49 +137,16 @@ def whole(value: object) -> int:
     return value
 
 
-def _format(connection: sqlite3.Connection, path: Path) -> int:
-    """Format of the store.  Raises StudyError: the file is no store, or of an unknown format."""
-    application = connection.execute("PRAGMA application_id").fetchone()[0]
-    number = int(connection.execute("PRAGMA user_version").fetchone()[0])
-    if application != _APPLICATION:
-        raise StudyError(f'"{path}" is no store of a study; give a file that diransac study made, or a new one')
-    if not 1 <= number <= _FORMAT:
-        raise StudyError(f'store "{path}" has format {number}, this version reads 1 to {_FORMAT}; run the study again')
-    return number
-
-
-def _upgrade(connection: sqlite3.Connection, path: Path) -> None:
-    """Give a store of format 1 the names of format 2.  Raises StudyError: as `_format`."""
-    if _format(connection, path) == _FORMAT:
-        return
-    for _, column, *_ in connection.execute("PRAGMA table_info(trials)").fetchall():
-        if column.startswith("best_"):
-            new = "pseudo_true_" + column.removeprefix("best_")
-            connection.execute(f"ALTER TABLE trials RENAME COLUMN {quoted(column)} TO {quoted(new)}")
-    for part, key, text in connection.execute("SELECT part, key, value FROM configuration").fetchall():
-        with damage(path):
-            value = json_data(text)
-        renamed = _RENAMED_VALUES.get((key, value), value) if isinstance(value, str) else value
-        connection.execute(
-            "UPDATE configuration SET key = ?, value = ? WHERE part = ? AND key = ?",
-            (_RENAMED_KEYS.get(key, key), json.dumps(renamed), part, key),
-        )
-    connection.execute(f"PRAGMA user_version = {_FORMAT}")
-
-
-def _create(connection: sqlite3.Connection, study: Study) -> None:
-    """Make the tables of a new store."""
+def _schema(study: Study) -> tuple[str, ...]:
+    """Statements that make the tables of a new store."""
     kinds = _columns(study)
     columns = ", ".join(f"{quoted(name)} {kind}" for name, kind in zip(kept_apart(kinds), kinds.values(), strict=True))
-    for statement in (
-        f"PRAGMA application_id = {_APPLICATION}",
-        f"PRAGMA user_version = {_FORMAT}",
+    return (
         f"CREATE TABLE trials ({columns}, PRIMARY KEY (level, trial, method))",
         "CREATE TABLE cells (level TEXT, method TEXT, trials INTEGER NOT NULL, PRIMARY KEY (level, method))",
         "CREATE TABLE configuration (part TEXT, key TEXT, value TEXT NOT NULL, PRIMARY KEY (part, key))",
         "CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL)",
-    ):
-        connection.execute(statement)
+    )
 
 
 def _columns(study: Study) -> dict[str, str]:

@@ -16,18 +16,13 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import StudyError
 from diransac.study.assessment import PlantFacts, covers, differ, relative_errors
 from diransac.study.database import damage
-from diransac.study.plants import PlantChoice, is_builtin
 from diransac.study.reading import Status, read, status
 from diransac.study.store import Store
-from diransac.study.tables import changed
 
 if TYPE_CHECKING:
     import polars as pl
 
 __all__ = ["ParameterErrors", "Summary", "TrackingErrors", "summarise"]
-
-_MOST_CELLS = 100_000_000
-"""Levels times methods times trials of the largest summary."""
 
 _Statistic = Callable[[FloatArray], np.floating]
 
@@ -118,12 +113,7 @@ class ParameterErrors:
         return _over_trials(errors, ~np.isnan(errors), np.max)
 
     def coverage(self, *, disturbed: bool) -> list[tuple[int, int]]:
-        """Number of intervals that contain the pseudo-true parameter, and number of intervals, by method.
-
-        Parameters
-        ----------
-        disturbed : count the levels whose plant has a disturbance, or the others
-        """
+        """Number of intervals that contain the pseudo-true parameter, and number of intervals, by method."""
         some = np.array([one[self.disturbed == disturbed] for one in self.covered.values()])
         held, there = np.nansum(some, axis=(0, 1, 3)), (~np.isnan(some)).sum(axis=(0, 1, 3))
         return [(int(a), int(n)) for a, n in zip(held, there, strict=True)]
@@ -214,7 +204,7 @@ def _summary(
     if len(set(values)) < len(values):
         raise ValueError(f"levels {', '.join(levels)} have equal values")
     methods = tuple(dict.fromkeys(method for _, method, _ in cells))
-    plants = [noted.get(level) or _facts(level, parts) for level in levels]
+    plants = [noted[level] for level in levels]
     if any((list(x.units), list(x.parameters)) != (list(plants[0].units), list(plants[0].parameters)) for x in plants):
         raise ValueError("plants of several models")
     units = plants[0].units
@@ -239,20 +229,6 @@ def _summary(
     )
 
 
-def _facts(level: str, parts: Mapping[str, Mapping[str, Any]]) -> PlantFacts:
-    """Properties of the built-in plant of a level, for old stores that have not kept them.
-
-    Raises StudyError: the plant is a user's file, which is not run for a look at a store.
-    """
-    table = changed(changed({}, parts["study"]), parts[f"levels.{level}"])
-    if not is_builtin(table["plant"]["kind"]):
-        raise StudyError(
-            "the store has no properties of its plant, which is a file that is not run here; repeat the study run "
-            "command that made it, which adds them"
-        )
-    return PlantFacts.of(PlantChoice.from_dict(table["plant"]).plant)
-
-
 class _Table:
     """A store's rows as arrays (n_levels, n_methods, n_trials)."""
 
@@ -262,7 +238,7 @@ class _Table:
             for level, method, trial in rows.select("level", "method", "trial").iter_rows()
         ]
         self._rows, self._where = rows, tuple(np.array(cells).T)
-        if len(levels) * len(methods) * int(self._where[2].max()) > _MOST_CELLS:
+        if len(levels) * len(methods) * int(self._where[2].max()) > 100_000_000:
             raise ValueError(f"trial {int(self._where[2].max())}")
         self.ran = np.zeros((len(levels), len(methods), int(self._where[2].max()) + 1), dtype=bool)
         self.ran[self._where] = True

@@ -176,8 +176,6 @@ class FunctionTable(Table):
 
 # Arguments of a function ----------------------------------------------------------------------------------------------
 _VARIABLE = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-_WHOLE = (int, "int")
-"""Annotations of arguments that are counts; a default of 0 alone may stand for 0.0."""
 
 
 def check_signature(function: Callable[..., Any], name: str) -> None:
@@ -244,7 +242,8 @@ def _arguments(function: Callable[..., Any], random: str, pairs: bool) -> dict[s
         if parameter.kind in _VARIABLE or parameter.default is None or parameter.default is parameter.empty:
             continue
         default = _as_written(parameter.default)
-        kind, wanted = _kind(default, pairs, parameter.annotation in _WHOLE)
+        # Annotations of arguments that are counts; a default of 0 alone may stand for 0.0.
+        kind, wanted = _kind(default, pairs, parameter.annotation in (int, "int"))
         drawn: Any = Literal["random"]
         found[name] = default, TypeAdapter[Any](kind | drawn if name == random else kind), wanted
     return found

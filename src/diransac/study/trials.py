@@ -40,20 +40,13 @@ from diransac.study.data import (
     trial_seed,
 )
 from diransac.study.library import load
-from diransac.study.specification import TRUE, ControlChoice, Study, planned_path
+from diransac.study.method_choice import TRUE
+from diransac.study.specification import ControlChoice, Study, planned_path
 
 __all__ = ["STAGES", "run_trials", "versions"]
 
 STAGES = ("record", "identify", "plan", "steer", "fly")
 """Stages that `seconds` is divided by."""
-
-_INTERVAL = 0.95
-"""Level of the intervals that are kept where parameters are evaluated."""
-
-_ROUNDING = 1e-10
-"""Relative difference of parameters below which they have the same plan, to about 1e-12 in states and inputs."""
-
-_PACKAGES = ("diransac", "casadi", "llvmlite", "numpy", "scipy")
 
 
 def run_trials(study: str, level: str, trials: Sequence[int], methods: Sequence[str]) -> list[dict[str, Any]]:
@@ -168,7 +161,8 @@ class _Case:
             seed = derived_seed(self.seed, "identify")
             result = identification.by(method.object(), seed)
             self.found = Plant(plant.model, result.parameters)
-            self.figures |= _ends(result.intervals(_INTERVAL)) if self.point.study.evaluate_parameters else {}
+            # Level of the intervals that are kept where parameters are evaluated.
+            self.figures |= _ends(result.intervals(0.95)) if self.point.study.evaluate_parameters else {}
             self.figures |= {
                 "fit_error": result.fit_error,
                 "inlier_fraction": result.inlier_fraction,
@@ -254,7 +248,8 @@ def _to_plan_with(found: Plant, plant: Plant) -> tuple[float, ...]:
     Without noise most estimates are exact but for rounding, each in its own way, and then their plans are, too.
     """
     estimates, own = (tuple(one.parameters[name] for name in plant.model.parameters) for one in (found, plant))
-    return own if np.allclose(estimates, own, rtol=_ROUNDING, atol=0.0) else estimates
+    # Relative difference of parameters below which they have the same plan, to about 1e-12 in states and inputs.
+    return own if np.allclose(estimates, own, rtol=1e-10, atol=0.0) else estimates
 
 
 @lru_cache(maxsize=64)
@@ -327,5 +322,8 @@ def _packed(paths: dict[str, Any]) -> bytes:
 @lru_cache(maxsize=1)
 def versions() -> str:
     """Versions of Python and of the packages that results depend on."""
-    found = [("python", platform.python_version()), *((name, version(name)) for name in _PACKAGES)]
+    found = [
+        ("python", platform.python_version()),
+        *((name, version(name)) for name in ("diransac", "casadi", "llvmlite", "numpy", "scipy")),
+    ]
     return " ".join(f"{name} {number}" for name, number in found)

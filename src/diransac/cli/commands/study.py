@@ -18,7 +18,7 @@ from diransac.cli.workers import Cluster, Jobs, running
 from diransac.errors import SettingsError
 from diransac.identification.identify import METHODS
 from diransac.study import builtin_names, export, load, run_study, status, template
-from diransac.study.specification import TRUE
+from diransac.study.method_choice import TRUE
 from diransac.text_table import aligned
 
 __all__ = ["app"]

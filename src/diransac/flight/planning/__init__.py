@@ -1,16 +1,19 @@
-"""Trajectory planning: direct transcription for any model, and named trajectories.
+"""Trajectory planning: direct transcription for any model, named trajectories, and designed experiments.
+
+In come a `Plant` or `Result` and arguments; out comes a `Trajectory`, or a `PlanningError` that says what to relax.
+Begin with `plan` in `planner.py`.
 
 | file | content |
 |---|---|
 | `planner.py` | `plan`: the search for a solution, and the explanation where there is none |
 | `trajectories.py` | square, star, sine, random waypoints, multisine |
-| `experiment.py` | `design_experiment`: excitation within limits that is optimal for identification |
-| `excitation.py` | its Fourier series, limits, information and optimisation |
 | `request.py` | the arguments of a plan, checked; the trim at its start |
 | `problem.py` | the nonlinear program of a task, a first guess, the trajectory of a solution |
 | `transcription.py` | the program: index of each unknown, values and exact derivatives |
 | `stage.py` | one stage of it, compiled |
-| `solvers.py`, `snopt.py` | interior-point solvers, SNOPT |
+| `solvers.py` | its solution by IPOPT |
+| `experiment.py` | `design_experiment`: excitation within limits that is optimal for identification |
+| `excitation.py`, `optimisation.py` | its Fourier series, limits and information; their optimisation |
 """
 
 from diransac.flight.planning.experiment import Experiment, design_experiment

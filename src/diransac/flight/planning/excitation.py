@@ -1,4 +1,4 @@
-"""Periodic motions that excite a machine within limits: Fourier series, information on parameters, its optimisation.
+"""Periodic motions that excite a machine within limits: Fourier series, limits, information on parameters.
 
 References
 ----------
@@ -9,64 +9,35 @@ robots", Robotica 24(5): series at rest at their ends.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, TypeAlias
 
 import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
+from diransac.errors import PlanningError, SettingsError
+
+if TYPE_CHECKING:
+    from diransac.model import Model
 
 __all__ = [
-    "DesignProblem",
     "FourierSeries",
+    "Limit",
     "Limited",
     "Observed",
-    "Search",
-    "best_motion",
+    "check_rest",
     "drawn_motion",
     "grid",
     "motion_of",
+    "ranges_of",
     "resting_pose",
 ]
 
-_DRAWN_SIZES = 0.2, 0.6
-"""Range of the amplitudes of a drawn motion, as of `multisine`."""
-
-_N_POSES = 200
-_SPREAD = 0.8
-"""Fraction of the ranges of the coordinates in which poses are drawn."""
-
-_SHARES = (*(1.0 - 0.002 * 2.0 ** np.arange(9.0)), *0.25 ** np.arange(1.0, 5.0), 0.0)
-"""Shares of a motion, one after the other, of which the first that keeps the limits is taken."""
-
-_BISECTIONS = 6
-
-_SAMPLES_PER_SINE = 12
-"""Rows per period of the fastest sine in which the optimisation evaluates the information.
-
-Limits hold in twice as many: forces have products of sines, of twice the frequency.
-"""
-
-_LAST_BARRIER, _BARRIER_FACTOR = 1e-4, 0.3
-"""Last barrier parameter, and what it is reduced by: it is the change of the objective per active limit."""
-
-_MERIT_CHANGE = 1e-2
-"""Decrease of the barrier function per unknown, over the barrier parameter, below which that is reduced."""
-
-_FRACTION = 0.99
-"""Of the way to a limit that a step may take."""
-
-_BACKTRACKS = 12
-
-_RANK = 1e-6
-"""Size of a direction, relative to the largest, below which no motion shows it; columns have unit length."""
-
-_HIDDEN = 1e-3
-"""Share of a parameter in such directions above which it is not identifiable."""
+Limit: TypeAlias = float | tuple[float, float]
+"""Largest magnitude, or lowest and highest value."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +87,8 @@ class FourierSeries:
 
     def drawn(self, rng: np.random.Generator) -> FloatArray:
         """Coefficients (n_coefficients,) of a sum of sines with random amplitudes and phases about zero."""
-        size = rng.uniform(*_DRAWN_SIZES, self.n_harmonics)
+        # Range of the amplitudes of a drawn motion, as of `multisine`.
+        size = rng.uniform(0.2, 0.6, self.n_harmonics)
         phase = rng.uniform(0.0, 2.0 * np.pi, self.n_harmonics)
         sines, cosines = self._bases
         return np.concatenate([sines.T @ (size * np.cos(phase)), cosines.T @ (size * np.sin(phase)), [0.0]])
@@ -201,14 +173,54 @@ class Limited:
         tried = 1.0
         if fits(tried):
             return scaled(tried)
-        for share in _SHARES:  # not by bisection alone: limits of forces may hold, fail and hold again
+        # Shares one after the other, not by bisection alone: limits of forces may hold, fail and hold again.
+        for share in (*(1.0 - 0.002 * 2.0 ** np.arange(9.0)), *0.25 ** np.arange(1.0, 5.0), 0.0):
             if fits(share):
                 break
             tried = share
-        for _ in range(_BISECTIONS):
+        for _ in range(6):
             middle = 0.5 * (share + tried)
             share, tried = (middle, tried) if fits(middle) else (share, middle)
         return scaled(share)
+
+
+def ranges_of(limits: Mapping[str, Limit], model: Model) -> dict[str, tuple[float, float]]:
+    """Range of each limited quantity.
+
+    Raises SettingsError: a limit is no range, a motion with it cannot rest, or a coordinate has no limit.
+    """
+    found = {}
+    moving = (*model.velocities, *model.accelerations)
+    for name, given in limits.items():
+        try:
+            pair = np.asarray(given if isinstance(given, tuple | list) else (-given, given), np.float64)
+        except (TypeError, ValueError):
+            pair = np.zeros(0)
+        if pair.shape != (2,) or not pair[0] < pair[1] or not np.isfinite(pair).any():
+            raise SettingsError(f'limits: "{name}" is {given!r:.60}; give a positive number, or (lowest, highest)')
+        if name in model.coordinates and not np.isfinite(pair).all():
+            raise SettingsError(f'limits: "{name}" is {given!r:.60}; give a coordinate two finite limits, or none')
+        if name in moving and not pair[0] < 0.0 < pair[1]:
+            raise SettingsError(f'limits: "{name}" is {given!r:.60}; the motion is at rest at both ends: include zero')
+        found[name] = (float(pair[0]), float(pair[1]))
+    for q, v in zip(model.coordinates, model.velocities, strict=False):
+        if q not in found and v not in found:
+            raise SettingsError(f'limits: neither "{q}" nor "{v}" has one; give one of them')
+    return found
+
+
+def check_rest(model: Model, limited: Limited, pose: FloatArray) -> None:
+    """Raise PlanningError if a limit is exceeded at rest in the best pose."""
+    rest = np.concatenate([pose, np.zeros(2 * len(pose))])[:, None]
+    margins = limited.margin(rest)
+    if not (margins > 0.0).all():
+        worst = limited.names[int(np.argmin(margins))]
+        value = limited.extremes(rest)[worst][0]
+        where = ", ".join(f"{n} = {x:.3g}" for n, x in zip(model.coordinates, pose, strict=True))
+        raise PlanningError(
+            f"no pose was found in which the machine rests within its limits: nearest, at {where}, {worst} is "
+            f"{value:.4g}; widen its limits, or check the parameters"
+        )
 
 
 def resting_pose(limited: Limited, lower: FloatArray, upper: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -224,8 +236,9 @@ def resting_pose(limited: Limited, lower: FloatArray, upper: FloatArray, rng: np
     bounded = np.isfinite(upper - lower)
     middle, half = np.zeros(len(lower)), np.zeros(len(lower))
     middle[bounded] = 0.5 * (lower + upper)[bounded]
-    half[bounded] = 0.5 * _SPREAD * (upper - lower)[bounded]
-    poses = np.vstack([middle, middle + half * rng.uniform(-1.0, 1.0, (_N_POSES, len(middle)))])
+    # Fraction of the ranges of the coordinates in which poses are drawn.
+    half[bounded] = 0.5 * 0.8 * (upper - lower)[bounded]
+    poses = np.vstack([middle, middle + half * rng.uniform(-1.0, 1.0, (200, len(middle)))])
     rest = np.zeros((3 * len(middle), 1))
     margins = np.empty(len(poses))
     for k, pose in enumerate(poses):
@@ -262,7 +275,9 @@ def drawn_motion(
 
 def grid(series: FourierSeries, density: int = 1) -> FloatArray:
     """Times of a period at which the optimisation evaluates a motion, s; as many times denser."""
-    n = density * _SAMPLES_PER_SINE * series.n_harmonics
+    # Rows per period of the fastest sine in which the optimisation evaluates the information. Limits hold in
+    # twice as many: forces have products of sines, of twice the frequency.
+    n = density * 12 * series.n_harmonics
     return np.linspace(0.0, series.period, n, endpoint=False)
 
 
@@ -292,9 +307,12 @@ class Observed:
         sizes = np.linalg.norm(J, axis=0)
         sizes[sizes == 0.0] = 1.0
         _, strengths, axes = np.linalg.svd(J / sizes, full_matrices=True)
-        n_shown = int((strengths > _RANK * max(strengths[0], 1e-300)).sum())
+        # Size of a direction, relative to the largest, below which no motion shows it; columns have unit
+        # length.
+        n_shown = int((strengths > 1e-6 * max(strengths[0], 1e-300)).sum())
         hidden = np.linalg.norm(axes[n_shown:], axis=0)
-        return cls(function, axes[:n_shown].T / sizes[:, None], hidden < _HIDDEN)
+        # Share of a parameter in such directions above which it is not identifiable.
+        return cls(function, axes[:n_shown].T / sizes[:, None], hidden < 1e-3)
 
     def information(self, x: FloatArray) -> FloatArray:
         """Fisher information (n_r, n_r) of the directions over the rows of a motion (3 n, K)."""
@@ -314,205 +332,3 @@ class Observed:
             variances = np.einsum("ij,jk,ik->i", self.directions, np.linalg.inv(information), self.directions)
             whole[self.identifiable] = np.sqrt(variances[self.identifiable])
         return whole
-
-
-# Optimisation --------------------------------------------------------------------------------------------------------
-@dataclass
-class Search:
-    """Limits of an optimisation, and what it has taken.
-
-    Parameters
-    ----------
-    iterations : int
-        At most.
-    deadline : float
-        By the monotonic clock, s.
-    progress : callable, optional
-        Called with the stage and the done fraction.
-    """
-
-    iterations: int
-    deadline: float
-    progress: Callable[[str, float], None] | None = None
-    taken: int = 0
-    out_of_time: bool = False
-    converged: bool = False
-
-    @property
-    def reason(self) -> str:
-        """Reason for the end of the search."""
-        if self.out_of_time:
-            return f"the time limit was reached after {self.taken} iterations"
-        return f"converged after {self.taken} iterations" if self.converged else f"{self.taken} iterations, the limit"
-
-    def goes_on(self) -> bool:
-        """Count an iteration; False if there is none left."""
-        self.out_of_time = time.monotonic() > self.deadline
-        if self.out_of_time or self.converged or self.taken >= self.iterations:
-            return False
-        self.taken += 1
-        if self.progress is not None:
-            self.progress(f"iteration {self.taken}", self.taken / self.iterations)
-        return True
-
-
-class _Point(NamedTuple):
-    """A motion's coefficients over sizes x (n,), objective f, distances from limits c (m,), and derivatives."""
-
-    x: FloatArray
-    f: float
-    c: FloatArray
-    gradient: FloatArray
-    jacobian: FloatArray
-
-
-class DesignProblem:
-    """Nonlinear program: minimise the mean logarithm of standard errors with distances ``c(x) > 0`` from the limits.
-
-    Parameters
-    ----------
-    series : FourierSeries
-    limited : Limited
-    observed : Observed
-        Observations in the rows of the grid.
-    sizes : (n,) array
-        Scale of each coordinate.
-    free : (n_coefficients, n) bool array
-        Coefficients that are unknowns.
-    start : (n_coefficients, n) array
-        Within the narrowed limits; the objective is zero there.
-    limit_times : (K,) array
-        Times of a period at which the limits hold, s.
-    narrowed : float
-        What the limits are narrowed by, over their scales.
-    """
-
-    def __init__(
-        self,
-        series: FourierSeries,
-        limited: Limited,
-        observed: Observed,
-        sizes: FloatArray,
-        free: BoolArray,
-        start: FloatArray,
-        limit_times: FloatArray,
-        narrowed: float,
-    ) -> None:
-        self._basis, self._limit_basis = series.basis(grid(series)), series.basis(limit_times)
-        self._sizes, self._free, self._start = sizes, free, start
-        self._limited, self._observed, self._narrowed = limited, observed, narrowed
-        x = ca.SX.sym("x", 3 * len(sizes))
-        slopes = ca.jacobian(limited.function(x) / ca.DM(limited.scale), x)
-        self._slopes = ca.Function("slopes", [x], [ca.densify(slopes)])
-        self._adjoint = observed.function.reverse(1)
-        self._finite = np.concatenate([np.isfinite(limited.lower), np.isfinite(limited.upper)])
-        # In these directions the information of the start is the identity.
-        root = np.linalg.cholesky(observed.information(motion_of(start, self._basis)))
-        self._directions = np.linalg.solve(root, observed.directions.T)
-
-    def coefficients(self, x: FloatArray) -> FloatArray:
-        """Coefficients (n_coefficients, n) of unknowns."""
-        z = self._start / self._sizes
-        z[self._free] = x
-        return z * self._sizes
-
-    def unknowns(self) -> FloatArray:
-        """Unknowns of the start."""
-        return np.asarray((self._start / self._sizes)[self._free])
-
-    def values(self, x: FloatArray) -> tuple[float, FloatArray]:
-        """Objective and distances from the limits (m,) over their scales."""
-        z = self.coefficients(x)
-        M = self._directions @ np.array(self._observed.function(motion_of(z, self._basis)))
-        sign, logarithm = np.linalg.slogdet(M @ M.T)
-        f = -0.5 * logarithm / len(M) if sign > 0.0 else np.inf
-        limited, values = self._limited, np.array(self._limited.function(motion_of(z, self._limit_basis)))
-        both = np.vstack([values - limited.lower[:, None], limited.upper[:, None] - values])
-        scaled = both / np.tile(limited.scale, 2)[:, None] - self._narrowed
-        return float(f), scaled[self._finite].ravel()
-
-    def point(self, x: FloatArray) -> _Point:
-        """Values and derivatives."""
-        f, c = self.values(x)
-        z, n = self.coefficients(x), len(self._sizes)
-        motion = motion_of(z, self._basis)
-        whole = self._observed.function(motion)
-        M = self._directions @ np.array(whole)
-        seeds = -self._directions.T @ np.linalg.solve(M @ M.T, M) / len(M)
-        by_motion = np.array(self._adjoint(motion, whole, seeds)).reshape(3, n, -1)
-        gradient = np.einsum("dnk,dkb->bn", by_motion, self._basis) * self._sizes
-        slopes = np.array(self._slopes(motion_of(z, self._limit_basis)))
-        by_row = slopes.reshape(len(self._limited.names), -1, 3, n)
-        jacobian = np.einsum("mkdn,dkb->mkbn", by_row, self._limit_basis) * self._sizes
-        both = np.concatenate([jacobian, -jacobian])[self._finite][:, :, self._free]
-        return _Point(x, f, c, gradient[self._free], both.reshape(len(c), -1))
-
-
-def best_motion(problem: DesignProblem, search: Search, barrier: float) -> FloatArray:
-    """Coefficients (n_coefficients, n) of a motion with a locally least objective.
-
-    A primal-dual interior-point method with a damped BFGS approximation of the Lagrangian's Hessian. There are few
-    unknowns and many limits, so that it eliminates the multipliers; all iterates keep the limits.
-
-    Parameters
-    ----------
-    problem : DesignProblem
-    search : Search
-        Limits; it counts the iterations.
-    barrier : float
-        First barrier parameter; a small one stays near the start.
-
-    References
-    ----------
-    Nocedal and Wright 2006, "Numerical Optimization", chapter 19 and procedure 18.2.
-    """
-    at, mu = problem.point(problem.unknowns()), barrier
-    multipliers, hessian, before = mu / at.c, np.eye(len(at.x)), np.inf
-    search.converged = False
-    while search.goes_on():
-        scaled = at.jacobian * (multipliers / at.c)[:, None]
-        pull = at.jacobian.T @ (mu / at.c) - at.gradient
-        step = np.asarray(np.linalg.solve(hessian + at.jacobian.T @ scaled, pull), np.float64)
-        change = (mu - multipliers * (at.jacobian @ step)) / at.c - multipliers
-        after = _along(problem, at, step, mu)
-        multipliers = multipliers + _share_inside(multipliers, change) * change
-        hessian = _updated(hessian, after, at, multipliers)
-        at = after
-        merit = at.f - mu * np.log(at.c).sum()
-        if before - merit < _MERIT_CHANGE * mu * len(at.x):
-            search.converged = mu <= _LAST_BARRIER
-            mu, merit = max(_LAST_BARRIER, _BARRIER_FACTOR * mu), np.inf
-        before = merit
-    return problem.coefficients(at.x)
-
-
-def _share_inside(values: FloatArray, change: FloatArray) -> float:
-    """Largest step, 1 at most, that leaves positive values a small fraction of themselves."""
-    shrinking = change < 0.0
-    return min(1.0, float((-_FRACTION * values[shrinking] / change[shrinking]).min(initial=1.0)))
-
-
-def _along(problem: DesignProblem, at: _Point, step: FloatArray, mu: float) -> _Point:
-    """Point on the way of a step, by backtracking on the barrier function; the point itself if none is better."""
-    merit = at.f - mu * np.log(at.c).sum()
-    slope = at.gradient @ step - mu * ((at.jacobian @ step) / at.c).sum()
-    share = _share_inside(at.c, at.jacobian @ step)
-    for _ in range(_BACKTRACKS):
-        f, c = problem.values(at.x + share * step)
-        if (c > (1.0 - _FRACTION) * at.c).all() and f - mu * np.log(c).sum() <= merit + 1e-4 * share * slope:
-            return problem.point(at.x + share * step)
-        share *= 0.5
-    return at
-
-
-def _updated(hessian: FloatArray, after: _Point, before: _Point, multipliers: FloatArray) -> FloatArray:
-    """Damped BFGS update (Powell) of the Lagrangian's Hessian; the identity after a step of no length."""
-    s = after.x - before.x
-    if not s.any():
-        return np.eye(len(s))
-    y = after.gradient - before.gradient - (after.jacobian - before.jacobian).T @ multipliers
-    Hs = hessian @ s
-    curvature, found = float(s @ Hs), float(s @ y)
-    theta = 1.0 if found >= 0.2 * curvature else 0.8 * curvature / (curvature - found)
-    r = theta * y + (1.0 - theta) * Hs
-    return np.asarray(hessian - np.outer(Hs, Hs) / curvature + np.outer(r, r) / (s @ r))

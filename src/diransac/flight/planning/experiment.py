@@ -16,17 +16,18 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import PlanningError, SettingsError
 from diransac.flight.planning.excitation import (
-    DesignProblem,
     FourierSeries,
+    Limit,
     Limited,
     Observed,
-    Search,
-    best_motion,
+    check_rest,
     drawn_motion,
     grid,
     motion_of,
+    ranges_of,
     resting_pose,
 )
+from diransac.flight.planning.optimisation import DesignProblem, Search, best_motion
 from diransac.flight.planning.trajectories import check_numbers, inverse_dynamics
 from diransac.flight.trajectory import Trajectory
 from diransac.process import single_threaded
@@ -39,14 +40,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Experiment", "design_experiment"]
 
-Limit: TypeAlias = float | tuple[float, float]
 Outputs: TypeAlias = Callable[..., Mapping[str, Any]]
 
 _N_DRAWS = 9
 """Plain multisines; the median one is the comparison, and the best one the start of the optimisation."""
 
-_NOISE = 0.01
-"""Default standard deviation of an input's noise, over what the input varies by."""
 
 _FEWEST_HARMONICS = 4
 """With these a period is always long enough for two."""
@@ -56,24 +54,6 @@ _ROOM = 1e-3
 
 _NARROWED = 5e-3
 """Fraction of limits that the optimisation leaves for extremes between its rows."""
-
-_CHECKED_PER_SINE = 64
-"""Rows of the check per period of the fastest sine, at least."""
-
-_BARRIERS = (3e-2, 1e-3, 1e-3, 1e-3)
-"""First barrier parameters of the optimisation, and of those that follow with the times at which limits are exceeded.
-
-They are also the fractions of the limits that the first motions leave.
-"""
-
-_AT_LIMIT = 0.03
-"""Fraction of a range within which an extreme is at the limit."""
-
-_LARGEST_SIZE = 4.0
-"""Amplitude of the sines of a drawn motion over half the range of the coordinate, before limits reduce it."""
-
-_N_RANDOM = 200
-"""Random states in which the derivatives show what any motion can show."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +147,8 @@ class Experiment(Trajectory):
             texts = [f"{number(low, 3)} to {number(high, 3)}" for low, high in (found, limits)]
             width = limits[1] - limits[0]
             near = min(found[0] - limits[0], limits[1] - found[1])
-            at = near < _AT_LIMIT * (0.5 * width if math.isfinite(width) else max(map(abs, found)))
+            # Fraction of a range within which an extreme is at the limit.
+            at = near < 0.03 * (0.5 * width if math.isfinite(width) else max(map(abs, found)))
             rows.append([n, self.units.get(n, ""), *texts, "at a limit" if at else ""])
         return rows
 
@@ -345,7 +326,8 @@ class _Rows:
     @cached_property
     def check_times(self) -> FloatArray:
         """Times at which limits are checked, s: rows, between them, and more often if the fastest sine needs it."""
-        wanted = _CHECKED_PER_SINE * self.series.highest / (2.0 * np.pi)
+        # Rows of the check per period of the fastest sine, at least.
+        wanted = 64 * self.series.highest / (2.0 * np.pi)
         per_row = 2 * math.ceil(max(wanted / self.rate, 1.0) / 2.0 + 0.5)
         return np.arange(per_row * self.n_rows) / (per_row * self.rate)
 
@@ -389,7 +371,9 @@ class _Task:
     def solved(self, search: Search) -> Experiment:
         """The best motion that is found, beside the median of the plain multisines."""
         times, found = grid(self.rows.series, 2), self.draws[-1]
-        for barrier in _BARRIERS:
+        # First barrier parameters of the optimisation, and of those that follow with the times at which
+        # limits are exceeded. They are also the fractions of the limits that the first motions leave.
+        for barrier in (3e-2, 1e-3, 1e-3, 1e-3):
             found = self._optimised(found, times, search, barrier)
             more = self._exceeding(found)
             if not len(more):
@@ -427,8 +411,7 @@ class _Task:
         designed, plain = (rows.trajectory(self.machine, z, self.limits) for z in (best, multisine))
         extremes = self.limited.extremes(motion_of(best, rows.check))
         return Experiment(
-            **{x.name: getattr(designed, x.name) for x in fields(Trajectory) if x.name != "solver"},
-            solver="interior point",
+            **{x.name: getattr(designed, x.name) for x in fields(Trajectory)},
             standard_errors=dict(zip(model.parameters, errors[0], strict=True)),
             multisine_standard_errors=dict(zip(model.parameters, errors[1], strict=True)),
             multisine=plain,
@@ -447,13 +430,14 @@ def _task(
     rng: np.random.Generator,
 ) -> _Task:
     """Task of a design.  Raises SettingsError, PlanningError: as `design_experiment`."""
-    pairs = _pairs(limits, machine.model)
+    pairs = ranges_of(limits, machine.model)
     limited, unlimited = machine.limited(pairs), (-np.inf, np.inf)
     lower, upper = np.array([pairs.get(n, unlimited) for n in machine.model.coordinates]).T
     sizes = _sizes(machine.model, pairs, rows.series)
     pose = resting_pose(limited, lower, upper, rng)
-    _check_rest(machine.model, limited, pose)
-    draws = [drawn_motion(rows.series, limited, pose, _LARGEST_SIZE * sizes, rng) for _ in range(_N_DRAWS)]
+    check_rest(machine.model, limited, pose)
+    # Amplitude of the sines of a drawn motion over half the range of the coordinate, before limits reduce it.
+    draws = [drawn_motion(rows.series, limited, pose, 4.0 * sizes, rng) for _ in range(_N_DRAWS)]
     basis = rows.series.basis(grid(rows.series))
     plain = [motion_of(z, basis) for z in draws]
     sigma = _noise_of(machine, noise, np.hstack(plain))
@@ -479,31 +463,6 @@ def _series(duration: float, frequency: float, harmonics: int) -> FourierSeries:
     return FourierSeries(duration / n_periods, int(cycles / n_periods))
 
 
-def _pairs(limits: Mapping[str, Limit], model: Model) -> dict[str, tuple[float, float]]:
-    """Range of each limited quantity.
-
-    Raises SettingsError: a limit is no range, a motion with it cannot rest, or a coordinate has no limit.
-    """
-    found = {}
-    moving = (*model.velocities, *model.accelerations)
-    for name, given in limits.items():
-        try:
-            pair = np.asarray(given if isinstance(given, tuple | list) else (-given, given), np.float64)
-        except (TypeError, ValueError):
-            pair = np.zeros(0)
-        if pair.shape != (2,) or not pair[0] < pair[1] or not np.isfinite(pair).any():
-            raise SettingsError(f'limits: "{name}" is {given!r:.60}; give a positive number, or (lowest, highest)')
-        if name in model.coordinates and not np.isfinite(pair).all():
-            raise SettingsError(f'limits: "{name}" is {given!r:.60}; give a coordinate two finite limits, or none')
-        if name in moving and not pair[0] < 0.0 < pair[1]:
-            raise SettingsError(f'limits: "{name}" is {given!r:.60}; the motion is at rest at both ends: include zero')
-        found[name] = (float(pair[0]), float(pair[1]))
-    for q, v in zip(model.coordinates, model.velocities, strict=False):
-        if q not in found and v not in found:
-            raise SettingsError(f'limits: neither "{q}" nor "{v}" has one; give one of them')
-    return found
-
-
 def _sizes(model: Model, limits: Mapping[str, tuple[float, float]], series: FourierSeries) -> FloatArray:
     """Size of each coordinate's motion (n,): half its range, or what a slow sine reaches at the largest velocity."""
     slow = 2.0 * np.pi / series.period
@@ -514,27 +473,14 @@ def _sizes(model: Model, limits: Mapping[str, tuple[float, float]], series: Four
     return np.array(sizes)
 
 
-def _check_rest(model: Model, limited: Limited, pose: FloatArray) -> None:
-    """Raise PlanningError if a limit is exceeded at rest in the best pose."""
-    rest = np.concatenate([pose, np.zeros(2 * len(pose))])[:, None]
-    margins = limited.margin(rest)
-    if not (margins > 0.0).all():
-        worst = limited.names[int(np.argmin(margins))]
-        value = limited.extremes(rest)[worst][0]
-        where = ", ".join(f"{n} = {x:.3g}" for n, x in zip(model.coordinates, pose, strict=True))
-        raise PlanningError(
-            f"no pose was found in which the machine rests within its limits: nearest, at {where}, {worst} is "
-            f"{value:.4g}; widen its limits, or check the parameters"
-        )
-
-
 def _noise_of(machine: _Machine, noise: Mapping[str, float] | None, motions: FloatArray) -> dict[str, float]:
     """Standard deviations by signal.  Raises SettingsError: a signal is unknown, or a number is not positive."""
     model = machine.model
     if noise is None:
         spread = np.array(machine.inputs(motions)).std(axis=1)
         spread = np.where(spread > 0.0, spread, max(spread.max(), 1.0))
-        return dict(zip(model.inputs, (_NOISE * spread).tolist(), strict=True))
+        # Default standard deviation of an input's noise, over what the input varies by.
+        return dict(zip(model.inputs, (0.01 * spread).tolist(), strict=True))
     names = (*model.state, *model.accelerations, *model.inputs)
     for name, value in noise.items():
         if name not in names:
@@ -548,6 +494,5 @@ def _random_motions(pose: FloatArray, sizes: FloatArray, series: FourierSeries, 
     """Random motions (3 n, K) about a pose, of the size and speed of the machine's."""
     w = series.highest
     scale = np.concatenate([sizes, w * sizes, w**2 * sizes])[:, None]
-    return np.concatenate([pose, np.zeros(2 * len(pose))])[:, None] + scale * rng.uniform(
-        -1.0, 1.0, (len(scale), _N_RANDOM)
-    )
+    # Random states in which the derivatives show what any motion can show.
+    return np.concatenate([pose, np.zeros(2 * len(pose))])[:, None] + scale * rng.uniform(-1.0, 1.0, (len(scale), 200))

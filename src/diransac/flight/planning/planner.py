@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.errors import PlanningError, SettingsError
+from diransac.errors import PlanningError
 from diransac.flight.planning.problem import (
     InitialGuess,
     Task,
@@ -45,15 +45,7 @@ if TYPE_CHECKING:
 
     from diransac.model.plant import ModelWithParameters
 
-__all__ = ["SOLVERS", "plan"]
-
-SOLVERS = ("ipopt", "fatrop", "snopt")
-
-_FIRST_ATTEMPTS = 0.4
-"""Fraction of the iterations for every attempt but the last: most plans take a tenth of them."""
-
-_MORE_ROWS = (0, 1, 2, 4, 8)
-"""Rows added to optimal durations in turn until there is a plan on the grid of the inputs."""
+__all__ = ["plan"]
 
 
 def plan(
@@ -72,7 +64,6 @@ def plan(
     trim: Mapping[str, float] | None = None,
     start_end_at_rest: bool = True,
     guess: Trajectory | None = None,
-    solver: str = "ipopt",
     max_iterations: int = 200,
     time_limit: float = 30.0,
 ) -> Trajectory:
@@ -111,11 +102,8 @@ def plan(
         under the inputs of zero cost in the first, and free in the last. False: they are all free.
     guess : Trajectory, optional
         Starting point of the search, of the same model.
-    solver : {"ipopt", "fatrop", "snopt"}
-        ``fatrop`` takes two thirds of the time of ``ipopt``, but with parameters far from plausible ones it may not
-        return, and then neither ``time_limit`` nor Ctrl-C ends it. ``snopt`` needs ``pip install diransac[snopt]``.
     max_iterations : int
-        Of the last attempt; earlier ones get two fifths of it. Five iterations of SNOPT count as one.
+        Of the last attempt; earlier ones get two fifths of it.
     time_limit : float
         s. Explaining why there is no plan may take the same time again.
 
@@ -141,8 +129,6 @@ def plan(
     ----------
     Betts 2010, "Practical Methods for Optimal Control and Estimation", chapter 4; Dimmig et al. 2023, section V-A.
     """
-    if solver not in SOLVERS:
-        raise SettingsError(f'solver "{solver}" is unknown; choose one of {", ".join(SOLVERS)}')
     model, limits = plant.model, limits_of("input", input_limits, tuple(plant.model.inputs))
     route = route_of(model, waypoints, times, reference, duration, start_end_at_rest)
     check_weights(state_weights, route, input_limit_fraction)
@@ -168,7 +154,7 @@ def plan(
         states=states,
         dt=TIME_STEP,
     )
-    search = _Search(task, solver, SearchLimits(int(max_iterations), float(time_limit)), route.start, limits)
+    search = _Search(task, SearchLimits(int(max_iterations), float(time_limit)), route.start, limits)
     initial = None if guess is None else guess_along(model, guess)
     return search.free(initial) if route.rows is None else search.fixed(route.rows, initial)
 
@@ -176,10 +162,9 @@ def plan(
 # Search --------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class _Search:
-    """Search for the solution of one task by one solver."""
+    """Search for the solution of one task."""
 
     task: Task
-    solver: str
     search_limits: SearchLimits
     start: float
     limits: Limits
@@ -199,7 +184,8 @@ class _Search:
         durations = None if guess is None else np.full(n, guess.time[-1] / n)
         straight = straight_guess(task, np.ones(n) if durations is None else durations)
         strategy: Strategy = "line search" if guess is None else "warm start"
-        solution = self._search(program, unknowns_of(program, guess or straight, durations), strategy)
+        unknowns = unknowns_of(program, guess or straight, durations)
+        solution = interior_point(program, unknowns, self.search_limits, strategy)
         if not solution.success:
             raise PlanningError(
                 f"no durations were found for which the plan works: {solution.summary}; "
@@ -207,11 +193,12 @@ class _Search:
             )
         found = program.split(solution.unknowns)[0][program.layout.waypoint_knots[:-1], -1]
         shortest = np.maximum(np.ceil(found / task.dt - 1e-6), 1).astype(int)
-        for more in _MORE_ROWS:
+        # Rows added to optimal durations in turn until there is a plan on the grid of the inputs.
+        for more in (0, 1, 2, 4, 8):
             rows = tuple(int(k) + more for k in shortest)
             whole = fixed_program(task, rows)
             along = stretched_guess(program, solution.unknowns, task.dt * np.array(rows))
-            rounded = self._search(whole, unknowns_of(whole, along), "warm start")
+            rounded = interior_point(whole, unknowns_of(whole, along), self.search_limits, "warm start")
             if rounded.success:
                 return self._trajectory(whole, rounded)
         raise PlanningError(_explanation(task, rows, rounded, self.search_limits))
@@ -226,57 +213,35 @@ class _Search:
         attempts: list[tuple[FloatArray, Strategy]] = [(straight, "line search")]
         if guess is not None:
             attempts.insert(0, (unknowns_of(program, guess), "warm start"))
-        if self.solver == "ipopt":
-            attempts.append((straight, "full steps"))
+        attempts.append((straight, "full steps"))
         whole = self.search_limits
-        short = replace(whole, iterations=max(1, round(_FIRST_ATTEMPTS * whole.iterations)))
+        # Fraction of the iterations for every attempt but the last: most plans take a tenth of them.
+        short = replace(whole, iterations=max(1, round(0.4 * whole.iterations)))
         for k, (unknowns, strategy) in enumerate(attempts, start=1):
-            solution = self._search(program, unknowns, strategy, whole if k == len(attempts) else short)
+            solution = interior_point(program, unknowns, whole if k == len(attempts) else short, strategy)
             if solution.success or solution.status == TIME_LIMIT:
                 break
         return solution
 
-    def _search(
-        self, program: Program, unknowns: FloatArray, strategy: Strategy, limits: SearchLimits | None = None
-    ) -> Solution:
-        """Solution by the chosen solver."""
-        limits = limits or self.search_limits
-        if self.solver == "snopt":
-            from diransac.flight.planning.snopt import active_set
-
-            return active_set(program, unknowns, limits)
-        return interior_point(self.solver, program, unknowns, limits, strategy)
-
     def _trajectory(self, program: Program, solution: Solution) -> Trajectory:
         kept = np.clip(solution.unknowns, program.numbers.lower, program.numbers.upper)
-        return trajectory_of(self.task, program, kept, self.start, self.limits, solution.solver)
+        return trajectory_of(self.task, program, kept, self.start, self.limits)
 
 
 # Infeasible plans ----------------------------------------------------------------------------------------------------
-
-_EXPLANATION_ITERATIONS = 500
-
-_MISS_WEIGHT = 1e4
-"""Penalty on the distance from a waypoint, one over the state's unit squared."""
-
-_MET = 1e-2
-"""Distance within which a waypoint counts as reached, state's unit: the penalty is finite."""
-
-_AT_LIMIT = 1e-3
-"""Fraction of a range, or of a unit, within which a value is at its limit."""
 
 
 def _explanation(task: Task, rows: tuple[int, ...], solution: Solution, limits: SearchLimits) -> str:
     """Sentence on the waypoint that is missed by most, the limits that bind, and what to relax.
 
     It describes the plan nearest to a feasible one: the start and all limits hold, and the squared distances from the
-    later waypoints are least. IPOPT finds it.
+    later waypoints are least.
     """
     if solution.status == TIME_LIMIT:
         return f"no plan was found within {limits.seconds:g} s; raise time_limit=, or give a guess="
     program = _relaxed(task, rows)
     guess = unknowns_of(program, straight_guess(task, task.dt * np.array(rows)))
-    nearest = interior_point("ipopt", program, guess, SearchLimits(_EXPLANATION_ITERATIONS, limits.seconds))
+    nearest = interior_point(program, guess, SearchLimits(500, limits.seconds))
     if not nearest.success:
         return (
             f"there is no plan: {solution.summary}, and none was found that may miss its waypoints; "
@@ -307,7 +272,8 @@ def _relaxed(task: Task, rows: tuple[int, ...]) -> Program:
     reference, weights = costs.reference.copy(), costs.weights.copy()
     for knot, waypoint in zip(program.layout.waypoint_knots[1:], task.waypoints[1:], strict=True):
         states = list(waypoint.states)
-        reference[knot, states], weights[knot, states] = waypoint.values, _MISS_WEIGHT
+        # Penalty on the distance from a waypoint, one over the state's unit squared.
+        reference[knot, states], weights[knot, states] = waypoint.values, 1e4
     numbers = replace(program.numbers, costs=replace(costs, reference=reference, weights=weights))
     return Program(program.stage, program.layout, numbers)
 
@@ -316,7 +282,8 @@ def _largest_miss(task: Task, program: Program, unknowns: FloatArray) -> str | N
     """Waypoint state that is missed by most; None where every waypoint is reached."""
     states, names = program.split(unknowns)[0], task.model.state
     ends = np.concatenate([[0.0], np.cumsum(program.numbers.steps.sum(axis=1))])
-    worst, text = _MET, None
+    # Distance within which a waypoint counts as reached, state's unit: the penalty is finite.
+    worst, text = 1e-2, None
     for k, (knot, waypoint) in enumerate(zip(program.layout.waypoint_knots, task.waypoints, strict=True)):
         misses = np.abs(states[knot, list(waypoint.states)] - waypoint.values)
         if len(misses) and misses.max() > worst:
@@ -336,7 +303,8 @@ def _binding(task: Task, program: Program, unknowns: FloatArray) -> str:
         (inputs, task.inputs, tuple(task.model.inputs)),
         (states[1:, : len(task.model.state)], task.states, task.model.state),
     ):
-        slack = _AT_LIMIT * limits.half_ranges
+        # Fraction of a range, or of a unit, within which a value is at its limit.
+        slack = 1e-3 * limits.half_ranges
         at_limit = np.any((values <= limits.lower + slack) | (values >= limits.upper - slack), axis=0)
         names += [known[j] for j in np.flatnonzero(at_limit)]
     return " and ".join(names)

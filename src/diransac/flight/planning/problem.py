@@ -39,9 +39,6 @@ FREE_INTERVALS = 20
 _DIGITS = 9
 """Decimals of a time in s, within which equal moments computed in different ways agree."""
 
-_FIRST_DURATION = 1.0
-"""First guess of a segment's duration, s."""
-
 
 @dataclass(frozen=True)
 class Task:
@@ -201,7 +198,8 @@ def unknowns_of(program: Program, guess: InitialGuess, durations: FloatArray | N
     lengths = numbers.steps.sum(axis=1)
     unknowns = np.zeros(layout.n_unknowns)
     if layout.free_time:
-        guessed = np.full(len(layout.intervals), _FIRST_DURATION) if durations is None else durations
+        # First guess of a segment's duration, s.
+        guessed = np.full(len(layout.intervals), 1.0) if durations is None else durations
         lengths = lengths * guessed[layout.segment_of]
         unknowns[layout.states[:, -1]] = np.append(guessed[layout.segment_of], guessed[-1])
         unknowns[layout.next_durations] = guessed[1:]
@@ -221,9 +219,7 @@ def stretched_guess(program: Program, unknowns: FloatArray, durations: FloatArra
 
 
 # Solutions -----------------------------------------------------------------------------------------------------------
-def trajectory_of(
-    task: Task, program: Program, unknowns: FloatArray, start: float, limits: Limits, solver: str
-) -> Trajectory:
+def trajectory_of(task: Task, program: Program, unknowns: FloatArray, start: float, limits: Limits) -> Trajectory:
     """Trajectory of a solution at fixed times, each interval integrated from its knot; the last input is repeated."""
     steps, layout = program.numbers.steps, program.layout
     states, inputs = program.split(unknowns)
@@ -237,5 +233,4 @@ def trajectory_of(
         tuple(task.model.inputs),
         limits.by_name(task.model.inputs),
         cost=program.objective(unknowns),
-        solver=solver,
     )

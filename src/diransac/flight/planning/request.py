@@ -38,8 +38,6 @@ __all__ = [
 TIME_STEP = 0.01
 """Time from row to row of a plan, s: flights are simulated and controlled at 100 Hz."""
 
-_UNIT_LENGTH = 1e-3
-"""Largest deviation of a given quaternion's norm from one."""
 
 Signal = Callable[["FloatArray"], "ArrayLike"]
 
@@ -153,7 +151,8 @@ def _check_quaternions(model: Model, k: int, values: Mapping[str, float], all_fi
             raise SettingsError(
                 f"waypoint {k} leaves the attitude open: name {', '.join(names)}, or pass start_end_at_rest=False"
             )
-        if len(given) == 4 and abs(np.linalg.norm(given) - 1.0) > _UNIT_LENGTH:
+        # Largest deviation of a given quaternion's norm from one.
+        if len(given) == 4 and abs(np.linalg.norm(given) - 1.0) > 1e-3:
             raise SettingsError(
                 f"waypoint {k}: {', '.join(names)} are a quaternion; its norm is {np.linalg.norm(given):.4g}, not 1"
             )
@@ -355,7 +354,6 @@ def _rest_state(model: Model, start: Waypoint) -> tuple[FloatArray, BoolArray]:
 
 # Trim ----------------------------------------------------------------------------------------------------------------
 
-_TRIM_ITERATIONS = 30
 _TRIM_TOLERANCE = 1e-6
 
 
@@ -404,7 +402,7 @@ def _least_acceleration(
     lower = np.concatenate([np.full(n_free, -np.inf), limits.lower])
     upper = np.concatenate([np.full(n_free, np.inf), limits.upper])
     z, open_ended = np.clip(np.concatenate([x[free], np.zeros(model.n_u)]), lower, upper), upper > lower
-    for _ in range(_TRIM_ITERATIONS):
+    for _ in range(30):
         x[free], u = z[:n_free], z[n_free:]
         A, B = (np.array(J)[model.n_q :] for J in model.linearization(x, u, parameters))
         J, a = np.hstack([A[:, free], B]), _accelerations(model, parameters, x, u)

@@ -1,9 +1,9 @@
-"""Interior-point solution of a `Program` by IPOPT or FATROP through CasADi, with the program's own derivatives.
+"""Interior-point solution of a `Program` by IPOPT through CasADi, with the program's own derivatives.
 
 An `nlpsol` object is built once per layout and serves every program of it: its functions read the program that is being
 solved. They are passed through CasADi's function cache, so that nothing is differentiated a second time.
 
-References: Waechter and Biegler 2006 (IPOPT); Vanroye et al. 2023, "FATROP" (structure-exploiting interior point).
+References: Waechter and Biegler 2006 (IPOPT).
 """
 
 from __future__ import annotations
@@ -22,30 +22,23 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
-from diransac.flight.planning.transcription import Layout, Numbers, Program
+from diransac.flight.planning.transcription import Layout, Program
 
 __all__ = ["TIME_LIMIT", "SearchLimits", "Solution", "Strategy", "interior_point"]
 
 Strategy: TypeAlias = Literal["line search", "warm start", "full steps"]
 """``warm start``: the guess is close to the solution, the barrier starts small; ``full steps``: without line search."""
 
-_QUIET: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
-_TOLERANCE = 1e-9
-_FATROP_RELAXES = 1e-8
-"""Relative widening of every limit by fatrop, which no option disables."""
-_FATROP_LARGEST = 1e10
-"""Magnitude beyond which fatrop may look for a regularisation without end and without evaluating a function."""
-
 TIME_LIMIT = "time limit reached"
 
 
 @dataclass(frozen=True)
 class SearchLimits:
-    """Limits of a search by one solver after the other.
+    """Limits of a search by one attempt after the other.
 
     Parameters
     ----------
-    iterations : of one solver
+    iterations : of one attempt
     seconds : of all of them together
     deadline : their end by the monotonic clock, s; by default that many seconds from now
     """
@@ -65,48 +58,38 @@ class SearchLimits:
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of a solver.
+    """Result of IPOPT.
 
     Parameters
     ----------
     unknowns : (n_unknowns,)   the last iterate
     success : whether that is a solution
-    status : the solver's return status
-    iterations : None where the solver does not report them
-    solver : its name
+    status : IPOPT's return status
+    iterations : None where it does not report them
     """
 
     unknowns: FloatArray
     success: bool
     status: str
     iterations: int | None
-    solver: str
 
     @property
     def summary(self) -> str:
-        """Solver, status and iterations."""
+        """Status and iterations in words."""
         count = "" if self.iterations is None else f" after {self.iterations} iterations"
-        return f"{self.solver} says {self.status}{count}"
+        return f"ipopt says {self.status}{count}"
 
 
 def interior_point(
-    name: str, program: Program, guess: FloatArray, limits: SearchLimits, strategy: Strategy = "line search"
+    program: Program, guess: FloatArray, limits: SearchLimits, strategy: Strategy = "line search"
 ) -> Solution:
-    """Solution by ``ipopt`` or ``fatrop``.
-
-    Parameters
-    ----------
-    guess : (n_unknowns,)   first iterate
-    strategy : ``full steps`` is for IPOPT alone
-
-    Raises KeyboardInterrupt: the user stopped it.
-    """
-    return _solver(name, program.layout, limits.iterations, strategy).solve(program, guess, limits.deadline)
+    """Solution by IPOPT from a first iterate (n_unknowns,).  Raises KeyboardInterrupt: the user stopped it."""
+    return _solver(program.layout, limits.iterations, strategy).solve(program, guess, limits.deadline)
 
 
 @lru_cache(maxsize=64)
-def _solver(name: str, layout: Layout, iterations: int, strategy: Strategy) -> _Solver:
-    return _Solver(name, layout, iterations, strategy)
+def _solver(layout: Layout, iterations: int, strategy: Strategy) -> _Solver:
+    return _Solver(layout, iterations, strategy)
 
 
 @contextmanager
@@ -134,9 +117,8 @@ class _Stopped(Exception):
 class _Solver:
     """`nlpsol` object of one layout, for one solve at a time."""
 
-    def __init__(self, name: str, layout: Layout, iterations: int, strategy: Strategy) -> None:
-        self._name, self._layout = name, layout
-        self._options = {"ipopt": _ipopt_options, "fatrop": _fatrop_options}[name](layout, iterations, strategy)
+    def __init__(self, layout: Layout, iterations: int, strategy: Strategy) -> None:
+        self._layout, self._options = layout, _options(iterations, strategy)
         self._lock = Lock()
         self._program: Program | None = None
         self._nlpsol: ca.Function | None = None
@@ -161,41 +143,25 @@ class _Solver:
         numbers = program.numbers
         with _interrupts_noted() as self._interrupts:
             try:
-                lower, upper = self._limits(numbers)
-                found = self._nlpsol(x0=guess, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+                found = self._nlpsol(x0=guess, lbx=numbers.lower, ubx=numbers.upper, lbg=0.0, ubg=0.0)
             except RuntimeError:
                 if self._stopped is None:
                     raise
         if self._interrupts:
             raise KeyboardInterrupt
         if isinstance(self._stopped, _Stopped):
-            return Solution(guess, False, str(self._stopped), None, self._name)
+            return Solution(guess, False, str(self._stopped), None)
         if self._stopped is not None:
             raise self._stopped
         stats, unknowns = self._nlpsol.stats(), np.array(found["x"]).ravel()
         success = bool(stats["success"]) and bool(np.isfinite(unknowns).all())
-        return Solution(unknowns, success, str(stats["return_status"]), int(stats["iter_count"]), self._name)
-
-    def _limits(self, numbers: Numbers) -> tuple[FloatArray, FloatArray]:
-        """Limits of the unknowns, narrowed by as much as the solver widens them."""
-        lower, upper = numbers.lower, numbers.upper
-        if self._name != "fatrop":
-            return lower, upper
-        finite = [np.where(np.isfinite(limit), np.abs(limit), 0.0) for limit in (lower, upper)]
-        inward = [_FATROP_RELAXES * np.maximum(1.0, size) for size in finite]
-        roomy = upper - lower > inward[0] + inward[1]
-        return np.where(roomy, lower + inward[0], lower), np.where(roomy, upper - inward[1], upper)
+        return Solution(unknowns, success, str(stats["return_status"]), int(stats["iter_count"]))
 
     def _build(self, program: Program) -> None:
         structure = _Structure(program)
-        signatures = _SIGNATURES[self._name]
-        self._functions = {
-            name: _Evaluation(name, results, structure, self._values) for name, results in signatures.items()
-        }
-        nlp = _Evaluation("nlp", ("f", "g"), structure, self._values)
-        self._functions["nlp"] = nlp
-        cache = {name: function for name, function in self._functions.items() if name != "nlp"}
-        self._nlpsol = ca.nlpsol("plan", self._name, nlp, {**_QUIET, **self._options, "cache": cache})
+        self._functions = {name: _Evaluation(name, results, structure, self._values) for name, results in _RESULTS}
+        nlp, cache = self._functions["nlp"], {name: x for name, x in self._functions.items() if name != "nlp"}
+        self._nlpsol = ca.nlpsol("plan", "ipopt", nlp, {**self._options, "cache": cache})
 
     def _values(self, name: str, x: FloatArray, objective_factor: float, multipliers: FloatArray) -> FloatArray:
         """One of `_COMPUTE` at a point.
@@ -210,13 +176,10 @@ class _Solver:
             raise self._stopped
         assert self._program is not None
         try:
-            values = np.asarray(_COMPUTE[name](self._program, x, objective_factor, multipliers))
-            if self._name == "fatrop" and not np.abs(values).max(initial=0.0) < _FATROP_LARGEST:
-                raise _Stopped("a number is too large")
+            return np.asarray(_COMPUTE[name](self._program, x, objective_factor, multipliers))
         except BaseException as error:  # an interrupt too: solvers print or hide what is raised in them
             self._stopped = error
             raise
-        return values
 
 
 class _Structure:
@@ -226,9 +189,6 @@ class _Structure:
         n, m = program.layout.n_unknowns, program.layout.n_constraints
         self.n_unknowns, self.n_constraints = n, m
         (rows, columns), (upper, right) = program.jacobian_entries, program.hessian_entries
-        lower = np.flatnonzero(upper < right)
-        both = np.concatenate([upper, right[lower]]), np.concatenate([right, upper[lower]])
-        whole, mirrored = _sorted(both, (n, n))
         self.parts: dict[str, tuple[ca.Sparsity, IntArray]] = {
             "f": _column(1),
             "g": _column(m),
@@ -236,50 +196,29 @@ class _Structure:
             "grad_gamma_x": _column(n),
             "grad_gamma_p": _column(0),
             "jac_g_x": _sorted((rows, columns), (m, n)),
-            "hess_gamma_x_x": (whole, np.concatenate([np.arange(len(upper)), lower])[mirrored]),
             "triu_hess_gamma_x_x": _sorted((upper, right), (n, n)),
         }
-
-
-def _lagrangian_gradient(
-    program: Program, x: FloatArray, objective_factor: float, multipliers: FloatArray
-) -> FloatArray:
-    rows, columns = program.jacobian_entries
-    sums = np.bincount(columns, program.jacobian(x) * multipliers[rows], program.layout.n_unknowns)
-    return np.asarray(objective_factor * program.gradient(x) + sums)
 
 
 _COMPUTE: Mapping[str, Callable[[Program, FloatArray, float, FloatArray], Any]] = {
     "f": lambda program, x, _factor, _multipliers: [program.objective(x)],
     "g": lambda program, x, _factor, _multipliers: program.constraints(x),
     "grad_f_x": lambda program, x, _factor, _multipliers: program.gradient(x),
-    "grad_gamma_x": _lagrangian_gradient,
-    "grad_gamma_p": lambda _program, _x, _factor, _multipliers: np.zeros(0),
     "jac_g_x": lambda program, x, _factor, _multipliers: program.jacobian(x),
-    "hess_gamma_x_x": Program.hessian,
     "triu_hess_gamma_x_x": Program.hessian,
 }
 """Functions by CasADi's names: (program, unknowns, objective's factor, multipliers) -> entries."""
 
-_SIGNATURES: dict[str, dict[str, tuple[str, ...]]] = {
-    "ipopt": {
-        "nlp_f": ("f",),
-        "nlp_g": ("g",),
-        "nlp_grad_f": ("f", "grad_f_x"),
-        "nlp_jac_g": ("g", "jac_g_x"),
-        "nlp_hess_l": ("triu_hess_gamma_x_x",),
-        "nlp_grad": ("f", "g", "grad_gamma_x", "grad_gamma_p"),
-    },
-    "fatrop": {
-        "nlp_f": ("f",),
-        "nlp_g": ("g",),
-        "nlp_grad_f": ("grad_f_x",),
-        "nlp_jac_g": ("g", "jac_g_x"),
-        "nlp_hess_l": ("grad_gamma_x", "hess_gamma_x_x"),
-        "nlp_grad": ("f", "g", "grad_gamma_x", "grad_gamma_p"),
-    },
-}
-"""Functions that each solver calls, and the results of each; CasADi's names decide which take multipliers."""
+_RESULTS = (
+    ("nlp", ("f", "g")),
+    ("nlp_f", ("f",)),
+    ("nlp_g", ("g",)),
+    ("nlp_grad_f", ("f", "grad_f_x")),
+    ("nlp_jac_g", ("g", "jac_g_x")),
+    ("nlp_hess_l", ("triu_hess_gamma_x_x",)),
+    ("nlp_grad", ("f", "g", "grad_gamma_x", "grad_gamma_p")),
+)
+"""Functions that IPOPT calls, and the results of each; CasADi's names decide which take multipliers."""
 
 
 class _Evaluation(ca.Callback):
@@ -353,22 +292,11 @@ def _sorted(entries: tuple[IntArray, IntArray], shape: tuple[int, int]) -> tuple
     return ca.Sparsity(*shape, starts.tolist(), rows[order].tolist()), order
 
 
-def _ipopt_options(_layout: Layout, iterations: int, strategy: Strategy) -> dict[str, Any]:
-    options = {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, **_interior(iterations, strategy)}
+def _options(iterations: int, strategy: Strategy) -> dict[str, Any]:
+    options = {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, "max_iter": iterations, "tol": 1e-9}
     options["option_file_name"] = ""  # else ipopt.opt of the working directory is read, which may load a library
-    if strategy == "full steps":
-        options |= {"accept_every_trial_step": "yes", "mu_init": 1e-3}
-    return {"ipopt": options}
-
-
-def _fatrop_options(layout: Layout, iterations: int, strategy: Strategy) -> dict[str, Any]:
-    options = {"print_level": 0, **_interior(iterations, strategy)}
-    return {"structure_detection": "auto", "equality": [True] * layout.n_constraints, "fatrop": options}
-
-
-def _interior(iterations: int, strategy: Strategy) -> dict[str, Any]:
-    """Options that both solvers share."""
-    options = {"max_iter": iterations, "tol": _TOLERANCE}
     if strategy == "warm start":
         options |= {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
-    return options
+    if strategy == "full steps":
+        options |= {"accept_every_trial_step": "yes", "mu_init": 1e-3}
+    return {"print_time": False, "error_on_fail": False, "show_eval_warnings": False, "ipopt": options}

@@ -73,11 +73,6 @@ MAX_DURATION = 3600.0
 _SHORTEST_SEGMENT = 1.0
 """s: a rotorcraft at rest must turn before it moves sideways."""
 
-_SMOOTHED_ROWS = 11
-"""Length of the moving average over planned inputs, rows: piecewise constant inputs hide a delay."""
-
-_N_SINES = 5
-"""Sines per coordinate."""
 
 _EQUAL: Mapping[str, float] = MappingProxyType({})
 
@@ -331,7 +326,8 @@ def random_waypoints(
     from scipy.ndimage import uniform_filter1d  # slow to import
 
     planned = _through(plant, points, times, input_limits, options)
-    return replace(planned, inputs=uniform_filter1d(planned.inputs, _SMOOTHED_ROWS, axis=0, mode="nearest"))
+    # Length of the moving average over planned inputs, rows: piecewise constant inputs hide a delay.
+    return replace(planned, inputs=uniform_filter1d(planned.inputs, 11, axis=0, mode="nearest"))
 
 
 def _random_points(
@@ -405,7 +401,8 @@ def multisine(
     check_numbers(seed, duration, amplitude=amplitude, frequency=frequency)
     rng = np.random.default_rng(seed)
     time = np.arange(round(duration / TIME_STEP) + 1, dtype=np.float64) * TIME_STEP
-    shape = (_N_SINES, model.n_q, 1)
+    # Sines per coordinate.
+    shape = (5, model.n_q, 1)
     w, phase = 2 * np.pi * frequency * rng.uniform(0.2, 1.0, shape), rng.uniform(0.0, 2 * np.pi, shape)
     size = amplitude * rng.uniform(0.2, 0.6, shape)
 

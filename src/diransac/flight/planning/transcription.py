@@ -27,15 +27,7 @@ __all__ = ["Layout", "Numbers", "Program"]
 
 @dataclass(frozen=True)
 class Layout:
-    """Index of each unknown and each constraint of a plan.
-
-    Parameters
-    ----------
-    n_x, n_u : states and inputs of the model
-    intervals : number of intervals of each segment
-    pinned : of each waypoint, the indices of the states that it fixes
-    free_time : whether the durations of the segments are unknowns
-    """
+    """Index of each unknown and each constraint of a plan."""
 
     n_x: int
     n_u: int

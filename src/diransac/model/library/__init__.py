@@ -59,12 +59,10 @@ BUILTIN: dict[str, Callable[[], Model]] = {
     "quadrotor": quadrotor,
 }
 
-_OF_ROBOTS = ("body_position", "coordinates_of_bodies", "drive_forces", "robot", "robot_limits")
-
 
 def __getattr__(name: str) -> Any:
     """Functions that read descriptions of robots, imported at their first use."""
-    if name not in _OF_ROBOTS:
+    if name not in ("body_position", "coordinates_of_bodies", "drive_forces", "robot", "robot_limits"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from diransac.model import robots
 

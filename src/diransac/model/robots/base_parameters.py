@@ -16,19 +16,8 @@ from diransac.arrays import FloatArray
 
 __all__ = ["Grouping", "base_parameters"]
 
-_DEPENDENT = 1e-4
-"""Share of a column, at most, that is left of it beside the others where it is their combination.
-
-Angles in descriptions are rounded: 1.5708 is a right angle. What such an error shows of a parameter is nothing.
-"""
 _ZERO = 1e-9
 """Size of a column relative to the largest, and of weights between columns of unit length, that is a rounding error."""
-
-_DIGITS = 10
-"""Decimal digits of weights, which are products of lengths in m."""
-_ROWS_PER_PARAMETER = 3
-_LARGEST = (np.pi, 3.0, 10.0, 3.0, 10.0, 15.0)
-"""Of random motions: position, velocity, acceleration; angular velocity and acceleration of a base, specific force."""
 
 
 @dataclass(frozen=True)
@@ -68,16 +57,17 @@ def base_parameters(regressor: ca.Function, seed: int = 0) -> Grouping:
         ``(q, v, a) -> Y (n, n_x)``, or ``(q, v, a, w, dw, f) -> Y`` with the motion of a base.
     seed : int, optional
         Seed of the random motions.
-
-    Returns
-    -------
-    Grouping
     """
     n, n_x = regressor.size1_in(0), regressor.size2_out(0)
     rng = np.random.default_rng(seed)
-    n_points = _ROWS_PER_PARAMETER * n_x // n + 10
+    n_points = 3 * n_x // n + 10
     sizes = [regressor.size1_in(k) for k in range(regressor.n_in())]
-    motion = [rng.uniform(-x, x, (size, n_points)) for x, size in zip(_LARGEST, sizes, strict=False)]
+    # Of random motions: position, velocity, acceleration; angular velocity and acceleration of a base, specific
+    # force.
+    motion = [
+        rng.uniform(-x, x, (size, n_points))
+        for x, size in zip((np.pi, 3.0, 10.0, 3.0, 10.0, 15.0), sizes, strict=False)
+    ]
     stacked = np.hsplit(np.array(ca.densify(regressor(*motion))), n_points)
     Y = np.vstack(stacked)
     lengths = np.linalg.norm(Y, axis=0)
@@ -88,7 +78,8 @@ def base_parameters(regressor: ca.Function, seed: int = 0) -> Grouping:
     weights = np.linalg.lstsq(Y[:, kept], Y[:, dropped])[0] if kept and dropped else np.zeros((len(kept), len(dropped)))
     weights[np.abs(weights) < _ZERO] = 0.0
     weights *= lengths[list(dropped)] / lengths[kept, None]
-    return Grouping(tuple(kept), dropped, np.round(weights, _DIGITS))
+    # Decimal digits of weights, which are products of lengths in m.
+    return Grouping(tuple(kept), dropped, np.round(weights, 10))
 
 
 def _independent_columns(Y: FloatArray) -> list[int]:
@@ -98,7 +89,10 @@ def _independent_columns(Y: FloatArray) -> list[int]:
         rest = column - basis @ (basis.T @ column)
         rest = rest - basis @ (basis.T @ rest)
         size = float(np.linalg.norm(rest))
-        if size > _DEPENDENT:
+        # Share of a column, at most, that is left of it beside the others where it is their combination.
+        # Angles in descriptions are rounded: 1.5708 is a right angle. What such an error shows of a parameter
+        # is nothing.
+        if size > 1e-4:
             kept.append(k)
             basis = np.column_stack([basis, rest / size])
     return kept

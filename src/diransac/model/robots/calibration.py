@@ -21,8 +21,6 @@ from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters
 __all__ = ["calibrated", "impossible_changes"]
 
 _MJCF = {"armature": "armature", "damping": "damping", "friction": "frictionloss", "spring": "stiffness"}
-_URDF = {"damping": "damping", "friction": "friction"}
-"""Attributes of a joint, and of a URDF joint's dynamics, by parameter."""
 
 
 def calibrated(
@@ -60,7 +58,8 @@ def calibrated(
     source = Path(path).read_bytes()
     found = _estimates(description, parameters, values, covariance)
     document = _Document(source, f'robot description "{path}"')
-    attributes = _URDF if document.is_urdf else _MJCF
+    # Attributes of a joint, and of a URDF joint's dynamics, by parameter.
+    attributes = {"damping": "damping", "friction": "friction"} if document.is_urdf else _MJCF
     for name, of_joint in found.joints.items():
         joint = next(x for x in description.joints if x.name == name)
         document.set_joint(joint, {attributes[kind]: x for kind, x in of_joint.items() if kind in attributes})

@@ -24,23 +24,9 @@ from diransac.model.robots.rigid_body import inertial_parameters, pseudo_inertia
 
 __all__ = ["consistent_parameters", "inconsistency"]
 
-_REDUCTION = 0.1
-"""Ratio of successive weights of the divergence, which begins as heavy as the error is (interior-point method)."""
-_RIDGE = 1e-9
-"""Added to correlations, which may be singular."""
-_ROUNDING = 1e-13
-"""Added to a Hessian with a diagonal of one, which is singular where a body is almost impossible."""
-_LEAST_ERROR = 1e-4
-"""Least standard error of a combination relative to the sum of its parts' magnitudes in the description."""
-_SINGULAR = 1e-12
-"""Ratio of eigenvalues of a pseudo-inertia that is taken as singular."""
-_MAX_STEPS, _TOLERANCE, _SHORTEST_STEP = 200, 1e-12, 1e-10
-"""Of Newton's method: steps, decrease of the cost, fraction of a step."""
 _LEAST_MOMENT = 1e-6
 """Second moments of thin bodies, whose pseudo-inertia is singular, relative to the mean one."""
 
-_LIGHT = 1e-3
-"""Weight of the divergence where only the error counts."""
 _ANY_BODY = (1.0, 0.0, 0.0, 0.0, 0.01, 0.01, 0.01, 0.0, 0.0, 0.0)
 """A possible body, from which the search for others begins."""
 
@@ -101,7 +87,8 @@ def inconsistency(combinations: FloatArray, n_bodies: int, values: FloatArray, c
     """
     bodies, n_constants = np.tile(_ANY_BODY, (n_bodies, 1)), combinations.shape[1] - 10 * n_bodies
     problem = _Problem(bodies, np.full(n_constants, _ANY_BODY[4]), combinations, values, covariance)
-    change = combinations @ _solution(problem, _LIGHT) - values
+    # Weight of the divergence where only the error counts.
+    change = combinations @ _solution(problem, 1e-3) - values
     return np.asarray(change / np.sqrt(np.diag(covariance)))
 
 
@@ -113,21 +100,24 @@ def _solution(problem: _Problem, last_weight: float) -> FloatArray:
         x = _minimized(problem, x, weight)
         if weight == last_weight:
             return x
-        weight = max(last_weight, _REDUCTION * weight)
+        # Ratio of successive weights of the divergence, which begins as heavy as the error is (interior-point
+        # method).
+        weight = max(last_weight, 0.1 * weight)
 
 
 def _minimized(problem: _Problem, x: FloatArray, prior_weight: float) -> FloatArray:
     """Optimum by Newton's method with a line search."""
     cost, gradient, hessian = problem.at(x, prior_weight)
-    for _ in range(_MAX_STEPS):
+    # Of Newton's method: steps, decrease of the cost, fraction of a step.
+    for _ in range(200):
         step, decrease = _newton_step(gradient, hessian, problem.free)
         length = 1.0
         while not (found := problem.at(x + length * step, prior_weight))[0] <= cost - 0.1 * length * decrease:
             length *= 0.5
-            if length < _SHORTEST_STEP:
+            if length < 1e-10:
                 return x
         x, (cost, gradient, hessian) = x + length * step, found
-        if decrease < _TOLERANCE * prior_weight:
+        if decrease < 1e-12 * prior_weight:
             break
     return x
 
@@ -135,7 +125,8 @@ def _minimized(problem: _Problem, x: FloatArray, prior_weight: float) -> FloatAr
 def _newton_step(gradient: FloatArray, hessian: FloatArray, free: BoolArray) -> tuple[FloatArray, float]:
     """Newton's step of the free parameters, each scaled by its own curvature, and the decrease that it promises."""
     scale = np.where(free, 1.0 / np.sqrt(np.where(free, np.diag(hessian), 1.0)), 0.0)
-    H = hessian * np.outer(scale, scale) + np.diag(1.0 - free + _ROUNDING)
+    # Added to a Hessian with a diagonal of one, which is singular where a body is almost impossible.
+    H = hessian * np.outer(scale, scale) + np.diag(1.0 - free + 1e-13)
     step = -scale * np.linalg.solve(H, scale * gradient)
     return step, float(-gradient @ step)
 
@@ -148,8 +139,11 @@ class _Problem:
     ) -> None:
         spread = np.sqrt(np.diag(covariance))
         scale = np.where(spread > 0.0, spread, 1.0)
-        correlation = covariance / np.outer(scale, scale) + np.diag(np.where(spread > 0.0, _RIDGE, 1.0))
-        spread = np.maximum(spread, _LEAST_ERROR * np.abs(B) @ np.abs([*bodies.ravel(), *constants]))
+        # Added to correlations, which may be singular.
+        correlation = covariance / np.outer(scale, scale) + np.diag(np.where(spread > 0.0, 1e-9, 1.0))
+        # Least standard error of a combination relative to the sum of its parts' magnitudes in the
+        # description.
+        spread = np.maximum(spread, 1e-4 * np.abs(B) @ np.abs([*bodies.ravel(), *constants]))
         self.weight: FloatArray = np.linalg.inv(correlation) / np.outer(spread, spread)
         self.B, self.b, self.weighted, self.curvature = B, values, B.T @ self.weight, B.T @ self.weight @ B
         self.constants, self.n_bodies = constants, len(bodies)
@@ -182,7 +176,8 @@ def _divergence(J: FloatArray, inverse: FloatArray) -> tuple[float, FloatArray, 
     ratio = J @ inverse
     eigenvalues = np.linalg.eigvalsh(J)
     sign, logarithm = np.linalg.slogdet(ratio)
-    if eigenvalues[0] <= _SINGULAR * eigenvalues[-1] or sign <= 0.0:
+    # Ratio of eigenvalues of a pseudo-inertia that is taken as singular.
+    if eigenvalues[0] <= 1e-12 * eigenvalues[-1] or sign <= 0.0:
         return np.inf, np.zeros(10), np.zeros((10, 10))
     own = np.linalg.inv(J)
     products = np.array([own @ E for E in _BASIS])

@@ -34,9 +34,6 @@ _FAILURES = (ValueError, RuntimeError, MemoryError)
 _LARGEST = 1e50
 """Of masses, lengths and coefficients; products of several of them do not overflow."""
 
-_ROUNDING = 1e-15
-"""Entries of rotations that differ from 0, 1 or -1 by less are these: rounding of quarter turns' quaternions."""
-
 
 @dataclass(frozen=True)
 class Joint:
@@ -179,10 +176,6 @@ def parsed(path: str | Path) -> Any:
     path : str or Path
         MJCF or URDF.
 
-    Returns
-    -------
-    mujoco.MjSpec
-
     Raises
     ------
     ModelError
@@ -209,10 +202,6 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
     base : str, optional
         A body with a free joint: "held" in the pose of the file, or "measured", so that its motion is known. None:
         there is none.
-
-    Returns
-    -------
-    Description
 
     Raises
     ------
@@ -415,4 +404,5 @@ def _rotation(quaternion: FloatArray) -> FloatArray:
 def _snapped(values: FloatArray) -> FloatArray:
     """Values with those that are 0, 1 or -1 but for rounding exactly so, for which expressions have no terms."""
     whole = np.round(values)
-    return np.where(np.abs(values - whole) < _ROUNDING, whole, values)
+    # Entries of rotations that differ from 0, 1 or -1 by less are these: rounding of quarter turns' quaternions.
+    return np.where(np.abs(values - whole) < 1e-15, whole, values)

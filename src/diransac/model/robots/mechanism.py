@@ -52,8 +52,6 @@ _BASE = {"base_w{}": "rad/s", "base_w{}_dot": "rad/s^2", "base_f{}": "m/s^2"}
 """Inputs of a measured base."""
 
 _INERTIAL_UNITS = dict(zip(INERTIAL_NAMES, ("kg", *("kg m",) * 3, *("kg m^2",) * 6), strict=True))
-_IN_ORDER = (*INERTIAL_NAMES[1:], INERTIAL_NAMES[0])
-"""Order in which inertial parameters of a body are kept as base parameters: the mass goes first."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +125,9 @@ class Mechanism:
                 found[f"{kind}_{n}"] = Parameter(unit, lower=lower, value=value, combination=place)
         for body in (self.description.bodies[i] for i in self.bodies):
             values = dict(zip(INERTIAL_NAMES, inertial_parameters(body.inertial).tolist(), strict=True))
-            for kind in _IN_ORDER:
+            # Order in which inertial parameters of a body are kept as base parameters: the mass goes
+            # first.
+            for kind in (*INERTIAL_NAMES[1:], INERTIAL_NAMES[0]):
                 positive = kind in ("mass", "Ixx", "Iyy", "Izz") and values[kind] > 0.0
                 found[f"{kind}_{identifier(body.name)}"] = Parameter(
                     _INERTIAL_UNITS[kind],

@@ -17,12 +17,6 @@ from diransac.limits import LARGEST_TABLE, MOST_CELLS, MOST_ELEMENTS, beyond, ch
 
 __all__ = ["check_description"]
 
-_LARGEST = 64 * LARGEST_TABLE
-_COPIES, _CELLS = ("count",), ("nrow", "ncol", "width", "height")
-"""Attributes whose product is a number of elements, or of points of fields of heights and of textures."""
-
-_FOLDERS = ("meshdir", "texturedir", "assetdir")
-
 
 def check_description(path: Path, label: str) -> None:
     """Raise ModelError where a description, or a file that it includes, is no ordinary file or describes too much.
@@ -61,14 +55,16 @@ class _Counts:
 
     def read(self, path: Path, copies: float) -> None:
         """Count what a file has, so many times.  Raises ModelError, OSError, ValueError: as `check_description`."""
-        content, stack = read_bytes(path, _LARGEST), [copies]
+        content, stack = read_bytes(path, 64 * LARGEST_TABLE), [copies]
         parser = expat.ParserCreate()
 
         def start(name: str, attributes: Mapping[str, str]) -> None:
-            own = stack[-1] * math.prod(_numbers(attributes, _COPIES))
+            # Attributes whose product is a number of elements, or of points of fields of heights and of
+            # textures.
+            own = stack[-1] * math.prod(_numbers(attributes, ("count",)))
             stack.append(own)
-            self._add(own, own * math.prod(_numbers(attributes, _CELLS)))
-            self.folders |= {attributes[key] for key in _FOLDERS if key in attributes}
+            self._add(own, own * math.prod(_numbers(attributes, ("nrow", "ncol", "width", "height"))))
+            self.folders |= {attributes[key] for key in ("meshdir", "texturedir", "assetdir") if key in attributes}
             if name == "include":
                 self._include(attributes.get("file", ""), own)
             elif "file" in attributes:

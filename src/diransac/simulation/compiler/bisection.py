@@ -22,10 +22,6 @@ def emit_bisection(name: str) -> Value:
 
     Its arguments are the arrays `values` (n_rows, width), `places` (n_rows,) and `found` (n_rows,), and the sizes
     n_rows and width, which is a multiple of eight.
-
-    Parameters
-    ----------
-    name : of the function
     """
     module = ir.Module(name)
     of = ir.FunctionType(ir.VoidType(), [POINTER] * 3 + [INTEGER] * 2)

@@ -32,10 +32,6 @@ def emit_block_elimination(name: str) -> Value:
     (n - 1, padded_k, padded_k) and `pivots` (n, k), and the sizes n, k, padded_k and padded_c.  A row of a block has
     those of D_w, E_w' and R_w beside each other, padded by zeros to whole vectors, which S_w, Y_w and X_w replace.
     `inverse_below` is zero at first; `pivots` are the least that are admitted, which the pivots replace.
-
-    Parameters
-    ----------
-    name : of the function
     """
     module = ir.Module(name)
     of = ir.FunctionType(ir.VoidType(), [POINTER] * 4 + [INTEGER] * 4)

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = ["BlockSolution", "solve_blocks"]
 
-# Part of its diagonal that a pivot is at least: what rounding leaves where a system is singular.
-_LEAST_PIVOT = 1e-16
 _SIGNATURE = {
     **dict.fromkeys(("blocks", "below", "inverse_below", "pivots"), "pointer"),
     **dict.fromkeys(("n", "k", "padded_k", "padded_c"), "integer"),
@@ -69,7 +67,8 @@ def solve_blocks(
     for columns in right:
         blocks[:, :, c : c + columns.shape[2]] = columns
         c += columns.shape[2]
-    coupling, pivots = np.ascontiguousarray(below, np.float64), _LEAST_PIVOT * own
+    # Part of its diagonal that a pivot is at least: what rounding leaves where a system is singular.
+    coupling, pivots = np.ascontiguousarray(below, np.float64), 1e-16 * own
     inverse_below = np.zeros((n - 1, padded_k, padded_k))
     arrays = (blocks, coupling, inverse_below, pivots)
     _code().call(*(array.ctypes.data for array in arrays), n, k, padded_k, padded_c)

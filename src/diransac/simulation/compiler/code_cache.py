@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["CodeCache", "hashed"]
 
-SIZE_LIMIT = 256 * 2**20
-"""Bytes of all entries of a folder; a module has 20 kB to 5 MB."""
 
 MAGIC = b"diransac machine code 1\n"
 
@@ -43,7 +41,8 @@ class CodeCache:
     """
 
     folder: Path
-    size_limit: int = SIZE_LIMIT
+    # Bytes of all entries of a folder; a module has 20 kB to 5 MB.
+    size_limit: int = 256 * 2**20
 
     @staticmethod
     def of_user() -> CodeCache | None:

@@ -70,7 +70,6 @@ LOG2_E = 1.4426950408889634
 LN_2 = (0.6931471805599453, 2.3190468138462996e-17)
 LN_2_SHORT = (6.93147180369123816490e-01, 1.90821492927058770002e-10)  # the first has 21 zero bits at its end
 SMALLEST_EXP, LARGEST_EXP = -746.0, 710.0
-LARGEST_SINH = 710.6
 EXPONENTIAL = tuple(1.0 / math.factorial(k) for k in range(13, 1, -1))  # remainder below 5e-18 for |r| <= ln(2) / 2
 
 SMALLEST_NORMAL = 2.0**-1022
@@ -238,20 +237,6 @@ def expm1(v: Vectors, x: Value) -> Value:
     return _identity_where_tiny(v, x, v.add(half, half))
 
 
-def sinh(v: Vectors, x: Value) -> Value:
-    """Return the hyperbolic sine, (E + E / (E + 1)) / 2 with E = e**x - 1."""
-    quarter = _scaled_expm1(v, v.clamped(v.absolute(x), 0.0, LARGEST_SINH), -2)
-    other = v.div(quarter, v.fma(quarter, v.number(4.0), v.number(1.0)))
-    size = v.mul(v.number(2.0), v.add(quarter, other))
-    return _identity_where_tiny(v, x, v.intrinsic("copysign", size, x))
-
-
-def cosh(v: Vectors, x: Value) -> Value:
-    """Return the hyperbolic cosine, (e**x + e**-x) / 2."""
-    quarter = _scaled_exp(v, v.clamped(v.absolute(x), 0.0, LARGEST_SINH), v.number(0.0), -2)
-    return v.mul(v.number(2.0), v.add(quarter, v.div(v.number(0.0625), quarter)))
-
-
 def tanh(v: Vectors, x: Value) -> Value:
     """Return the hyperbolic tangent, E / (E + 2) with E = e**2x - 1."""
     size = v.clamped(v.absolute(x), 0.0, 20.0)
@@ -299,49 +284,6 @@ def log(v: Vectors, x: Value) -> Value:
     k, m = _exponent_and_mantissa(v, x)
     value = _log(v, k, v.sub(m, v.number(1.0)), v.number(0.0))
     return _with_log_edges(v, x, value)
-
-
-def log1p(v: Vectors, x: Value) -> Value:
-    """Return log(1 + x), accurate near zero."""
-    one = v.number(1.0)
-    total = v.add(x, one)
-    part = v.sub(total, one)
-    lost = v.add(v.sub(x, part), v.sub(one, v.sub(total, part)))
-    k, m = _exponent_and_mantissa(v, total)
-    plain = v.compare("==", k, v.number(0.0))
-    f = v.select(plain, x, v.sub(m, one))
-    correction = v.select(plain, v.number(0.0), v.div(lost, total))
-    return _identity_where_tiny(v, x, _with_log_edges(v, total, _log(v, k, f, correction)))
-
-
-def asinh(v: Vectors, x: Value) -> Value:
-    """Return the inverse hyperbolic sine."""
-    size = v.absolute(x)
-    root = v.intrinsic("sqrt", v.fma(size, size, v.number(1.0)))
-    inside = v.add(size, v.div(v.mul(size, size), v.add(root, v.number(1.0))))
-    return v.intrinsic("copysign", _log1p_or_log_twice(v, size, inside), x)
-
-
-def acosh(v: Vectors, x: Value) -> Value:
-    """Return the inverse hyperbolic cosine."""
-    t = v.sub(x, v.number(1.0))
-    inside = v.add(t, v.intrinsic("sqrt", v.mul(t, v.add(t, v.number(2.0)))))
-    inside = v.select(v.compare("<", t, v.number(0.0)), v.number(math.nan), inside)
-    return _log1p_or_log_twice(v, x, inside)
-
-
-def atanh(v: Vectors, x: Value) -> Value:
-    """Return the inverse hyperbolic tangent, log1p(2x / (1 - x)) / 2."""
-    size = v.absolute(x)
-    ratio = v.div(v.add(size, size), v.sub(v.number(1.0), size))
-    return v.intrinsic("copysign", v.mul(v.number(0.5), log1p(v, ratio)), x)
-
-
-def _log1p_or_log_twice(v: Vectors, size: Value, inside: Value) -> Value:
-    """log(1 + inside), or log(2 size) where the size is so large that `inside` may overflow."""
-    large = v.compare(">", size, v.number(2.0**60))
-    value = log1p(v, v.select(large, size, inside))
-    return v.add(value, v.select(large, v.number(LN_2[0]), v.number(0.0)))
 
 
 def _exponent_and_mantissa(v: Vectors, x: Value) -> tuple[Value, Value]:
@@ -455,29 +397,16 @@ def _edges_in_two_parts(v: Vectors, x: Value, high: Value, low: Value) -> tuple[
 
 # Inverse error function ----------------------------------------------------------------------------------------------
 def erfinv(v: Vectors, x: Value) -> Value:
-    """Return the inverse of the error function: a rational guess and three Newton steps, on erfc near one."""
-    size = v.absolute(x)
-    gap = v.sub(v.number(1.0), size)
-    central = v.compare("<", size, v.number(0.7))
-    y = v.select(central, _central_erfinv(v, size), _outer_erfinv(v, gap))
-    for _ in range(3):
+    """Return the inverse of the error function: Winitzki's guess and four Newton steps, on erfc near one."""
+    size, one = v.absolute(x), v.number(1.0)
+    gap, central = v.sub(one, size), v.compare("<", size, v.number(0.7))
+    logarithm = log(v, v.mul(gap, v.add(one, size)))
+    t = v.fma(logarithm, v.number(0.5), v.number(2.0 / (math.pi * 0.147)))
+    root = v.intrinsic("sqrt", v.fma(t, t, v.mul(logarithm, v.number(-1.0 / 0.147))))
+    y = v.intrinsic("sqrt", v.sub(root, t))
+    for _ in range(4):
         error = v.select(central, v.sub(v.libm("erf", y), size), v.sub(gap, v.libm("erfc", y)))
         slope = v.mul(v.number(2.0 / math.sqrt(math.pi)), exp(v, v.neg(v.mul(y, y))))
         y = v.sub(y, v.div(error, slope))
-    y = v.select(v.compare("==", size, v.number(1.0)), v.number(math.inf), y)
+    y = v.select(v.compare("==", size, one), v.number(math.inf), y)
     return v.intrinsic("copysign", y, x)
-
-
-def _central_erfinv(v: Vectors, x: Value) -> Value:
-    """First guess for x < 0.7, good to 1e-3."""
-    z = v.mul(x, x)
-    above = v.polynomial(z, (-0.140543331, 0.914624893, -1.645349621, 0.886226899))
-    below = v.polynomial(z, (0.012229801, -0.329097515, 1.442710462, -2.118377725, 1.0))
-    return v.div(v.mul(x, above), below)
-
-
-def _outer_erfinv(v: Vectors, gap: Value) -> Value:
-    """First guess for 1 - x = gap <= 0.3, good to 1e-3."""
-    z = v.intrinsic("sqrt", v.neg(log(v, v.mul(gap, v.number(0.5)))))
-    above = v.polynomial(z, (1.641345311, 3.429567803, -1.624906493, -1.970840454))
-    return v.div(above, v.polynomial(z, (1.637067800, 3.543889200, 1.0)))

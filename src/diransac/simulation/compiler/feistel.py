@@ -29,12 +29,6 @@ def emit_permutations(name: str, most_rounds: int, at_a_time: int) -> Value:
     Its arguments are the arrays `iterations` (n,) and `found` (n, width), the seed, and the sizes n, n_rows, start,
     stop, width, half and n_rounds.  Row i of `found` begins with positions start to stop of the permutation of n_rows
     numbers whose key is (seed, iterations[i]).
-
-    Parameters
-    ----------
-    name : of the function
-    most_rounds : largest n_rounds
-    at_a_time : positions that are permuted at a time, whole vectors, of which width is a multiple
     """
     module = ir.Module(name)
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER] * 2 + [INTEGER] * 8), name)

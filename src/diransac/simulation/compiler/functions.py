@@ -16,7 +16,7 @@ from diransac.simulation.compiler.lanes import ARGUMENTS, Lanes, arranged_lanes,
 from diransac.simulation.compiler.machine_code import LANES, MachineCode, Target, compile_function, run_blocks
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Collection, Sequence
 
     from numpy.typing import ArrayLike
 
@@ -27,16 +27,32 @@ if TYPE_CHECKING:
 __all__ = ["Map", "PreparedMap", "PreparedScan", "Scan", "compile_map", "compile_scan"]
 
 
-class Map:
-    """An SX function over many rows; made by `compile_map`, compiled when first called."""
+class _Compiled:
+    """An SX function, and its machine code by variant.  Raises ModelError: an operation cannot be compiled."""
 
     def __init__(self, serialized: str, target: Target | None) -> None:
-        self._function, self._serialized = ca.Function.deserialize(serialized), serialized
-        self._target = target
-        self._code: dict[tuple[bool, ...], MachineCode] = {}
+        self._function = function = ca.Function.deserialize(serialized)
+        self._serialized, self._target = serialized, target
+        self._code: dict[object, MachineCode] = {}
         self._lock = Lock()
-        self._widths_in, self._widths_out = _widths(self._function)
-        check_compilable(self._function)
+        self._widths_in = [function.numel_in(k) for k in range(function.n_in())]
+        self._widths_out = [function.numel_out(k) for k in range(function.n_out())]
+        check_compilable(function)
+
+    def _variant(
+        self, kind: str, variant: object, emit: Callable[[], Value], signature: Collection[str]
+    ) -> MachineCode:
+        """Machine code of one variant, compiled when it is first asked for."""
+        with self._lock:
+            if variant not in self._code:
+                definition = (kind, self._serialized, repr(variant))
+                name = "map_loop" if kind == "map" else "time_loop"
+                self._code[variant] = compile_function(emit, definition, name, signature, self._target)
+            return self._code[variant]
+
+
+class Map(_Compiled):
+    """An SX function over many rows; made by `compile_map`, compiled when first called."""
 
     def __call__(self, *arrays: ArrayLike, threads: int = 1) -> tuple[FloatArray, ...]:
         """Evaluate the function in every row.
@@ -87,19 +103,14 @@ class Map:
 
     def _compiled(self, shared: tuple[bool, ...]) -> MachineCode:
         """Machine code for inputs some of which are shared by all rows."""
-        function, definition = self._function, ("map", self._serialized, repr(shared))
 
         def emit() -> Value:
             from diransac.simulation.compiler.operations import emit_map_loop
 
-            graph = read_graph(function, [k for k, fixed in enumerate(shared) if fixed])
+            graph = read_graph(self._function, [k for k, fixed in enumerate(shared) if fixed])
             return emit_map_loop(graph, self._widths_in)
 
-        with self._lock:
-            if shared not in self._code:
-                signature = map_signature(len(self._widths_in) + len(self._widths_out))
-                self._code[shared] = compile_function(emit, definition, "map_loop", signature, self._target)
-            return self._code[shared]
+        return self._variant("map", shared, emit, map_signature(len(self._widths_in) + len(self._widths_out)))
 
 
 def compile_map(function: ca.Function, target: Target | None = None) -> Map:
@@ -117,21 +128,16 @@ def compile_map(function: ca.Function, target: Target | None = None) -> Map:
     ModelError
         An operation cannot be compiled.
     """
-    if not function.is_a("SXFunction"):
-        raise ModelError(f"function {function.name()!r} is not made of SX symbols; expand it: Function.expand().")
+    _check_expanded(function)
     return _map(function.serialize(), target)
 
 
-@lru_cache(maxsize=64)
-def _map(serialized: str, target: Target | None) -> Map:
-    """Map by value of what defines it."""
-    return Map(serialized, target)
+_map = lru_cache(maxsize=64)(Map)
 
 
-def _widths(function: ca.Function) -> tuple[list[int], list[int]]:
-    """Number of elements of each input and of each output."""
-    inputs = [function.numel_in(k) for k in range(function.n_in())]
-    return inputs, [function.numel_out(k) for k in range(function.n_out())]
+def _check_expanded(function: ca.Function) -> None:
+    if not function.is_a("SXFunction"):
+        raise ModelError(f"function {function.name()!r} is not made of SX symbols; expand it: Function.expand().")
 
 
 class PreparedMap:
@@ -154,20 +160,12 @@ class PreparedMap:
         return self.outputs
 
 
-class Scan:
+class Scan(_Compiled):
     """A recurrence over rows, many lanes at once; made by `compile_scan`, compiled when first called.
 
     It runs in the time loop of a simulation, with the carry as state, the outputs as signals and the rows as inputs.
     The results of a lane depend neither on the other lanes, nor on their number, nor on `threads`.
     """
-
-    def __init__(self, serialized: str, target: Target | None) -> None:
-        self._function, self._serialized = ca.Function.deserialize(serialized), serialized
-        self._target = target
-        self._code: dict[bool, MachineCode] = {}
-        self._lock = Lock()
-        self._widths_in, self._widths_out = _widths(self._function)
-        check_compilable(self._function)
 
     def __call__(self, carry: ArrayLike, rows: ArrayLike, constants: ArrayLike, *, threads: int = 1) -> FloatArray:
         """Outputs of every lane and row.
@@ -224,17 +222,12 @@ class Scan:
         """Machine code for lanes with rows of their own, or with the same ones."""
 
         def emit() -> Value:
-            from diransac.simulation.compiler.outputs import ScanOutput
+            from diransac.simulation.compiler.outputs import SignalOutput
             from diransac.simulation.compiler.time_loop import emit_time_loop, inputs_from_log
 
-            return emit_time_loop(self._specification(), ScanOutput, inputs_from_log, windows=windows)
+            return emit_time_loop(self._specification(), SignalOutput, inputs_from_log, windows=windows)
 
-        definition = ("scan", self._serialized, repr(windows))
-        with self._lock:
-            if windows not in self._code:
-                code = compile_function(emit, definition, "time_loop", ARGUMENTS.values(), self._target)
-                self._code[windows] = code
-            return self._code[windows]
+        return self._variant("scan", windows, emit, ARGUMENTS.values())
 
     def _specification(self) -> LoopSpecification:
         """The recurrence as a simulation without sub-steps and without scored signals."""
@@ -309,8 +302,7 @@ def compile_scan(function: ca.Function, target: Target | None = None) -> Scan:
     ModelError
         The function is not a recurrence, or an operation cannot be compiled.
     """
-    if not function.is_a("SXFunction"):
-        raise ModelError(f"function {function.name()!r} is not made of SX symbols; expand it: Function.expand().")
+    _check_expanded(function)
     if function.n_in() != 3 or function.n_out() != 2 or function.numel_in(0) != function.numel_out(0):
         raise ModelError(
             f"function {function.name()!r} is not a recurrence; it must take carry, row and constants, and return a "
@@ -319,7 +311,4 @@ def compile_scan(function: ca.Function, target: Target | None = None) -> Scan:
     return _scan(function.serialize(), target)
 
 
-@lru_cache(maxsize=64)
-def _scan(serialized: str, target: Target | None) -> Scan:
-    """Scan by value of what defines it."""
-    return Scan(serialized, target)
+_scan = lru_cache(maxsize=64)(Scan)

@@ -26,20 +26,14 @@ __all__ = ["LANES", "MachineCode", "Part", "Target", "compile_function", "defaul
 LANES = 8
 """Lanes of a vector, on every processor: results do not depend on the width of its registers."""
 
-CHUNKS_PER_THREAD = 4
 
 _PATIENCE = 0.2
 """Longest time, s, for which signals are not noticed, where the work can be interrupted."""
 
-_FIRST_BLOCKS = 8
-"""Blocks of a loop that are run before their time is known."""
 
 PASSES = ("sroa", "simplify_cfg", "loop_rotate")
 """Optimisation passes: variables into registers, tidying. LLVM's default list takes 3 times as long, for no gain."""
 
-CODE_GENERATION = 1
-"""LLVM's level of code generation. From 2 on, instructions are scheduled again after registers are allocated, in a time
-quadratic in the length of a block: up to 1.7 times the compilation, for the same bits and no measurable speed."""
 
 LLVM: TypeAlias = Any
 """An object of llvmlite, which has no type annotations."""
@@ -142,7 +136,10 @@ def compile_function(
 def _machine(target: Target) -> LLVM:
     """LLVM's code generator for a processor."""
     triple = _binding().Target.from_default_triple()
-    return triple.create_target_machine(cpu=target.cpu, features=target.features, opt=CODE_GENERATION)
+    # LLVM's level of code generation. From 2 on, instructions are scheduled again after registers are allocated,
+    # in a time quadratic in the length of a block: up to 1.7 times the compilation, for the same bits and no
+    # measurable speed.
+    return triple.create_target_machine(cpu=target.cpu, features=target.features, opt=1)
 
 
 def _object_code(emit: Callable[[], LLVM], key: str, machine: LLVM) -> bytes:
@@ -205,10 +202,6 @@ def _optimise(module: LLVM, machine: LLVM) -> None:
             passes.run(function, builder)
 
 
-_MOST_DIGITS = 6
-"""Of a number of threads."""
-
-
 def default_threads() -> int:
     """Default number of threads: `DIRANSAC_THREADS`, else one in a worker process, else all available cores.
 
@@ -221,7 +214,8 @@ def default_threads() -> int:
     """
     asked = os.environ.get("DIRANSAC_THREADS", "")
     if asked:
-        if not asked.isdecimal() or len(asked) > _MOST_DIGITS or int(asked) < 1:
+        # Of a number of threads.
+        if not asked.isdecimal() or len(asked) > 6 or int(asked) < 1:
             raise SettingsError(f"DIRANSAC_THREADS is {asked!r:.40}; give a positive whole number, or unset it.")
         return int(asked)
     from multiprocessing import parent_process
@@ -247,7 +241,7 @@ def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: in
         return
     from concurrent.futures import Future, wait
 
-    edges = np.linspace(0, n_blocks, min(n_blocks, threads * CHUNKS_PER_THREAD) + 1).astype(int).tolist()
+    edges = np.linspace(0, n_blocks, min(n_blocks, threads * 4) + 1).astype(int).tolist()
     pool, stopped, parts = _pool(os.getpid(), threads), Event(), list[Future[None]]()
     try:
         for first, end in pairwise(edges):
@@ -261,7 +255,8 @@ def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: in
 
 def _run_some(loop: Callable[[int, int], None], first: int, end: int, stopped: Event) -> None:
     """Call a loop for blocks first .. end - 1, a part of a second at a time, until it is stopped."""
-    at_a_time = _FIRST_BLOCKS
+    # Blocks of a loop that are run before their time is known.
+    at_a_time = 8
     while first < end and not stopped.is_set():
         begin, last = time.monotonic(), min(first + at_a_time, end)
         loop(first, last)

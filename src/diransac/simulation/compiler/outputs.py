@@ -20,7 +20,6 @@ __all__ = [
     "ErrorOutput",
     "GaussNewtonOutput",
     "LinearizedErrorOutput",
-    "ScanOutput",
     "ScoreOutput",
     "SignalOutput",
 ]
@@ -294,14 +293,6 @@ class _SeriesOutput(_Output):
                 v.store(v.lane(value, lane), self.arguments["series"], builder.add(place, integer(k)))
 
 
-class SignalOutput(_SeriesOutput):
-    """All signals."""
-
-    def values(self, block: Block, row: LoopRow) -> list[Value]:
-        """All signals."""
-        return row.signals
-
-
 class _FinalOutput(_SeriesOutput):
     """A series, and `final` states (n_lanes, n_states), NaN in a lane that diverged."""
 
@@ -315,7 +306,7 @@ class _FinalOutput(_SeriesOutput):
                 v.store(v.lane(value, lane), self.arguments["final"], builder.add(place, integer(k)))
 
 
-class ScanOutput(_FinalOutput):
+class SignalOutput(_FinalOutput):
     """All signals, and `final` states."""
 
     def values(self, block: Block, row: LoopRow) -> list[Value]:

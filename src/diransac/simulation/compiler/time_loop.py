@@ -147,15 +147,7 @@ InputSource: TypeAlias = "Callable[[TimeLoop, Block, Value], list[Value]]"
 def emit_time_loop(
     specification: LoopSpecification, output: type[Output], inputs: InputSource, *, windows: bool
 ) -> Value:
-    """LLVM module with one function, `time_loop`, that takes `ARGUMENTS`.
-
-    Parameters
-    ----------
-    specification : expressions and sizes
-    output : emits the output of a row
-    inputs : emits the inputs of a row
-    windows : every lane starts at its own row of the log, not all at its first
-    """
+    """LLVM module with one function, `time_loop`, that takes `ARGUMENTS`."""
     module = ir.Module("diransac")
     kinds = {"pointer": POINTER, "integer": INTEGER, "number": DOUBLE}
     signature = ir.FunctionType(ir.VoidType(), [kinds[kind] for kind in ARGUMENTS.values()])
