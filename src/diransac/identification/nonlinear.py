@@ -42,6 +42,8 @@ __all__ = ["NonlinearLeastSquares", "ParameterChart"]
 _START_DECADES = 3.0
 _ROWS_FOR_STARTS = 100
 _ROWS_FOR_WHOLE = 2000
+_SOME_STARTS = 20
+"""Other parameters at which the rank of the Jacobian is compared."""
 # Evaluated together: bounds the memory, whatever the number of sets.
 _ROWS_AT_A_TIME = 300_000
 _CONVERGED = 1e-14
@@ -118,6 +120,7 @@ class BoundNonlinear:
         everything = np.arange(self.n_rows)[None]
         whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // _ROWS_FOR_WHOLE)]))
         self._starts = np.vstack([whole, self._starts])
+        self.of_all_rows = self._chart.to_parameters(whole)[0]
         errors, J = self._errors(everything, whole)
         errors, J = errors.reshape(self.n_rows, len(self._scale)), J.reshape(self.n_rows, len(self._scale), -1)
         scale = np.sqrt(np.square(J).mean(axis=(0, 1)))
@@ -139,6 +142,16 @@ class BoundNonlinear:
     def null_space(self) -> NullSpace:
         gram = self._blocks.sum(axis=0) + self._counted_priors()
         return null_space(gram, self._column_scale, self._settings.min_eigenvalue)
+
+    def is_informed_elsewhere(self) -> bool:
+        """True if the Jacobian of the rows has full rank at other parameters than those of the fit."""
+        rows = np.arange(self.n_rows)[:: max(1, self.n_rows // _ROWS_FOR_STARTS)]
+        some = self._starts[1 :: max(1, len(self._starts) // _SOME_STARTS)]
+        J = self._errors(np.tile(rows, (len(some), 1)), some)[1].reshape(len(some), -1, self._n_p)
+        J = J[np.isfinite(J).all(axis=(1, 2))]
+        J = J / np.maximum(np.sqrt(np.square(J).mean(axis=1, keepdims=True)), np.finfo(float).tiny)
+        gram = np.einsum("bri,brj->bij", J, J)
+        return bool((smallest_eigenvalue(gram) > self._settings.min_eigenvalue).any()) if len(J) else False
 
     def correlations(self) -> FloatArray:
         return correlations(self._blocks.sum(axis=0) + self._counted_priors())

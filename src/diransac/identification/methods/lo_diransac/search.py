@@ -11,6 +11,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.input_timing import InputTiming
 from diransac.errors import IdentificationError, TimeLimitError
+from diransac.identification.columns import MotionRows
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
 from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
@@ -29,7 +30,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     with_observed_states,
     with_unmeasured_states,
 )
-from diransac.identification.refusal import MotionRows, cause_of_refusal
+from diransac.identification.refusal import cause_of_refusal
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -207,7 +208,7 @@ def searched(
     if not able:
         raise IdentificationError(
             f"{dataset.source}: simulations of {intervals.length} rows from smoothed states diverge, with each of "
-            f"{len(hypotheses)} samples of the parameters; check the model's constants, signs and units, or bound them"
+            f"{len(hypotheses)} samples of the parameters; compare the model with the machine, or bound them"
         )
     search = LocalSearch(settings, motion, np.array(able), prior, callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)

@@ -1,0 +1,549 @@
+"""Mistakes of a log's columns: another unit, another sign, an input that is zero.
+
+Each is a hypothesis that is tested, not a guess.  A column whose derivative is measured, too, contradicts it by the
+factor of a unit (`contradictions`).  A column in another unit or with another sign makes the equations hold much better
+once it is corrected, or brings all parameters within their bounds (`explanations`).
+
+References
+----------
+Holland and Welsch 1977 (iteratively reweighted least squares); Theil 1950 (slopes by medians).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray
+from diransac.data.dataset import Dataset
+from diransac.data.preprocessing import continuous, differentiate, in_units
+from diransac.data.units import conversion
+from diransac.errors import DiransacError
+from diransac.identification.identifiability import NullSpace, null_space, residual_slopes
+from diransac.identification.regression import regression_rows
+from diransac.text_table import listed, number
+
+if TYPE_CHECKING:
+    from diransac.data.dataset import ParameterLayout
+    from diransac.data.log import Log
+    from diransac.model import Model
+
+__all__ = [
+    "Mistake",
+    "MotionRows",
+    "Solution",
+    "contradictions",
+    "excited",
+    "explanations",
+    "mistakes_of_columns",
+    "motion_rows",
+    "outside_bounds",
+    "solved",
+]
+
+# Units in which columns are recorded by mistake; those of another dimension than the model's are none.
+_UNITS: tuple[str, ...] = ("rad", "deg", "rev", "rad/s", "deg/s", "rpm", "deg/s^2", "rad/s^2", "m", "mm", "cm", "m/s")
+_UNITS += ("mm/s", "km/h", "m/s^2", "g", "mm/s^2", "N", "mN", "kN", "N m", "mN m", "Pa", "kPa", "bar", "V", "mV")
+_UNITS += ("A", "mA", "K", "s", "ms")
+_TIMES = ("ms", "us")
+# Samples over which changes are compared with integrals of derivatives; scatter of their ratios that is agreement, and
+# largest logarithm of a ratio over that of a unit; part of the samples that both columns need.
+_SPANS, _AGREES, _SAME_FACTOR, _KNOWN = (1, 4, 16, 64, 256), 0.25, 0.1, 0.05
+# Residual over that without the correction from which on it explains a log much better, and as well; that of the next
+# best correction over it.
+_MUCH_BETTER, _AS_GOOD, _DISTINCT = 0.5, 1.05, 1.5
+# Standard errors of an estimate outside of its bounds that are no chance; batches of rows for them.
+_CLEARLY, _BATCHES = 3.0, 30
+# Steps of iteratively reweighted least squares, and the residual, in median ones, from which on a row counts less.
+_STEPS, _FAR = 10, 3.0
+# Rows of a log that are enough to find a cause, and for ranks; size from which on the square of a number overflows.
+_ENOUGH_ROWS, _FEW_ROWS, _HUGE, _TINY = 5000, 1000, 1e150, 1e-300
+# Eigenvalue of a log's rows, over their number, below which it is zero.
+_RANK_OF_LOG = 1e-9
+# Part of a parameter's column that those of the others leave where the equations inform about it.
+_INFORMED = 0.1
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A mistake of columns, its evidence, and the option that corrects it.
+
+    Parameters
+    ----------
+    factors : mapping of str to float
+        Factor by which each column is to be multiplied; empty where no factor helps.
+    what : str
+        The mistake: ``theta is in deg, not in rad``.
+    evidence : str
+        Why, as a clause.
+    otherwise : str, optional
+        What to do where no factor helps.
+    """
+
+    factors: Mapping[str, float]
+    what: str
+    evidence: str
+    otherwise: str = ""
+
+    @property
+    def claim(self) -> str:
+        """The mistake with its evidence."""
+        return f"{self.what}: {self.evidence}"
+
+    @property
+    def action(self) -> str:
+        """What to do."""
+        option = ",".join(f"{n}={x:.6g}" for n, x in self.factors.items())
+        return f"identify again with --scale {option}" if option else self.otherwise
+
+
+def mistakes_of_columns(dataset: Dataset) -> tuple[list[Mistake], int]:
+    """Mistakes that explain a bad answer, the clearest first, and the number of corrections that were tested.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    """
+    found = contradictions(dataset.model, dataset.given) or _zero_inputs(dataset)
+    if found:
+        return found, 0
+    try:
+        model = dataset.model.with_sensors(())
+        complete = all(set(model.required_signals) <= set(log.signals) for log in dataset.given)
+        logs = dataset.given if complete else tuple(differentiate(log, model) for log in dataset.given)
+        other = Dataset.of(model, logs, pointwise=True)
+        return explanations(model, other.layout, motion_rows(other), dataset.given)
+    except (DiransacError, np.linalg.LinAlgError):
+        return [], 0  # the equations cannot be evaluated on the logs
+
+
+def _zero_inputs(dataset: Dataset) -> list[Mistake]:
+    """Inputs of the equations that are zero throughout."""
+    used = set(dataset.model.required_signals)
+    inputs = [n for n in dataset.model.inputs if n in used]
+    zero = [n for n in inputs if all(n in log and not np.nan_to_num(log[n]).any() for log in dataset.given)]
+    if not zero:
+        return []
+    verb = "is" if len(zero) == 1 else "are"
+    evidence = "no force of it is in the equations" if len(zero) == 1 else "no force of them is in the equations"
+    return [
+        Mistake(
+            {},
+            f"{listed(zero)} {verb} zero throughout",
+            evidence,
+            f"give the column that was recorded: --map {zero[0]}=COLUMN",
+        )
+    ]
+
+
+# ---------------------------------------------------------------------- columns and their derivatives
+
+
+def contradictions(model: Model, logs: Sequence[Log]) -> list[Mistake]:
+    """Columns that are not the derivatives of each other, but are so up to the factor of a unit, or a sign.
+
+    Parameters
+    ----------
+    model : Model
+    logs : sequence of Log
+    """
+    ratios = list(_ratios(model, [continuous(in_units(log.measured, model), model) for log in logs]))
+    named = [(x, culprit) for x in ratios if (culprit := _culprit(model, x.low, x.high, x.ratio)) is not None]
+    slow = next(
+        (u for u in _TIMES if ratios and all(_is_near(x.ratio, _factor(u, "s") ** x.order) for x in ratios)), ""
+    )
+    if slow and len(ratios) > 1:
+        why = f"all derivatives are those of a clock that is {number(1.0 / _factor(slow, 's'))} times as fast"
+        return [Mistake({"t": _factor(slow, "s")}, f"The time is in {slow}, not in s", why)]
+    found = list[Mistake]()
+    for unit, factor in dict.fromkeys(culprit[1:] for _, culprit in named):
+        same = [(x, culprit[0]) for x, culprit in named if culprit[1:] == (unit, factor)]
+        names, (first, _) = list(dict.fromkeys(name for _, name in same)), same[0]
+        derivative = "second derivative" if first.order == 2 else "derivative"
+        why = f"the {derivative} of {first.low} is {number(first.ratio, 3)} times {first.high}"
+        why += f" (or the time is in {slow}: --scale t={_factor(slow, 's'):g})" if slow else ""
+        found.append(Mistake(dict.fromkeys(names, factor), _in_unit(names, unit, model.units[names[0]]), why))
+    return found
+
+
+@dataclass(frozen=True)
+class _Ratio:
+    """Ratio of a derivative of a column, of order 1 or 2, and the column that should be it."""
+
+    low: str
+    high: str
+    order: int
+    ratio: float
+
+
+def _ratios(model: Model, logs: Sequence[Log]) -> Iterator[_Ratio]:
+    """Ratios of all columns whose derivative is measured, too, where derivative and column agree but for a factor."""
+    for chain in model.chains:
+        known = [n for n in chain if all(n in log for log in logs)]
+        for low, high in pairwise(known):
+            order = chain.index(high) - chain.index(low)
+            ratio = _ratio([(log[low], log[high], log.dt) for log in logs], order)
+            if ratio is not None:
+                yield _Ratio(low, high, order, ratio)
+
+
+def _in_unit(names: Sequence[str], unit: str, wanted: str) -> str:
+    """``theta is in deg, not in rad``; or that a sign is reversed, for an empty unit."""
+    one = len(names) == 1
+    if not unit:
+        return f"The {'sign' if one else 'signs'} of {listed(names)} {'is' if one else 'are'} reversed"
+    return f"{listed(names)} {'is' if one else 'are'} in {unit}, not in {wanted}"
+
+
+def _culprit(model: Model, low: str, high: str, ratio: float) -> tuple[str, str, float] | None:
+    """Column, unit and factor that explain the ratio of a derivative and its column; None without one."""
+    found = [(high, unit, factor, factor) for unit, factor in _other_units(model.units[high])]
+    found += [(low, unit, factor, 1.0 / factor) for unit, factor in _other_units(model.units[low])]
+    found.append((high, "", -1.0, -1.0))
+    near = [x for x in found if _is_near(ratio, x[3])]
+    return min(near, key=lambda x: abs(np.log(ratio / x[3])))[:3] if near else None
+
+
+def _is_near(ratio: float, factor: float) -> bool:
+    return bool(ratio / factor > 0.0 and abs(np.log(ratio / factor)) < _SAME_FACTOR)
+
+
+def _factor(unit: str, wanted: str) -> float:
+    """Factor between units of one dimension."""
+    factor = conversion(unit, wanted)
+    assert factor is not None
+    return factor
+
+
+def _other_units(wanted: str) -> list[tuple[str, float]]:
+    """Other units of a dimension, with the factors that convert from them."""
+    found: dict[float, str] = {}
+    for unit in _UNITS:
+        factor = conversion(unit, wanted)
+        if factor is not None and abs(np.log(factor)) > _SAME_FACTOR:
+            found.setdefault(round(factor, 12), unit)
+    return [(unit, _factor(unit, wanted)) for unit in found.values()]
+
+
+def _ratio(pairs: Sequence[tuple[FloatArray, FloatArray, float]], order: int) -> float | None:
+    """Ratio of the derivatives of columns and other columns of several logs; None where nothing agrees.
+
+    Changes over some samples are compared with integrals, which need no derivative of noise.
+    """
+    filled = [(_filled(low), _filled(high), dt) for low, high, dt in pairs]
+    known = [(low, high, dt) for low, high, dt in filled if low is not None and high is not None]
+    least, found = _AGREES, None
+    for span in _SPANS:
+        changes = [_changes(*one, order, span) for one in known if order * span <= len(one[0]) // 4]
+        if not changes:
+            break
+        y, x = np.concatenate(changes, axis=1)
+        large = np.abs(x) > max(float(np.median(np.abs(x))), _TINY)
+        ratios = y[large] / x[large]
+        middle = float(np.median(ratios)) if len(ratios) else 0.0
+        scatter = float(np.median(np.abs(ratios - middle))) / (abs(middle) + _TINY) if len(ratios) else np.inf
+        if scatter < least:
+            least, found = scatter, middle
+    return found
+
+
+def _changes(low: FloatArray, high: FloatArray, dt: float, order: int, span: int) -> FloatArray:
+    """Changes (2, n) of a column, and of the integral of another one, over some samples, each as often as the order."""
+    for _ in range(order):
+        high = np.concatenate([[0.0], np.cumsum(0.5 * dt * (high[1:] + high[:-1]))])
+    both = np.stack([low, high])
+    for _ in range(order):
+        both = both[:, span:] - both[:, :-span]
+    return both
+
+
+def _filled(x: FloatArray) -> FloatArray | None:
+    """A column with its gaps interpolated; None where too few samples are known."""
+    known = np.flatnonzero(np.isfinite(x))
+    if len(known) < max(2, _KNOWN * len(x)):
+        return None
+    return np.interp(np.arange(len(x)), known, x[known])
+
+
+# ---------------------------------------------------------------------- columns and the equations
+
+
+def explanations(
+    model: Model, layout: ParameterLayout, rows: Sequence[MotionRows], logs: Sequence[Log]
+) -> tuple[list[Mistake], int]:
+    """Corrections of columns with which the equations hold much better, and the number of those that were tested.
+
+    Where parameters are clearly outside of their bounds, equations that hold as well, with all parameters within,
+    are enough.
+
+    Parameters
+    ----------
+    model : Model
+        Affine in its parameters; for others nothing is tested.
+    layout : ParameterLayout
+    rows : sequence of MotionRows
+    logs : sequence of Log
+        With the columns that a correction names.
+    """
+    found = None if model.nonlinear_parameters else solved(model, layout, rows)
+    if found is None or not found.has_known_terms:
+        return [], 0
+    tested = list[_Correction]()
+    for names, unit, factor in _corrections(model):
+        other = solved(model, layout, [one.scaled(model, dict.fromkeys(names, factor)) for one in rows])
+        if other is not None:
+            tested.append(_Correction(names, unit, factor, other))
+    possible = [x for x in tested if layout.admits(x.solution.parameters[None])[0]]
+    possible.sort(key=lambda x: (x.solution.residual, len(x.names)))
+    mistakes = _much_better(model, logs, found, possible) or _within_bounds(model, layout, logs, found, possible)
+    return mistakes, len(tested)
+
+
+@dataclass(frozen=True)
+class _Correction:
+    """Signals that are multiplied by the factor of a unit, or by -1, and the solution with them."""
+
+    names: tuple[str, ...]
+    unit: str
+    factor: float
+    solution: Solution
+
+    def rivals(self, other: _Correction) -> bool:
+        """True if another correction, neither a part of this one nor the reverse, explains a log nearly as well."""
+        own, others = set(self.names), set(other.names)
+        nested = self.factor == other.factor and (own <= others or others <= own)
+        return not nested and other.solution.residual < _DISTINCT * self.solution.residual
+
+
+def _much_better(model: Model, logs: Sequence[Log], found: Solution, possible: Sequence[_Correction]) -> list[Mistake]:
+    """The one correction with which the equations hold much better; none where several do."""
+    clear = [x for x in possible if x.solution.residual < _MUCH_BETTER * found.residual]
+    if not clear or any(clear[0].rivals(x) for x in clear[1:]):
+        return []
+    best, ratio = clear[0], number(found.residual / clear[0].solution.residual, 2)
+    them = "it" if len(best.names) == 1 else "them"
+    why = f"with {them} multiplied by {best.factor:.4g}, the equations hold {ratio} times as well"
+    return [_mistake(model, logs, best, why)]
+
+
+def _within_bounds(
+    model: Model, layout: ParameterLayout, logs: Sequence[Log], found: Solution, possible: Sequence[_Correction]
+) -> list[Mistake]:
+    """The correction of the fewest signals that brings parameters within their bounds: of a sign, or the only one."""
+    outside = outside_bounds(layout, found)
+    as_good = [x for x in possible if outside and x.solution.residual < _AS_GOOD * found.residual]
+    fewest = min((len(x.names) for x in as_good), default=0)
+    as_good = [x for x in as_good if len(x.names) == fewest]
+    signs = [x for x in as_good if x.factor < 0.0]
+    chosen = sorted(signs, key=lambda x: x.names[0] not in model.inputs) or (as_good if len(as_good) == 1 else [])
+    if not chosen:
+        return []
+    values = dict(zip(layout.names, found.parameters, strict=True))
+    given = ", ".join(f"{n} = {values[n]:.4g}" for n in outside)
+    why = f"as recorded, least squares gives {given}, outside the bounds, and within them once this is corrected"
+    mistake = _mistake(model, logs, chosen[0], why)
+    if len(chosen) == 1:
+        return [mistake]
+    which = " or ".join(listed(x.names) for x in chosen)
+    return [replace(mistake, what=f"The sign of {which} is reversed")]
+
+
+def _mistake(model: Model, logs: Sequence[Log], found: _Correction, why: str) -> Mistake:
+    """The mistake of signals, with all of their columns: derivatives change with a coordinate."""
+    chains = {chain[0]: chain for chain in model.chains}
+    columns = [n for name in found.names for n in chains.get(name, (name,)) if any(n in x.measured for x in logs)]
+    what = _in_unit(found.names, found.unit, model.units[found.names[0]])
+    return Mistake(dict.fromkeys(columns, found.factor), what, why)
+
+
+def _corrections(model: Model) -> Iterator[tuple[tuple[str, ...], str, float]]:
+    """Signals, unit and factor of each correction: of single ones, and of all of a kind and unit."""
+    coordinates = {} if model.kinematics is not None else model.coordinates
+    for kind in (model.inputs, coordinates, model.first_order):
+        for unit in dict.fromkeys(kind.values()):
+            names = tuple(n for n, x in kind.items() if x == unit)
+            groups = [(n,) for n in names] + ([names] if len(names) > 1 else [])
+            yield from ((g, other, factor) for g in groups for other, factor in _other_units(unit))
+            yield from ((g, "", -1.0) for g in groups)
+    if len(set(model.inputs.values())) > 1:
+        yield tuple(model.inputs), "", -1.0
+
+
+def outside_bounds(layout: ParameterLayout, found: Solution) -> list[str]:
+    """Parameters that are outside of their bounds by more than chance.
+
+    Parameters
+    ----------
+    layout : ParameterLayout
+    found : Solution
+    """
+    lower, upper = np.array([(max(x.lower, 0.0) if x.positive else x.lower, x.upper) for x in layout.bounds]).T
+    nearest = np.clip(found.parameters, lower, upper)
+    far = np.abs(found.parameters - nearest) > _CLEARLY * found.errors
+    outside = set(layout.violations(found.parameters))
+    return [n for n, x in zip(layout.names, far, strict=True) if n in outside and x]
+
+
+# ---------------------------------------------------------------------- rows of the equations
+
+
+def excited(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows], parameters: FloatArray) -> BoolArray:
+    """Parameters ``(n,)`` about which the equations inform at an estimate, whatever the others are.
+
+    Parameters
+    ----------
+    model : Model
+    layout : ParameterLayout
+    rows : sequence of MotionRows
+    parameters : (n,) array
+        Estimate, each in its unit.
+    """
+    slope, parts = residual_slopes(model), []
+    for i, one in enumerate(rows):
+        every = max(1, len(one.q) // _FEW_ROWS)
+        p = layout.of_log(parameters, i)
+        motion = (x[::every].T for x in (one.q, one.v, one.a, one.u))
+        n = len(one.q[::every])
+        J = np.array(slope(*motion, np.repeat(p[:, None], n, axis=1))).reshape(-1, n, model.n_p)
+        parts.append(layout.scattered(J.transpose(1, 0, 2), i))
+    J = np.concatenate(parts)
+    J = J[np.isfinite(J).all(axis=(1, 2))]
+    size = np.median(np.abs(J).max(axis=2), axis=0) if len(J) else np.ones(J.shape[1])
+    A = (J / np.where(size > 0.0, size, 1.0)[:, None]).reshape(-1, J.shape[2])
+    norms = np.linalg.norm(A, axis=0)
+    A = A / np.where(norms > 0.0, norms, 1.0)
+    free = [np.linalg.norm(x - others @ np.linalg.lstsq(others, x, rcond=None)[0]) for x, others in _each(A)]
+    return np.asarray((norms > 0.0) & (np.array(free) > _INFORMED))
+
+
+def _each(A: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Each column, and the others."""
+    yield from ((A[:, k], np.delete(A, k, axis=1)) for k in range(A.shape[1]))
+
+
+@dataclass(frozen=True)
+class MotionRows:
+    """Rows of one log at which the equations are evaluated.
+
+    Parameters
+    ----------
+    q, v, a, u : (N, n_q), (N, n_v), (N, n_v), (N, n_u) array
+        Coordinates, velocities, accelerations and inputs, each in its unit.
+    y : (N, n_y) array
+        Sensors; NaN where one is missing.
+    """
+
+    q: FloatArray
+    v: FloatArray
+    a: FloatArray
+    u: FloatArray
+    y: FloatArray
+
+    def scaled(self, model: Model, factors: Mapping[str, float]) -> MotionRows:
+        """The rows with inputs, coordinates and states of first order, and their derivatives, multiplied by factors."""
+        names = (model.coordinates, model.rate_names, model.inputs)
+        of_q, of_v, of_u = (np.array([factors.get(n, 1.0) for n in group]) for group in names)
+        return MotionRows(self.q * of_q, self.v * of_v, self.a * of_v, self.u * of_u, self.y)
+
+
+def motion_rows(dataset: Dataset) -> list[MotionRows]:
+    """Rows of each log that count; 0 in signals that a log lacks."""
+    parts = ((one.valid, (*one.state_arrays(), one.acting_inputs(), one.sensor_samples())) for one in dataset.segments)
+    return [MotionRows(*(x[valid] for x in arrays)) for valid, arrays in parts]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Robust least squares of all rows of logs.
+
+    Parameters
+    ----------
+    parameters, errors : (n,) array
+        Each in its unit, whatever its bounds, and standard errors; infinite where the rows do not determine one.
+    residual : float
+        Median size of the residuals over the median size of the equations' terms.
+    space : NullSpace
+        Directions that the rows do not determine.
+    has_known_terms : bool
+        Whether b differs from zero in any row.
+    """
+
+    parameters: FloatArray
+    errors: FloatArray
+    residual: float
+    space: NullSpace
+    has_known_terms: bool
+
+
+def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> Solution | None:
+    """Solution of ``W p = b`` by iteratively reweighted least squares; None where no row is finite.
+
+    Parameters
+    ----------
+    model : Model
+    layout : ParameterLayout
+    logs : sequence of MotionRows
+
+    Returns
+    -------
+    Solution or None
+    """
+    rows = _equations(model, layout, logs)
+    if not len(rows):
+        return None
+    scale = np.sqrt(np.square(rows).mean(axis=0))
+    has_known_terms = bool(scale[-1] > 0.0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    rows = rows / scale
+    A, y, size = rows[:, :-1], rows[:, -1], np.linalg.norm(rows, axis=1)
+    weights = 1.0 / (1.0 + size / (np.median(size) + _TINY))
+    for _ in range(_STEPS):
+        p = np.linalg.lstsq(A * weights[:, None], y * weights, rcond=None)[0]
+        residuals = np.abs(A @ p - y)
+        if not np.isfinite(residuals).all():
+            return None
+        middle = np.median(residuals) + _TINY
+        weights = 1.0 / (1.0 + np.square(residuals / (_FAR * middle)))
+    whole = np.median(np.abs(A) @ np.abs(p) + np.abs(y)) + _TINY
+    # The information at the solution: rows that are outliers there inform of nothing.
+    weighted = A * weights[:, None]
+    size = np.sqrt(np.square(weighted).mean(axis=0))
+    size = np.where(size > 0.0, size, 1.0)
+    units = scale[-1] / scale[:-1]
+    return Solution(
+        p * units,
+        _errors(weighted, weights * (A @ p - y)) * units,
+        float(middle / whole),
+        null_space((weighted / size).T @ (weighted / size), size * scale[:-1], _RANK_OF_LOG * len(A)),
+        has_known_terms,
+    )
+
+
+def _errors(A: FloatArray, residuals: FloatArray) -> FloatArray:
+    """Standard errors ``(n,)`` of least squares, from sums of scores over batches of rows, in their order."""
+    sums = np.add.reduceat(A * residuals[:, None], np.arange(0, len(A), max(1, len(A) // _BATCHES)), axis=0)
+    H = A.T @ A
+    inverse = np.linalg.pinv(H, hermitian=True)
+    found = np.sqrt(np.square(sums @ inverse).sum(axis=0))
+    return np.asarray(np.where(np.diag(H) > 0.0, found, np.inf))
+
+
+def _equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> FloatArray:
+    """Finite rows ``[W b]`` of all equations and logs, ``(n, n_p + 1)``, each equation of unit median size."""
+    parts = []
+    for i, one in enumerate(logs):
+        every = max(1, len(one.q) // _ENOUGH_ROWS)
+        few = (np.ascontiguousarray(x[::every]) for x in (one.q, one.v, one.a, one.u, one.y))
+        W, b = regression_rows(model, *few)
+        W = layout.scattered(W, i)
+        parts.append(np.concatenate([W, b[:, :, None]], axis=2))
+    rows = np.concatenate(parts)
+    rows = rows[(np.abs(rows) < _HUGE).all(axis=(1, 2))]
+    if not len(rows):
+        return np.empty((0, rows.shape[2]))
+    size = np.median(np.abs(rows).sum(axis=2), axis=0)
+    return np.asarray((rows / np.where(size > 0.0, size, 1.0)[:, None]).reshape(-1, rows.shape[2]))
