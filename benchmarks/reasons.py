@@ -1,7 +1,7 @@
 """The reason that a user is told for a refusal or a bad answer, beside its true cause: mistakes x machines.
 
-Run it as ``python benchmarks/reasons.py [--cases "deg,reactor"] [--seed 1000] [-o docs/tables/reasons.md]``.  Every case
-is a machine of the regimes, or one below, whose log or model has one mistake.  A reason is *true* if a finding, or the
+Run it as ``python benchmarks/reasons.py [--cases deg,reactor] [--seed 1000] [-o docs/tables/reasons.md]``.  A case is a
+machine of the regimes, or one below, whose log or model has one mistake.  A reason is *true* if a finding, or the
 refusal, that a user is shown names the cause; *silent* if the answer is refused or bad and none does; *false* if one
 says what is not so.
 """
@@ -60,12 +60,11 @@ class Told:
 
     @property
     def truth(self) -> str:
-        """ "true", "silent", "false", or "fine" for an answer that is neither refused nor bad and is not false."""
-        text = " ".join(self.shown)
-        if re.search(self.case.named, text):
-            return "true"
-        if FALSE.search(text):
+        """The reason is "true", "silent" or "false"; "fine" for an answer that is neither refused nor bad."""
+        if any(FALSE.search(x) and not re.search(self.case.named, x) for x in self.shown):
             return "false"
+        if re.search(self.case.named, " ".join(self.shown)):
+            return "true"
         return "silent" if self.answer in ("refused", UNRELIABLE) else "fine"
 
     @property
@@ -304,7 +303,7 @@ def _cases() -> Iterator[Case]:
 
     reversed_ = r"sign of {0}\b|signs of [^.]*{0}\b|{0} reversed"
     for regime, name in (
-        ("rotor noise 1x", "thrust"), ("rotor noise 1x", "moment"), ("pendulum noisy", "torque"), ("cart-pole 40 Hz", "force"),
+        (rotor, "thrust"), (rotor, "moment"), ("pendulum noisy", "torque"), ("cart-pole 40 Hz", "force"),
         ("underwater noisy", "thrust"), ("car all measured", "steering"), ("motor noisy", "torque"),
     ):  # fmt: skip
         yield Case(
@@ -328,8 +327,8 @@ def _cases() -> Iterator[Case]:
     )
 
     for regime, name, named in (
-        (rotor, "moment", r"moment (is|are) (zero|constant)"), ("pendulum noisy", "torque", r"torque is (zero|constant)"),
-        ("arm noisy", "t2", r"t2 is (zero|constant)"), ("car all measured", "steering", r"steering is (zero|constant)"),
+        (rotor, "moment", "moment is zero"), ("pendulum noisy", "torque", "torque is zero"),
+        ("arm noisy", "t2", "t2 is zero"), ("car all measured", "steering", "steering is zero"),
     ):  # fmt: skip
         yield Case(
             f"{regime.split()[0]} {name} missing", f"the column {name} is zero", named, scaled(regime, **{name: 0.0})
@@ -397,7 +396,7 @@ def _cases() -> Iterator[Case]:
     yield Case(
         "underwater x_dot every 40th row, ols",
         "x_dot is slow",
-        r"x_dot .*(every 40|slow|rate)",
+        r"x_dot.*every 40 rows",
         thinned("underwater noisy", "x_dot", 40),
         "ols",
     )
@@ -461,7 +460,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             counts[found.truth] = counts.get(found.truth, 0) + 1
             message = "<br>".join(found.shown) if chosen.all else found.message
             rows.append(
-                f"| {case.name} | {case.cause} | {found.answer} | {found.truth} | {message.replace('|', chr(92) + '|')} |"
+                f"| {' | '.join([case.name, case.cause, found.answer, found.truth, message.replace('|', '&#124;')])} |"
             )
             print(rows[-1], file=sys.stderr, flush=True)
     total = ", ".join(f"{n} {name}" for name, n in sorted(counts.items(), key=lambda x: -x[1]))

@@ -390,7 +390,7 @@ _NAMES = {
     "cubic stiffness": "cubic spring on {x}",
     INPUT_GAIN: "gain of {x}",
     "input offset": "offset of {x}",
-    "curved input": "curvature of {x}",
+    "curved input": "curved gain of {x}",
     "dead band": "dead band of {x}",
     "saturation": "saturation of {x}",
 }

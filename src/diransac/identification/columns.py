@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,9 +28,13 @@ from diransac.identification.regression import regression_rows
 from diransac.text_table import listed, number
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from diransac.data.dataset import ParameterLayout
     from diransac.data.log import Log
     from diransac.model import Model
+
+    Solver = Callable[[Model, ParameterLayout, Sequence["MotionRows"]], "Solution | None"]
 
 __all__ = [
     "Mistake",
@@ -49,6 +53,7 @@ __all__ = [
 _UNITS: tuple[str, ...] = ("rad", "deg", "rev", "rad/s", "deg/s", "rpm", "deg/s^2", "rad/s^2", "m", "mm", "cm", "m/s")
 _UNITS += ("mm/s", "km/h", "m/s^2", "g", "mm/s^2", "N", "mN", "kN", "N m", "mN m", "Pa", "kPa", "bar", "V", "mV")
 _UNITS += ("A", "mA", "K", "s", "ms")
+_OFFSETS = {"K": ("degC", 1.0, 273.15)}
 _TIMES = ("ms", "us")
 # Samples over which changes are compared with integrals of derivatives; scatter of their ratios that is agreement, and
 # largest logarithm of a ratio over that of a unit; part of the samples that both columns need.
@@ -56,12 +61,18 @@ _SPANS, _AGREES, _SAME_FACTOR, _KNOWN = (1, 4, 16, 64, 256), 0.25, 0.1, 0.05
 # Residual over that without the correction from which on it explains a log much better, and as well; that of the next
 # best correction over it.
 _MUCH_BETTER, _AS_GOOD, _DISTINCT = 0.5, 1.05, 1.5
+# Samples of the running median that leaves out outliers.
+_MEDIAN = 5
+# Signals of a unit of which all subsets are tested.
+_SUBSETS = 3
 # Standard errors of an estimate outside of its bounds that are no chance; batches of rows for them.
 _CLEARLY, _BATCHES = 3.0, 30
 # Steps of iteratively reweighted least squares, and the residual, in median ones, from which on a row counts less.
 _STEPS, _FAR = 10, 3.0
 # Rows of a log that are enough to find a cause, and for ranks; size from which on the square of a number overflows.
 _ENOUGH_ROWS, _FEW_ROWS, _HUGE, _TINY = 5000, 1000, 1e150, 1e-300
+# Residual of an equation, over its terms, that is exact.
+_EXACT = 1e-6
 # Eigenvalue of a log's rows, over their number, below which it is zero.
 _RANK_OF_LOG = 1e-9
 # Part of a parameter's column that those of the others leave where the equations inform about it.
@@ -75,19 +86,22 @@ class Mistake:
     Parameters
     ----------
     factors : mapping of str to float
-        Factor by which each column is to be multiplied; empty where no factor helps.
+        Factor by which each column is to be multiplied; empty where that does not help.
     what : str
         The mistake: ``theta is in deg, not in rad``.
     evidence : str
         Why, as a clause.
     otherwise : str, optional
         What to do where no factor helps.
+    explains : bool, optional
+        Whether the mistake explains all that is bad.
     """
 
     factors: Mapping[str, float]
     what: str
     evidence: str
     otherwise: str = ""
+    explains: bool = True
 
     @property
     def claim(self) -> str:
@@ -101,12 +115,14 @@ class Mistake:
         return f"identify again with --scale {option}" if option else self.otherwise
 
 
-def mistakes_of_columns(dataset: Dataset) -> tuple[list[Mistake], int]:
+def mistakes_of_columns(dataset: Dataset, nonlinear: Solver) -> tuple[list[Mistake], int]:
     """Mistakes that explain a bad answer, the clearest first, and the number of corrections that were tested.
 
     Parameters
     ----------
     dataset : Dataset
+    nonlinear : callable
+        Solution of a model that is not affine in its parameters, as `solved`.
     """
     found = contradictions(dataset.model, dataset.given) or _zero_inputs(dataset)
     if found:
@@ -116,7 +132,8 @@ def mistakes_of_columns(dataset: Dataset) -> tuple[list[Mistake], int]:
         complete = all(set(model.required_signals) <= set(log.signals) for log in dataset.given)
         logs = dataset.given if complete else tuple(differentiate(log, model) for log in dataset.given)
         other = Dataset.of(model, logs, pointwise=True)
-        return explanations(model, other.layout, motion_rows(other), dataset.given)
+        solve = nonlinear if model.nonlinear_parameters else solved
+        return explanations(model, other.layout, motion_rows(other), dataset.given, solve)
     except (DiransacError, np.linalg.LinAlgError):
         return [], 0  # the equations cannot be evaluated on the logs
 
@@ -129,13 +146,14 @@ def _zero_inputs(dataset: Dataset) -> list[Mistake]:
     if not zero:
         return []
     verb = "is" if len(zero) == 1 else "are"
-    evidence = "no force of it is in the equations" if len(zero) == 1 else "no force of them is in the equations"
+    evidence = f"{'its force is' if len(zero) == 1 else 'their forces are'} not in the equations"
     return [
         Mistake(
             {},
             f"{listed(zero)} {verb} zero throughout",
             evidence,
             f"give the column that was recorded: --map {zero[0]}=COLUMN",
+            explains=False,
         )
     ]
 
@@ -151,7 +169,10 @@ def contradictions(model: Model, logs: Sequence[Log]) -> list[Mistake]:
     model : Model
     logs : sequence of Log
     """
-    ratios = list(_ratios(model, [continuous(in_units(log.measured, model), model) for log in logs]))
+    prepared = [continuous(in_units(log.measured, model), model) for log in logs]
+    if model.kinematics is not None and not model.quaternions:
+        return _of_kinematics(model, prepared)
+    ratios = list(_ratios(model, prepared))
     named = [(x, culprit) for x in ratios if (culprit := _culprit(model, x.low, x.high, x.ratio)) is not None]
     slow = next(
         (u for u in _TIMES if ratios and all(_is_near(x.ratio, _factor(u, "s") ** x.order) for x in ratios)), ""
@@ -168,6 +189,50 @@ def contradictions(model: Model, logs: Sequence[Log]) -> list[Mistake]:
         why += f" (or the time is in {slow}: --scale t={_factor(slow, 's'):g})" if slow else ""
         found.append(Mistake(dict.fromkeys(names, factor), _in_unit(names, unit, model.units[names[0]]), why))
     return found
+
+
+def _of_kinematics(model: Model, logs: Sequence[Log]) -> list[Mistake]:
+    """Coordinates or velocities in other units, with which the kinematics ``dq/dt = k(q, v)`` hold much better."""
+    rates = model.velocities_of_motion
+    names = (*model.coordinates, *rates)
+    if not all(n in log for log in logs for n in names):
+        return []
+    columns = [(np.stack([np.nan_to_num(log[n]) for n in names]), log.dt) for log in logs]
+
+    def mismatch(group: Sequence[str], factor: float) -> float:
+        factors = np.where([n in group for n in names], factor, 1.0)[:, None]
+        return min(_mismatch(model, [(x * factors, dt) for x, dt in columns], span) for span in _SPANS[:4])
+
+    found, as_recorded = list[tuple[float, tuple[str, ...], str, float]](), mismatch((), 1.0)
+    for kind in (model.coordinates, rates):
+        for unit in dict.fromkeys(kind.values()):
+            same = tuple(n for n, x in kind.items() if x == unit)
+            for group in dict.fromkeys([*((n,) for n in same), same]):
+                found += [(mismatch(group, x), group, other, x) for other, x in [*_other_units(unit), ("", -1.0)]]
+    found.sort(key=lambda x: (x[0], len(x[1])))
+    best, group, unit, factor = found[0]
+    if best > min(_AGREES, _MUCH_BETTER * as_recorded) or found[1][0] < _DISTINCT * best:
+        return []
+    ratio = number(as_recorded / best, 2)
+    why = f"with this corrected, the kinematics of the model hold {ratio} times as well"
+    return [Mistake(dict.fromkeys(group, factor), _in_unit(group, unit, model.units[group[0]]), why)]
+
+
+def _mismatch(model: Model, columns: Sequence[tuple[FloatArray, float]], span: int) -> float:
+    """Changes of coordinates over some samples less the integrals of their rates, over the changes, by medians."""
+    assert model.kinematics is not None
+    errors, changes = [], []
+    for both, dt in columns:
+        q, v = both[: model.n_q], both[model.n_q :]
+        whole = np.zeros((len(q) + len(model.velocities) - len(v), q.shape[1]))
+        rates = np.array(model.kinematics(q, np.vstack([v, whole[len(q) :]])))
+        steps = np.cumsum(0.5 * dt * (rates[:, 1:] + rates[:, :-1]), axis=1)
+        change = q[:, span + 1 :] - q[:, 1:-span]
+        errors.append(change - (steps[:, span:] - steps[:, :-span]))
+        changes.append(change)
+    sizes = np.median(np.abs(np.concatenate(changes, axis=1)), axis=1) + _TINY
+    found = float((np.median(np.abs(np.concatenate(errors, axis=1)), axis=1) / sizes).mean())
+    return found if np.isfinite(found) else np.inf
 
 
 @dataclass(frozen=True)
@@ -262,18 +327,19 @@ def _changes(low: FloatArray, high: FloatArray, dt: float, order: int, span: int
 
 
 def _filled(x: FloatArray) -> FloatArray | None:
-    """A column with its gaps interpolated; None where too few samples are known."""
+    """A column without single outliers, with its gaps interpolated; None where too few samples are known."""
     known = np.flatnonzero(np.isfinite(x))
-    if len(known) < max(2, _KNOWN * len(x)):
+    if len(known) < max(_MEDIAN, _KNOWN * len(x)):
         return None
-    return np.interp(np.arange(len(x)), known, x[known])
+    middle = np.median(np.lib.stride_tricks.sliding_window_view(x[known], _MEDIAN), axis=1)
+    return np.interp(np.arange(len(x)), known[_MEDIAN // 2 : -(_MEDIAN // 2)], middle)
 
 
 # ---------------------------------------------------------------------- columns and the equations
 
 
 def explanations(
-    model: Model, layout: ParameterLayout, rows: Sequence[MotionRows], logs: Sequence[Log]
+    model: Model, layout: ParameterLayout, rows: Sequence[MotionRows], logs: Sequence[Log], solve: Solver
 ) -> tuple[list[Mistake], int]:
     """Corrections of columns with which the equations hold much better, and the number of those that were tested.
 
@@ -283,20 +349,21 @@ def explanations(
     Parameters
     ----------
     model : Model
-        Affine in its parameters; for others nothing is tested.
     layout : ParameterLayout
     rows : sequence of MotionRows
     logs : sequence of Log
         With the columns that a correction names.
+    solve : callable
+        `solved`, or as that.
     """
-    found = None if model.nonlinear_parameters else solved(model, layout, rows)
+    found = solve(model, layout, rows)
     if found is None or not found.has_known_terms:
         return [], 0
     tested = list[_Correction]()
-    for names, unit, factor in _corrections(model):
-        other = solved(model, layout, [one.scaled(model, dict.fromkeys(names, factor)) for one in rows])
+    for names, unit, factor, offset in _corrections(model):
+        other = solve(model, layout, [one.corrected(model, names, factor, offset) for one in rows])
         if other is not None:
-            tested.append(_Correction(names, unit, factor, other))
+            tested.append(_Correction(names, unit, factor, offset, other))
     possible = [x for x in tested if layout.admits(x.solution.parameters[None])[0]]
     possible.sort(key=lambda x: (x.solution.residual, len(x.names)))
     mistakes = _much_better(model, logs, found, possible) or _within_bounds(model, layout, logs, found, possible)
@@ -305,17 +372,18 @@ def explanations(
 
 @dataclass(frozen=True)
 class _Correction:
-    """Signals that are multiplied by the factor of a unit, or by -1, and the solution with them."""
+    """Signals that are converted from a unit, or multiplied by -1, and the solution with them."""
 
     names: tuple[str, ...]
     unit: str
     factor: float
+    offset: float
     solution: Solution
 
     def rivals(self, other: _Correction) -> bool:
         """True if another correction, neither a part of this one nor the reverse, explains a log nearly as well."""
         own, others = set(self.names), set(other.names)
-        nested = self.factor == other.factor and (own <= others or others <= own)
+        nested = (self.factor, self.offset) == (other.factor, other.offset) and (own <= others or others <= own)
         return not nested and other.solution.residual < _DISTINCT * self.solution.residual
 
 
@@ -324,9 +392,10 @@ def _much_better(model: Model, logs: Sequence[Log], found: Solution, possible: S
     clear = [x for x in possible if x.solution.residual < _MUCH_BETTER * found.residual]
     if not clear or any(clear[0].rivals(x) for x in clear[1:]):
         return []
-    best, ratio = clear[0], number(found.residual / clear[0].solution.residual, 2)
+    best, ratio = clear[0], number(float((found.residuals / clear[0].solution.residuals).max()), 2)
     them = "it" if len(best.names) == 1 else "them"
-    why = f"with {them} multiplied by {best.factor:.4g}, the equations hold {ratio} times as well"
+    how = f"plus {best.offset:g}" if best.offset else f"multiplied by {best.factor:.4g}"
+    why = f"with {them} {how}, the equations hold up to {ratio} times as well"
     return [_mistake(model, logs, best, why)]
 
 
@@ -357,20 +426,31 @@ def _mistake(model: Model, logs: Sequence[Log], found: _Correction, why: str) ->
     chains = {chain[0]: chain for chain in model.chains}
     columns = [n for name in found.names for n in chains.get(name, (name,)) if any(n in x.measured for x in logs)]
     what = _in_unit(found.names, found.unit, model.units[found.names[0]])
+    if found.offset:
+        return Mistake({}, what, why, f"add {found.offset:g} to {listed(columns)}")
     return Mistake(dict.fromkeys(columns, found.factor), what, why)
 
 
-def _corrections(model: Model) -> Iterator[tuple[tuple[str, ...], str, float]]:
-    """Signals, unit and factor of each correction: of single ones, and of all of a kind and unit."""
-    coordinates = {} if model.kinematics is not None else model.coordinates
-    for kind in (model.inputs, coordinates, model.first_order):
+def _corrections(model: Model) -> Iterator[tuple[tuple[str, ...], str, float, float]]:
+    """Signals, unit, factor and offset of each correction: of single ones, of several, and of all of a kind and unit.
+
+    A thermometer in another unit than all others is rare: states and inputs have their offsets together, too.
+    """
+    moving = model.coordinates if model.kinematics is None else model.velocities_of_motion
+    for kind in (model.inputs, moving, model.first_order):
         for unit in dict.fromkeys(kind.values()):
             names = tuple(n for n, x in kind.items() if x == unit)
-            groups = [(n,) for n in names] + ([names] if len(names) > 1 else [])
-            yield from ((g, other, factor) for g in groups for other, factor in _other_units(unit))
-            yield from ((g, "", -1.0) for g in groups)
+            sizes = range(1, len(names) + 1) if len(names) <= _SUBSETS else (1, len(names))
+            groups = [group for size in sizes for group in combinations(names, size)]
+            yield from ((g, other, factor, 0.0) for g in groups for other, factor in _other_units(unit))
+            yield from ((g, "", -1.0, 0.0) for g in groups)
+            yield from ((g, *_OFFSETS[unit]) for g in groups if unit in _OFFSETS)
     if len(set(model.inputs.values())) > 1:
-        yield tuple(model.inputs), "", -1.0
+        yield tuple(model.inputs), "", -1.0, 0.0
+    for unit, other in _OFFSETS.items():
+        every = tuple(n for n, x in (model.first_order | model.inputs).items() if x == unit)
+        if len(every) > 1:
+            yield every, *other
 
 
 def outside_bounds(layout: ParameterLayout, found: Solution) -> list[str]:
@@ -443,11 +523,16 @@ class MotionRows:
     u: FloatArray
     y: FloatArray
 
-    def scaled(self, model: Model, factors: Mapping[str, float]) -> MotionRows:
-        """The rows with inputs, coordinates and states of first order, and their derivatives, multiplied by factors."""
-        names = (model.coordinates, model.rate_names, model.inputs)
-        of_q, of_v, of_u = (np.array([factors.get(n, 1.0) for n in group]) for group in names)
-        return MotionRows(self.q * of_q, self.v * of_v, self.a * of_v, self.u * of_u, self.y)
+    def corrected(self, model: Model, names: Sequence[str], factor: float, offset: float) -> MotionRows:
+        """The rows with some inputs, coordinates and states of first order, with their derivatives, in another unit."""
+        groups = (model.coordinates, model.rate_names, model.inputs)
+        of_q, of_v, of_u = (np.array([n in names for n in group], float) for group in groups)
+        own = np.array([n in model.first_order for n in model.rate_names], float) * of_v
+        q, v, a, u = (
+            x * (1.0 + (factor - 1.0) * of)
+            for x, of in zip((self.q, self.v, self.a, self.u), (of_q, of_v, of_v, of_u), strict=True)
+        )
+        return MotionRows(q + offset * of_q, v + offset * own, a, u + offset * of_u, self.y)
 
 
 def motion_rows(dataset: Dataset) -> list[MotionRows]:
@@ -464,8 +549,8 @@ class Solution:
     ----------
     parameters, errors : (n,) array
         Each in its unit, whatever its bounds, and standard errors; infinite where the rows do not determine one.
-    residual : float
-        Median size of the residuals over the median size of the equations' terms.
+    residuals : (n_eq,) array
+        Median size of the residuals of each equation, over the median size of its terms.
     space : NullSpace
         Directions that the rows do not determine.
     has_known_terms : bool
@@ -474,9 +559,14 @@ class Solution:
 
     parameters: FloatArray
     errors: FloatArray
-    residual: float
+    residuals: FloatArray
     space: NullSpace
     has_known_terms: bool
+
+    @property
+    def residual(self) -> float:
+        """Product of the residuals of the equations, as in a likelihood: those that nothing changes do not matter."""
+        return float(np.prod(self.residuals))
 
 
 def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> Solution | None:
@@ -492,7 +582,7 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
     -------
     Solution or None
     """
-    rows = _equations(model, layout, logs)
+    rows, n_equations = _equations(model, layout, logs)
     if not len(rows):
         return None
     scale = np.sqrt(np.square(rows).mean(axis=0))
@@ -508,7 +598,8 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
             return None
         middle = np.median(residuals) + _TINY
         weights = 1.0 / (1.0 + np.square(residuals / (_FAR * middle)))
-    whole = np.median(np.abs(A) @ np.abs(p) + np.abs(y)) + _TINY
+    whole = np.abs(A) @ np.abs(p) + np.abs(y)
+    sizes = (np.median(x.reshape(-1, n_equations), axis=0) + _TINY for x in (residuals, whole))
     # The information at the solution: rows that are outliers there inform of nothing.
     weighted = A * weights[:, None]
     size = np.sqrt(np.square(weighted).mean(axis=0))
@@ -517,7 +608,7 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
     return Solution(
         p * units,
         _errors(weighted, weights * (A @ p - y)) * units,
-        float(middle / whole),
+        np.maximum(np.divide(*sizes), _EXACT),
         null_space((weighted / size).T @ (weighted / size), size * scale[:-1], _RANK_OF_LOG * len(A)),
         has_known_terms,
     )
@@ -532,8 +623,8 @@ def _errors(A: FloatArray, residuals: FloatArray) -> FloatArray:
     return np.asarray(np.where(np.diag(H) > 0.0, found, np.inf))
 
 
-def _equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> FloatArray:
-    """Finite rows ``[W b]`` of all equations and logs, ``(n, n_p + 1)``, each equation of unit median size."""
+def _equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> tuple[FloatArray, int]:
+    """Finite rows ``[W b]`` of all logs, ``(n, n_p + 1)``, each equation of unit median size; number of equations."""
     parts = []
     for i, one in enumerate(logs):
         every = max(1, len(one.q) // _ENOUGH_ROWS)
@@ -544,6 +635,6 @@ def _equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]
     rows = np.concatenate(parts)
     rows = rows[(np.abs(rows) < _HUGE).all(axis=(1, 2))]
     if not len(rows):
-        return np.empty((0, rows.shape[2]))
+        return np.empty((0, rows.shape[2])), rows.shape[1]
     size = np.median(np.abs(rows).sum(axis=2), axis=0)
-    return np.asarray((rows / np.where(size > 0.0, size, 1.0)[:, None]).reshape(-1, rows.shape[2]))
+    return (rows / np.where(size > 0.0, size, 1.0)[:, None]).reshape(-1, rows.shape[2]), rows.shape[1]

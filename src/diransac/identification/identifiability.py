@@ -648,13 +648,16 @@ def unidentifiable(
     of_model = structural(model, measured, ranges)
     ambiguous = {name for x in of_model for name in x.names}
     by_equations = np.array([name.partition("[")[0] in ambiguous for name in layout.names])
-    hidden = np.zeros(len(uncertain), bool) if excited is None else excited & uncertain & ~by_equations
-    from_log = collinear(layout.names, values, covariance, uncertain & ~by_equations & ~hidden)
+    from_log = collinear(layout.names, values, covariance, uncertain & ~by_equations)
     sentences = [x.sentence(x.of_equations()) for x in of_model]
-    sentences += [in_words([x], layout.n_logs) for x in from_log]
-    if hidden.any():
-        x = Ambiguity(tuple(n for n, one in zip(layout.names, hidden, strict=True) if one), 0, ())
-        sentences.append(x.sentence(x.of_noise(), _of_logs(layout.n_logs)))
+    sentences += [in_words([x], layout.n_logs) for x in from_log if x.n_determined]
+    alone = [n for x in from_log if not x.n_determined for n in x.names]
+    seen = dict(zip(layout.names, np.zeros(len(uncertain), bool) if excited is None else excited, strict=True))
+    for is_seen in (False, True):
+        names = tuple(n for n in alone if seen[n] == is_seen)
+        if names:
+            x = Ambiguity(names, 0, ())
+            sentences.append(x.sentence(x.of_noise() if is_seen else x.of_motion(), _of_logs(layout.n_logs)))
     return uncertain | by_equations, tuple(sentences)
 
 

@@ -20,6 +20,7 @@ from diransac.identification.evaluation import choose_scoring, evaluate, judged_
 from diransac.identification.known_parameters import KnownParameters
 from diransac.identification.method import Callback, Method, fit, numerical_failures, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, estimator_named, factory
+from diransac.identification.nonlinear import solved_nonlinear
 from diransac.identification.prediction import predictions
 from diransac.identification.refusal import check_motion
 from diransac.identification.result import Result
@@ -380,22 +381,24 @@ def _explained(dataset: Dataset, fitted: Callable[[], Estimate]) -> Estimate:
     try:
         return fitted()
     except IdentificationError as error:
-        mistakes, _ = mistakes_of_columns(dataset)
+        mistakes, _ = mistakes_of_columns(dataset, solved_nonlinear)
         if not mistakes:
             raise
         named = "; ".join(f"{x.claim}; {x.action}" for x in mistakes)
-        raise IdentificationError(f"{dataset.source}: {named}") from error
+        explains = any(x.explains for x in mistakes)
+        raise IdentificationError(f"{dataset.source}: {named}" if explains else f"{error}. {named}") from error
 
 
 def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     """The result with findings on mistakes of columns: contradictions, and what explains a bad answer."""
     left = (x for one in result.logs if one.prediction for x in one.prediction.unexplained.values())
-    is_doubtful, n_tested = result.verdict == "do not rely on this" or max(left, default=0.0) > _DOUBTFUL, 0
+    is_bad, n_tested = result.verdict == "do not rely on this", 0
+    is_doubtful = is_bad or max(left, default=0.0) > _DOUBTFUL
     if is_doubtful:
-        mistakes, n_tested = mistakes_of_columns(dataset)
+        mistakes, n_tested = mistakes_of_columns(dataset, solved_nonlinear)
     else:
         mistakes = contradictions(dataset.model, dataset.given)
-    found = [Finding("bad" if is_doubtful else "care", x.claim, x.action) for x in mistakes]
+    found = [Finding("bad" if is_bad or (is_doubtful and x.explains) else "care", x.claim, x.action) for x in mistakes]
     if not found and not n_tested:
         return result
     n_others = 0 if found else n_tested

@@ -201,6 +201,6 @@ def check_signs(dataset: Dataset, rows: Sequence[MotionRows]) -> None:
     found = solved(model, layout, rows)
     if found is None or not signed or not signed <= set(layout.violations(found.parameters)):
         return
-    mistakes, _ = explanations(model, layout, rows, dataset.given)
+    mistakes, _ = explanations(model, layout, rows, dataset.given, solved)
     if mistakes and any(x < 0.0 for x in mistakes[0].factors.values()):
         raise IdentificationError(f"{dataset.source}: {mistakes[0].claim}; {mistakes[0].action}")

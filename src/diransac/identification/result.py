@@ -642,7 +642,8 @@ class Result:
         if found != _FORMAT and found not in _SINCE:
             writer = "an earlier version" if found < _FORMAT else "a later version"
             raise ResultError(
-                f"the result has format {found}, of {writer} of diransac; this one reads {_FORMAT}. Identify again"
+                f"the result has format {found}, of {writer} of diransac; this one reads {min(_SINCE)} to {_FORMAT}. "
+                "Identify again"
             )
         assert isinstance(data, Mapping)
         try:
