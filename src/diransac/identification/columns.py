@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import TYPE_CHECKING
 
+import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
@@ -50,7 +51,7 @@ __all__ = [
 ]
 
 # Units in which columns are recorded by mistake; those of another dimension than the model's are none.
-_UNITS: tuple[str, ...] = ("rad", "deg", "rev", "rad/s", "deg/s", "rpm", "deg/s^2", "rad/s^2", "m", "mm", "cm", "m/s")
+_UNITS: tuple[str, ...] = ("rad", "deg", "rad/s", "deg/s", "rpm", "deg/s^2", "rad/s^2", "m", "mm", "cm", "m/s")
 _UNITS += ("mm/s", "km/h", "m/s^2", "g", "mm/s^2", "N", "mN", "kN", "N m", "mN m", "Pa", "kPa", "bar", "V", "mV")
 _UNITS += ("A", "mA", "K", "s", "ms")
 _OFFSETS = {"K": ("degC", 1.0, 273.15)}
@@ -488,7 +489,7 @@ def excited(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows], p
         p = layout.of_log(parameters, i)
         motion = (x[::every].T for x in (one.q, one.v, one.a, one.u))
         n = len(one.q[::every])
-        J = np.array(slope(*motion, np.repeat(p[:, None], n, axis=1))).reshape(-1, n, model.n_p)
+        J = np.array(ca.densify(slope(*motion, np.repeat(p[:, None], n, axis=1)))).reshape(-1, n, model.n_p)
         parts.append(layout.scattered(J.transpose(1, 0, 2), i))
     J = np.concatenate(parts)
     J = J[np.isfinite(J).all(axis=(1, 2))]
@@ -596,8 +597,9 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
         residuals = np.abs(A @ p - y)
         if not np.isfinite(residuals).all():
             return None
-        middle = np.median(residuals) + _TINY
-        weights = 1.0 / (1.0 + np.square(residuals / (_FAR * middle)))
+        # Each equation has its own residuals: zeros satisfy one without a known term, and would outweigh the others.
+        middle = np.median(residuals.reshape(-1, n_equations), axis=0) + _TINY
+        weights = 1.0 / (1.0 + np.square(residuals.reshape(-1, n_equations) / (_FAR * middle))).ravel()
     whole = np.abs(A) @ np.abs(p) + np.abs(y)
     sizes = (np.median(x.reshape(-1, n_equations), axis=0) + _TINY for x in (residuals, whole))
     # The information at the solution: rows that are outliers there inform of nothing.

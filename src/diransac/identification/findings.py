@@ -152,7 +152,7 @@ def _bounds(result: Result) -> Iterator[Finding]:
         bounds = parameters[name.partition("[")[0]]
         value = f"{name} = {number(result.estimate.parameters[name])} {bounds.unit}"
         claim = f"{value} is outside its bounds ({bounds_text(bounds)}), which is physically impossible"
-        yield Finding("bad", claim, _remedy(result))
+        yield Finding("bad", claim, _remedy(result, "bad"))
     for name in result.on_bounds:
         value = number(result.estimate.parameters[name])
         yield Finding(
@@ -222,19 +222,21 @@ def bounds_text(parameter: Parameter) -> str:
 # ---------------------------------------------------------------------- simulation and inliers
 
 
-def _remedy(result: Result) -> str:
-    """What to do about an answer that is bad throughout, by the causes that were tested."""
+def _remedy(result: Result, level: Level = "care") -> str:
+    """What to do about an answer that is off throughout, by the causes that were tested."""
     if result.suggestions:
         return _added(result.suggestions[0])
     if result.estimate.n_columns_tested:
         tested = f"{result.estimate.n_columns_tested} other signs and units of columns explain the log no better"
         return f"compare the terms and constants of the model with the machine ({tested})"
-    return "check the signs and units of the log and the terms of the model"
+    if level == "bad":
+        return "check the signs and units of the log, which could not be tested, and the terms of the model"
+    return "compare the terms and constants of the model with the machine"
 
 
 def _added(suggestion: Suggestion) -> str:
     """The action that adds a suggested term."""
-    return f"add the {suggestion.name or suggestion.kind}, by --with-suggestions"
+    return f"add the {suggestion.name or suggestion.kind}: identify again with --with-suggestions"
 
 
 def _suggested(result: Result) -> Iterator[Finding]:
@@ -256,12 +258,12 @@ def _simulation(result: Result) -> Iterator[Finding]:
             yield Finding(
                 "bad" if np.isfinite(found.restart_period) or not restarts else "care",
                 f"The simulation diverges at t = {number(found.divergence)} s{where}",
-                _remedy(result),
+                _remedy(result, "bad"),
             )
     scored = [x for x in _predicted(logs) if not np.isfinite(x[1].divergence) and x[1].relative_errors]
     if scored:
         one, found = max(scored, key=lambda x: max(x[1].relative_errors.values()))
-        yield _median_error(found, _worst_of(one, logs), _remedy(result), restarts=restarts)
+        yield _median_error(result, found, _worst_of(one, logs))
     if any(one.prediction is None for one in logs):
         yield Finding(
             "care",
@@ -270,7 +272,7 @@ def _simulation(result: Result) -> Iterator[Finding]:
         )
 
 
-def _median_error(found: Prediction, where: str, remedy: str, *, restarts: bool) -> Finding:
+def _median_error(result: Result, found: Prediction, where: str) -> Finding:
     """Finding on the signal with the largest median error of a simulation."""
     errors = found.relative_errors
     name, restarted = max(errors, key=lambda n: errors[n]), bool(np.isfinite(found.restart_period))
@@ -283,10 +285,10 @@ def _median_error(found: Prediction, where: str, remedy: str, *, restarts: bool)
             return Finding(level, f"Median error of {method}: within the noise, in every signal.")
     else:
         method = "one simulation of the whole log"
-        level = "care" if restarts and level == "bad" else level
+        level = "care" if result.diagnosis is not None and level == "bad" else level
     others = "the other scored signals are closer" if len(errors) > 1 else "no other signal is scored"
     claim = f"Median error of {method}: {name} is off by {what}; {others}{where}"
-    return Finding(level, f"{claim}.") if level == "good" else Finding(level, claim, remedy)
+    return Finding(level, f"{claim}.") if level == "good" else Finding(level, claim, _remedy(result, level))
 
 
 def _predicted(logs: Sequence[LogSummary]) -> list[tuple[LogSummary, Prediction]]:
@@ -314,7 +316,7 @@ def _inliers(result: Result) -> Iterator[Finding]:
         return
     if fraction < _HALF:
         claim = f"{text} the simulation, which is less than half of the log"
-        yield Finding("bad", claim, f"identify with --method lo-diransac, or {_remedy(result)}")
+        yield Finding("bad", claim, f"identify with --method lo-diransac, or {_remedy(result, 'bad')}")
         return
     if fraction >= _MOST:
         yield Finding("good", f"{text} the simulation.")
@@ -347,7 +349,7 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
             else:
                 yield Finding("care", f"{text}, which the estimate down-weights", f"look at {name}, or leave it out")
         else:
-            yield Finding("bad", text, f"leave {name} out of the log, or {_remedy(result)}")
+            yield Finding("bad", text, f"leave {name} out of the log, or {_remedy(result, 'bad')}")
     yield from _departures(result.logs, found)
     yield from _unexplained(result)
     if found.input_delay_significant:
@@ -390,12 +392,12 @@ def _unexplained(result: Result) -> Iterator[Finding]:
     others = ", less of the others" if len(found.unexplained) > 1 else ""
     text = f"The model leaves {percent(left)} of {name} unexplained (RMS){others}{_worst_of(one, result.logs)}"
     level = _graded(left, _NEAR, _HALF)
-    yield Finding("good", f"{text}.") if level == "good" else Finding(level, text, _remedy(result))
+    yield Finding("good", f"{text}.") if level == "good" else Finding(level, text, _remedy(result, level))
 
 
 def _unidentifiable(result: Result, found: Diagnosis) -> Iterator[Finding]:
     if len(result.unidentifiable) == len(result.parameters) - len(result.fixed):
-        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}", _remedy(result))
+        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}", _remedy(result, "bad"))
     for sentence in found.unidentifiable_sentences():
         claim, _, action = sentence.rpartition("; ")
         yield Finding("care", claim or sentence, action)

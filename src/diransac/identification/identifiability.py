@@ -79,7 +79,7 @@ class Ambiguity:
     noun : str, optional
         "combination" or "ratio".
     reason : str, optional
-        Reason, as a clause that follows a comma.
+        Reason, as a clause that follows a comma; where nothing is determined, the motions for which that holds.
     """
 
     names: tuple[str, ...]
@@ -100,6 +100,10 @@ class Ambiguity:
         """Clause about an ambiguity of the equations: what is determined, why, and what to do."""
         if not self.n_determined:
             have, them = ("it has", "it") if len(self.names) == 1 else ("they have", "them")
+            if self.reason:
+                return (
+                    f"{have} no effect in the equations {self.reason}; compare units and constants of the model with it"
+                )
             return f"{have} no effect in the equations, whatever the motion; remove {them} from the model"
         reason = f", {self.reason}" if self.reason else ""
         n_free = len(self.names) - self.n_determined
@@ -187,10 +191,20 @@ def structural(
         parts = [x.of(group) for x in spaces]
         found.append(_ambiguity(names[group].tolist(), parts, [p[free][group] for p in vectors]))
     if measured is not None:
-        found = [replace(x, reason=_UNMEASURED) for x in found]
+        found = [replace(x, reason=_UNMEASURED if x.n_determined else "") for x in found]
     elif not model.nonlinear_parameters:
         found = [replace(x, reason=_HOMOGENEOUS) if x.noun == "ratio" else x for x in found]
-    return _joined(found)
+    joined = _joined(found)
+    if any(not x.n_determined and _in_equations(model) & set(x.names) for x in joined):
+        where = "at random motions" if ranges is None else "at any motion in the ranges of the log"
+        joined = tuple(replace(x, reason=x.reason if x.n_determined else where) for x in joined)
+    return joined
+
+
+def _in_equations(model: Model) -> set[str]:
+    """Parameters that are in the equations or in a sensor, whatever their values."""
+    columns = residual_slopes(model).sparsity_out(0).get_triplet()[1]
+    return {list(model.parameters)[k] for k in columns}
 
 
 def check_structure(
@@ -272,7 +286,7 @@ def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, rang
     repeated = np.repeat(p[:, None], n, axis=1)
     a = np.array(model.dynamics(np.vstack([q, v]), u, repeated)[1])
     slope = residual_slopes(model)
-    J = np.array(slope(q, v, a, u, repeated)).reshape(-1, model.n_p)
+    J = np.array(ca.densify(slope(q, v, a, u, repeated))).reshape(-1, model.n_p)
     size = np.abs(J).max(axis=1)
     usable = np.isfinite(size) & (size > 0.0) & (size < 1e100)
     return np.asarray(J[usable] / size[usable, None])
@@ -290,7 +304,7 @@ def residual_slopes(model: Model) -> ca.Function:
     outputs = model.residual(*symbols)
     if model.measurement is not None:
         outputs = ca.vertcat(outputs, model.measurement(*symbols))
-    return ca.Function("slope", symbols, [ca.densify(ca.jacobian(outputs, symbols[4]))])
+    return ca.Function("slope", symbols, [ca.jacobian(outputs, symbols[4])])
 
 
 def _output_jacobian(

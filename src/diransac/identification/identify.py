@@ -381,7 +381,8 @@ def _explained(dataset: Dataset, fitted: Callable[[], Estimate]) -> Estimate:
     try:
         return fitted()
     except IdentificationError as error:
-        mistakes, _ = mistakes_of_columns(dataset, solved_nonlinear)
+        with np.errstate(all="ignore"):
+            mistakes, _ = mistakes_of_columns(dataset, solved_nonlinear)
         if not mistakes:
             raise
         named = "; ".join(f"{x.claim}; {x.action}" for x in mistakes)
@@ -395,7 +396,8 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     is_bad, n_tested = result.verdict == "do not rely on this", 0
     is_doubtful = is_bad or max(left, default=0.0) > _DOUBTFUL
     if is_doubtful:
-        mistakes, n_tested = mistakes_of_columns(dataset, solved_nonlinear)
+        with np.errstate(all="ignore"):  # a correction that overflows explains nothing
+            mistakes, n_tested = mistakes_of_columns(dataset, solved_nonlinear)
     else:
         mistakes = contradictions(dataset.model, dataset.given)
     found = [Finding("bad" if is_bad or (is_doubtful and x.explains) else "care", x.claim, x.action) for x in mistakes]

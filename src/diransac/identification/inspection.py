@@ -14,6 +14,7 @@ from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, usable_sensors
 from diransac.errors import IdentificationError, LogError
+from diransac.identification.columns import contradictions
 from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.evaluation import choose_scoring
 from diransac.identification.identifiability import Ambiguity, in_words, of_log, structural
@@ -203,7 +204,8 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
     signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names if name not in events}
     fitness = None if model is None else _fitness(log, model)
     if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
-        fitness = dataclasses.replace(fitness, caveat=_caveat(signals, model))
+        mistakes = (f"{x.claim}; {x.action}" for x in contradictions(model, [log]))
+        fitness = dataclasses.replace(fitness, caveat="; ".join(filter(None, [*mistakes, _caveat(signals, model)])))
     return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, log.notes, fitness, events)
 
 

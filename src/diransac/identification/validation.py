@@ -33,7 +33,7 @@ _BEYOND, _SEEN = 3.0, 0.2
 """Least error of a bad prediction, over its sensitivity; effect of uncertain starts up to which an error is seen."""
 _VISIBLE = 0.01
 _USE = "use the model: diransac export RESULT.json -o dynamics.c"
-_CORRECT = "add the terms that the model lacks: diransac identify this log, too, with --with-suggestions"
+_CORRECT = "identify from this log, too, with --with-suggestions for terms that the model lacks"
 
 
 @dataclass(frozen=True)
