@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from diransac.errors import IdentificationError
-from diransac.identification.columns import motion_rows
 from diransac.identification.identifiability import structural
+from diransac.identification.motion_rows import motion_rows
 from diransac.identification.refusal import cause_of_refusal
 
 if TYPE_CHECKING:

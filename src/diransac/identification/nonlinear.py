@@ -21,7 +21,6 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.dataset import Dataset
 from diransac.data.log import Log
 from diransac.errors import DiransacError
-from diransac.identification.columns import Solution
 from diransac.identification.estimators import (
     OrdinaryLeastSquares,
     correlations,
@@ -30,6 +29,7 @@ from diransac.identification.estimators import (
     solve_definite,
 )
 from diransac.identification.identifiability import NullSpace, null_space
+from diransac.identification.motion_rows import Solution
 from diransac.identification.uncertainty import rows_without, score_inflation
 from diransac.time_limit import check_time
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from diransac.data.dataset import ParameterLayout
     from diransac.data.segment import Segment
-    from diransac.identification.columns import MotionRows
+    from diransac.identification.motion_rows import MotionRows
     from diransac.model import Model, Parameter
     from diransac.simulation.compiler import Map
 

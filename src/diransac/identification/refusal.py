@@ -16,8 +16,9 @@ from diransac.arrays import FloatArray
 from diransac.data.checks import rows_per_sample
 from diransac.data.segment import bulk_range
 from diransac.errors import IdentificationError
-from diransac.identification.columns import MotionRows, Solution, explanations, motion_rows, outside_bounds, solved
+from diransac.identification.columns import explanations
 from diransac.identification.identifiability import Ambiguity, Ranges, in_words, of_log, structural
+from diransac.identification.motion_rows import MotionRows, Solution, motion_rows, outside_bounds, solved
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset, ParameterLayout

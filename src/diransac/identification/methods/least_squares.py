@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.errors import IdentificationError
-from diransac.identification.columns import motion_rows
 from diransac.identification.estimate import Estimate, Resolution
 from diransac.identification.estimators import (
     BoundEstimator,
@@ -20,6 +19,7 @@ from diransac.identification.estimators import (
 )
 from diransac.identification.identifiability import check_structure, in_words, of_log, vague_parameters
 from diransac.identification.method import report
+from diransac.identification.motion_rows import motion_rows
 from diransac.identification.nonlinear import BoundNonlinear, NonlinearLeastSquares
 from diransac.identification.refusal import cause_of_refusal, check_known_terms
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used

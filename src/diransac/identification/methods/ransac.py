@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
 import numpy as np
 
 from diransac.errors import IdentificationError, LogError, TimeLimitError
-from diransac.identification.columns import motion_rows
 from diransac.identification.estimate import TIME_LIMIT, Estimate, Resolution
 from diransac.identification.estimators import Estimator, OrdinaryLeastSquares, as_estimator, name_of
 from diransac.identification.evaluation import choose_scoring
 from diransac.identification.method import report
 from diransac.identification.methods.least_squares import bound_to, fitted
 from diransac.identification.methods.samples import Evaluator, Hypothesis, Samples, Score, fingerprint
+from diransac.identification.motion_rows import motion_rows
 from diransac.identification.nonlinear import NonlinearLeastSquares
 from diransac.identification.refusal import cause_of_refusal
 from diransac.identification.sampling import sample_rows

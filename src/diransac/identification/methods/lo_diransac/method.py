@@ -17,7 +17,6 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import ModelError, SettingsError
-from diransac.identification.columns import excited
 from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, HausmanTest, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report
@@ -40,6 +39,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     unmeasured_by_name,
     unmeasured_states,
 )
+from diransac.identification.motion_rows import excited
 from diransac.identification.refusal import check_signs
 from diransac.process import memory_kept, single_threaded
 

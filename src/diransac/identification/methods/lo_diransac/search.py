@@ -11,7 +11,6 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.input_timing import InputTiming
 from diransac.errors import IdentificationError, TimeLimitError
-from diransac.identification.columns import MotionRows
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
 from diransac.identification.methods.lo_diransac.local_search import LEAST_LAG, LocalSearch
@@ -30,6 +29,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     with_observed_states,
     with_unmeasured_states,
 )
+from diransac.identification.motion_rows import MotionRows
 from diransac.identification.refusal import cause_of_refusal
 from diransac.time_limit import check_time
 
