@@ -376,7 +376,9 @@ class _Correction:
 
 def _much_better(model: Model, logs: Sequence[Log], found: Solution, possible: Sequence[_Correction]) -> list[Mistake]:
     """The one correction with which the equations hold much better; none where several do."""
-    clear = [x for x in possible if x.solution.residual < _MUCH_BETTER * found.residual]
+    better = [x for x in possible if x.solution.residual < _MUCH_BETTER * found.residual]
+    # Units of parameters change the weights of the equations, and with them each residual by a little.
+    clear = [x for x in better if (x.solution.residuals < _MUCH_BETTER * found.residuals).any()]
     if not clear or any(clear[0].rivals(x) for x in clear[1:]):
         return []
     best, ratio = clear[0], number(float((found.residuals / clear[0].solution.residuals).max()), 2)
