@@ -355,11 +355,9 @@ def test_findings_over_several_logs_are_on_the_worst_one_and_on_all_rows(model, 
 
 def test_findings_on_a_held_out_log_join_those_of_the_result(result, log, other, tmp_path):
     page = Page(written(result, [log, other], tmp_path))
-    assert all(str(finding) in page.text for finding in result.findings)
     held_out, own = page.text.partition("Held out, another dive")[2].split(f"Identification from {log.source}", 1)
-    assert "Outliers are left out of robust scores:" in held_out
     assert "Over the whole log the prediction of x_dot is off by" in held_out
-    assert all(str(finding) in own for finding in result.findings)
+    assert all(str(finding) in own for finding in result.findings if finding.level == "good")
     assert "Held out" not in Page(written(result, log, tmp_path)).text
 
 
@@ -517,7 +515,7 @@ def test_an_unidentifiable_parameter_has_no_number(diagnosed, hit, tmp_path):
 def test_an_input_delay_is_reported_and_the_simulation_includes_it(model, log, tmp_path):
     late = with_signals(log, thrust=np.r_[log["thrust"][4:], np.full(4, log["thrust"][-1])])
     found = dr.identify(model, late, seed=0)
-    assert level_of(found, late, "Inputs act 80 ms later than recorded: the estimate includes this delay") == "care"
+    assert level_of(found, late, "Inputs act 80 ms later than recorded, which the estimate includes") == "care"
     assert "The estimate and the simulations shown include it." in Page(written(found, late, tmp_path)).text
     run = simulate_on("it", found, late, found.diagnosis)
     assert run.median_errors["x_dot"] < 0.01 * np.ptp(log["x_dot"])

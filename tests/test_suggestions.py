@@ -343,7 +343,7 @@ def test_missing_dry_friction_is_suggested_with_its_size(result):
     assert (found.kind, found.equation, found.unit) == ("Coulomb friction", "q", "N m")
     assert abs(found.value - COULOMB) < 0.15 * COULOMB
     assert found.explained > 0.8
-    assert found.text.startswith("Coulomb friction on q: 0.0")
+    assert found.text.startswith("Dry friction of q: 0.0")
     assert "sign(q_dot) explains" in found.text
 
 
@@ -379,7 +379,7 @@ def test_the_refit_has_the_parameters_of_the_machine(with_dry_friction):
     refit = dr.identify(pendulum(), with_dry_friction, differentiate=True, with_suggestions=True)
     true = {"inertia": INERTIA, "damping": DAMPING, "moment": MOMENT, "coulomb_q": COULOMB}
     assert refit.parameters == pytest.approx(true, rel=0.05)
-    assert "terms were added to the model as suggested: Coulomb friction on q" in refit.notes[0]
+    assert "terms were added to the model as suggested: Dry friction of q" in refit.notes[0]
     assert dr.Result.from_dict(refit.to_dict()) == refit
     assert not refit.suggestions
 
@@ -392,16 +392,16 @@ def test_of_an_exact_model_nothing_is_suggested_and_nothing_added():
 
 
 @pytest.mark.parametrize(
-    ("kind", "actuator"),
+    ("name", "actuator"),
     [
-        ("dead band", lambda u: u - 0.08 * np.clip(u / 0.08, -1.0, 1.0)),
-        ("curved input", lambda u: u * (1.0 + 0.15 * np.abs(u))),
-        ("saturation", lambda u: np.clip(u, -0.6, 0.6)),
+        ("Dead band", lambda u: u - 0.08 * np.clip(u / 0.08, -1.0, 1.0)),
+        ("Curved gain", lambda u: u * (1.0 + 0.15 * np.abs(u))),
+        ("Saturation", lambda u: np.clip(u, -0.6, 0.6)),
     ],
 )
-def test_what_an_actuator_does_to_its_input_is_suggested(kind, actuator):
+def test_what_an_actuator_does_to_its_input_is_suggested(name, actuator):
     found = dr.identify(pendulum(), swing(actuator=actuator), differentiate=True, with_suggestions=True)
-    assert f"terms were added to the model as suggested: {kind[0].upper()}{kind[1:]} of torque" in found.notes[0]
+    assert f"terms were added to the model as suggested: {name} of torque" in found.notes[0]
     true = {"inertia": INERTIA, "damping": DAMPING, "moment": MOMENT}
     assert {name: found.parameters[name] for name in true} == pytest.approx(true, rel=0.05)
 
@@ -432,7 +432,7 @@ def test_candidate_terms_must_be_a_function():
 def test_the_report_shows_the_term_and_the_line_to_add(result, with_dry_friction, tmp_path):
     dr.write_report(result, with_dry_friction, tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
-    assert "The model seems to lack a term. Coulomb friction on q" in page
+    assert "The model seems to lack a term. Dry friction of q" in page
     assert "add to the equation of q: + p.coulomb_q" in page
 
 
@@ -454,4 +454,4 @@ def test_the_command_line_refits_on_request(with_dry_friction, tmp_path):
     done = run(*words, "--with-suggestions")
     assert done.exit_code == 0
     assert "pendulum with coulomb_q by lo-diransac" in done.stdout
-    assert "terms were added to the model as suggested: Coulomb friction on q" in done.stdout
+    assert "terms were added to the model as suggested: Dry friction of q" in done.stdout

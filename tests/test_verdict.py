@@ -15,7 +15,7 @@ import pytest
 import diransac as dr
 from command_line import MODEL, run, run_both, working_folder
 from diransac.identification.estimate import Finding
-from diransac.identification.findings import by_seriousness, verdict_of
+from diransac.identification.findings import by_seriousness, next_line, shown, shown_lines, verdict_of
 from diransac.identification.prediction import unexplained
 from diransac.report.runs import simulate_on
 from results import changed
@@ -119,20 +119,23 @@ CASES = pytest.mark.parametrize(
 
 
 @CASES
-def test_print_json_and_page_have_the_same_verdict_and_sentences(cases, name, tmp_path):
+def test_json_has_all_findings_and_print_and_page_the_most_serious(cases, name, tmp_path):
     result, log = cases[name]
     data = json.loads(json.dumps(result.to_dict()))
     assert data["verdict"] == result.verdict
-    assert data["findings"] == [{"level": x.level, "text": str(x)} for x in result.findings]
+    assert data["findings"] == [{"level": x.level, "text": str(x), "action": x.action} for x in result.findings]
     lines = str(result).splitlines()
     assert lines.count(f"verdict: {result.verdict}") == 1
     printed = [line[2:] for line in lines if line.startswith(("! ", "· "))]
-    assert printed == [x for x in result.findings if x.level in ("bad", "care")]
+    assert printed == shown(result.findings)[0]
+    assert lines[-1] == next_line(result.findings)
     dr.write_report(result, log, tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
     assert re.search(r'<span class="method">.*?</span> (.*?)</h3>', page).group(1) == result.verdict
-    shown = re.findall(r'<li class="(\w+)"><span class="sign".*?</span> (.*?)</li>', page)
-    assert [(level, html.unescape(text)) for level, text in shown] == [(x.level, str(x)) for x in result.findings]
+    listed = re.findall(r'<li class="(\w+)"><span class="sign".*?</span> (.*?)</li>', page)
+    few = shown(result.findings, good=True)[0]
+    assert [(level, html.unescape(text)) for level, text in listed] == [(x.level, str(x)) for x in few]
+    assert html.unescape(re.search(r'<p class="next">(.*?)</p>', page).group(1)) == next_line(result.findings)
 
 
 @CASES
@@ -152,6 +155,52 @@ def test_every_finding_is_a_sentence_and_the_most_serious_stand_first(cases, nam
     assert [x.seriousness for x in found] == sorted((x.seriousness for x in found), reverse=True)
 
 
+@CASES
+def test_each_finding_against_a_result_has_an_action(cases, name):
+    assert all(x.action and x.endswith(f"; {x.action}.") for x in cases[name][0].findings if x.level in ("bad", "care"))
+
+
+def test_five_findings_are_shown_and_the_others_counted():
+    found = [Finding("care", f"Signal {k} is late", f"shift {k}") for k in range(7)]
+    found += [Finding("note", "Innovations are not white."), Finding("bad", "The time runs backwards", "sort the rows")]
+    few, more = shown(found)
+    assert (len(few), more) == (5, 3)
+    assert few[0] == "The time runs backwards; sort the rows."
+    assert shown_lines(found)[-1] == "  and 3 more in the JSON"
+    assert next_line(found) == "Next: sort the rows."
+
+
+def test_findings_with_one_action_are_shown_as_the_first():
+    found = [Finding("bad", f"{name} is off", "add the drag") for name in "xyz"]
+    assert shown(found) == ([found[0]], 2)
+
+
+def test_a_result_that_nothing_opposes_is_to_be_validated(cases):
+    assert str(cases["lo-diransac"][0]).splitlines()[-1].startswith("Next: predict a log that it was not identified")
+
+
+def test_a_mistake_of_a_column_explains_all_that_is_bad(cases):
+    result = cases["a wrong sign"][0]
+    against = [x for x in result.findings if x.level in ("bad", "care")]
+    assert len(against) > 2
+    assert {x.action for x in against} == {"identify again with --scale force=-1"}
+    assert "The sign of force or s is reversed" in against[0]
+
+
+def test_results_of_the_format_before_are_read(cases):
+    """Their findings are sentences without actions, and no columns were tested."""
+    result = cases["a drift"][0]
+    data = json.loads(json.dumps(result.to_dict()))
+    for one in (*data["checks"], *data["findings"]):
+        del one["action"]
+    for one in (*data["suggestions"], *(data["possible_terms"] or ())):
+        del one["name"]
+    del data["mistakes"], data["n_columns_tested"]
+    old = dr.Result.from_dict({**data, "format": 9})
+    assert old.verdict == result.verdict
+    assert old.parameters == result.parameters
+
+
 # ---------------------------------------------------------------------- what a verdict rests on
 
 
@@ -160,7 +209,7 @@ def test_every_finding_is_a_sentence_and_the_most_serious_stand_first(cases, nam
     [
         ("least squares", "usable", ""),
         ("lo-diransac", "usable", ""),
-        ("a delay", "usable with care", "Inputs act 60 ms later than recorded: the estimate includes this delay"),
+        ("a delay", "usable with care", "Inputs act 60 ms later than recorded, which the estimate includes"),
         ("a push", "usable with care", "of s_ddot unexplained"),
         ("a drift", "do not rely on this", "Fifths of the log that are held out have"),
         ("a wrong sign", "do not rely on this", "mass = −1.5 kg is outside its bounds"),
@@ -183,7 +232,6 @@ def test_an_unstable_machine_is_judged_by_restarted_simulations_of_held_out_logs
     assert result.logs[0].prediction.restart_period < 0.2 * (len(log) - 1) * DT
     dr.write_report(result, inverted(seed=4)[1], tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
-    assert "Prediction over" in page  # and it is not judged where noise of the start has grown 500 times
     assert "</span> usable</h3>" in page
     falling = changed(result, parameters={"stiffness": -25.0, "gain": 5.0})
     dr.write_report(falling, inverted(seed=4)[1], tmp_path / "page.html")
@@ -329,6 +377,8 @@ def test_compare_shows_each_methods_verdict_and_sentences(folder, monkeypatch):
         assert found["verdict"] == "do not rely on this"
         (row,) = [line for line in text.splitlines() if line.startswith(f"{name} ")]
         assert row.endswith(found["verdict"])
-        serious = [x for x in found["findings"] if x["level"] in ("bad", "care")]
-        assert serious
-        assert all(f" {name}: {x['text']}" in text for x in serious)
+        parts = [(x["level"], x["text"].removesuffix(f"; {x['action']}."), x["action"]) for x in found["findings"]]
+        few, more = shown(Finding(*x) for x in parts)
+        assert few
+        assert all(f" {name}: {x}" in text for x in few)
+        assert f"{name}: and {more} more in the JSON" in text

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 from diransac.cli.screen import bar
 from diransac.data.log import Log
 from diransac.errors import DiransacError
+from diransac.identification.findings import shown_lines
 from diransac.identification.identify import identify
 from diransac.identification.method import Method
-from diransac.identification.result import MARKS, Result
+from diransac.identification.result import Result
 from diransac.model import Model, Parameter
 from diransac.model.library import BUILTIN
 from diransac.simulation.compiler.code_cache import CodeCache
@@ -81,7 +82,7 @@ class Comparison:
         for text in dict.fromkeys(filter(None, said.values())):
             yield f"{', '.join(name for name, x in said.items() if x == text)}: {text}"
         for name, result in self.results.items():
-            yield from (f"{MARKS[x.level]} {name}: {x}" for x in result.findings if x.level in MARKS)
+            yield from (f"{line[:2]}{name}: {line[2:]}" for line in shown_lines(result.findings))
 
     def _row(self, name: str, result: Result) -> list[str]:
         errors = result.standard_errors

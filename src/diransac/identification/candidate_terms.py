@@ -68,6 +68,8 @@ class CandidateTerm:
         ``h (n_v)`` of the symbols of `CandidateTerms`.
     bounds : (float, float), optional
         Smallest and largest coefficient that is possible.
+    name : str, optional
+        Name in an engineer's words, such as ``dry friction of x``.
     """
 
     kind: str
@@ -79,6 +81,7 @@ class CandidateTerm:
     unit: str
     residuals: ca.SX
     bounds: tuple[float, float] = (-np.inf, np.inf)
+    name: str = ""
 
     @property
     def is_of_input(self) -> bool:
@@ -317,7 +320,8 @@ class _Maker:
                 parameter = self._free(f"{label}_{name}")
                 line = f"u.{name}" + (" * (1 + p.{0})" if kind == INPUT_GAIN else f" + p.{{0}}{code}").format(parameter)
                 h = ca.densify(slope * value)
-                yield CandidateTerm(kind, -1, name, formula, line, parameter, of_value, h, bounds)
+                called = _NAMES[kind].format(x=name)
+                yield CandidateTerm(kind, -1, name, formula, line, parameter, of_value, h, bounds, called)
 
     def _changes(
         self, name: str, u: ca.SX, unit: str, size: float, largest: float
@@ -360,7 +364,8 @@ class _Maker:
         known = self.model.kinematics is None and self.model.force_sign
         force = _FORCES.get(self.model.coordinates.get(place, ""), "") if known else ""
         whole = "" if unit is None or not force else _over(force, unit)
-        return CandidateTerm(kind, i, place, formula, line, parameter, whole, residuals)
+        name = _name(kind, place, formula, self.model.coordinates.get(place, ""))
+        return CandidateTerm(kind, i, place, formula, line, parameter, whole, residuals, name=name)
 
     def _free(self, name: str) -> str:
         """The name, or the next that no signal and no parameter has."""
@@ -368,6 +373,48 @@ class _Maker:
         taken = {*model.units, *model.parameters}
         names = (name, *(f"{name}_{k}" for k in range(2, len(taken) + 3)))
         return next(x for x in names if x not in taken)
+
+
+_NAMES = {
+    "Coulomb friction": "dry friction of {x}",
+    "viscous friction": "viscous friction of {x}",
+    "quadratic drag": "quadratic drag of {x}",
+    "asymmetric drag": "drag of {x} in a current",
+    "Stribeck friction": "Stribeck friction of {x}",
+    "constant force": "constant {force} {x}",
+    "constant term": "constant rate of {x}",
+    "linear term": "decay of {x}",
+    "quadratic term": "quadratic decay of {x}",
+    "stiffness": "spring on {x}",
+    "quadratic stiffness": "quadratic spring on {x}",
+    "cubic stiffness": "cubic spring on {x}",
+    INPUT_GAIN: "gain of {x}",
+    "input offset": "offset of {x}",
+    "curved input": "curved gain of {x}",
+    "dead band": "dead band of {x}",
+    "saturation": "saturation of {x}",
+}
+"""Names by kind; {force} is a force along or a torque about a coordinate, or what acts on a velocity."""
+_ACTIONS = {"m": "force along", "rad": "torque about"}
+
+
+def _name(kind: str, place: str, formula: str, unit: str) -> str:
+    """Name of a term in the equation of a coordinate with a unit, or of a velocity without one."""
+    force, first = _ACTIONS.get(unit, "force on"), kind.partition(" ")[0]
+    if kind in _NAMES:
+        return _NAMES[kind].format(x=place, force=force)
+    if first in ("gravity", "harmonic"):
+        angle = kind.rpartition(" ")[2]
+        if first == "harmonic":
+            return f"ripple of the {force} {place}, {kind.split()[1]} periods per turn of {angle}"
+        return f"gravity {force.removeprefix('force ')} {place}" + (f", as {angle} tilts" if angle != place else "")
+    if first == "coupling":
+        return f"viscous coupling of {place} to {kind.rpartition(' ')[2]}"
+    if kind == "product of velocities":
+        a, b = formula.split(" ")
+        cause = "Coriolis" if a != b else "centrifugal"
+        return f"{cause} {force} {place}, by {a if a == b else f'{a} and {b}'}"
+    return f"{kind} on {place}"
 
 
 _QUOTIENTS = {

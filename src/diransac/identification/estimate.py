@@ -54,14 +54,16 @@ Level = Literal["note", "good", "care", "bad"]
 
 
 class Finding(str):
-    """A sentence for or against a result: a string with a level.
+    """A sentence for or against a result: a string with a level and an action.
 
     Parameters
     ----------
     level : {"note", "good", "care", "bad"}
         ``good`` supports the result, ``care`` and ``bad`` oppose it, a ``note`` is neutral.
-    text : str
-        The sentence; a bad one ends with what to do.
+    claim : str
+        What was found: a sentence, without a stop where an action follows.
+    action : str, optional
+        What to do about it, in the imperative; the sentence ends with it.
 
     Raises
     ------
@@ -70,39 +72,57 @@ class Finding(str):
     """
 
     level: Level
+    action: str
 
-    def __new__(cls, level: Level, text: str) -> Finding:
+    def __new__(cls, level: Level, claim: str, action: str = "") -> Finding:
         """A finding of a level."""
         if level not in get_args(Level):
             raise ValueError(f"level {level!r} of a finding; there are {', '.join(get_args(Level))}")
-        made = super().__new__(cls, text)
-        made.level = level
+        made = super().__new__(cls, f"{claim}; {action}." if action else claim)
+        made.level, made.action = level, action
         return made
 
-    def __getnewargs__(self) -> tuple[Level, str]:  # type: ignore[override]  # a string's are its text alone
-        return self.level, str(self)
+    @property
+    def claim(self) -> str:
+        """The sentence without the action."""
+        return self.removesuffix(f"; {self.action}.") if self.action else str(self)
+
+    def __getnewargs__(self) -> tuple[Level, str, str]:  # type: ignore[override]  # a string's are its text alone
+        return self.level, self.claim, self.action
 
     def __repr__(self) -> str:
-        return f"Finding({self.level!r}, {str(self)!r})"
+        return f"Finding({self.level!r}, {self.claim!r}, {self.action!r})"
 
     @property
     def seriousness(self) -> int:
         """Place of the level among the levels: 0 for a note, 3 for bad."""
         return get_args(Level).index(self.level)
 
+    def to_dict(self) -> dict[str, str]:
+        """Form in JSON: level, the whole sentence, and the action at its end."""
+        return {"level": self.level, "text": str(self), "action": self.action}
+
+    @classmethod
+    def _from_dict(cls, data: Mapping[str, Any]) -> Finding:
+        """The finding of `to_dict`; those of earlier versions have no action."""
+        action = data.get("action", "")
+        return cls(data["level"], data["text"].removesuffix(f"; {action}.") if action else data["text"], action)
+
     @classmethod
     def __get_pydantic_core_schema__(cls, _source: object, _handler: object) -> Any:
-        """Form in JSON: level and text."""
+        """Form in JSON: that of `to_dict`."""
         from pydantic_core import core_schema
 
-        text = core_schema.typed_dict_field(core_schema.str_schema(strict=True))
-        level = core_schema.typed_dict_field(core_schema.literal_schema(list(get_args(Level))))
+        text = core_schema.str_schema(strict=True)
+        fields = {
+            "level": core_schema.typed_dict_field(core_schema.literal_schema(list(get_args(Level)))),
+            "text": core_schema.typed_dict_field(text),
+            "action": core_schema.typed_dict_field(text, required=False),
+        }
         return core_schema.no_info_after_validator_function(
-            lambda found: cls(**found),
-            core_schema.typed_dict_schema({"level": level, "text": text}),
-            serialization=core_schema.plain_serializer_function_ser_schema(
-                lambda found: {"level": found.level, "text": str(found)}
-            ),
+            cls._from_dict,
+            core_schema.typed_dict_schema(fields),
+            serialization=core_schema.plain_serializer_function_ser_schema(lambda found: found.to_dict()),
         )
 
 
@@ -439,6 +459,11 @@ class Estimate:
         Noise, outliers and unmodelled forces; of lo-diransac alone.
     checks : tuple of Finding, optional
         Findings of the method's own tests.
+    mistakes : tuple of Finding, optional
+        Mistakes of the logs' columns: units, signs, inputs that are zero.  A bad one explains all that is bad.
+    n_columns_tested : int, optional
+        Number of other signs and units of columns that were tested, and that explain the logs no better; 0 where they
+        were not tested.
     suggestions : tuple of Suggestion, optional
         Terms that the model lacks, by the unmodelled forces; of lo-diransac alone.
     competition : Competition, optional
@@ -464,6 +489,8 @@ class Estimate:
     notes: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     checks: tuple[Finding, ...] = ()
+    mistakes: tuple[Finding, ...] = ()
+    n_columns_tested: int = 0
     suggestions: tuple[Suggestion, ...] = ()
     competition: Competition | None = None
     possible_terms: tuple[PossibleTerm, ...] | None = None

@@ -14,12 +14,19 @@ from diransac.text_table import duration, number, percent, plural, share
 if TYPE_CHECKING:
     from diransac.identification.estimate import Diagnosis, LogSummary, Prediction
     from diransac.identification.result import Result
+    from diransac.identification.suggestions import Suggestion
     from diransac.model import Parameter
 
-__all__ = ["Verdict", "bounds_text", "by_seriousness", "findings_of", "verdict_of"]
+__all__ = ["Verdict", "bounds_text", "by_seriousness", "findings_of", "next_line", "shown", "shown_lines", "verdict_of"]
 
 Verdict = Literal["usable", "usable with care", "do not rely on this"]
 
+_MOST_SHOWN = 5
+"""Findings that are shown of one result."""
+_MARKS = {"bad": "!", "care": "·", "good": " "}
+"""Marks of the findings that are printed."""
+_VALIDATE = "predict a log that it was not identified from: diransac validate RESULT.json OTHER_LOG"
+"""What to do with a result that nothing opposes."""
 _NEAR, _FAR = 0.05, 0.25
 """Median errors of simulations, over the range of the signal, that are good, and that need care."""
 _MOST, _HALF, _FEW = 0.7, 0.5, 0.01
@@ -34,6 +41,7 @@ _CONTRADICTION = 3.0
 """Distance of an estimate from the mean of its prior, in standard deviations of that, which needs care."""
 _IMPOSSIBLE = 4.0
 """Distance of base parameters from those of possible bodies, in standard errors of one, which needs care."""
+_OTHER_BANDWIDTH = "choose another bandwidth (--bandwidth), or identify with --method lo-diransac"
 _STEADY, _UNSTEADY = 0.05, 0.2
 """Relative changes of a parameter with the filter's bandwidth that are good, and that need care."""
 
@@ -42,33 +50,79 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
     """Findings on a result, the most serious first.
 
     They depend on what the result contains alone: parameters and intervals, the predictions of its logs, its diagnosis
-    and the checks of its method.
+    and the checks of its method.  Where a mistake of a column explains what is bad, all findings have its action.
 
     Parameters
     ----------
     result : Result
     """
-    return by_seriousness(
+    mistakes = result.estimate.mistakes
+    found = by_seriousness(
         (
+            *mistakes,
+            *result.estimate.checks,
+            *_logs(result),
+            *_suggested(result),
             *_bounds(result),
+            *_diagnosis(result),
             *_bodies(result),
             *_known(result),
-            *_simulation(result.logs, restarts=result.diagnosis is not None),
-            *_inliers(result.logs, result.inlier_fraction, restarted=result.diagnosis is not None),
-            *_diagnosis(result),
+            *_simulation(result),
+            *_inliers(result),
             *_uncertainty(result),
             *_structure(result),
             *_bandwidth(result),
             *_search(result),
-            *_logs(result),
-            *result.estimate.checks,
         )
     )
+    cause = next((x for x in mistakes if x.level == "bad"), None)
+    if cause is None:
+        return found
+    return tuple(Finding(x.level, x.claim, cause.action) if x.action else x for x in found)
 
 
 def by_seriousness(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """The findings, the most serious first, in their order within a level."""
     return tuple(sorted(findings, key=lambda finding: -finding.seriousness))
+
+
+def shown(findings: Iterable[Finding], *, good: bool = False) -> tuple[list[Finding], int]:
+    """The findings that a person is shown, the most serious first, and the number of those that are left out.
+
+    Of findings with the same action, which are consequences of one cause, the first is shown.
+
+    Parameters
+    ----------
+    findings : iterable of Finding
+    good : bool, optional
+        Whether findings that support the result are shown, too; notes are not.
+    """
+    levels = ("bad", "care", "good") if good else ("bad", "care")
+    found = [x for x in by_seriousness(findings) if x.level in levels]
+    first = dict[str, Finding]()
+    for one in found:
+        first.setdefault(one.action or one, one)
+    kept = list(first.values())[:_MOST_SHOWN]
+    return kept, len(found) - len(kept)
+
+
+def shown_lines(findings: Iterable[Finding], *, good: bool = False) -> list[str]:
+    """The findings that a person is shown, a line each, and one on those that are left out.  Parameters as `shown`."""
+    found, more = shown(findings, good=good)
+    return [f"{_MARKS[x.level]} {x}" for x in found] + ([f"  and {more} more in the JSON"] if more else [])
+
+
+def next_line(findings: Iterable[Finding], otherwise: str = _VALIDATE) -> str:
+    """A line on the single most useful thing to do: the action of the most serious finding.
+
+    Parameters
+    ----------
+    findings : iterable of Finding
+    otherwise : str, optional
+        What to do where no finding opposes the result.
+    """
+    actions = [x.action for x in shown(findings)[0] if x.action]
+    return f"Next: {(actions or [otherwise])[0]}."
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
@@ -97,17 +151,14 @@ def _bounds(result: Result) -> Iterator[Finding]:
     for name in result.violations:
         bounds = parameters[name.partition("[")[0]]
         value = f"{name} = {number(result.estimate.parameters[name])} {bounds.unit}"
-        yield Finding(
-            "bad",
-            f"{value} is outside its bounds ({bounds_text(bounds)}), which is physically impossible: check the signs "
-            "and units of the log and the terms of the model.",
-        )
+        claim = f"{value} is outside its bounds ({bounds_text(bounds)}), which is physically impossible"
+        yield Finding("bad", claim, _remedy(result, "bad"))
     for name in result.on_bounds:
         value = number(result.estimate.parameters[name])
         yield Finding(
             "bad",
-            f"{name} = {value} is on its bound, where the fit was stopped: its interval is unknown; check the bound, "
-            "or take the parameter out of the model.",
+            f"{name} = {value} is on its bound, where the fit was stopped, so that its interval is unknown",
+            f"widen the bound, or fix the parameter: --fix {name.partition('[')[0]}={value}",
         )
     bounded = any(bounds_text(x) for n, x in parameters.items() if n not in result.fixed)
     if bounded and not (result.violations or result.on_bounds):
@@ -129,8 +180,9 @@ def _bodies(result: Result) -> Iterator[Finding]:
         yield Finding(
             "care",
             "No possible bodies (of positive mass, with inertias that satisfy the triangle inequality) have these base "
-            f"parameters: the nearest differ by {far} standard errors of {name}. A term is missing, or an interval is "
-            "too narrow; an exported description has the nearest possible bodies.",
+            f"parameters, the nearest of which differ by {far} standard errors of {name}; an exported description has "
+            "these",
+            "add the term that the model lacks, or record a longer log",
         )
 
 
@@ -147,7 +199,9 @@ def _known(result: Result) -> Iterator[Finding]:
                 f"{_these(result.logs)} {'contradict' if len(result.logs) > 1 else 'contradicts'} the prior of {name}"
             )
             far = f"{number(x)} lies {number(away, 2)} prior standard deviations from its mean {number(mean)}"
-            yield Finding("care", f"{text[0].upper()}{text[1:]}: the estimate {far}; check the prior, and the model.")
+            yield Finding(
+                "care", f"{text[0].upper()}{text[1:]}, since the estimate {far}", f"check the prior of {name}"
+            )
         elif np.isfinite(away):
             yield Finding("note", f"The estimate of {name} uses the prior {number(mean)} ± {number(std, 2)}.")
 
@@ -168,33 +222,57 @@ def bounds_text(parameter: Parameter) -> str:
 # ---------------------------------------------------------------------- simulation and inliers
 
 
-def _simulation(logs: Sequence[LogSummary], *, restarts: bool) -> Iterator[Finding]:
+def _remedy(result: Result, level: Level = "care") -> str:
+    """What to do about an answer that is off throughout, by the causes that were tested."""
+    if result.suggestions:
+        return _added(result.suggestions[0])
+    if result.estimate.n_columns_tested:
+        tested = f"{result.estimate.n_columns_tested} other signs and units of columns explain the log no better"
+        return f"compare the terms and constants of the model with the machine ({tested})"
+    if level == "bad":
+        return "check the signs and units of the log, which could not be tested, and the terms of the model"
+    return "compare the terms and constants of the model with the machine"
+
+
+def _added(suggestion: Suggestion) -> str:
+    """The action that adds a suggested term."""
+    return f"add the {suggestion.name or suggestion.kind}: identify again with --with-suggestions"
+
+
+def _suggested(result: Result) -> Iterator[Finding]:
+    """The terms that the model lacks."""
+    for x in result.suggestions:
+        yield Finding("care", f"The model seems to lack a term. {x.text}", _added(x))
+
+
+def _simulation(result: Result) -> Iterator[Finding]:
     """Errors of the simulations relative to the signals' ranges, of the worst log.
 
-    ``restarts`` says that the method restarts simulations.  Then one of a whole log needs care at worst, because
-    unmodelled forces accumulate in it.
+    Where the method restarts simulations, one of a whole log needs care at worst, because unmodelled forces accumulate
+    in it.
     """
+    logs, restarts = result.logs, result.diagnosis is not None
     for one, found in _predicted(logs):
         if np.isfinite(found.divergence):
             where = f" in {one.source}" if len(logs) > 1 else ""
             yield Finding(
                 "bad" if np.isfinite(found.restart_period) or not restarts else "care",
-                f"The simulation diverges at t = {number(found.divergence)} s{where}: check the signs and units of the "
-                "log and the terms of the model.",
+                f"The simulation diverges at t = {number(found.divergence)} s{where}",
+                _remedy(result, "bad"),
             )
     scored = [x for x in _predicted(logs) if not np.isfinite(x[1].divergence) and x[1].relative_errors]
     if scored:
         one, found = max(scored, key=lambda x: max(x[1].relative_errors.values()))
-        yield _median_error(found, _worst_of(one, logs), restarts=restarts)
+        yield _median_error(result, found, _worst_of(one, logs))
     if any(one.prediction is None for one in logs):
         yield Finding(
             "care",
-            "No simulation is compared with the log, because its initial state is missing: validate the model on "
-            "another log.",
+            "No simulation is compared with the log, because its initial state is missing",
+            _VALIDATE,
         )
 
 
-def _median_error(found: Prediction, where: str, *, restarts: bool) -> Finding:
+def _median_error(result: Result, found: Prediction, where: str) -> Finding:
     """Finding on the signal with the largest median error of a simulation."""
     errors = found.relative_errors
     name, restarted = max(errors, key=lambda n: errors[n]), bool(np.isfinite(found.restart_period))
@@ -207,10 +285,10 @@ def _median_error(found: Prediction, where: str, *, restarts: bool) -> Finding:
             return Finding(level, f"Median error of {method}: within the noise, in every signal.")
     else:
         method = "one simulation of the whole log"
-        level = "care" if restarts and level == "bad" else level
+        level = "care" if result.diagnosis is not None and level == "bad" else level
     others = "the other scored signals are closer" if len(errors) > 1 else "no other signal is scored"
-    advice = "; check the terms of the model and the units of the log" if level == "bad" else ""
-    return Finding(level, f"Median error of {method}: {name} is off by {what}; {others}{where}{advice}.")
+    claim = f"Median error of {method}: {name} is off by {what}; {others}{where}"
+    return Finding(level, f"{claim}.") if level == "good" else Finding(level, claim, _remedy(result, level))
 
 
 def _predicted(logs: Sequence[LogSummary]) -> list[tuple[LogSummary, Prediction]]:
@@ -222,14 +300,14 @@ def _worst_of(one: LogSummary, logs: Sequence[LogSummary]) -> str:
     return f" ({one.source}, the worst of {plural(len(logs), 'log')})" if len(logs) > 1 else ""
 
 
-def _inliers(logs: Sequence[LogSummary], fraction: float, *, restarted: bool) -> Iterator[Finding]:
+def _inliers(result: Result) -> Iterator[Finding]:
     """The inlier fraction of all logs, and the window with the fewest inliers."""
-    predicted = _predicted(logs)
+    logs, fraction, predicted = result.logs, result.inlier_fraction, _predicted(result.logs)
     if not np.isfinite(fraction):
         return
     n_rows = sum(found.n_rows for _, found in predicted) or sum(one.n_rows for one in logs)
     text = f"{percent(fraction)} of {plural(n_rows, 'row')} agree with"
-    if restarted:
+    if result.diagnosis is not None:
         yield Finding(
             "note",
             f"{text} an open-loop simulation of the whole log, in which effects of unmodelled forces and errors of its "
@@ -237,18 +315,20 @@ def _inliers(logs: Sequence[LogSummary], fraction: float, *, restarted: bool) ->
         )
         return
     if fraction < _HALF:
-        advice = "check the terms of the model and the units of the log, or use lo-diransac"
-        yield Finding("bad", f"{text} the simulation, which is less than half of the log: {advice}.")
+        claim = f"{text} the simulation, which is less than half of the log"
+        yield Finding("bad", claim, f"identify with --method lo-diransac, or {_remedy(result, 'bad')}")
         return
-    yield Finding("good" if fraction >= _MOST else "care", f"{text} the simulation.")
+    if fraction >= _MOST:
+        yield Finding("good", f"{text} the simulation.")
+    else:
+        yield Finding("care", f"{text} the simulation", "identify with --method lo-diransac")
     for one, found in predicted:
         begin, end, lowest = found.weakest_window
         if lowest < _HALF * fraction:
             where = f" of {one.source}" if len(logs) > 1 else ""
             between = f"Between {number(begin)} and {number(end)} s{where}"
-            yield Finding(
-                "care", f"{between} only {percent(lowest)} of the rows agree with the simulation: inspect it."
-            )
+            claim = f"{between} only {percent(lowest)} of the rows agree with the simulation"
+            yield Finding("care", claim, f"look at it, or leave it out: --leave-out={begin:.4g}:{end:.4g}")
 
 
 # ---------------------------------------------------------------------- diagnosis and uncertainty
@@ -264,24 +344,21 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
     if most > _FEW:
         text = f"Up to {percent(most)} of the samples of a signal ({name}) are outliers"
         if most <= _BREAKDOWN:
-            level: Level = "note" if most <= _HALF else "care"
-            yield Finding(level, f"{text}; the estimate down-weights them.")
+            if most <= _HALF:
+                yield Finding("note", f"{text}; the estimate down-weights them.")
+            else:
+                yield Finding("care", f"{text}, which the estimate down-weights", f"look at {name}, or leave it out")
         else:
-            yield Finding(
-                "bad", f"{text}: check its sign and unit and the terms of the model, or leave the signal out."
-            )
+            yield Finding("bad", text, f"leave {name} out of the log, or {_remedy(result, 'bad')}")
     yield from _departures(result.logs, found)
-    yield from _unexplained(result.logs)
-    for suggestion in result.suggestions:
-        yield Finding("care", f"The model seems to lack a term. {suggestion.text}.")
+    yield from _unexplained(result)
     if found.input_delay_significant:
         sense, lag = "later" if found.input_delay > 0.0 else "earlier", result.estimate.resolution.timing.lag
         time = duration(abs(found.input_delay))
         late, what = f"Inputs act {time} {sense} than recorded", "delay"
         if lag:
             late, what = f"Inputs act after a first-order lag of the actuators of {time} (time constant)", "lag"
-        included = f"the estimate includes this {what}, as do its evaluation and validation"
-        yield Finding("care", f"{late}: {included}; other simulations of the model must include it, too.")
+        yield Finding("care", f"{late}, which the estimate includes", f"give other simulations this {what}, too")
     yield from _unidentifiable(result, found)
 
 
@@ -299,28 +376,31 @@ def _departures(logs: Sequence[LogSummary], found: Diagnosis) -> Iterator[Findin
                 "care",
                 f"The model does not hold from {listed}{more}{_worst_of(one, logs)}: forces that it lacks are up to "
                 f"{ratio} times as large there as elsewhere, as on the ground, in the hand, at a stop or at a limit of "
-                f"the inputs. Leave it out, unless a term explains it: --leave-out={option}.",
+                "the inputs",
+                f"leave it out, unless a term explains it: --leave-out={option}",
             )
 
 
-def _unexplained(logs: Sequence[LogSummary]) -> Iterator[Finding]:
+def _unexplained(result: Result) -> Iterator[Finding]:
     """The largest share of an acceleration that the model leaves unexplained."""
-    having = [(one, found) for one, found in _predicted(logs) if found.unexplained]
+    having = [(one, found) for one, found in _predicted(result.logs) if found.unexplained]
     if not having:
         return
     one, found = max(having, key=lambda x: max(x[1].unexplained.values()))
     name = max(found.unexplained, key=lambda n: found.unexplained[n])
     left = found.unexplained[name]
     others = ", less of the others" if len(found.unexplained) > 1 else ""
-    text = f"The model leaves {percent(left)} of {name} unexplained (RMS){others}{_worst_of(one, logs)}"
+    text = f"The model leaves {percent(left)} of {name} unexplained (RMS){others}{_worst_of(one, result.logs)}"
     level = _graded(left, _NEAR, _HALF)
-    yield Finding(level, f"{text}: a term is missing, or an input; add it." if level == "bad" else f"{text}.")
+    yield Finding("good", f"{text}.") if level == "good" else Finding(level, text, _remedy(result, level))
 
 
 def _unidentifiable(result: Result, found: Diagnosis) -> Iterator[Finding]:
     if len(result.unidentifiable) == len(result.parameters) - len(result.fixed):
-        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}.")
-    yield from (Finding("care", f"{sentence}.") for sentence in found.unidentifiable_sentences())
+        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}", _remedy(result, "bad"))
+    for sentence in found.unidentifiable_sentences():
+        claim, _, action = sentence.rpartition("; ")
+        yield Finding("care", claim or sentence, action)
 
 
 def _these(logs: Sequence[LogSummary]) -> str:
@@ -336,26 +416,41 @@ def _uncertainty(result: Result) -> Iterator[Finding]:
     lost = [name for name in unknown if name not in stuck]
     if lost and result.diagnosis is None:
         rows = plural(result.n_fitted, "fitted row")
-        yield Finding(
-            "care", f"The uncertainty of {', '.join(lost)} is unknown: {rows} are too few, or do not excite it."
-        )
+        claim = f"The uncertainty of {', '.join(lost)} is unknown: {rows} are too few, or do not excite it"
+        yield Finding("care", claim, "give a longer log")
+    zero: dict[bool, list[str]] = {True: [], False: []}
     for name, (low, high) in intervals.items():
         # The mean of a per-log parameter is of no machine: the table of the logs has its values.
         if name in unknown or (result.model.parameters[name].per_log and not result.layout.is_shared):
             continue
         if low <= 0.0 <= high:
-            possible = result.model.parameters[name].admits(0.0)
-            text = f"{name} does not differ significantly from zero: its 95 % interval includes zero."
-            yield Finding("note" if possible else "care", text)
+            zero[bool(result.model.parameters[name].admits(0.0))].append(name)
         else:
             widths[name] = 0.5 * (high - low) / abs(result.parameters[name])
-    for name, width in widths.items():
-        if width > _UNCERTAIN:
-            yield Finding("care", f"{name} is uncertain by ±{percent(width)} (95 % interval): excite it more.")
-    if widths and max(widths.values()) <= _UNCERTAIN:
+    for possible, names in zero.items():
+        if names:
+            claim = f"{', '.join(names)} {_differ(names)} significantly from zero: 0 is in the 95 % interval"
+            yield Finding("note", f"{claim}.") if possible else Finding("care", claim, _more_of(result, names))
+    wide = sorted((n for n, x in widths.items() if x > _UNCERTAIN), key=lambda n: -widths[n])
+    if wide:
+        listed = ", ".join(f"{n} by ±{percent(widths[n])}" for n in wide)
+        yield Finding("care", f"Uncertain by more than half (95 % interval): {listed}", _more_of(result, wide))
+    if widths and not wide:
         name = max(widths, key=lambda n: widths[n])
         what = f"{name} is" if len(widths) == 1 else f"The least certain parameter is {name},"
         yield Finding("good", f"{what} uncertain by ±{percent(widths[name])} (95 % interval).")
+
+
+def _differ(names: Sequence[str]) -> str:
+    return "does not differ" if len(names) == 1 else "do not differ"
+
+
+def _more_of(result: Result, names: Sequence[str]) -> str:
+    """What makes uncertain parameters certain: a motion that moves their terms more, or a value from elsewhere."""
+    one = names[0].partition("[")[0]
+    if any(x.prediction and max(x.prediction.unexplained.values(), default=0.0) > _HALF for x in result.logs):
+        return _remedy(result)
+    return f"record a log in which the term of {one} is larger, or fix it: --fix {one}=VALUE"
 
 
 def _structure(result: Result) -> Iterator[Finding]:
@@ -372,8 +467,8 @@ def _structure(result: Result) -> Iterator[Finding]:
         yield Finding(
             "care",
             f"If the model lacks a term, {name} may be anywhere from {low} to {high}, an interval that is "
-            f"{number(found.widening, 2)} times as wide: {_these(result.logs)} cannot exclude {found.term}. Record "
-            f"{found.motion}.",
+            f"{number(found.widening, 2)} times as wide, since {_these(result.logs)} cannot exclude {found.term}",
+            f"record {found.motion}",
         )
 
 
@@ -383,14 +478,16 @@ def _bandwidth(result: Result) -> Iterator[Finding]:
     if not changes:
         return
     if any(np.isnan(pair).any() for pair in changes.values()):
-        yield Finding("care", "Identification failed at half or twice the filter's bandwidth.")
+        yield Finding("care", "Identification failed at half or twice the filter's bandwidth", _OTHER_BANDWIDTH)
         return
     name = max(changes, key=lambda n: max(map(abs, changes[n])))
     change = max(map(abs, changes[name]))
-    text = f"At half or twice the filter's bandwidth no parameter changes by more than {percent(change)} ({name})."
     if change > _STEADY:
-        text = f"{name} changes by {percent(change)} at half or twice the filter's bandwidth: choose it with care."
-    yield Finding(_graded(change, _STEADY, _UNSTEADY), text)
+        claim = f"{name} changes by {percent(change)} at half or twice the filter's bandwidth"
+        yield Finding(_graded(change, _STEADY, _UNSTEADY), claim, _OTHER_BANDWIDTH)
+        return
+    text = f"At half or twice the filter's bandwidth no parameter changes by more than {percent(change)} ({name})."
+    yield Finding("good", text)
 
 
 # ---------------------------------------------------------------------- search and logs
@@ -398,7 +495,7 @@ def _bandwidth(result: Result) -> Iterator[Finding]:
 
 def _search(result: Result) -> Iterator[Finding]:
     if result.stop_reason == TIME_LIMIT:
-        yield Finding("care", "The time limit ended the search: parameters are the best so far; give a longer one.")
+        yield Finding("care", "The time limit ended the search; parameters are the best so far", "give a longer limit")
         return
     wanted = result.settings.stop_inlier_fraction
     if result.iterations and result.diagnosis is None and wanted is not None and result.inlier_fraction < wanted:
@@ -411,7 +508,7 @@ def _logs(result: Result) -> Iterator[Finding]:
     for one in result.logs:
         if one.remark:
             advice = "leave this log out, or give what differs a value per log"
-            yield Finding("bad", f"{one.remark}. One set of parameters does not describe all logs: {advice}.")
+            yield Finding("bad", f"{one.remark}. One set of parameters does not describe all logs", advice)
     yield from _excluded(result.logs)
     which = "the logs" if len(result.logs) > 1 else "the log"
     text = f"Evaluated on {which} of the identification; held-out data are a stricter test."

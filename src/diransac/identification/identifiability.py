@@ -36,6 +36,7 @@ __all__ = [
     "in_words",
     "null_space",
     "of_log",
+    "residual_slopes",
     "structural",
     "structural_slopes",
     "unidentifiable",
@@ -78,7 +79,7 @@ class Ambiguity:
     noun : str, optional
         "combination" or "ratio".
     reason : str, optional
-        Reason, as a clause that follows a comma.
+        Reason, as a clause that follows a comma; where nothing is determined, the motions for which that holds.
     """
 
     names: tuple[str, ...]
@@ -99,6 +100,10 @@ class Ambiguity:
         """Clause about an ambiguity of the equations: what is determined, why, and what to do."""
         if not self.n_determined:
             have, them = ("it has", "it") if len(self.names) == 1 else ("they have", "them")
+            if self.reason:
+                return (
+                    f"{have} no effect in the equations {self.reason}; compare units and constants of the model with it"
+                )
             return f"{have} no effect in the equations, whatever the motion; remove {them} from the model"
         reason = f", {self.reason}" if self.reason else ""
         n_free = len(self.names) - self.n_determined
@@ -111,6 +116,12 @@ class Ambiguity:
             them = "it" if len(self.names) == 1 else "them"
             return f"the motion does not excite {them}; record a livelier motion, or fix {them}, {self.remedy()}"
         return f"{self.determined()} by this motion; record a livelier motion, or fix one of them, {self.remedy()}"
+
+    def of_noise(self) -> str:
+        """Clause about parameters that the motion excites, but less than forces that are not in the model."""
+        it, terms = ("it", "its term") if len(self.names) == 1 else ("them", "their terms")
+        what = f"the motion excites {it}, but unmodelled forces and noise are larger than {terms}"
+        return f"{what}; correct the model, or fix {it}, {self.remedy()}"
 
     def remedy(self) -> str:
         """Argument and option that fix the first parameter, for example."""
@@ -180,10 +191,20 @@ def structural(
         parts = [x.of(group) for x in spaces]
         found.append(_ambiguity(names[group].tolist(), parts, [p[free][group] for p in vectors]))
     if measured is not None:
-        found = [replace(x, reason=_UNMEASURED) for x in found]
+        found = [replace(x, reason=_UNMEASURED if x.n_determined else "") for x in found]
     elif not model.nonlinear_parameters:
         found = [replace(x, reason=_HOMOGENEOUS) if x.noun == "ratio" else x for x in found]
-    return _joined(found)
+    joined = _joined(found)
+    if any(not x.n_determined and _in_equations(model) & set(x.names) for x in joined):
+        where = "at random motions" if ranges is None else "at any motion in the ranges of the log"
+        joined = tuple(replace(x, reason=x.reason if x.n_determined else where) for x in joined)
+    return joined
+
+
+def _in_equations(model: Model) -> set[str]:
+    """Parameters that are in the equations or in a sensor, whatever their values."""
+    columns = residual_slopes(model).sparsity_out(0).get_triplet()[1]
+    return {list(model.parameters)[k] for k in columns}
 
 
 def check_structure(
@@ -264,15 +285,26 @@ def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, rang
         q[list(four)] /= np.linalg.norm(q[list(four)], axis=0)
     repeated = np.repeat(p[:, None], n, axis=1)
     a = np.array(model.dynamics(np.vstack([q, v]), u, repeated)[1])
+    slope = residual_slopes(model)
+    J = np.array(ca.densify(slope(q, v, a, u, repeated))).reshape(-1, model.n_p)
+    size = np.abs(J).max(axis=1)
+    usable = np.isfinite(size) & (size > 0.0) & (size < 1e100)
+    return np.asarray(J[usable] / size[usable, None])
+
+
+@lru_cache(maxsize=64)
+def residual_slopes(model: Model) -> ca.Function:
+    """Function ``(q, v, a, u, p) -> d(r, y)/dp`` of the equations and the sensors.
+
+    Parameters
+    ----------
+    model : Model
+    """
     symbols = [ca.SX.sym(name, model.residual.size1_in(i)) for i, name in enumerate("qvaup")]
     outputs = model.residual(*symbols)
     if model.measurement is not None:
         outputs = ca.vertcat(outputs, model.measurement(*symbols))
-    slope = ca.Function("slope", symbols, [ca.densify(ca.jacobian(outputs, symbols[4]))])
-    J = np.array(slope(q, v, a, u, repeated)).reshape(outputs.numel(), n, model.n_p).reshape(-1, model.n_p)
-    size = np.abs(J).max(axis=1)
-    usable = np.isfinite(size) & (size > 0.0) & (size < 1e100)
-    return np.asarray(J[usable] / size[usable, None])
+    return ca.Function("slope", symbols, [ca.jacobian(outputs, symbols[4])])
 
 
 def _output_jacobian(
@@ -472,9 +504,15 @@ def null_space(gram: FloatArray, scale: FloatArray, threshold: float) -> NullSpa
     Returns
     -------
     NullSpace
-        All parameters where the sum is not finite.
+
+    Raises
+    ------
+    LinAlgError
+        The sum is not finite, which says nothing of the motion.
     """
-    sizes, vectors = np.linalg.eigh(np.where(np.isfinite(gram).all(), gram, 0.0))
+    if not np.isfinite(gram).all():
+        raise np.linalg.LinAlgError("the information matrix is not finite")
+    sizes, vectors = np.linalg.eigh(gram)
     return NullSpace(vectors[:, sizes <= threshold].T, np.where(scale > 0.0, scale, 1.0))
 
 
@@ -514,8 +552,11 @@ def in_words(ambiguous: Sequence[Ambiguity], n_logs: int) -> str:
     -------
     str
     """
-    logs = " from this log" if n_logs == 1 else " from these logs"
-    return "; ".join(x.sentence(x.of_motion(), logs) for x in ambiguous)
+    return "; ".join(x.sentence(x.of_motion(), _of_logs(n_logs)) for x in ambiguous)
+
+
+def _of_logs(n_logs: int) -> str:
+    return " from this log" if n_logs == 1 else " from these logs"
 
 
 def collinear(
@@ -590,6 +631,7 @@ def unidentifiable(
     uncertain: BoolArray,
     measured: tuple[str, ...] | None = None,
     ranges: Ranges | None = None,
+    excited: BoolArray | None = None,
 ) -> tuple[BoolArray, tuple[str, ...]]:
     """Parameters of an estimate that are not identifiable, by the equations or from the log.
 
@@ -607,6 +649,8 @@ def unidentifiable(
         Signals that are measured; None: all.
     ranges : tuple of (str, float, float), optional
         As `structural`.
+    excited : (n,) bool array, optional
+        Parameters about which the motion informs at the estimate; None: it is not known of any.
 
     Returns
     -------
@@ -620,7 +664,14 @@ def unidentifiable(
     by_equations = np.array([name.partition("[")[0] in ambiguous for name in layout.names])
     from_log = collinear(layout.names, values, covariance, uncertain & ~by_equations)
     sentences = [x.sentence(x.of_equations()) for x in of_model]
-    sentences += [in_words([x], layout.n_logs) for x in from_log]
+    sentences += [in_words([x], layout.n_logs) for x in from_log if x.n_determined]
+    alone = [n for x in from_log if not x.n_determined for n in x.names]
+    seen = dict(zip(layout.names, np.zeros(len(uncertain), bool) if excited is None else excited, strict=True))
+    for is_seen in (False, True):
+        names = tuple(n for n in alone if seen[n] == is_seen)
+        if names:
+            x = Ambiguity(names, 0, ())
+            sentences.append(x.sentence(x.of_noise() if is_seen else x.of_motion(), _of_logs(layout.n_logs)))
     return uncertain | by_equations, tuple(sentences)
 
 

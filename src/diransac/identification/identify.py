@@ -12,13 +12,15 @@ import numpy as np
 from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, distinct_logs, usable_sensors
 from diransac.data.log import Log
-from diransac.errors import DiransacError, SettingsError, TimeLimitError
+from diransac.errors import DiransacError, IdentificationError, SettingsError, TimeLimitError
 from diransac.identification.agreement import disagreements
-from diransac.identification.estimate import Evaluation, LogSummary, Prediction
+from diransac.identification.columns import contradictions, mistakes_of_columns
+from diransac.identification.estimate import Estimate, Evaluation, Finding, LogSummary, Prediction
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
 from diransac.identification.known_parameters import KnownParameters
 from diransac.identification.method import Callback, Method, fit, numerical_failures, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, estimator_named, factory
+from diransac.identification.nonlinear import solved_nonlinear
 from diransac.identification.prediction import predictions
 from diransac.identification.refusal import check_motion
 from diransac.identification.result import Result
@@ -29,6 +31,9 @@ from diransac.simulation import HOLDS
 from diransac.time_limit import check_time, time_limited
 
 __all__ = ["METHODS", "Identification", "checked_hold", "identify", "method_object"]
+
+_DOUBTFUL = 0.25
+"""Part of an acceleration that is unexplained from which on mistakes of columns are sought."""
 
 
 def identify(
@@ -290,7 +295,7 @@ class _Task:
             priors=known.priors_of_fit,
         )
         fitted = 0.5 if self.compares else 0.95
-        estimate = fit(self.method, dataset, self.seed, within(progress, 0.0, fitted))
+        estimate = _explained(dataset, lambda: fit(self.method, dataset, self.seed, within(progress, 0.0, fitted)))
         report(progress, "evaluating", fitted)
         scoring = choose_scoring(dataset, criteria)
         evaluation = evaluate(estimate, dataset, scoring, criteria)
@@ -300,7 +305,7 @@ class _Task:
                 self.method, estimate, dataset, self.seed, within(progress, fitted, 1.0)
             )
         report(progress, "done", 1.0)
-        return Result(
+        result = Result(
             model=known.model,
             method=self.method.name,
             seed=self.seed,
@@ -315,6 +320,7 @@ class _Task:
             fixed=tuple(n for n in known.model.parameters if n in known.fixed),
             priors=dict(known.priors),
         )
+        return _with_tested_columns(result, dataset)
 
     def _observed(self, logs: Sequence[Log]) -> tuple[KnownParameters, tuple[str, ...]]:
         """The known parameters of the model with the sensors that the method can use, and notes on the others."""
@@ -368,6 +374,38 @@ class _Task:
         except DiransacError:
             return dict.fromkeys(result.parameters, np.nan)
         return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}
+
+
+def _explained(dataset: Dataset, fitted: Callable[[], Estimate]) -> Estimate:
+    """The estimate of a method.  Raises IdentificationError: as the method does; a mistake of a column is named."""
+    try:
+        return fitted()
+    except IdentificationError as error:
+        with np.errstate(all="ignore"):
+            mistakes, _ = mistakes_of_columns(dataset, solved_nonlinear)
+        if not mistakes:
+            raise
+        named = "; ".join(f"{x.claim}; {x.action}" for x in mistakes)
+        explains = any(x.explains for x in mistakes)
+        raise IdentificationError(f"{dataset.source}: {named}" if explains else f"{error}. {named}") from error
+
+
+def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
+    """The result with findings on mistakes of columns: contradictions, and what explains a bad answer."""
+    left = (x for one in result.logs if one.prediction for x in one.prediction.unexplained.values())
+    is_bad, n_tested = result.verdict == "do not rely on this", 0
+    is_doubtful = is_bad or max(left, default=0.0) > _DOUBTFUL
+    if is_doubtful:
+        with np.errstate(all="ignore"):  # a correction that overflows explains nothing
+            mistakes, n_tested = mistakes_of_columns(dataset, solved_nonlinear)
+    else:
+        mistakes = contradictions(dataset.model, dataset.given)
+    found = [Finding("bad" if is_bad or (is_doubtful and x.explains) else "care", x.claim, x.action) for x in mistakes]
+    if not found and not n_tested:
+        return result
+    n_others = 0 if found else n_tested
+    estimate = dataclasses.replace(result.estimate, mistakes=tuple(found), n_columns_tested=n_others)
+    return dataclasses.replace(result, estimate=estimate)
 
 
 def _summaries(

@@ -15,6 +15,7 @@ from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, usable_sensors
 from diransac.data.segment import spelling_notes
 from diransac.errors import IdentificationError, LogError
+from diransac.identification.columns import contradictions
 from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.evaluation import choose_scoring
 from diransac.identification.identifiability import Ambiguity, in_words, of_log, structural
@@ -208,7 +209,8 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
     signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names if name not in events}
     fitness = None if model is None else dataclasses.replace(_fitness(log, model), bases=_bases(log, model))
     if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
-        fitness = dataclasses.replace(fitness, caveat=_caveat(signals, model))
+        mistakes = (f"{x.claim}; {x.action}" for x in contradictions(model, [log]))
+        fitness = dataclasses.replace(fitness, caveat="; ".join(filter(None, [*mistakes, _caveat(signals, model)])))
     like = () if model is None else spelling_notes(model, log, (*model.signals, *model.inputs))
     notes = (*log.notes, *like)
     return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, notes, fitness, events)

@@ -11,7 +11,8 @@ import numpy as np
 
 from diransac.errors import IdentificationError
 from diransac.identification.identifiability import structural
-from diransac.identification.refusal import cause_of_refusal, motion_rows
+from diransac.identification.motion_rows import motion_rows
+from diransac.identification.refusal import cause_of_refusal
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -111,7 +112,7 @@ def fit(method: Method, dataset: Dataset, seed: int, callback: Callback | None =
         with np.errstate(all="ignore"):  # what is not finite is refused, or an infinite error
             found = method.fit(dataset, seed, callback)
     except np.linalg.LinAlgError as error:
-        failed = f"linear algebra fails in {method.name} ({error})"
+        failed = f"a matrix of {method.name} is singular or not finite ({error})"
         raise IdentificationError(f"{dataset.source}: {failed}: {_cause_of_failure(dataset)}") from error
     forces = [] if found.diagnosis is None else list(found.diagnosis.unmodelled_accelerations.values())
     if not all(np.isfinite(x).all() for x in (found.values, *forces)):

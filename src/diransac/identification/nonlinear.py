@@ -11,12 +11,16 @@ A Gaussian prior ``p_j = m +- s`` is a further error ``(sigma / s) (p_j - m)`` o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.dataset import Dataset
+from diransac.data.log import Log
+from diransac.errors import DiransacError
 from diransac.identification.estimators import (
     OrdinaryLeastSquares,
     correlations,
@@ -25,14 +29,16 @@ from diransac.identification.estimators import (
     solve_definite,
 )
 from diransac.identification.identifiability import NullSpace, null_space
+from diransac.identification.motion_rows import Solution
 from diransac.identification.uncertainty import rows_without, score_inflation
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from diransac.data.dataset import Dataset
+    from diransac.data.dataset import ParameterLayout
     from diransac.data.segment import Segment
+    from diransac.identification.motion_rows import MotionRows
     from diransac.model import Model, Parameter
     from diransac.simulation.compiler import Map
 
@@ -42,6 +48,8 @@ __all__ = ["NonlinearLeastSquares", "ParameterChart"]
 _START_DECADES = 3.0
 _ROWS_FOR_STARTS = 100
 _ROWS_FOR_WHOLE = 2000
+_SOME_STARTS = 20
+"""Other parameters at which the rank of the Jacobian is compared."""
 # Evaluated together: bounds the memory, whatever the number of sets.
 _ROWS_AT_A_TIME = 300_000
 _CONVERGED = 1e-14
@@ -90,6 +98,32 @@ class NonlinearLeastSquares:
         return BoundNonlinear(self, dataset)
 
 
+def solved_nonlinear(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows]) -> Solution | None:
+    """Nonlinear least squares of rows of motions, as `solved` for affine models; None where no row is finite.
+
+    Parameters
+    ----------
+    model : Model
+    layout : ParameterLayout
+    rows : sequence of MotionRows
+
+    Returns
+    -------
+    Solution or None
+    """
+    names = (model.coordinates, model.velocities, model.accelerations, model.inputs)
+    try:
+        logs = list[Log]()
+        for one in rows:
+            columns = dict(zip(chain.from_iterable(names), np.hstack([one.q, one.v, one.a, one.u]).T, strict=True))
+            logs.append(Log.from_arrays(np.arange(float(len(one.q))), columns, source=f"log {len(logs)}"))
+        bound = NonlinearLeastSquares().bind(Dataset.of(model, logs, pointwise=True))
+    except (DiransacError, np.linalg.LinAlgError):
+        return None
+    nothing = NullSpace(np.zeros((0, len(layout))), np.ones(len(layout)))
+    return Solution(bound.of_all_rows, np.zeros(len(layout)), bound.median_errors(), nothing, has_known_terms=True)
+
+
 class BoundNonlinear:
     """Measured accelerations and sensors of the usable rows, and the compiled model of them."""
 
@@ -118,6 +152,7 @@ class BoundNonlinear:
         everything = np.arange(self.n_rows)[None]
         whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // _ROWS_FOR_WHOLE)]))
         self._starts = np.vstack([whole, self._starts])
+        self.of_all_rows = self._chart.to_parameters(whole)[0]
         errors, J = self._errors(everything, whole)
         errors, J = errors.reshape(self.n_rows, len(self._scale)), J.reshape(self.n_rows, len(self._scale), -1)
         scale = np.sqrt(np.square(J).mean(axis=(0, 1)))
@@ -139,6 +174,21 @@ class BoundNonlinear:
     def null_space(self) -> NullSpace:
         gram = self._blocks.sum(axis=0) + self._counted_priors()
         return null_space(gram, self._column_scale, self._settings.min_eigenvalue)
+
+    def median_errors(self) -> FloatArray:
+        """Median error ``(r,)`` of the fit of all rows, over the size of each signal."""
+        errors, _ = self._errors(np.arange(self.n_rows)[None], self._chart.to_free(self.of_all_rows[None]))
+        return np.median(np.abs(errors.reshape(self.n_rows, -1)), axis=0) + np.finfo(float).tiny
+
+    def is_informed_elsewhere(self) -> bool:
+        """True if the Jacobian of the rows has full rank at other parameters than those of the fit."""
+        rows = np.arange(self.n_rows)[:: max(1, self.n_rows // _ROWS_FOR_STARTS)]
+        some = self._starts[1 :: max(1, len(self._starts) // _SOME_STARTS)]
+        J = self._errors(np.tile(rows, (len(some), 1)), some)[1].reshape(len(some), -1, self._n_p)
+        J = J[np.isfinite(J).all(axis=(1, 2))]
+        J = J / np.maximum(np.sqrt(np.square(J).mean(axis=1, keepdims=True)), np.finfo(float).tiny)
+        gram = np.einsum("bri,brj->bij", J, J)
+        return bool((smallest_eigenvalue(gram) > self._settings.min_eigenvalue).any()) if len(J) else False
 
     def correlations(self) -> FloatArray:
         return correlations(self._blocks.sum(axis=0) + self._counted_priors())

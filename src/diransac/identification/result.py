@@ -26,7 +26,7 @@ from diransac.identification.estimate import (
     LogSummary,
     Resolution,
 )
-from diransac.identification.findings import Verdict, findings_of, verdict_of
+from diransac.identification.findings import Verdict, findings_of, next_line, shown_lines, verdict_of
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
 from diransac.identification.structure import StructuralUncertainty, check_terms, largest, mixture_intervals
@@ -41,9 +41,11 @@ if TYPE_CHECKING:
     from diransac.export import PortableModel
     from diransac.identification.structure import PossibleTerm
 
-__all__ = ["MARKS", "Result"]
+__all__ = ["Result"]
 
-_FORMAT = 9
+_FORMAT = 10
+_SINCE: Mapping[int, Mapping[str, object]] = {9: {"mistakes": (), "n_columns_tested": 0}}
+"""Formats that are read besides, with the values of what they lack."""
 _LATEST = 1e9
 """Bound of delays and lags, s, and of the drift of gains."""
 _BY_LOG = ("parameters", "covariance")
@@ -52,8 +54,6 @@ _ROUNDING = 1e-3
 """Errors of correlations, by far: those of collinear parameters come from matrices that are nearly singular."""
 _N_EXPORTED = 1000
 """Draws of the parameters in a YAML file."""
-MARKS = {"bad": "!", "care": "·"}
-"""Marks of the findings that are printed."""
 
 
 def _check_resolution(resolution: Resolution, n_u: int) -> None:
@@ -639,14 +639,15 @@ class Result:
         found = data.get("format") if isinstance(data, Mapping) else None
         if type(found) is not int:
             raise ResultError("this is no result of diransac; give a file that identify wrote")
-        if found != _FORMAT:
+        if found != _FORMAT and found not in _SINCE:
             writer = "an earlier version" if found < _FORMAT else "a later version"
             raise ResultError(
-                f"the result has format {found}, of {writer} of diransac; this one reads {_FORMAT}. Identify again"
+                f"the result has format {found}, of {writer} of diransac; this one reads {min(_SINCE)} to {_FORMAT}. "
+                "Identify again"
             )
         assert isinstance(data, Mapping)
         try:
-            return cls._from_checked(data)
+            return cls._from_checked({**_SINCE.get(found, {}), **data})
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
             reason = str(error).partition("\n")[0]
             raise ResultError(
@@ -742,12 +743,12 @@ class Result:
 
         header, *rows = ([escape(cell) for cell in row] for row in self._cells())
         table = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-        against = [x for x in self.findings if x.level in MARKS]
-        findings = "".join(f"<li>{escape(f'{MARKS[x.level]} {x}')}</li>" for x in against)
+        findings = "".join(f"<li>{escape(x)}</li>" for x in shown_lines(self.findings))
         return (
             f"<p>{escape(self._headline())}: <strong>{self.verdict}</strong></p>"
             f"<table><tr>{''.join(f'<th>{cell}</th>' for cell in header)}</tr>{table}</table>"
             + (f"<ul>{findings}</ul>" if findings else "")
+            + f"<p>{escape(next_line(self.findings))}</p>"
         )
 
     def __str__(self) -> str:
@@ -821,8 +822,7 @@ class Result:
 
     def _assessed(self) -> list[str]:
         """The verdict, the findings against the result, sensitivities and notes."""
-        lines = [f"verdict: {self.verdict}"]
-        lines += [f"{MARKS[finding.level]} {finding}" for finding in self.findings if finding.level in MARKS]
+        lines = [f"verdict: {self.verdict}", *shown_lines(self.findings)]
         for name, (half, double) in (self.bandwidth_sensitivity or {}).items():
             lines.append(
                 f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice"
@@ -831,4 +831,4 @@ class Result:
             lines.append(f"  {self.competition.sentence()}")
         remarks = [log.remark for log in self.logs]
         lines += [f"  {note}" for note in self.notes if note not in remarks]
-        return lines + [f"? {suggestion.change}" for suggestion in self.suggestions]
+        return [*lines, *(f"? {suggestion.change}" for suggestion in self.suggestions), next_line(self.findings)]

@@ -74,6 +74,8 @@ class PossibleTerm:
         Change of each parameter per unit of the coefficient.
     shifts : mapping of str to float
         Parameters if the model lacks the term, less those of the estimate.
+    name : str, optional
+        Name in an engineer's words, such as ``dry friction of x``.
     """
 
     kind: str
@@ -83,8 +85,11 @@ class PossibleTerm:
     variance: Number
     effects: Values
     shifts: Values
+    name: str = ""
 
     def __str__(self) -> str:
+        if self.name:
+            return f"{self.name} ({self.formula})" if self.formula and self.kind != INPUT_GAIN else self.name
         formula = f", {self.formula}" if self.formula and self.kind != INPUT_GAIN else ""
         return f"{self.kind} {'of' if self.kind in INPUT_CHANGES else 'on'} {self.place}{formula}"
 

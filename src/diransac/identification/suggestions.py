@@ -42,6 +42,8 @@ class Suggestion:
         Python code, with CasADi as ``ca``: a summand of the residual with its sign, or what replaces the input.
     term : mapping of str to object
         The term without its coefficient, ``(q, v, a, u, p) -> h (n_v)``, as data.
+    name : str, optional
+        Name in an engineer's words, such as ``dry friction of x``.
     """
 
     kind: str
@@ -54,6 +56,7 @@ class Suggestion:
     explained: Number
     code: str
     term: Mapping[str, Any]
+    name: str = ""
 
     @property
     def declaration(self) -> str:

@@ -475,11 +475,10 @@ def _suggestion(candidates: CandidateTerms, term: CandidateTerm, found: Selected
     if term.is_input_gain:
         text = f"Gain of {term.place}: an error of {value} ± {error} {share}"
     else:
-        effect = term.kind[0].upper() + term.kind[1:]
         formula = f" {term.formula}" if term.formula else ""
-        text = f"{effect} {'of' if term.is_of_input else 'on'} {term.place}: {value} ± {error}{unit}{formula} {share}"
+        text = f"{term.name[0].upper()}{term.name[1:]}: {value} ± {error}{unit}{formula} {share}"
     h = ca.Function("term", list(candidates.symbols), [ca.densify(term.residuals)], list("qvaup"), ["h"])
     return Suggestion(
         term.kind, term.place, text, term.parameter, found.value, found.standard_error, term.unit, found.explained,
-        term.code, expressions.stored(f"term {term.parameter}", h),
+        term.code, expressions.stored(f"term {term.parameter}", h), term.name,
     )  # fmt: skip

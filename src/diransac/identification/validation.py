@@ -12,11 +12,11 @@ from diransac.data.dataset import Dataset, as_logs
 from diransac.data.log import Log
 from diransac.errors import SettingsError
 from diransac.identification.estimate import Finding, Level
-from diransac.identification.findings import Verdict, by_seriousness, verdict_of
+from diransac.identification.findings import Verdict, by_seriousness, next_line, shown_lines, verdict_of
 from diransac.identification.horizons import HorizonScores, OpenLoop, StartRule, pooled_scores
 from diransac.identification.innovations import Innovations, innovations
 from diransac.identification.open_loop import resolution_of
-from diransac.identification.result import MARKS, Result
+from diransac.identification.result import Result
 from diransac.model.plant import ModelWithParameters, as_plant
 from diransac.text_table import aligned, listed, number, percent
 
@@ -32,6 +32,8 @@ _TELLING = 0.1
 _BEYOND, _SEEN = 3.0, 0.2
 """Least error of a bad prediction, over its sensitivity; effect of uncertain starts up to which an error is seen."""
 _VISIBLE = 0.01
+_USE = "use the model: diransac export RESULT.json -o dynamics.c"
+_CORRECT = "identify from this log, too, with --with-suggestions for terms that the model lacks"
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ class Validation:
         return {
             "log": self.source,
             "verdict": self.verdict,
-            "findings": [{"level": x.level, "text": str(x)} for x in self.findings],
+            "findings": [x.to_dict() for x in self.findings],
             **top,
             "units": dict(self.units),
             "horizons": rows,
@@ -126,10 +128,11 @@ class Validation:
         forces = [["force of the inputs", "relative error %"]]
         forces += [[n, f"{x:.1f}"] for n, x in self.force_error_percent.items()]
         parts = [
-            [f"{self.verdict}: {self.source}", *(f"{MARKS.get(x.level, ' ')} {x}" for x in self.findings)],
+            [f"{self.verdict}: {self.source}", *shown_lines(self.findings, good=True)],
             *([*_head(scores), *aligned(self._rows(scores))] for scores in self.horizons),
             aligned(forces) if self.force_error_percent else [],
             *(_innovation_lines(one) for one in self.innovations),
+            [next_line(self.findings, _USE)],
         ]
         return "\n\n".join("\n".join(lines) for lines in parts if lines)
 
@@ -156,15 +159,16 @@ def _prediction(found: Validation) -> Iterator[Finding]:
     unseen = worst <= _GOOD and max(scores.of_starts.values(), default=0.0) > _SEEN
     over = "the whole log" if np.isinf(scores.horizon) else scores.name
     if scores.diverged:
-        yield Finding("bad", f"The simulation diverges ({scores.name}): check signs, units and terms of the model.")
+        yield Finding("bad", f"The simulation diverges ({scores.name})", "validate over a shorter --horizon")
     elif not scores.relative_error:
-        yield Finding("care", "No state moves ten times as far as its noise: this log tells little of the model.")
+        claim = "No state moves ten times as far as its noise, so that this log tells little of the model"
+        yield Finding("care", claim, "give a log with more motion")
     elif found.unsmoothed:
         where = f"a log, or its stretches between gaps, are too short ({listed(found.unsmoothed)})"
-        yield Finding("care", f"Noise and starts are unknown where {where}: give longer ones.")
+        yield Finding("care", f"Noise and starts are unknown where {where}", "give longer ones")
     elif unseen or _FAR < worst <= _BEYOND * effect:
-        advice = "a shorter horizon, less noise or more motion tells more"
-        yield Finding("care", f"Prediction over {over} tells little of the model: {_cause(effect)}; {advice}.")
+        claim = f"Prediction over {over} tells little of the model, since {_cause(effect)}"
+        yield Finding("care", claim, "give a shorter --horizon, or a log with less noise or more motion")
     else:
         yield from _worst_state(states, over)
         yield from _worst_sensor({n: x for n, x in scores.relative_error.items() if n in found.sensors}, over)
@@ -182,8 +186,7 @@ def _worst_state(errors: Mapping[str, float], over: str) -> Iterator[Finding]:
     level: Level = "good" if x <= _GOOD else "care" if x <= _FAR else "bad"
     text = f"Over {over} the prediction of {name} is off by {percent(x)} of its motion, in excess of the noise"
     others = "; the other states are closer" if len(errors) > 1 else ""
-    advice = ": check the parameters and the terms of the model" if level == "bad" else ""
-    yield Finding(level, f"{text}{others}{advice}.")
+    yield Finding(level, f"{text}{others}.") if level == "good" else Finding(level, f"{text}{others}", _CORRECT)
 
 
 def _worst_sensor(errors: Mapping[str, float], over: str) -> Iterator[Finding]:
@@ -191,7 +194,7 @@ def _worst_sensor(errors: Mapping[str, float], over: str) -> Iterator[Finding]:
     name = max(errors, key=lambda n: errors[n], default="")
     if name and errors[name] > _GOOD:
         text = f"Over {over} the predicted reading of {name} is off by {percent(errors[name])} of its motion"
-        yield Finding("care", f"{text}, in excess of the noise: check the parameters of this sensor.")
+        yield Finding("care", f"{text}, in excess of the noise", "check the parameters of this sensor")
 
 
 def _remarks(found: Validation) -> Iterator[Finding]:

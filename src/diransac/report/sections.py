@@ -9,7 +9,7 @@ import numpy as np
 
 from diransac.data.log import Log
 from diransac.identification.estimate import Finding, Level
-from diransac.identification.findings import Verdict, bounds_text, by_seriousness, verdict_of
+from diransac.identification.findings import Verdict, bounds_text, next_line, shown, verdict_of
 from diransac.identification.horizons import HorizonScores
 from diransac.identification.innovations import Innovations
 from diransac.identification.validation import Validation
@@ -80,12 +80,14 @@ def _size(logs: Sequence[Log]) -> str:
 
 @dataclass(frozen=True)
 class Card:
-    """The verdict on one result and the findings behind it, by the log that they are about."""
+    """The verdict on one result, the findings behind it, by the log that they are about, and what to do next."""
 
     label: str
     level: Level
     verdict: Verdict
     groups: tuple[tuple[str, tuple[Finding, ...]], ...]
+    n_more: int
+    next: str
 
 
 def card(entry: Entry) -> Card:
@@ -93,15 +95,18 @@ def card(entry: Entry) -> Card:
     held_out = [run for run in entry.runs if run.held_out]
     groups = [(f"Held out, {_name(run)}", _findings_on(run)) for run in held_out]
     groups.append((f"Identification from {_sources([entry])}" if held_out else "", entry.result.findings))
-    verdict = verdict_of(finding for _, found in groups for finding in found)
-    return Card(entry.label, _LEVELS[verdict], verdict, tuple(groups))
+    every = [finding for _, found in groups for finding in found]
+    verdict, (kept, n_more) = verdict_of(every), shown(every, good=True)
+    few = [(about, tuple(x for x in kept if any(x is y for y in found))) for about, found in groups]
+    few = [(about, found) for about, found in few if found]
+    return Card(entry.label, _LEVELS[verdict], verdict, tuple(few), n_more, next_line(every))
 
 
 def _findings_on(run: Run) -> tuple[Finding, ...]:
     """Findings of the validation of a held-out log."""
     if isinstance(run.validation, str):
         return (Finding("care", f"Not scored: {run.validation}"),)
-    return by_seriousness(run.validation.findings)
+    return run.validation.findings
 
 
 def _name(run: Run) -> str:
@@ -330,7 +335,7 @@ def suggestions(entries: Sequence[Entry]) -> list[Table]:
     for entry in entries:
         rows = [
             (
-                f"{x.kind}, {x.equation}",
+                x.name or f"{x.kind}, {x.equation}",
                 f"{number(x.value)} ± {number(x.standard_error, 2)}",
                 x.unit,
                 percent(x.explained),

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.data.checks import other_spelling
+from diransac.data.checks import other_spelling, rows_per_sample
 from diransac.data.filters import REACH, FilterSpecification, convolve, half_length, kernels
 from diransac.data.preprocessing.continuity import continuous, unit_quaternions, whole_quaternions
 from diransac.data.preprocessing.steps import in_units
@@ -93,6 +93,7 @@ def differentiate(log: Log, model: Model, bandwidth: float | None = None) -> Log
     derived = {**{name: (name, 0) for name in names}, **sources}
     blank = {name: _near_long_gaps(log[name], _LONGEST_BRIDGE / (bandwidth * log.dt), L) for name in names}
     signals = _on_spheres({**log.signals, **_derived(bridged, derived, blank, kernels(wide, log.dt))}, model)
+    _check_slow(log, model, signals, bandwidth)
     specification = FilterSpecification(bandwidth, wide, {name: source for name, (source, _) in sources.items()})
     filtered = log.with_step(
         _step(specification, chosen, names, L),
@@ -102,6 +103,18 @@ def differentiate(log: Log, model: Model, bandwidth: float | None = None) -> Log
         notes=_notes(bandwidth, chosen, sources, L * log.dt),
     )
     return replace(filtered, filter=specification)
+
+
+def _check_slow(log: Log, model: Model, signals: Mapping[str, FloatArray], bandwidth: float) -> None:
+    """Raise LogError: samples of a signal are so far apart that the filter bridges none of its gaps."""
+    for name in model.required_signals:
+        if name in log and np.isnan(signals[name]).all():
+            every = rows_per_sample(np.isfinite(log[name]))
+            raise LogError(
+                f'{log.source}: "{name}" has a sample every {every} rows, too slow for a filter of {bandwidth:.3g} Hz; '
+                f"give --bandwidth below {_LONGEST_BRIDGE / (every * log.dt):.2g} Hz, or use lo-diransac, which needs "
+                "no filter"
+            )
 
 
 def _derived(

@@ -19,8 +19,9 @@ from diransac.identification.estimators import (
 )
 from diransac.identification.identifiability import check_structure, in_words, of_log, vague_parameters
 from diransac.identification.method import report
-from diransac.identification.nonlinear import NonlinearLeastSquares
-from diransac.identification.refusal import cause_of_refusal, check_known_terms, motion_rows
+from diransac.identification.motion_rows import motion_rows
+from diransac.identification.nonlinear import BoundNonlinear, NonlinearLeastSquares
+from diransac.identification.refusal import cause_of_refusal, check_known_terms
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
 from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance
 from diransac.time_limit import time_unlimited
@@ -154,10 +155,19 @@ def _checked(estimator: Estimator, dataset: Dataset) -> BoundEstimator:
     bound = estimator.bind(dataset)
     if bound.select([np.arange(bound.n_rows)]).well_defined()[0]:
         return bound
-    if isinstance(estimator, NonlinearLeastSquares) and not dataset.model.nonlinear_parameters:
+    if isinstance(estimator, NonlinearLeastSquares):
         # A fit within bounds that exclude the solution runs to a bound, where its Jacobian may be singular.
-        cause = cause_of_refusal(dataset.model, dataset.layout, motion_rows(dataset))
-        raise IdentificationError(f"{dataset.source}: {cause}")
+        if not dataset.model.nonlinear_parameters:
+            cause = cause_of_refusal(dataset.model, dataset.layout, motion_rows(dataset))
+            raise IdentificationError(f"{dataset.source}: {cause}")
+        assert isinstance(bound, BoundNonlinear)
+        if bound.is_informed_elsewhere():
+            ends = ", ".join(f"{n} = {x:.3g}" for n, x in zip(dataset.layout.names, bound.of_all_rows, strict=True))
+            raise IdentificationError(
+                f"{dataset.source}: the fit ends at {ends}, where the information matrix is singular, as it is not "
+                "elsewhere: the motion excites the parameters, but the model does not follow it; compare its "
+                "constants and units with the machine, or give narrower bounds"
+            )
     found = of_log(dataset.layout.names, bound.null_space())
     raise IdentificationError(f"{dataset.source}: {in_words(found, len(dataset.segments))}")
 

@@ -22,8 +22,9 @@ from diransac.identification.evaluation import choose_scoring
 from diransac.identification.method import report
 from diransac.identification.methods.least_squares import bound_to, fitted
 from diransac.identification.methods.samples import Evaluator, Hypothesis, Samples, Score, fingerprint
+from diransac.identification.motion_rows import motion_rows
 from diransac.identification.nonlinear import NonlinearLeastSquares
-from diransac.identification.refusal import cause_of_refusal, motion_rows
+from diransac.identification.refusal import cause_of_refusal
 from diransac.identification.sampling import sample_rows
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
 from diransac.time_limit import check_time

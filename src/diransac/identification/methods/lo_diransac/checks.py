@@ -53,24 +53,35 @@ def _of_recordings(intervals: ShootingIntervals) -> Iterator[Finding]:
         names = f"{', '.join(late[:-1])} and {late[-1]} are" if len(late) > 1 else f"{late[0]} is"
         time, sense = duration(abs(delay) * intervals.dt), "late" if delay > 0.0 else "early"
         text = f"{names} recorded {time} {sense} with respect to the other signals"
-        yield Finding("care", f"{text}, a sensor delay that the estimate includes.")
+        yield Finding(
+            "care", f"{text}, a sensor delay that the estimate includes", _shifted(late, delay * intervals.dt)
+        )
     for name, bias in zip(signals, errors.bias, strict=True):
         if bias:
             size, unit = number(bias, 3), intervals.model.units[name]
-            yield Finding("care", f"{name} has a sensor bias of {size} {unit}, which the estimate includes.")
+            claim = f"{name} has a sensor bias of {size} {unit}, which the estimate includes"
+            yield Finding("care", claim, "correct it where other programs read the sensor")
     own = {x.what: x != intervals.all_inputs(x.what) for x in errors.kinds if x.of_inputs and x.what != "drift"}
     delays, lags = errors.input_delay * own.get("delay", False), errors.input_lag * own.get("lag", False)
     for name, delay, lag, drift in zip(intervals.model.inputs, delays, lags, errors.gain_drift, strict=True):
         if abs(delay) > LEAST_DELAY:
             time, sense = duration(abs(delay) * intervals.dt), "later" if delay > 0.0 else "earlier"
-            yield Finding("care", f"{name} acts {time} {sense} than recorded, a delay that the estimate includes.")
+            claim = f"{name} acts {time} {sense} than recorded, a delay that the estimate includes"
+            yield Finding("care", claim, "give other simulations this delay, too")
         if lag > LEAST_DELAY:
             time = duration(lag * intervals.dt)
-            yield Finding("care", f"{name} acts after a first-order lag of {time}, which the estimate includes.")
+            claim = f"{name} acts after a first-order lag of {time}, which the estimate includes"
+            yield Finding("care", claim, "give other simulations this lag, too")
         if drift:
             moves = f"{'rises' if drift > 0.0 else 'falls'} by {percent(abs(drift))} during the log"
-            holds = "the estimate includes this drift, and its parameters are those of the beginning"
-            yield Finding("care", f"The gain of {name} {moves}, as with a battery that sags: {holds}.")
+            holds = "which the estimate includes, with the parameters of the beginning"
+            claim = f"The gain of {name} {moves}, as with a battery that sags, {holds}"
+            yield Finding("care", claim, "record the supply, or what the actuator gives, as the input")
+
+
+def _shifted(names: Sequence[str], delay: float) -> str:
+    """The option that corrects a delay of signals."""
+    return f"correct it where other programs read the log: --shift {','.join(f'{n}={-delay:.4g}' for n in names)}"
 
 
 def _of_parts(names: Sequence[str], parts: Parts) -> Iterator[Finding]:
@@ -78,13 +89,18 @@ def _of_parts(names: Sequence[str], parts: Parts) -> Iterator[Finding]:
     for change in parts.changes:
         first, second = number(change.first, 3), number(change.second, 3)
         text = f"{names[change.index]} changes during the log, from {first} in its first half to {second} in its second"
-        advice = "a payload, a drifting gain or another regime; identify stretches of the log one by one"
+        text = f"{text}, as by a payload, a drifting gain or another regime"
         is_serious = change.is_large and parts.fail_elsewhere
-        yield Finding("bad" if is_serious else "care", f"{text}: {advice}.")
+        advice = "identify stretches of the log one by one, with --from and --until"
+        yield Finding("bad" if is_serious else "care", text, advice)
     if parts.fail_elsewhere:
         more = percent(np.sqrt(parts.held_out) - 1.0)
         text = f"Fifths of the log that are held out have {more} more unmodelled force (RMS) than in the fit of all"
-        yield Finding("care" if parts.changes else "note", f"{text}: what is estimated from one part fails in another.")
+        claim = f"{text}, so that what is estimated from one part fails in another"
+        if parts.changes:
+            yield Finding("care", claim, "identify stretches of the log one by one, with --from and --until")
+        else:
+            yield Finding("note", f"{claim}.")
     found = parts.deviation
     if found is not None:
         where = f"most between {percent(found.begin)} and {percent(found.end)} of its duration"
@@ -92,4 +108,5 @@ def _of_parts(names: Sequence[str], parts: Parts) -> Iterator[Finding]:
             f"Parts of the log disagree on the parameters {number(found.scatter, 2)} times as much as by noise, {where}"
         )
         effect = f"without that part {names[found.index]} changes by {percent(found.change)}"
-        yield Finding("care", f"{text}: {effect}. Intervals are too narrow, or the model lacks an effect.")
+        claim = f"{text}, so that {effect}; intervals are too narrow, or the model lacks an effect"
+        yield Finding("care", claim, "look at that part, or leave it out with --leave-out")

@@ -137,7 +137,7 @@ def compete(
         if isinstance(refused, IdentificationError):
             raise refused
         failed = f"the joint fit fails numerically ({refused}), and no other estimate predicts the log"
-        raise IdentificationError(f"{dataset.source}: {failed}; check the model's constants, signs and units")
+        raise IdentificationError(f"{dataset.source}: {failed}; compare the model's constants with the machine")
     return found or first  # type: ignore[return-value]  # one of them is there
 
 

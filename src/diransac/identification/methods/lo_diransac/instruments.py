@@ -249,7 +249,12 @@ def _findings(tests: Sequence[HausmanTest], names: Sequence[str], replaced: Bool
             text = (
                 f"Unmodelled forces are correlated with the motion: {values}, {number(one.distance, 2)} standard errors"
             )
-            yield Finding("care" if one.outcome == "rejected" else "note", f"{text} apart; {use}.")
+            if one.outcome == "rejected":
+                yield Finding(
+                    "care", f"{text} apart; {use}", "record the motion again without the feedback, if you can"
+                )
+            else:
+                yield Finding("note", f"{text} apart; {use}.")
     passed = [x.parameter for x in tests if x.outcome == "passed"]
     if passed:
         yield Finding("note", f"Hausman's test {by} finds no bias of least squares by feedback in {listed(passed)}.")

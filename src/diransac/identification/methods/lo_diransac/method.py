@@ -39,6 +39,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     unmeasured_by_name,
     unmeasured_states,
 )
+from diransac.identification.motion_rows import excited
 from diransac.identification.refusal import check_signs
 from diransac.process import memory_kept, single_threaded
 
@@ -213,7 +214,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         result = instrumented.result
     predicts = best.decided is None or best.decided.summary.predicts
     if best.impossible or not predicts or dataset.layout.on_bounds(result.parameters).any():
-        check_signs(dataset.model, dataset.layout, rows_of_logs(intervals, motion), dataset.source)
+        check_signs(dataset, rows_of_logs(intervals, motion))
     parts, lacks = compared_parts(likeliest, result), None
     if settings.suggestions and not likeliest.exact:
         from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
@@ -257,10 +258,11 @@ def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:
 def _checks(settings: LoDiransacSettings, found: Searched) -> Iterator[Finding]:
     """Findings on the fit itself."""
     if found.explains_nothing:
-        advice = "check its terms, and the signs and units of the log"
-        yield Finding("bad", f"The model explains almost nothing of this log: {advice}.")
+        advice = "compare its terms and constants with the machine"
+        yield Finding("bad", "The model explains almost nothing of this log", advice)
     if not found.likeliest.refinement.converged and settings.max_steps:
-        yield Finding("care", f"Local optimisation did not converge within its limit of {settings.max_steps} steps.")
+        claim = f"Local optimisation did not converge within its limit of {settings.max_steps} steps"
+        yield Finding("care", claim, f"give it more: --set max_steps={2 * settings.max_steps}")
 
 
 def _checks_of_bounds(found: Searched) -> Iterator[Finding]:
@@ -270,8 +272,8 @@ def _checks_of_bounds(found: Searched) -> Iterator[Finding]:
         yield Finding(
             "bad",
             f"Least squares of the whole motion leaves the bounds of {names}, which is physically impossible; the "
-            "parameters are those of the most probable motion: a term is missing, an input acts late, or a sign or a "
-            "unit is wrong.",
+            "parameters are those of the most probable motion",
+            "compare the terms and constants of the model with the machine",
         )
 
 
@@ -281,8 +283,9 @@ def _checks_of_unmeasured(found: Searched) -> Iterator[Finding]:
         names, share = unmeasured_by_name(found.likeliest.intervals), 100.0 * found.unexplained
         yield Finding(
             "bad",
-            f"Nothing measures {names}, and the model leaves {share:.2g} % of an acceleration unexplained: the log "
-            f"does not tell one from the other. Measure {names}.",
+            f"Nothing measures {names}, and the model leaves {share:.2g} % of an acceleration unexplained, and the log "
+            "does not tell them apart",
+            f"measure {names}",
         )
 
 
@@ -326,8 +329,11 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
     units = parameter_units(intervals, best.motion, result.parameters)
     lost = ~((spans < units) | (spans < np.abs(result.parameters)))
     measured = measured_signals(intervals) if unmeasured_states(intervals) else None
+    informed = None
+    if lost.any():
+        informed = excited(dataset.model, dataset.layout, rows_of_logs(intervals, best.motion), result.parameters)
     lost, combinations = unidentifiable(
-        dataset.model, dataset.layout, result.parameters, result.covariance, lost, measured, dataset.ranges
+        dataset.model, dataset.layout, result.parameters, result.covariance, lost, measured, dataset.ranges, informed
     )
     covariance = result.covariance + found.ambiguity
     covariance[lost] = covariance[:, lost] = np.inf

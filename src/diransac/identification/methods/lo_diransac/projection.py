@@ -718,7 +718,7 @@ def least_squares_gains(W: FloatArray, weights: FloatArray) -> FloatArray:
     (n, N, r) array
     """
     weights = np.broadcast_to(weights, W.shape[:2])
-    rows = (W * weights[:, :, None]).reshape(-1, W.shape[2])
+    rows = (W * weights[:, :, None]).reshape(W.shape[0] * W.shape[1], W.shape[2])
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0.0] = 1.0
     rows = rows / scale

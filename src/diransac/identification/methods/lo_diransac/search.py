@@ -30,7 +30,8 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     with_observed_states,
     with_unmeasured_states,
 )
-from diransac.identification.refusal import MotionRows, cause_of_refusal
+from diransac.identification.motion_rows import MotionRows
+from diransac.identification.refusal import cause_of_refusal
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -215,7 +216,7 @@ def searched(
     if not able:
         raise IdentificationError(
             f"{dataset.source}: simulations of {intervals.length} rows from smoothed states diverge, with each of "
-            f"{len(hypotheses)} samples of the parameters; check the model's constants, signs and units, or bound them"
+            f"{len(hypotheses)} samples of the parameters; compare the model with the machine, or bound them"
         )
     search = LocalSearch(settings, motion, np.array(able), prior, callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)

@@ -131,6 +131,7 @@ def possible_terms(
             float(variances[k]),
             dict(zip(names, tests.effects[:, k].tolist(), strict=True)),
             dict(zip(names, shifts[:, k].tolist(), strict=True)),
+            term.name,
         )
         for k in kept[np.argsort(-weights[kept], kind="stable")]
     )

@@ -1,0 +1,72 @@
+"""Reasons of refusals and bad answers: mistakes of columns are named, and none where there is none."""
+
+import numpy as np
+import pytest
+import reasons
+from regime_flights import REGIMES, recordings
+
+import diransac as dr
+from diransac.data.dataset import Dataset
+from diransac.identification.columns import contradictions, mistakes_of_columns
+from diransac.identification.nonlinear import solved_nonlinear
+
+SEED = 2000
+"""Of no figure that is reported."""
+EXACT = {one.machine.name: one for one in REGIMES.values() if one.exact and one.signals is None and one.noise == 1.0}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "pendulum q deg, ols",
+        "pendulum torque reversed, ols",
+        "lift pressure bar",
+        "underwater time ms",
+        "rotor theta_dot deg/s",
+        "rotor moment missing",
+        "vehicle of two masses, ols",
+        "underwater x_dot every 40th row, ols",
+        "reactor, degC for K, nls",
+        "pendulum at rest",
+    ],
+)
+def test_the_true_cause_is_named(name):
+    found = reasons.told(reasons.CASES[name], SEED)
+    assert found.truth == "true", found.shown
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_columns_without_a_mistake_are_not_accused(name):
+    (one,) = recordings(EXACT[name], [SEED])
+    dataset = Dataset.of(EXACT[name].machine.model, one.log, pointwise=False)
+    assert contradictions(dataset.model, dataset.given) == []
+    with np.errstate(all="ignore"):
+        assert mistakes_of_columns(dataset, solved_nonlinear)[0] == []
+
+
+def test_a_mass_that_changes_is_no_wrong_unit():
+    (one,) = recordings(REGIMES["rotor payload -30 %"], [3000])
+    dataset = Dataset.of(REGIMES["rotor payload -30 %"].machine.model, one.log, pointwise=False)
+    assert mistakes_of_columns(dataset, solved_nonlinear)[0] == []
+
+
+@pytest.mark.parametrize("low", ["x", "x_dot"])
+@pytest.mark.parametrize("outliers", [0.0, 0.2])
+def test_a_unit_is_that_of_the_column_by_the_ratio_of_both(low, outliers):
+    """Degrees of an angle and of its rate change the ratio in opposite directions, and outliers do not matter."""
+    model = dr.Model("m", {"x": "rad"}, {"u": "N m"}, {"J": dr.Parameter("1")}, lambda q, v, a, u, p: [p.J * a.x - u.u])
+    rng, t = np.random.default_rng(SEED), 0.01 * np.arange(1000)
+    columns = {"x": np.sin(2.0 * t), "x_dot": 2.0 * np.cos(2.0 * t), "u": np.sin(t)}
+    columns = {n: np.where(rng.random(1000) < outliers, rng.uniform(-50.0, 50.0, 1000), x) for n, x in columns.items()}
+    columns[low] = np.degrees(columns[low])
+    (found,) = contradictions(model, [dr.Log.from_arrays(t, columns)])
+    assert found.factors == pytest.approx({low: np.pi / 180.0})
+    assert found.action == f"identify again with --scale {low}=0.0174533"
+
+
+def test_a_known_unit_is_no_mistake():
+    """A header says deg: the log is converted, and nothing contradicts."""
+    model = dr.Model("m", {"x": "rad"}, {"u": "N m"}, {"J": dr.Parameter("1")}, lambda q, v, a, u, p: [p.J * a.x - u.u])
+    t = 0.01 * np.arange(1000)
+    columns = {"x": np.degrees(np.sin(2.0 * t)), "x_dot": 2.0 * np.cos(2.0 * t), "u": np.sin(t)}
+    assert contradictions(model, [dr.Log.from_arrays(t, columns, units={"x": "deg"})]) == []
