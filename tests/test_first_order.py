@@ -560,3 +560,30 @@ def test_motor_lag_and_hover_thrust_of_a_crazyflie_follow_from_its_accelerometer
     seen = w.mean(axis=0)[flying & (np.abs(log["acc"] / 9.81 - 1.0) < 0.02)].mean()
     assert hover == pytest.approx(seen, rel=0.02)
     assert 0.05 < found["lag"] < 0.1
+
+
+@pytest.mark.parametrize("lost", [slice(0, 0), slice(200, 260)])
+def test_a_rotor_whose_sense_of_rotation_nothing_measures_is_identified_from_its_height(lost):
+    """The log begins far from the command, and in a gap nothing says which way the rotor turns."""
+    gain, lag, n, dt = 1e-5, 0.1, 400, 0.01
+    model = Model(
+        "rotor",
+        {"z": "m"},
+        {"command": "rad/s"},
+        {"gain": Parameter("m", positive=True), "lag": Parameter("s", positive=True)},
+        lambda q, v, a, u, p: [a.z - p.gain * v.speed**2 + 9.81, p.lag * a.speed + v.speed - u.command],
+        first_order={"speed": "rad/s"},
+    )
+    command, states = 1000.0 + 150.0 * np.sign(np.sin(0.09 * np.arange(n)) + 0.4), [np.array([0.0, 0.0, 900.0])]
+    for u in command[:-1]:
+        rates = lambda x, _t, u=u: [x[1], gain * x[2] ** 2 - 9.81, (u - x[2]) / lag]  # noqa: E731
+        states.append(odeint(rates, states[-1], [0.0, dt], rtol=1e-10, atol=1e-10)[-1])
+    rng = np.random.default_rng(1)
+    measured = np.array(states)[:, :2] + 1e-3 * rng.normal(size=(n, 2))
+    measured[rng.random(n) < 0.05, 0] += 5.0
+    measured[lost] = np.nan
+    columns = {"z": measured[:, 0], "z_dot": measured[:, 1], "command": command}
+    result = dr.identify(model, dr.Log.from_arrays(dt * np.arange(n), columns))
+    assert result.parameters["gain"] == pytest.approx(gain, rel=0.01)
+    assert result.parameters["lag"] == pytest.approx(lag, rel=0.05)
+    assert result.diagnosis.smoothed_states["speed"][0] == pytest.approx(900.0, rel=0.05)
