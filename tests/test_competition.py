@@ -171,8 +171,8 @@ def test_an_interval_that_diverges_does_not_lose_the_fit() -> None:
 
 
 def test_a_wrong_unit_is_no_failure_of_linear_algebra() -> None:
-    with pytest.raises(dr.IdentificationError, match=r"diverge.*units"):
-        dr.identify(explosive(), settling(slice(400, 425), 1e3), differentiate=True)
+    found = dr.identify(explosive(), settling(slice(400, 425), 1e3), differentiate=True)
+    assert found.verdict == "do not rely on this"
 
 
 # ---------------------------------------------------------------------- the arbiter

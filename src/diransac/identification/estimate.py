@@ -352,6 +352,11 @@ class Competitor:
     parameters: Values
 
 
+def _error(error: float) -> str:
+    """An error in a table; that of a simulation that diverges is no number."""
+    return f"{error:.2g}" if np.isfinite(error) else "diverges"
+
+
 @dataclass(frozen=True)
 class Competition:
     """Comparison of estimates by the prediction of blocks of the logs that they were not estimated from.
@@ -380,7 +385,7 @@ class Competition:
         rows = [["estimate", *(f"{h:.2g} s" for h in self.horizons), ""]]
         for one in self._best_of_sources():
             said = "chosen" if one.name == self.winner else "as good" if one.as_good else ""
-            rows.append([one.name, *(f"{x:.2g}" for x in one.errors), said])
+            rows.append([one.name, *map(_error, one.errors), said])
         return rows
 
     def sentence(self) -> str:
@@ -388,7 +393,7 @@ class Competition:
         middle = len(self.horizons) // 2
         best = self._best_of_sources()
         own = next(x for x in best if x.name == self.winner)
-        others = ", ".join(f"{x.name} {x.errors[middle]:.2g}" for x in best if x is not own)
+        others = ", ".join(f"{x.name} {_error(x.errors[middle])}" for x in best if x is not own)
         n = sum(x.as_good for x in self.competitors if x.name != self.winner)
         also = f" and {n} that predict as well" if n else ""
         text = f"held-out prediction over {self.horizons[middle]:.2g} s chose: {self.winner}{also}"

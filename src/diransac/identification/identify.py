@@ -14,13 +14,12 @@ from diransac.data.dataset import Dataset, distinct_logs, usable_sensors
 from diransac.data.log import Log
 from diransac.errors import DiransacError, IdentificationError, SettingsError, TimeLimitError
 from diransac.identification.agreement import disagreements
-from diransac.identification.columns import contradictions, mistakes_of_columns
+from diransac.identification.columns import Mistake, contradictions, mistakes_of_columns
 from diransac.identification.estimate import Estimate, Evaluation, Finding, LogSummary, Prediction
 from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
 from diransac.identification.known_parameters import KnownParameters
 from diransac.identification.method import Callback, Method, fit, numerical_failures, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, estimator_named, factory
-from diransac.identification.nonlinear import solved_nonlinear
 from diransac.identification.prediction import predictions
 from diransac.identification.refusal import check_motion
 from diransac.identification.result import Result
@@ -376,13 +375,20 @@ class _Task:
         return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}
 
 
+def _mistakes(dataset: Dataset) -> tuple[list[Mistake], int]:
+    """Mistakes of columns that explain the logs, and the number of those tested."""
+    from diransac.identification.nonlinear import solved_nonlinear
+
+    with np.errstate(all="ignore"):  # a correction that overflows explains nothing
+        return mistakes_of_columns(dataset, solved_nonlinear)
+
+
 def _explained(dataset: Dataset, fitted: Callable[[], Estimate]) -> Estimate:
     """The estimate of a method.  Raises IdentificationError: as the method does; a mistake of a column is named."""
     try:
         return fitted()
     except IdentificationError as error:
-        with np.errstate(all="ignore"):
-            mistakes, _ = mistakes_of_columns(dataset, solved_nonlinear)
+        mistakes, _ = _mistakes(dataset)
         if not mistakes:
             raise
         named = "; ".join(f"{x.claim}; {x.action}" for x in mistakes)
@@ -396,8 +402,7 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     is_bad, n_tested = result.verdict == "do not rely on this", 0
     is_doubtful = is_bad or max(left, default=0.0) > _DOUBTFUL
     if is_doubtful:
-        with np.errstate(all="ignore"):  # a correction that overflows explains nothing
-            mistakes, n_tested = mistakes_of_columns(dataset, solved_nonlinear)
+        mistakes, n_tested = _mistakes(dataset)
     else:
         mistakes = contradictions(dataset.model, dataset.given)
     found = [Finding("bad" if is_bad or (is_doubtful and x.explains) else "care", x.claim, x.action) for x in mistakes]

@@ -211,7 +211,9 @@ class Contest:
     def _acting(self, found: Searched) -> ActingInputs:
         """Inputs as they act in a fit."""
         intervals = found.likeliest.intervals
-        return ActingInputs(intervals.inputs, intervals.hold, found.timing, fitted=True)
+        return ActingInputs(
+            intervals.inputs, intervals.hold, found.timing(forced=self.settings.forces_timing), fitted=True
+        )
 
     def add_sources(self, first: Searched | None) -> None:
         """Add a fit's estimates, least squares of all rows, and simulation error, which starts from all of these."""
@@ -289,14 +291,15 @@ class Contest:
     def challenger(self, search: Searched | None) -> int | None:
         """Index of the best estimate that no fit gave, where it beats a fit, or contradicts one that predicts as well.
 
-        Two estimates contradict each other if their intervals of a parameter are disjoint.
+        Two estimates contradict each other if their intervals of a parameter are disjoint.  An exact model whose noise
+        is not white is contradicted by that.
         """
         assert self.comparison is not None
         as_good, fitted = self.comparison.as_good, np.array([not isinstance(x, Motion) for x in self.origins])
         found = int(np.argmin(np.where(as_good & ~fitted, self.comparison.losses, np.inf)))
         if fitted[found] or not as_good[found]:
             return None
-        if search is None or not (as_good & fitted).any():
+        if search is None or search.likeliest.exact or not (as_good & fitted).any():
             return found
         one, variances = self.candidates[found], np.diag(search.result.covariance)
         spans = _INTERVAL * (np.sqrt(np.diag(jackknife(one.without))) + np.sqrt(variances))

@@ -24,6 +24,7 @@ from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
 from diransac.identification.methods.lo_diransac.recording_errors import (
+    LEAST_DELAY,
     RecordingError,
     clear_errors,
     errors_of,
@@ -264,14 +265,18 @@ class LocalSearch:
     def _with_another_error(self, best: Explanation, *, free_hold: bool) -> list[Explanation]:
         """Likelier explanations with another error of a recording, or another hold of the inputs."""
         sought, timings = self._sought(best), [best.intervals.all_inputs(what) for what in LATE]
-        errors = clear_errors(best.intervals, best.refinement.fit, sought, worth=_AS_LIKELY)
+        # A lag shows as a delay, and is tried where one does.
+        tested = [x for x in sought if x.what != "lag" or replace(x, what="delay") not in sought]
+        errors = clear_errors(best.intervals, best.refinement.fit, tested, worth=_AS_LIKELY)
         common = max((x for x in errors if x.kind in timings), key=lambda x: x.gain, default=None)
         others = [self._moved(best, x) for x in self._timings(best, common, sought, free_hold=free_hold)]
         found = [self._better(best, others)]
         for error in errors:
             if error.kind not in timings:
                 share = _EXPLAINS_DRIFT if error.kind.what == "drift" else _EXPLAINS
-                found.append(self._better(best, [self._with_errors(best, [error])], share, of_one=True))
+                lag = replace(error, kind=replace(error.kind, what="lag"))
+                tried = [error, lag] if lag.kind in sought and error.size > _SHORTEST_LAG else [error]
+                found += [self._better(best, [self._with_errors(best, [x])], share, of_one=True) for x in tried]
         return [x for x in found if x is not best]
 
     def _timings(
@@ -286,8 +291,8 @@ class LocalSearch:
         if error is not None:
             found.append(intervals.with_input_error(error.kind, error.size))
         if delay in sought:
-            tried = {self._late(intervals, delay, best.projected), round(now + error.size) - now if error else 0.0}
-            found += [intervals.with_input_error(delay, x) for x in tried if x]
+            tried = {self._late(intervals, delay, best.projected), round(late) - now if late else 0.0}
+            found += [intervals.with_input_error(delay, x) for x in tried if abs(x) > _REFINED * LEAST_DELAY]
         punctual = intervals.with_input_error(delay, -now)
         if lag in sought and lag not in sizes and late > _SHORTEST_LAG:
             hold = "linear" if free_hold else intervals.hold

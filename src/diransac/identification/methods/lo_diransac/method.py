@@ -312,13 +312,12 @@ class _Found:
         """True for a significant delay or lag that all inputs have."""
         return self.best.is_late and (self.best.decided is None or self.best.decided.acting is None)
 
-    @property
-    def resolution(self) -> Resolution:
-        """Simulation of the estimate."""
+    def resolution(self, *, forced: bool) -> Resolution:
+        """Simulation of the estimate; a forced delay of the inputs need not be significant."""
         intervals, decided = self.best.likeliest.intervals, self.best.decided
         if decided is not None and decided.acting is not None:
             return Resolution("rk4", intervals.substeps, decided.acting.hold, decided.acting.timing)
-        return Resolution("rk4", intervals.substeps, intervals.hold, self.best.timing)
+        return Resolution("rk4", intervals.substeps, intervals.hold, self.best.timing(forced=forced))
 
 
 def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Finding, ...]) -> Estimate:
@@ -347,7 +346,7 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
         iterations=settings.n_nonlinear_samples if nonlinear else settings.n_samples,
         n_hypotheses=best.n_hypotheses,
         stop_reason=end,
-        resolution=found.resolution,
+        resolution=found.resolution(forced=settings.forces_timing),
         notes=best.notes,
         diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),
         checks=checks,

@@ -116,11 +116,10 @@ def clear_errors(
         Empty if no error is clear.
     """
     scores, at_a_time = _Scores(intervals, fit), max(1, _NUMBERS_AT_A_TIME // intervals.measured.size)
-    latest = _LATEST * max(x.stop - x.start for x in intervals.rows_of_logs)
     parts = [tested[k : k + at_a_time] for k in range(0, len(tested), at_a_time)]
     found = [x for part in parts for x in scores.tested(part)]
-    found = [x for x in found if x.kind.what != "delay" or LEAST_DELAY < abs(x.size) < latest]
-    inputs = [x for x in found if x.kind.of_inputs and x.gain > worth and _is_possible(intervals, x)]
+    found = [x for x in found if _is_possible(intervals, x) and (x.kind.what != "delay" or abs(x.size) > LEAST_DELAY)]
+    inputs = [x for x in found if x.kind.of_inputs and x.gain > worth]
     single = [x for x in found if len(x.kind.columns) == 1 and not x.kind.of_inputs and x.ratio > _CLEAR]
     groups = [x for x in found if len(x.kind.columns) > 1 and not x.kind.of_inputs and x.gain > worth]
     single.sort(key=lambda x: x.ratio, reverse=True)
@@ -132,11 +131,15 @@ def clear_errors(
 
 
 def _is_possible(intervals: ShootingIntervals, error: RecordingError) -> bool:
-    """False for a time constant below zero, and for a gain that changes its sign."""
-    if error.kind.what == "drift":
-        return abs(error.size) < _NO_GAIN
-    lags = intervals.all_errors.input_lag[list(error.kind.columns)]
-    return error.kind.what != "lag" or bool((lags + error.size > 0.0).all())
+    """False for a delay or a lag of a tenth of the log, a negative time constant, and a gain that vanishes."""
+    what, size = error.kind.what, intervals.all_errors.sizes.get(error.kind, 0.0) + error.size
+    if what == "bias":
+        return True
+    if what == "drift":
+        return abs(size) < _NO_GAIN
+    lags = intervals.all_errors.input_lag[list(error.kind.columns)] if what == "lag" else np.zeros(0)
+    longest = max(x.stop - x.start for x in intervals.rows_of_logs)
+    return abs(size) < _LATEST * longest and bool((lags + error.size > 0.0).all())
 
 
 def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> list[RecordingError]:
@@ -152,17 +155,18 @@ def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]
     Returns
     -------
     list of RecordingError
-        Without those that the log does not determine.
+        Without those that the log does not determine, and impossible ones.
     """
     scores = _Scores(intervals, fit)
     slopes = [scores.slope(x) for x in kinds]
     determined, covariance, _, _ = scores.together(slopes)
     sizes = -covariance @ np.array([slopes[k].score for k in determined])
     errors = np.sqrt(np.diag(covariance)) + _TINY
-    return [
+    found = [
         RecordingError(kinds[k], float(x), float(std), float(0.5 * (x / std) ** 2))
         for k, x, std in zip(determined, sizes, errors, strict=True)
     ]
+    return [x for x in found if _is_possible(intervals, x)]
 
 
 def effect_on(intervals: ShootingIntervals, fit: Fit, z: FloatArray, s: FloatArray) -> FloatArray:

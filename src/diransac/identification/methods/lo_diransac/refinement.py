@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
@@ -65,7 +65,7 @@ _UNBROKEN = 0.01
 _NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
 # Correlation of unmodelled accelerations from interval to interval at most.
 _MOST_ALIKE = 0.98
-_MAX_TRIALS = 8
+_MAX_TRIALS, _MAX_SWEEPS = 8, 12
 # Part of what is left of the excess of its cost when a step is corrected for the curvature of the rollouts, at most.
 _CORRECTED = 0.3
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
@@ -149,7 +149,7 @@ def _accelerations(model: Model, motion: Motion) -> FloatArray:
 def start(
     settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, p: FloatArray, prior: Prior
 ) -> Fit:
-    """Initial fit from a hypothesis and the smoothed motion at the intervals' starts.
+    """Initial fit from a hypothesis and the smoothed motion at the intervals' starts, or their neighbours' ends.
 
     Parameters
     ----------
@@ -181,7 +181,63 @@ def start(
     sizes[: len(p)] = intervals.layout.prior_std
     mean = np.concatenate([intervals.layout.prior_mean, np.zeros(len(shared) - len(p))])
     tau = _TAU_START * _accelerations(intervals.model, motion)
-    return Fit(shared, x, d, residuals, ends, noise, tau, np.zeros(n_v), motion.spread[:n_x].copy(), sizes, mean)
+    fit = Fit(shared, x, d, residuals, ends, noise, tau, np.zeros(n_v), motion.spread[:n_x].copy(), sizes, mean)
+    return _anchored(intervals, fit)
+
+
+def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
+    """The fit with initial states propagated from neighbouring intervals, where they have a higher likelihood.
+
+    Where outliers are in the majority for longer than an interval, its state follows from its neighbours alone.
+    """
+    n, losses = len(intervals), _losses(intervals, fit.noise, fit.residuals, fit.ends, np.arange(len(intervals)))
+    # States that changed since those of their neighbours were last propagated from them: others give what they gave.
+    forward, backward = np.ones(n, bool), np.ones(n, bool)
+    for _ in range(_MAX_SWEEPS):
+        after = 1 + np.flatnonzero(intervals.linked & forward[:-1] & _ends_well(fit.ends)[:-1])
+        fit, losses, forward = _better(intervals, fit, losses, after, fit.ends[after - 1])
+        backward |= forward
+        before = np.flatnonzero(intervals.linked & (backward[:-1] | backward[1:]))
+        if len(before):
+            found = intervals.origins(fit.shared, fit.x, fit.d, before)
+            fit, losses, backward = _better(intervals, fit, losses, before, found)
+            forward |= backward
+        if not forward.any():
+            break
+    return fit
+
+
+def _better(
+    intervals: ShootingIntervals, fit: Fit, losses: FloatArray, chosen: IntArray, states: FloatArray
+) -> tuple[Fit, FloatArray, BoolArray]:
+    """The fit with other initial states of chosen intervals where they have a higher likelihood, and its losses.
+
+    The last result is the mask ``(W,)`` of the intervals whose states are new.
+    """
+    changed = np.zeros(len(intervals), bool)
+    if not len(chosen):
+        return fit, losses, changed
+    x, residuals, ends = fit.x.copy(), fit.residuals.copy(), fit.ends.copy()
+    x[chosen] = states
+    simulated, ended = intervals.simulated(fit.shared, x, fit.d, chosen)
+    found = _losses(intervals, fit.noise, simulated, ended, chosen)
+    better = found < losses[chosen]
+    x[chosen[~better]] = fit.x[chosen[~better]]
+    changed[chosen[better]] = True
+    residuals[np.repeat(changed, intervals.length)] = simulated[np.repeat(better, intervals.length)]
+    ends[changed] = ended[better]
+    losses = losses.copy()
+    losses[changed] = found[better]
+    return replace(fit, x=x, residuals=residuals, ends=ends), losses, changed
+
+
+def _losses(
+    intervals: ShootingIntervals, noise: Mixture, residuals: FloatArray, ends: FloatArray, chosen: IntArray
+) -> FloatArray:
+    """Negative log-likelihood ``(n,)`` of the samples of chosen intervals; infinite where a rollout diverges."""
+    known = intervals.known if len(chosen) == len(intervals) else intervals.known[intervals.rows_of(chosen)]
+    found = noise.negative_log_likelihood(residuals, known).reshape(len(chosen), -1).sum(axis=1)
+    return np.where(_ends_well(ends), found, np.inf)
 
 
 def _ends_well(ends: FloatArray) -> BoolArray:

@@ -105,11 +105,13 @@ class Searched:
         is_shared = bool(late) and all(x == intervals.all_inputs(x.what) for x in late)
         return is_shared and common is not None and abs(common.size) > LEAST_DELAY
 
-    @property
-    def timing(self) -> InputTiming:
-        """Delays, lags and drifts of the inputs."""
-        errors, dt = self.likeliest.intervals.all_errors, self.likeliest.intervals.dt
-        return InputTiming.of(errors.input_delay * dt, errors.input_lag * dt, errors.gain_drift)
+    def timing(self, *, forced: bool) -> InputTiming:
+        """Delays, lags and drifts of the inputs; a negligible delay of all counts if it is forced."""
+        intervals = self.likeliest.intervals
+        errors, dt = intervals.all_errors, intervals.dt
+        common = errors.sizes.get(intervals.all_inputs("delay"), 0.0)
+        delays = errors.input_delay - common * (abs(common) < LEAST_DELAY and not forced)
+        return InputTiming.of(delays * dt, errors.input_lag * dt, errors.gain_drift)
 
     def corrected(self, intervals: ShootingIntervals) -> ShootingIntervals:
         """Intervals of the same logs, corrected of the errors of sensors of the explanation."""

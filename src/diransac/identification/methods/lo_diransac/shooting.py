@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["ErrorKind", "ShootingIntervals"]
 
 _DIVERGED = 1e6
+_WELL_CONDITIONED = 1e8
 # Rows times squared unknowns from which on derivatives take longer than threads take to be told (a few milliseconds).
 _WORTH_THREADS = 4e6
 
@@ -484,6 +485,20 @@ class ShootingIntervals:
         names = [name for name, has in zip(signals, seen, strict=True) if has]
         simulator = rollouts(self.augmented.model, names, substeps=self.substeps, hold=self.hold)
         return simulator, slice(None) if seen.all() else np.flatnonzero(seen)
+
+    def origins(self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray) -> FloatArray:
+        """Initial states (n, n_x) for which chosen intervals end in their successors' initial states.
+
+        One Newton step; states are unchanged where it has no solution.
+        """
+        sums = self.gauss_newton(shared, x, d, np.zeros(self.measured.shape), chosen=chosen, normal_matrix=False)
+        jumps, slopes = x[chosen + 1] - sums.final_states, sums.final_slopes[:, :, : x.shape[1]]
+        finite = np.isfinite(jumps).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
+        usable = np.flatnonzero(finite)
+        usable = usable[np.linalg.cond(slopes[usable]) < _WELL_CONDITIONED]
+        found = x[chosen]
+        found[usable] += np.linalg.solve(slopes[usable], jumps[usable][:, :, None])[:, :, 0]
+        return found
 
 
 def _differences(values: FloatArray) -> FloatArray:
