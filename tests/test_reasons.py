@@ -1,5 +1,7 @@
 """Reasons of refusals and bad answers: mistakes of columns are named, and none where there is none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import reasons
@@ -8,7 +10,9 @@ from regime_flights import REGIMES, recordings
 import diransac as dr
 from diransac.data.dataset import Dataset
 from diransac.identification.columns import contradictions, mistakes_of_columns
+from diransac.identification.motion_rows import motion_rows, solved
 from diransac.identification.nonlinear import solved_nonlinear
+from simulated import MACHINES, as_log, flight
 
 SEED = 2000
 """Of no figure that is reported."""
@@ -70,3 +74,22 @@ def test_a_known_unit_is_no_mistake():
     t = 0.01 * np.arange(1000)
     columns = {"x": np.degrees(np.sin(2.0 * t)), "x_dot": 2.0 * np.cos(2.0 * t), "u": np.sin(t)}
     assert contradictions(model, [dr.Log.from_arrays(t, columns, units={"x": "deg"})]) == []
+
+
+def test_a_unit_that_parameters_take_up_changes_no_residual():
+    """An excess of lift, in one equation alone, so that equations contradict each other about the mass."""
+    machine = MACHINES["planar-rotorcraft"]
+
+    def lifted(q, v, u, p):
+        x, z, theta = machine.acceleration(q, v, u, p)
+        return x, z + 0.1 * u[0] / p[0], theta
+
+    signals, inputs = flight(replace(machine, acceleration=lifted), 2500, 0.01)
+    hit = np.random.default_rng(0).random(signals.shape) < 0.1
+    spoilt = signals + hit * np.random.default_rng(1).uniform(-80.0, 80.0, signals.shape)
+    dataset = Dataset.of(dr.models.planar_rotorcraft(), as_log(machine, spoilt, inputs, 0.01), pointwise=True)
+    rows, every = motion_rows(dataset), tuple(dataset.model.inputs)
+    found = solved(dataset.model, dataset.layout, rows)
+    other = solved(dataset.model, dataset.layout, [x.corrected(dataset.model, every, 1000.0, 0.0) for x in rows])
+    np.testing.assert_allclose(other.residuals, found.residuals, rtol=0.02)
+    np.testing.assert_allclose(other.parameters, found.parameters * [1000.0, 1000.0, 1.0], rtol=0.02)

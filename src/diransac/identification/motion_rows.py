@@ -126,6 +126,11 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
     weights = 1.0 / (1.0 + size / (np.median(size) + _TINY))
     for _ in range(_STEPS):
         p = np.linalg.lstsq(A * weights[:, None], y * weights, rcond=None)[0]
+        # Equations count by the sizes of their terms, which units of columns and of parameters do not change.
+        terms = (np.abs(A) @ np.abs(p) + np.abs(y)).reshape(-1, n_equations)
+        size = np.median(terms, axis=0)
+        unit = np.tile(np.where(size > _TINY, 1.0 / np.maximum(size, _TINY), 1.0), len(terms))
+        A, y = A * unit[:, None], y * unit
         residuals = np.abs(A @ p - y)
         if not np.isfinite(residuals).all():
             return None
