@@ -1,6 +1,7 @@
 """Recordings for the Rerun viewer, read back with its own library."""
 
 import sys
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -13,6 +14,9 @@ from diransac.report.viewer import write_recording
 T = 0.02 * np.arange(800)
 OUTLIERS = np.arange(50, 760, 60)
 GAP = slice(300, 340)
+
+
+needs_rerun = pytest.mark.skipif(find_spec("rerun") is None, reason="NOT CHECKED: rerun-sdk is missing")
 
 
 def swum(frequency: float = 1.3) -> dr.Log:
@@ -36,7 +40,8 @@ def identified():
 
 def read(path):
     """Times, s, and values, an empty list where there is none, by entity; properties of each entity; views."""
-    chunks = pytest.importorskip("rerun.chunk", reason="NOT CHECKED: rerun-sdk is missing")
+    from rerun import chunk as chunks
+
     series: dict[str, tuple[list[float], list[list[float]]]] = {}
     looks: dict[str, set[str]] = {}
     reader = chunks.RrdReader(path)
@@ -62,6 +67,7 @@ def rows_of(series):
     return rows.tolist(), np.array([x[0] if x else np.nan for x in values])
 
 
+@needs_rerun
 def test_a_slow_signal_is_a_line_through_its_samples(tmp_path):
     columns = swim(T)
     columns["x"] = np.where(np.arange(800) % 5 == 0, columns["x"], np.nan)
@@ -73,6 +79,7 @@ def test_a_slow_signal_is_a_line_through_its_samples(tmp_path):
     assert np.isnan(values[rows.index(196)])
 
 
+@needs_rerun
 def test_signals_predictions_outliers_inputs_and_forces_are_read_back(identified, tmp_path):
     result, log = identified
     assert write_recording(result, [log], tmp_path / "a.rrd") == []
@@ -102,6 +109,7 @@ def test_signals_predictions_outliers_inputs_and_forces_are_read_back(identified
     assert np.ptp(forces) > 4.0
 
 
+@needs_rerun
 def test_several_logs_stand_below_their_names(identified, tmp_path):
     result, log = identified
     lacking = write_recording(result, [log, swum(0.9)], tmp_path / "b.rrd")
@@ -114,8 +122,8 @@ def test_several_logs_stand_below_their_names(identified, tmp_path):
     assert all("\n" not in path for path in series)
 
 
+@needs_rerun
 def test_the_command_writes_beside_the_model_unless_told(tmp_path, monkeypatch):
-    pytest.importorskip("rerun.chunk", reason="NOT CHECKED: rerun-sdk is missing")
     working_folder(tmp_path, monkeypatch)
     run("identify", "swim.csv", *MODEL, "--method", "ols", "-o", "m.json")
     done = run("view", "m.json", "swim.csv")
