@@ -379,6 +379,8 @@ def _much_better(model: Model, logs: Sequence[Log], found: Solution, possible: S
     better = [x for x in possible if x.solution.residual < _MUCH_BETTER * found.residual]
     # Units of parameters change the weights of the equations, and with them each residual by a little.
     clear = [x for x in better if (x.solution.residuals < _MUCH_BETTER * found.residuals).any()]
+    # A unit that makes the terms of an equation vanish silences what contradicts the others, and explains nothing.
+    clear = [x for x in clear if (x.solution.residuals < _DISTINCT * found.residuals).all()]
     if not clear or any(clear[0].rivals(x) for x in clear[1:]):
         return []
     best, ratio = clear[0], number(float((found.residuals / clear[0].solution.residuals).max()), 2)

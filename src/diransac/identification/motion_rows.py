@@ -27,7 +27,7 @@ __all__ = ["MotionRows", "Solution", "excited", "motion_rows", "outside_bounds",
 # Steps of iteratively reweighted least squares, and the residual, in median ones, from which on a row counts less.
 _STEPS, _FAR = 10, 3.0
 # Rows of a log that are enough to find a cause, and for ranks; size from which on the square of a number overflows.
-_ENOUGH_ROWS, _FEW_ROWS, _HUGE, _TINY = 5000, 1000, 1e150, 1e-300
+_ENOUGH_ROWS, _FEW_ROWS, _HUGE, _TINY, _ROUNDING = 5000, 1000, 1e150, 1e-300, 1e-9
 # Residual of an equation, over its terms, that is exact.
 _EXACT = 1e-6
 # Eigenvalue of a log's rows, over their number, below which it is zero.
@@ -126,11 +126,6 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
     weights = 1.0 / (1.0 + size / (np.median(size) + _TINY))
     for _ in range(_STEPS):
         p = np.linalg.lstsq(A * weights[:, None], y * weights, rcond=None)[0]
-        # Equations count by the sizes of their terms, which units of columns and of parameters do not change.
-        terms = (np.abs(A) @ np.abs(p) + np.abs(y)).reshape(-1, n_equations)
-        size = np.median(terms, axis=0)
-        unit = np.tile(np.where(size > _TINY, 1.0 / np.maximum(size, _TINY), 1.0), len(terms))
-        A, y = A * unit[:, None], y * unit
         residuals = np.abs(A @ p - y)
         if not np.isfinite(residuals).all():
             return None
@@ -163,7 +158,7 @@ def _errors(A: FloatArray, residuals: FloatArray) -> FloatArray:
 
 
 def _equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> tuple[FloatArray, int]:
-    """Finite rows ``[W b]`` of all logs, ``(n, n_p + 1)``, each equation of unit median size; number of equations."""
+    """Finite rows ``[W b]`` of all logs, ``(n, n_p + 1)``, each equation of unit size; number of equations."""
     parts = []
     for i, one in enumerate(logs):
         every = max(1, len(one.q) // _ENOUGH_ROWS)
@@ -175,8 +170,27 @@ def _equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]
     rows = rows[(np.abs(rows) < _HUGE).all(axis=(1, 2))]
     if not len(rows):
         return np.empty((0, rows.shape[2])), rows.shape[1]
-    size = np.median(np.abs(rows).sum(axis=2), axis=0)
-    return (rows / np.where(size > 0.0, size, 1.0)[:, None]).reshape(-1, rows.shape[2]), rows.shape[1]
+    return (rows / _sizes(rows)[:, None]).reshape(-1, rows.shape[2]), rows.shape[1]
+
+
+def _sizes(rows: FloatArray) -> FloatArray:
+    """Size ``(n_eq,)`` of each equation ``[W b]`` ``(n, n_eq, n_p + 1)``: the median of its known terms.
+
+    Parameters take up units of columns, so that these change no weight of one equation against another.  An equation
+    without a known term has the size of its other terms, with the parameters that the others give.
+    """
+    W, b = rows[:, :, :-1], np.abs(rows[:, :, -1])
+    size = np.array([np.median(x[x > 0.0]) if x.any() else 0.0 for x in b.T])
+    size = np.where(size > _ROUNDING * size.max(), size, 0.0)
+    known = size > 0.0
+    if known.any() and not known.all():
+        A, y = ((x[:, known] / size[known, None]).reshape(-1, x.shape[2]) for x in (W, rows[:, :, -1:]))
+        column = np.sqrt(np.square(A).mean(axis=0))
+        column = np.where(column > 0.0, column, 1.0)
+        p = np.linalg.lstsq(A / column, y[:, 0], rcond=None)[0] / column
+        size = np.where(known, size, np.median(np.abs(W) @ np.abs(p), axis=0))
+    whole = np.median(np.abs(rows).sum(axis=2), axis=0)
+    return np.where(size > 0.0, size, np.where(whole > 0.0, whole, 1.0))
 
 
 def outside_bounds(layout: ParameterLayout, found: Solution) -> list[str]:
