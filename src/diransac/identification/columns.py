@@ -90,7 +90,7 @@ class Mistake:
 
     @property
     def action(self) -> str:
-        """What to do."""
+        """Remedy, as an option where there is one."""
         option = ",".join(f"{n}={x:.6g}" for n, x in self.factors.items())
         return f"identify again with --scale {option}" if option else self.otherwise
 

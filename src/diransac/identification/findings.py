@@ -26,7 +26,7 @@ _MOST_SHOWN = 5
 _MARKS = {"bad": "!", "care": "·", "good": " "}
 """Marks of the findings that are printed."""
 _VALIDATE = "predict a log that it was not identified from: diransac validate RESULT.json OTHER_LOG"
-"""What to do with a result that nothing opposes."""
+"""Action for a result that nothing opposes."""
 _NEAR, _FAR = 0.05, 0.25
 """Median errors of simulations, over the range of the signal, that are good, and that need care."""
 _MOST, _HALF, _FEW = 0.7, 0.5, 0.01
@@ -223,7 +223,7 @@ def bounds_text(parameter: Parameter) -> str:
 
 
 def _remedy(result: Result, level: Level = "care") -> str:
-    """What to do about an answer that is off throughout, by the causes that were tested."""
+    """Action for an answer that is off throughout, by the causes that were tested."""
     if result.suggestions:
         return _added(result.suggestions[0])
     if result.estimate.n_columns_tested:
@@ -446,7 +446,7 @@ def _differ(names: Sequence[str]) -> str:
 
 
 def _more_of(result: Result, names: Sequence[str]) -> str:
-    """What makes uncertain parameters certain: a motion that moves their terms more, or a value from elsewhere."""
+    """Action for uncertain parameters: a motion that moves their terms more, or a value from elsewhere."""
     one = names[0].partition("[")[0]
     if any(x.prediction and max(x.prediction.unexplained.values(), default=0.0) > _HALF for x in result.logs):
         return _remedy(result)

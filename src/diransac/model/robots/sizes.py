@@ -1,4 +1,4 @@
-"""What the file of a robot's description makes MuJoCo build, counted in its text before MuJoCo reads it.
+"""Sizes of what MuJoCo builds from the file of a robot's description, counted in its text before MuJoCo reads it.
 
 A line of MJCF repeats bodies or declares a field of heights as large as it likes, and MuJoCo's compiler, which has no
 limit of time or memory, waits for pipes.
