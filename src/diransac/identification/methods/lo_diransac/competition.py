@@ -62,7 +62,8 @@ _SHORT = 25
 def is_settled(explanation: Explanation, motion: Motion) -> bool:
     """True if the exact model predicts the log within the noise of its most accurate signal.
 
-    That noise is small beside the signal, and hardly correlated from sample to sample.
+    That noise is small beside the signal, and hardly correlated from sample to sample.  Outliers are the minority of
+    every signal: a fit that has lost one takes the rest for them.
 
     Parameters
     ----------
@@ -83,7 +84,8 @@ def is_settled(explanation: Explanation, motion: Motion) -> bool:
     e = fit.residuals[:, best] / fit.noise.sigma[best]
     both = inlying[1:] & inlying[:-1]
     correlation = (e[1:] * e[:-1])[both].mean() if both.any() else 0.0
-    return bool(share[best] < _WITHIN and correlation < _WHITE)
+    explains_most = (fit.noise.pi < _INLYING)[intervals.known.any(axis=0)].all()
+    return bool(share[best] < _WITHIN and correlation < _WHITE and explains_most)
 
 
 def compete(

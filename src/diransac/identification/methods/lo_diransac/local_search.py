@@ -34,6 +34,7 @@ from diransac.identification.methods.lo_diransac.recording_errors import (
 )
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
+from diransac.simulation import HOLDS
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -270,7 +271,8 @@ class LocalSearch:
         errors = clear_errors(best.intervals, best.refinement.fit, tested, worth=_AS_LIKELY)
         common = max((x for x in errors if x.kind in timings), key=lambda x: x.gain, default=None)
         others = [self._moved(best, x) for x in self._timings(best, common, sought, free_hold=free_hold)]
-        found = [self._better(best, others)]
+        # Which hold is the likelier shows once its errors are at their optimum.
+        found = [self._better(best, [x for x in others if x.intervals.hold == hold]) for hold in HOLDS]
         for error in errors:
             if error.kind not in timings:
                 share = _EXPLAINS_DRIFT if error.kind.what == "drift" else _EXPLAINS
