@@ -29,9 +29,9 @@ from diransac.identification.methods.lo_diransac.projection import (
     residuals_of_motion,
     unexplained,
 )
-from diransac.identification.methods.lo_diransac.recording_errors import effect_on
-from diransac.identification.methods.lo_diransac.refinement import Refinement
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+from diransac.identification.methods.lo_diransac.recording_errors import JointEquations, effect_on
+from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement, refine_exact
+from diransac.identification.methods.lo_diransac.shooting import ErrorKind, ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import (
     Samples,
     choose_half_widths,
@@ -287,7 +287,7 @@ def test_intervals_are_split_into_equal_parts_of_three_rows_at_least():
 def test_an_exact_model_is_hopeless_until_unmodelled_accelerations_fall_by_as_much_as_it_was_behind():
     intervals, signals = intervals_of()
     fit = with_residuals(intervals, perturbed_fit(intervals, signals))
-    now = Explanation(intervals, Refinement(fit, 0.0, 9, True), exact=False)
+    now = Explanation(Refinement(intervals, fit, 0.0, 9, True), exact=False)
     left = np.log(np.sqrt(np.square(unexplained(intervals, fit, projected_parameters(intervals, fit))).mean(axis=0)))
     samples = float(intervals.known.sum())
 
@@ -393,24 +393,69 @@ def test_a_gauss_newton_step_solves_a_linear_problem_at_once():
     assert np.abs(again.right_s[:1]).max() < 1e-6 * np.abs(first.right_s).max()
 
 
-def test_a_corrected_step_keeps_to_tight_continuity_along_curved_rollouts():
+@pytest.mark.parametrize("late", [False, True])
+def test_a_corrected_step_keeps_to_tight_continuity_along_curved_rollouts(late):
     """Maratos' effect: a step that is right for what was measured breaks the motion by the curvature of rollouts."""
     intervals, signals = intervals_of(n_rows=200)
     fit = replace(perturbed_fit(intervals, signals), d=np.zeros((len(intervals), 3)), continuity_std=np.full(6, 1e-7))
+    intervals = intervals.with_errors([intervals.all_inputs("delay")] if late else [])
     fit = with_residuals(intervals, fit)
-    weights = np.ones(signals.shape)
-    at = linearize(intervals, fit, weights)
+    at = JointEquations.of(intervals, fit, intervals.all_errors.kinds)
+    weights = at.of_fit.weights
 
     def after(right):
-        step = at.system.solve(*right)
-        return moved(intervals, fit, step.step_z, step.step_p)
+        step = at.step(right)
+        there = at.moved(intervals, step)
+        return step, there, moved(there, fit, step.of_fit.step_z, step.of_fit.step_p)
 
-    plain = after((at.right_z, at.right_s))
-    corrected = after(at.corrected(intervals, fit, plain))
-    broken, kept, best = (cost(intervals, one, weights) for one in (plain, corrected, fit))
+    step, there, plain = after(at.right)
+    assert bool(step.sizes.any()) == late
+    _, then, corrected = after(at.corrected(there, fit, plain, step))
+    broken, kept, best = cost(there, plain, weights), cost(then, corrected, weights), cost(intervals, fit, weights)
     assert kept < 0.01 * broken
-    assert np.square(corrected.residuals).sum() < 1.1 * np.square(plain.residuals).sum()
+    assert (weights * np.square(corrected.residuals)).sum() < 1.1 * (weights * np.square(plain.residuals)).sum()
     assert kept < best
+
+
+def test_a_step_of_a_fit_and_its_errors_is_that_of_dense_algebra():
+    intervals, signals = intervals_of(n_rows=200)
+    fit = with_residuals(intervals, perturbed_fit(intervals, signals))
+    kinds = (intervals.all_inputs("delay"), ErrorKind((4,), "bias"), ErrorKind((2,), "delay"))
+    at = JointEquations.of(intervals, fit, kinds)
+    system, (right_z, right_s, right_e) = at.of_fit.system, at.right
+    n, k = right_z.size, right_z.shape[1]
+    A = np.zeros((n + len(right_s), n + len(right_s)))
+    for w in range(len(intervals)):
+        own = slice(w * k, (w + 1) * k)
+        A[own, own], A[own, n:] = system.diagonal[w], system.border[w]
+        if w:
+            A[own, (w - 1) * k : w * k] = system.below[w - 1]
+            A[(w - 1) * k : w * k, own] = system.below[w - 1].T
+    A[n:, :n], A[n:, n:] = A[:n, n:].T, system.corner
+    of = np.vstack([at.of_z.reshape(n, -1), at.of_s])
+    whole = np.block([[A, of], [of.T, at.information]])
+    unit = 1.0 / np.sqrt(np.diag(whole))
+    right = np.concatenate([right_z.ravel(), right_s, right_e])
+    solution = unit * np.linalg.solve(unit[:, None] * whole * unit, unit * right)
+    found = at.step(at.right)
+    assert found.sizes == pytest.approx(solution[-3:], rel=1e-4)
+    expected, scale = solution[:-3], 1.0 / np.sqrt(np.diag(A))
+    off = (np.append(found.of_fit.step_z, found.of_fit.step_p) - expected) / scale
+    assert np.abs(off).max() < 1e-3 * np.abs(expected / scale).max()
+
+
+def test_a_late_recording_of_the_inputs_is_an_unknown_of_the_fit():
+    intervals, signals = intervals_of(n_rows=400)
+    delay = intervals.all_inputs("delay")
+    early = replace(intervals, recorded=intervals.with_input_error(delay, -2.4).inputs)
+    begin = replace(perturbed_fit(intervals, signals), tau=np.full(3, 1e-3))
+    unit = np.concatenate([np.full(3, np.inf), np.ones(intervals.n_shared - 3)])
+    prior = Prior(tau=np.full(3, 1e-3), unit=unit, discrepancy=1e-3, guarded=1e-3)
+    found = refine_exact(dr.LoDiransac(), early.with_errors([delay]), begin, prior)
+    assert found.converged
+    assert found.intervals.all_errors.sizes[delay] == pytest.approx(2.4, abs=0.05)
+    assert found.fit.shared[:3] == pytest.approx(TRUTH, rel=0.02)
+    assert found.cost < refine_exact(dr.LoDiransac(), early, begin, prior).cost - 100.0
 
 
 # ---------------------------------------------------------------------- projection
@@ -518,6 +563,16 @@ def test_rows_that_repeat_exactly_are_stuck_and_others_are_not():
     measured[5:8] = measured[4]
     measured[12, 0] = measured[11, 0]
     assert np.flatnonzero(stuck_rows(measured)).tolist() == [5, 6, 7]
+
+
+def test_rows_that_repeat_because_signals_are_coarse_are_not_stuck():
+    slow = 0.1 * np.round(np.column_stack([np.sin(0.02 * np.arange(200)), np.cos(0.03 * np.arange(200))]) / 0.1)
+    assert (np.diff(slow, axis=0) == 0.0).all(axis=1).sum() > 100
+    assert not stuck_rows(slow)[:-20].any()
+    frozen = slow.copy()
+    frozen[60:100] = frozen[59]
+    assert stuck_rows(frozen)[60:100].all()
+    assert not stuck_rows(frozen)[:50].any()
 
 
 def test_momentary_leaps_of_an_input_are_replaced_and_steps_are_not():

@@ -31,9 +31,9 @@ class Factored:
 
     Parameters
     ----------
-    step_z : (W, k) array
+    step_z : (W, k) or (W, k, c) array
         Solution of each window.
-    step_p : (m,) array
+    step_p : (m,) or (m, c) array
         Solution of the shared unknowns.
     alone : (W, k, k) array
         Diagonal blocks of ``A^-1``, the inverse without the shared unknowns: covariances where these are given.
@@ -98,12 +98,12 @@ class Arrowhead:
     ridge: float = _RIDGE
 
     def solve(self, right_z: FloatArray, right_p: FloatArray, damping: float = 0.0) -> Factored:
-        """Solution for one right-hand side.
+        """Solution for one right-hand side, or for c.
 
         Parameters
         ----------
-        right_z : (W, k) array
-        right_p : (m,) array
+        right_z : (W, k) or (W, k, c) array
+        right_p : (m,) or (m, c) array
         damping : float, optional
             The diagonal is multiplied by ``1 + damping``.
 
@@ -111,6 +111,8 @@ class Arrowhead:
         -------
         Factored
         """
+        if right_z.ndim > 2:
+            return self._solved(right_z, right_p, damping)
         found = self._solved(right_z[:, :, None], right_p[:, None], damping)
         return replace(found, step_z=found.step_z[:, :, 0], step_p=found.step_p[:, 0])
 

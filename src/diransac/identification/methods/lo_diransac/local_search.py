@@ -24,10 +24,8 @@ from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
 from diransac.identification.methods.lo_diransac.recording_errors import (
-    LEAST_DELAY,
     RecordingError,
     clear_errors,
-    errors_of,
     errors_of_inputs,
     errors_of_signals,
     with_errors,
@@ -66,8 +64,6 @@ _APART = 0.2
 _EXPLAINS, _EXPLAINS_DRIFT = float(np.log(1.25)), float(np.log(4.0))
 # Decrease of the log residuals of each signal by which a delay is worth to be tried.
 _SMALL_GAIN = 0.03
-# Newton steps of the errors of recordings at most; changes over standard errors that end them.
-_REFINEMENTS, _REFINED = 4, 0.1
 # Delays, samples, of held inputs that vary between samples; shortest lag.
 _CONTINUOUS, _SHORTEST_LAG = (-0.9, -0.1), 0.5
 
@@ -100,8 +96,6 @@ class Explanation:
 
     Parameters
     ----------
-    intervals : ShootingIntervals
-        With the timing of the inputs.
     refinement : Refinement
     exact : bool
         Whether the fit is one of the model as it is.
@@ -111,11 +105,15 @@ class Explanation:
         The latest, of this explanation or of one that it came from.
     """
 
-    intervals: ShootingIntervals
     refinement: Refinement
     exact: bool
     complete: bool = True
     trial: ExactTrial | None = None
+
+    @property
+    def intervals(self) -> ShootingIntervals:
+        """The logs, with the most probable errors of the recordings."""
+        return self.refinement.intervals
 
     @property
     def cost(self) -> float:
@@ -213,11 +211,11 @@ class LocalSearch:
         yield best
         named = [*required, *self._named(intervals)]
         if named:
-            best = self._simplified(self._with_refined_errors(best, named))
+            best = self._simplified(self._moved(best, best.intervals.with_errors(named)))
             yield best
         for k in range(self.settings.max_recording_errors):
             report(self.callback, "errors of the recordings", 0.6 + 0.03 * k)
-            likelier = [self._settled(x) for x in self._with_another_error(best, free_hold=free_hold)]
+            likelier = [self._simplified(x) for x in self._with_another_error(best, free_hold=free_hold)]
             if not likelier:
                 break
             best = min(likelier, key=lambda x: x.cost)
@@ -294,8 +292,8 @@ class LocalSearch:
             found.append(intervals.with_input_error(error.kind, error.size))
         if delay in sought:
             tried = {self._late(intervals, delay, best.projected), round(late) - now if late else 0.0}
-            found += [intervals.with_input_error(delay, x) for x in tried if abs(x) > _REFINED * LEAST_DELAY]
-        punctual = intervals.with_input_error(delay, -now)
+            found += [intervals.with_input_error(delay, x) for x in tried if x]
+        punctual = intervals.without_error(delay)
         if lag in sought and lag not in sizes and late > _SHORTEST_LAG:
             hold = "linear" if free_hold else intervals.hold
             found.append(replace(punctual.with_input_error(lag, late), hold=hold))
@@ -307,28 +305,6 @@ class LocalSearch:
         """The explanation with other inputs, and the same freedom."""
         return self._optimised(now, intervals, with_residuals(intervals, now.refinement.fit))
 
-    def _settled(self, found: Explanation) -> Explanation:
-        """The explanation with its errors at their optimum, and without the freedom that is no longer likely.
-
-        Unmodelled accelerations stand for what is left of an error of inputs until there are none: the exact model
-        comes first.
-        """
-        if any(x.of_inputs for x in found.intervals.all_errors.kinds):
-            found = self._simplified(found)
-        return self._simplified(self._with_refined_errors(found))
-
-    def _with_refined_errors(self, best: Explanation, more: Sequence[ErrorKind] = ()) -> Explanation:
-        """The explanation at the optimum of its errors of recordings, and of more, with the same freedom."""
-        for _ in range(_REFINEMENTS):
-            kinds = dict.fromkeys([*best.intervals.all_errors.kinds, *more])
-            if not kinds:
-                break
-            errors = errors_of(best.intervals, best.refinement.fit, tuple(kinds))
-            if all(x.ratio < _REFINED for x in errors):
-                break
-            best = self._with_errors(best, errors)
-        return best
-
     def _with_errors(self, now: Explanation, errors: Sequence[RecordingError]) -> Explanation:
         """The explanation with more errors, with the same freedom."""
         return self._moved(now, with_errors(now.intervals, now.refinement.fit, errors))
@@ -336,7 +312,7 @@ class LocalSearch:
     def _optimised(self, now: Explanation, intervals: ShootingIntervals, begin: Fit) -> Explanation:
         """The explanation of other intervals with the same freedom."""
         fitted = refine_exact if now.exact else refine
-        return replace(now, intervals=intervals, refinement=fitted(self.settings, intervals, begin, self.prior))
+        return replace(now, refinement=fitted(self.settings, intervals, begin, self.prior))
 
     def _better(
         self,
@@ -364,7 +340,7 @@ class LocalSearch:
         """Local optimisation from the best hypothesis, with unmodelled accelerations."""
         report(self.callback, "local optimisation", 0.1)
         begin = start(self.settings, intervals, self.motion, self.hypotheses[0], self.prior)
-        return Explanation(intervals, refine(self.settings, intervals, begin, self.prior), exact=False)
+        return Explanation(refine(self.settings, intervals, begin, self.prior), exact=False)
 
     def _simplified(self, found: Explanation) -> Explanation:
         """The explanation without the freedom that is no longer likely."""
@@ -386,30 +362,38 @@ class LocalSearch:
         return replace(flexible, trial=ExactTrial(exact.cost - cost, cost, flexible.unexplained, length))
 
     def _likeliest_exact(self, flexible: Explanation) -> Explanation | None:
-        """The exact model from the parameters of a fit, or the best hypothesis; None if both are impossible."""
+        """The exact model from the parameters of a fit, or the best hypothesis; None if both are impossible.
+
+        One that is less likely may be so for a delay of all inputs, for which unmodelled accelerations stand.
+        """
         intervals, fit = flexible.intervals, flexible.refinement.fit
-        projected, found = flexible.projected, list[Explanation]()
-        errors, late = intervals.all_errors.kinds, intervals.all_inputs("delay")
+        projected, found, late = flexible.projected, list[Explanation](), intervals.all_inputs("delay")
         starts = np.array([projected, self.hypotheses[0]])
         starts = starts[: 1 + bool((np.abs(starts[1] - starts[0]) > _APART * np.abs(starts[0])).any())]
         for p in starts[intervals.layout.admits(starts)]:
-            begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
-            try:
-                refined = refine_exact(self.settings, intervals, begin, self.prior, flexible.cost)
-            except np.linalg.LinAlgError:  # simulations by the exact model overflow from here: it is no explanation
+            shared = np.concatenate([p, fit.shared[intervals.n_p :]])
+            exact = self._exact(intervals, replace(fit, shared=shared), flexible.cost)
+            if exact is None:
                 continue
-            exact = Explanation(intervals, refined, exact=True)
-            found.append(self._with_refined_errors(exact) if any(x.of_inputs for x in errors) else exact)
+            found.append(exact)
             if (
-                refined.converged
-                and found[-1].cost > flexible.cost
-                and late not in errors
+                exact.cost > flexible.cost
+                and late not in exact.intervals.all_errors.kinds
                 and late in self._sought(exact)
             ):
-                found.append(self._with_refined_errors(exact, [late]))
+                also = self._exact(intervals.with_errors([late]), replace(fit, shared=shared), flexible.cost)
+                found += [also] if also is not None else []
             if found[-1].cost < flexible.cost:
                 break
         return min(found, key=lambda x: x.cost, default=None)
+
+    def _exact(self, intervals: ShootingIntervals, begin: Fit, rival: float) -> Explanation | None:
+        """The exact model from a motion; None if simulations overflow from there."""
+        try:
+            refined = refine_exact(self.settings, intervals, with_residuals(intervals, begin), self.prior, rival)
+        except np.linalg.LinAlgError:
+            return None
+        return Explanation(refined, exact=True)
 
     def _split(self, coarse: Explanation, parts: int) -> Explanation:
         """The fit with unmodelled accelerations that vary faster."""

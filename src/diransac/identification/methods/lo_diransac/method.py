@@ -260,6 +260,9 @@ def _checks(settings: LoDiransacSettings, found: Searched) -> Iterator[Finding]:
     if found.explains_nothing:
         advice = "compare its terms and constants with the machine"
         yield Finding("bad", "The model explains almost nothing of this log", advice)
+    elif found.decided is not None and not found.decided.summary.predicts:
+        claim = "No estimate predicts parts of the log that it was not made from much better than no change would"
+        yield Finding("bad", claim, "compare the terms and constants of the model with the machine")
     if not found.likeliest.refinement.converged and settings.max_steps:
         claim = f"Local optimisation did not converge within its limit of {settings.max_steps} steps"
         yield Finding("care", claim, f"give it more: --set max_steps={2 * settings.max_steps}")

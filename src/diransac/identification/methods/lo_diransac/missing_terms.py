@@ -12,13 +12,12 @@ import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
 from diransac.identification.candidate_terms import TermLibrary, candidate_terms
-from diransac.identification.methods.lo_diransac.normal_equations import linearize
+from diransac.identification.methods.lo_diransac.normal_equations import linearize, weights_of
 from diransac.identification.methods.lo_diransac.projection import (
     inertia_slopes,
     means_of_windows,
     residuals_of_motion,
 )
-from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.term_selection import MeanForces, changes_beside, select_terms, spanned, suggestions_of
 from diransac.simulation.compiler import compile_map
 

@@ -40,6 +40,7 @@ __all__ = [
     "linearize",
     "sum_in_places",
     "variances_of_intervals",
+    "weights_of",
     "with_residuals",
 ]
 
@@ -128,11 +129,8 @@ class NormalEquations:
     slopes: FloatArray
     precision: FloatArray
 
-    def corrected(self, intervals: ShootingIntervals, fit: Fit, moved: Fit) -> tuple[FloatArray, FloatArray]:
-        """Right-hand sides of a step that makes up for the curvature of the rollouts along another step.
-
-        Where continuity is tight, ends that are curved fill the cost of a step that is right otherwise, and no step but
-        a tiny one would lower it (Maratos' effect; Nocedal and Wright 2006, section 18.3, second-order correction).
+    def excess(self, intervals: ShootingIntervals, fit: Fit, moved: Fit) -> FloatArray:
+        """Jumps ``(W - 1, n_x)`` after a step, less those that these equations expect, from the step of a fit alone.
 
         Parameters
         ----------
@@ -140,19 +138,13 @@ class NormalEquations:
         fit : Fit
             Of these equations.
         moved : Fit
-            After the other step.
-
-        Returns
-        -------
-        (W, k) array, (n_s,) array
-            Not finite where a rollout diverges.
+            After the step; not finite where a rollout diverges.
         """
         n_x = fit.x.shape[1]
         z = np.hstack([moved.x - fit.x, moved.d - fit.d])
         s = (moved.shared - fit.shared)[_places(intervals)[intervals.log_of]]
         linear = self.jumps + z[1:, :n_x] - np.einsum("wij,wj->wi", self.slopes, np.hstack([z, s])[:-1])
-        of_z, of_s = self.by_jumps(intervals, moved.jumps(intervals) - linear)
-        return self.right_z - of_z, self.right_s - of_s
+        return np.asarray(moved.jumps(intervals) - linear)
 
     def by_jumps(self, intervals: ShootingIntervals, more: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Change of the gradient by larger jumps.
@@ -394,3 +386,18 @@ def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
     )
     total = float(sum(terms))
     return total if np.isfinite(total) else np.inf
+
+
+def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+    """Weight of each measurement: the probability that it is not an outlier, over its variance.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    (N, n_signals) array
+    """
+    return fit.noise.inlying(fit.residuals, intervals.known) / np.square(fit.noise.sigma)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.normal_equations import variances_of_intervals
+from diransac.identification.methods.lo_diransac.normal_equations import variances_of_intervals, weights_of
 from diransac.identification.methods.lo_diransac.projection import (
     batch_sums,
     effect_of_intervals,
@@ -27,7 +27,6 @@ from diransac.identification.methods.lo_diransac.projection import (
     means_of_windows,
     residuals_of_motion,
 )
-from diransac.identification.methods.lo_diransac.refinement import weights_of
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.local_search import Explanation

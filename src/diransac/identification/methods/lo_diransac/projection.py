@@ -42,9 +42,8 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.hypotheses import WeakForm
-from diransac.identification.methods.lo_diransac.normal_equations import linearize
+from diransac.identification.methods.lo_diransac.normal_equations import linearize, weights_of
 from diransac.identification.methods.lo_diransac.recording_errors import effect_on
-from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.methods.lo_diransac.smoothing import split_signals
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.identification.uncertainty import combined, student_quantile

@@ -5,8 +5,7 @@ A sensor is here whatever measures a signal, with a measurement equation or with
 An error of a sensor that no parameter and no discrepancy explains is in the residuals: a delay in
 proportion to the signal's rate, a bias a constant.  One of an input is in them as simulations with it differ: an
 actuator that is late, a battery that sags.  A score test finds the most significant error, given all else that is
-estimated; it costs a call of the simulator, and no fit.  The error is then estimated jointly with all other unknowns,
-by one Newton step and a new fit.
+estimated; it costs a call of the simulator, and no fit.  From then on the error is an unknown of the fit as others.
 
 References
 ----------
@@ -16,23 +15,31 @@ Rao 1948 (score test); Furgale, Rehder, Siegwart 2013 (delays of sensors).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.identification.methods.lo_diransac.normal_equations import data_gradient, linearize, with_residuals
-from diransac.identification.methods.lo_diransac.refinement import weights_of
+from diransac.identification.methods.lo_diransac.normal_equations import (
+    data_gradient,
+    linearize,
+    weights_of,
+    with_residuals,
+)
 from diransac.identification.methods.lo_diransac.score_tests import ScoreTests, Slopes, scores_tested
 from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.methods.lo_diransac.arrowhead import Factored
+    from diransac.identification.methods.lo_diransac.normal_equations import Fit, NormalEquations
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
 __all__ = [
     "LEAST_DELAY",
+    "JointEquations",
+    "JointStep",
     "RecordingError",
     "clear_errors",
     "effect_on",
@@ -118,7 +125,11 @@ def clear_errors(
     scores, at_a_time = _Scores(intervals, fit), max(1, _NUMBERS_AT_A_TIME // intervals.measured.size)
     parts = [tested[k : k + at_a_time] for k in range(0, len(tested), at_a_time)]
     found = [x for part in parts for x in scores.tested(part)]
-    found = [x for x in found if _is_possible(intervals, x) and (x.kind.what != "delay" or abs(x.size) > LEAST_DELAY)]
+    found = [
+        x
+        for x in found
+        if _is_possible(intervals, x.kind, x.size) and (x.kind.what != "delay" or abs(x.size) > LEAST_DELAY)
+    ]
     inputs = [x for x in found if x.kind.of_inputs and x.gain > worth]
     single = [x for x in found if len(x.kind.columns) == 1 and not x.kind.of_inputs and x.ratio > _CLEAR]
     groups = [x for x in found if len(x.kind.columns) > 1 and not x.kind.of_inputs and x.gain > worth]
@@ -130,16 +141,16 @@ def clear_errors(
     return [*single[:1], *groups[:_GROUPS], *likeliest.values()]
 
 
-def _is_possible(intervals: ShootingIntervals, error: RecordingError) -> bool:
-    """False for a delay or a lag of a tenth of the log, a negative time constant, and a gain that vanishes."""
-    what, size = error.kind.what, intervals.all_errors.sizes.get(error.kind, 0.0) + error.size
+def _is_possible(intervals: ShootingIntervals, kind: ErrorKind, more: float) -> bool:
+    """False for a delay or a lag of a tenth of the log, a negative time constant, a gain that vanishes, infinity."""
+    what, size = kind.what, intervals.all_errors.sizes.get(kind, 0.0) + more
     if what == "bias":
-        return True
+        return bool(np.isfinite(size))
     if what == "drift":
         return abs(size) < _NO_GAIN
-    lags = intervals.all_errors.input_lag[list(error.kind.columns)] if what == "lag" else np.zeros(0)
+    lags = intervals.all_errors.input_lag[list(kind.columns)] if what == "lag" else np.zeros(0)
     longest = max(x.stop - x.start for x in intervals.rows_of_logs)
-    return abs(size) < _LATEST * longest and bool((lags + error.size > 0.0).all())
+    return abs(size) < _LATEST * longest and bool((lags + more > 0.0).all())
 
 
 def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> list[RecordingError]:
@@ -157,16 +168,11 @@ def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]
     list of RecordingError
         Without those that the log does not determine, and impossible ones.
     """
-    scores = _Scores(intervals, fit)
-    slopes = [scores.slope(x) for x in kinds]
-    determined, covariance, _, _ = scores.together(slopes)
-    sizes = -covariance @ np.array([slopes[k].score for k in determined])
-    errors = np.sqrt(np.diag(covariance)) + _TINY
-    found = [
-        RecordingError(kinds[k], float(x), float(std), float(0.5 * (x / std) ** 2))
-        for k, x, std in zip(determined, sizes, errors, strict=True)
-    ]
-    return [x for x in found if _is_possible(intervals, x)]
+    joint = JointEquations.of(intervals, fit, kinds)
+    step = joint.step(joint.right)
+    each = zip(kinds, step.sizes.tolist(), step.std.tolist(), strict=True)
+    found = [RecordingError(kind, size, std, 0.5 * (size / std) ** 2) for kind, size, std in each if np.isfinite(std)]
+    return [x for x in found if _is_possible(intervals, x.kind, x.size)]
 
 
 def effect_on(intervals: ShootingIntervals, fit: Fit, z: FloatArray, s: FloatArray) -> FloatArray:
@@ -188,10 +194,9 @@ def effect_on(intervals: ShootingIntervals, fit: Fit, z: FloatArray, s: FloatArr
     kinds = intervals.all_errors.kinds
     if not kinds:
         return np.zeros((s.shape[1], s.shape[1]))
-    scores = _Scores(intervals, fit)
-    _, covariance, of_z, of_s = scores.together([scores.slope(x) for x in kinds])
-    slopes = np.einsum("wkn,wke->ne", z, of_z) + s.T @ of_s
-    return np.asarray(slopes @ covariance @ slopes.T)
+    joint = JointEquations.of(intervals, fit, kinds)
+    slopes = np.einsum("wkn,wke->ne", z, joint.of_z) + s.T @ joint.of_s
+    return np.asarray(slopes @ joint.step(joint.right).covariance @ slopes.T)
 
 
 @dataclass(frozen=True)
@@ -230,8 +235,18 @@ class _Scores:
 
     def __init__(self, intervals: ShootingIntervals, fit: Fit) -> None:
         self.intervals, self.fit = intervals, fit
-        self.weights, self.rates = weights_of(intervals, fit), signal_rates(intervals, fit)
+        self.weights = weights_of(intervals, fit)
         self.at = linearize(intervals, fit, self.weights)
+
+    @cached_property
+    def rates(self) -> FloatArray:
+        """Change of each signal per sample."""
+        return signal_rates(self.intervals, self.fit)
+
+    def product(self, x: _Slope, y: _Slope) -> float:
+        """Information that two errors have in common, before other unknowns take theirs."""
+        of_signals = (self.weights * x.sensitivity * y.sensitivity).sum()
+        return float(of_signals + (self.at.precision * x.jumps * y.jumps).sum())
 
     def slope(self, kind: ErrorKind) -> _Slope:
         """Derivatives with respect to an error."""
@@ -251,7 +266,7 @@ class _Scores:
 
     def _of_signals(self, kind: ErrorKind) -> _Slope:
         columns = list(kind.columns)
-        own = np.zeros_like(self.rates)
+        own = np.zeros_like(self.intervals.measured)
         own[:, columns] = -self.rates[:, columns] if kind.what == "delay" else 1.0
         return self._slope(kind, own, np.zeros_like(self.at.jumps))
 
@@ -297,30 +312,172 @@ class _Scores:
 
     def _estimate(self, slope: _Slope, tests: ScoreTests, k: int) -> RecordingError | None:
         """Estimate of the k-th error, or None if the log does not determine it."""
-        information = float(tests.information[k])
+        information, score = float(tests.information[k]), float(tests.score[k])
         if information <= _least_information(slope.kind) * tests.direct[k]:
             return None
         n = len(self.intervals)
         batches = np.add.reduceat(tests.scores[:, k], np.arange(0, n, max(1, round(np.sqrt(n)))))
         variance = max(information, float(np.square(batches).sum()))
-        gain = 0.5 * slope.score**2 / information
-        return RecordingError(slope.kind, -slope.score / information, float(np.sqrt(variance)) / information, gain)
+        gain = 0.5 * score**2 / information
+        return RecordingError(slope.kind, -score / information, float(np.sqrt(variance)) / information, gain)
 
-    def together(self, slopes: Sequence[_Slope]) -> tuple[list[int], FloatArray, FloatArray, FloatArray]:
-        """Errors that the log determines, their covariance, and what they change of the gradient of the fit."""
-        of_z, of_s = np.stack([x.of_z for x in slopes], axis=-1), np.stack([x.of_s for x in slopes], axis=-1)
-        z, s = self.at.system.functional(of_z, of_s)
-        direct = np.array([[self._product(x, y) for y in slopes] for x in slopes])
-        information = direct - np.einsum("wke,wkf->ef", of_z, z) - of_s.T @ s
-        least = np.array([_least_information(x.kind) for x in slopes])
-        found = np.flatnonzero(np.diag(information) > least * np.diag(direct)).tolist()
-        covariance = np.linalg.pinv(information[np.ix_(found, found)], hermitian=True)
-        return found, covariance, of_z[..., found], of_s[:, found]
 
-    def _product(self, x: _Slope, y: _Slope) -> float:
-        """Information that two errors have in common, before other unknowns take theirs."""
-        of_signals = (self.weights * x.sensitivity * y.sensitivity).sum()
-        return float(of_signals + (self.at.precision * x.jumps * y.jumps).sum())
+@dataclass(frozen=True)
+class JointStep:
+    """Step of a fit and of errors of its recordings.
+
+    Parameters
+    ----------
+    of_fit : Factored
+    sizes : (E,) array
+        Of the errors; 0 of those that the logs do not determine.
+    std : (E,) array
+        Standard errors; infinite of those.
+    covariance : (E, E) array
+        0 of those.
+    """
+
+    of_fit: Factored
+    sizes: FloatArray
+    std: FloatArray
+    covariance: FloatArray
+
+
+Right = tuple[FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True)
+class JointEquations:
+    """Gauss-Newton system at a fit, with errors of its recordings as further unknowns.
+
+    Parameters
+    ----------
+    of_fit : NormalEquations
+        Of the fit alone.
+    kinds : tuple of ErrorKind
+    rates : (N, n_s) array
+        Change of each signal per sample.
+    of_z, of_s, jumps : (W, k, E), (n_s, E) and (W - 1, n_x, E) array
+        Derivatives with respect to the errors of the gradient of the fit, and of the jumps.
+    information : (E, E) array
+        Of the errors, if all else were known.
+    score : (E,) array
+        Derivative of the cost.
+    """
+
+    of_fit: NormalEquations
+    kinds: tuple[ErrorKind, ...]
+    rates: FloatArray
+    of_z: FloatArray
+    of_s: FloatArray
+    jumps: FloatArray
+    information: FloatArray
+    score: FloatArray
+
+    @classmethod
+    def of(cls, intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> JointEquations:
+        """Equations at a fit, with its own weights.
+
+        Parameters
+        ----------
+        intervals : ShootingIntervals
+        fit : Fit
+        kinds : sequence of ErrorKind
+        """
+        scores = _Scores(intervals, fit)
+        slopes = [scores.slope(x) for x in kinds]
+
+        def stacked(values: list[FloatArray], like: FloatArray) -> FloatArray:
+            return np.stack(values, axis=-1) if values else np.zeros((*like.shape, 0))
+
+        at = scores.at
+        return cls(
+            of_fit=at,
+            kinds=tuple(kinds),
+            rates=scores.rates if any(not x.of_inputs for x in kinds) else np.zeros_like(intervals.measured),
+            of_z=stacked([x.of_z for x in slopes], at.right_z),
+            of_s=stacked([x.of_s for x in slopes], at.right_s),
+            jumps=stacked([x.jumps for x in slopes], at.jumps),
+            information=np.array([[scores.product(x, y) for y in slopes] for x in slopes]).reshape(
+                len(kinds), len(kinds)
+            ),
+            score=np.array([x.score for x in slopes]),
+        )
+
+    @property
+    def right(self) -> Right:
+        """Right-hand sides, minus the gradient: of intervals, of shared unknowns, and of errors."""
+        return self.of_fit.right_z, self.of_fit.right_s, -self.score
+
+    def step(self, right: Right, damping: float = 0.0) -> JointStep:
+        """Solution for a right-hand side.
+
+        Parameters
+        ----------
+        right : (W, k) array, (n_s,) array, (E,) array
+        damping : float, optional
+            The diagonal is multiplied by ``1 + damping``.
+        """
+        z, s, e = right
+        columns = np.concatenate([z[:, :, None], self.of_z], axis=2), np.hstack([s[:, None], self.of_s])
+        solved = self.of_fit.system.solve(*columns, damping)
+        alone = replace(solved, step_z=solved.step_z[:, :, 0], step_p=solved.step_p[:, 0])
+        of_z, of_s = solved.step_z[:, :, 1:], solved.step_p[:, 1:]
+        direct = np.diag(self.information)
+        left = self.information + damping * np.diag(direct)
+        left = left - np.einsum("wke,wkf->ef", self.of_z, of_z) - self.of_s.T @ of_s
+        least = np.array([_least_information(x) for x in self.kinds])
+        found = np.flatnonzero(np.diag(left) > least * direct)
+        covariance, std = np.zeros_like(left), np.full(len(direct), np.inf)
+        covariance[np.ix_(found, found)] = np.linalg.pinv(left[np.ix_(found, found)], hermitian=True)
+        std[found] = np.sqrt(np.diag(covariance)[found]) + _TINY
+        expected = np.einsum("wke,wk->e", self.of_z, alone.step_z) + self.of_s.T @ alone.step_p
+        sizes = covariance @ (e - expected)
+        moved = replace(alone, step_z=alone.step_z - of_z @ sizes, step_p=alone.step_p - of_s @ sizes)
+        return JointStep(moved, sizes, std, covariance)
+
+    def moved(self, intervals: ShootingIntervals, step: JointStep) -> ShootingIntervals | None:
+        """The intervals with errors after a step; None if one is impossible.
+
+        Parameters
+        ----------
+        intervals : ShootingIntervals
+            Of these equations.
+        step : JointStep
+        """
+        if not step.sizes.any():
+            return intervals
+        sizes = dict(zip(self.kinds, step.sizes.tolist(), strict=True))
+        possible = all(_is_possible(intervals, kind, x) for kind, x in sizes.items())
+        return intervals.corrected(sizes, self.rates) if possible else None
+
+    def corrected(self, intervals: ShootingIntervals, fit: Fit, moved: Fit, step: JointStep) -> Right:
+        """Right-hand sides of a step that makes up for the curvature of the rollouts along another step.
+
+        Where continuity is tight, ends that are curved fill the cost of a step that is right otherwise, and no step but
+        a tiny one would lower it (Maratos' effect; Nocedal and Wright 2006, section 18.3, second-order correction).
+
+        Parameters
+        ----------
+        intervals : ShootingIntervals
+        fit : Fit
+            Of these equations.
+        moved : Fit
+            After the other step.
+        step : JointStep
+            That step.
+
+        Returns
+        -------
+        (W, k) array, (n_s,) array, (E,) array
+            Not finite where a rollout diverges.
+        """
+        at = self.of_fit
+        more = at.excess(intervals, fit, moved) - self.jumps @ step.sizes
+        of_z, of_s = at.by_jumps(intervals, more)
+        of_e = np.einsum("wi,wi,wie->e", at.precision, np.where(intervals.linked[:, None], more, 0.0), self.jumps)
+        right_z, right_s, right_e = self.right
+        return right_z - of_z, right_s - of_s, right_e - of_e
 
 
 def _least_information(kind: ErrorKind) -> float:

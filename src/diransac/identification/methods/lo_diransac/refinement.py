@@ -32,21 +32,20 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
     cost,
     innovation_std,
     innovations,
-    linearize,
     with_residuals,
 )
+from diransac.identification.methods.lo_diransac.recording_errors import JointEquations
 from diransac.identification.methods.lo_diransac.segments import DIVERGED
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.arrowhead import Factored
-    from diransac.identification.methods.lo_diransac.normal_equations import NormalEquations
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.model import Model
 
-__all__ = ["Prior", "Refinement", "diverges", "make_prior", "refine", "refine_exact", "start", "weights_of"]
+__all__ = ["Prior", "Refinement", "diverges", "make_prior", "refine", "refine_exact", "start"]
 
 
 # Where tau starts, in spreads of the accelerations; the largest change of any scale in a step.
@@ -69,6 +68,8 @@ _MAX_TRIALS, _MAX_SWEEPS = 8, 12
 # Part of what is left of the excess of its cost when a step is corrected for the curvature of the rollouts, at most.
 _CORRECTED = 0.3
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
+# Change of an error of a recording over its standard error that ends a fit.
+_ERRORS_SETTLED = 0.1
 # Steps of which the best says how much a fit may gain in each of those that are left.
 _RECENT = 6
 
@@ -101,6 +102,8 @@ class Refinement:
 
     Parameters
     ----------
+    intervals : ShootingIntervals
+        With the most probable errors of the recordings.
     fit : Fit
         Most probable motion and parameters.
     cost : float
@@ -111,6 +114,7 @@ class Refinement:
         Whether the steps ended before the limit.
     """
 
+    intervals: ShootingIntervals
     fit: Fit
     cost: float
     steps: int
@@ -257,6 +261,7 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
     ----------
     settings : LoDiransacSettings
     intervals : ShootingIntervals
+        Their errors of recordings are estimated, too.
     fit : Fit
         Initial fit, as from `start`.
     prior : Prior
@@ -274,12 +279,13 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
     while steps < settings.max_steps and not converged:
         check_time()
         steps += 1
-        moved, solved, damping = _step(intervals, fit, at, damping)
-        updated = _update(settings, intervals, moved, solved, prior)
+        taken = _step(intervals, fit, at, damping)
+        intervals, solved, damping = taken.intervals, taken.solved, taken.damping
+        updated = _update(settings, intervals, taken.fit, solved, prior)
         errors = np.sqrt(np.diag(solved.var_p)[: intervals.n_p])
-        converged = _unchanged(fit, updated, errors)
+        converged = taken.of_errors < _ERRORS_SETTLED and _unchanged(fit, updated, errors)
         fit, at = updated, _linearized(intervals, updated)
-    return Refinement(fit, _evidence(intervals, fit, at), steps, converged)
+    return Refinement(intervals, fit, _evidence(intervals, fit, at), steps, converged)
 
 
 def refine_exact(
@@ -318,7 +324,8 @@ def refine_exact(
     while steps < settings.max_steps and not converged and not _is_lost(intervals, losses, settings, rival):
         check_time()
         steps += 1
-        moved, solved, damping = _step(intervals, fit, at, damping)
+        taken = _step(intervals, fit, at, damping)
+        intervals, moved, solved, damping = taken.intervals, taken.fit, taken.solved, taken.damping
         losses.append(float(moved.noise.negative_log_likelihood(moved.residuals, intervals.known).sum()))
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
         noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
@@ -326,9 +333,10 @@ def refine_exact(
         jumps = np.clip(_unbroken(fit, solved), _continuity(intervals, least), jumps) if steps == 1 else jumps
         continuity = np.maximum(jumps, _TIGHTENED * fit.continuity_std)
         updated = replace(moved, noise=noise, tau=tau, continuity_std=continuity)
-        converged = bool((tau == fit.tau).all()) and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
+        settled = bool((tau == fit.tau).all()) and taken.of_errors < _ERRORS_SETTLED
+        converged = settled and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
         fit, at = updated, _linearized(intervals, updated)
-    return Refinement(fit, _evidence(intervals, fit, at), steps, converged)
+    return Refinement(intervals, fit, _evidence(intervals, fit, at), steps, converged)
 
 
 def _is_lost(intervals: ShootingIntervals, losses: Sequence[float], settings: LoDiransacSettings, rival: float) -> bool:
@@ -340,12 +348,12 @@ def _is_lost(intervals: ShootingIntervals, losses: Sequence[float], settings: Lo
     return bool(losses[-1] - rival > intervals.known.sum() + left * best)
 
 
-def _linearized(intervals: ShootingIntervals, fit: Fit) -> NormalEquations:
+def _linearized(intervals: ShootingIntervals, fit: Fit) -> JointEquations:
     """Normal equations at a fit, with its own weights."""
-    return linearize(intervals, fit, weights_of(intervals, fit))
+    return JointEquations.of(intervals, fit, intervals.all_errors.kinds)
 
 
-def _evidence(intervals: ShootingIntervals, fit: Fit, at: NormalEquations) -> float:
+def _evidence(intervals: ShootingIntervals, fit: Fit, at: JointEquations) -> float:
     """Negative logarithm of the probability of the measurements by Laplace's method.
 
     Up to a constant that fits of the same log have in common, given the scales of a fit at its optimum; infinite where
@@ -356,44 +364,44 @@ def _evidence(intervals: ShootingIntervals, fit: Fit, at: NormalEquations) -> fl
     beforehand = cost(intervals, fit, np.zeros_like(fit.residuals))
     if not np.isfinite(loss + beforehand):
         return np.inf
-    solved = at.system.solve(at.right_z, at.right_s)
+    solved = at.of_fit.system.solve(at.of_fit.right_z, at.of_fit.right_s)
     scales = intervals.linked.sum() * np.log(fit.continuity_std).sum() + np.log(innovation_std(intervals, fit)).sum()
     scales += np.log(fit.prior[np.isfinite(fit.prior)]).sum()
     return float(loss + 0.5 * beforehand + 0.5 * solved.log_det + scales)
 
 
-def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
-    """Weight of each measurement: the probability that it is not an outlier, over its variance.
+@dataclass(frozen=True)
+class _Step:
+    """Where a step leads, its solution, the damping of the next, and largest change of an error over its std."""
 
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-
-    Returns
-    -------
-    (N, n_signals) array
-    """
-    return fit.noise.inlying(fit.residuals, intervals.known) / np.square(fit.noise.sigma)
+    intervals: ShootingIntervals
+    fit: Fit
+    solved: Factored
+    damping: float
+    of_errors: float
 
 
-def _step(intervals: ShootingIntervals, fit: Fit, at: NormalEquations, damping: float) -> tuple[Fit, Factored, float]:
-    """One Gauss-Newton step within the bounds, corrected or damped until the cost falls; damping of the next one."""
-    weights = at.weights
+def _step(intervals: ShootingIntervals, fit: Fit, at: JointEquations, damping: float) -> _Step:
+    """One Gauss-Newton step within the bounds, corrected or damped until the cost falls."""
+    weights = at.of_fit.weights
     before = cost(intervals, fit, weights)
     for _ in range(_MAX_TRIALS):
-        right, excess = (at.right_z, at.right_s), np.inf
+        right, excess = at.right, np.inf
         while True:
-            solved = at.system.solve(*right, damping)
-            trial = _moved(intervals, fit, solved)
-            more = cost(intervals, trial, weights) - before
+            step = at.step(right, damping)
+            there = at.moved(intervals, step)
+            if there is None:
+                break
+            trial = _moved(there, fit, step.of_fit)
+            more = cost(there, trial, weights) - before
             if more <= 1e-9 * before:
-                return trial, solved, damping / 10.0 if damping > _LEAST_DAMPING else 0.0
+                least = damping / 10.0 if damping > _LEAST_DAMPING else 0.0
+                return _Step(there, trial, step.of_fit, least, float((np.abs(step.sizes) / step.std).max(initial=0.0)))
             if not more < _CORRECTED * excess:
                 break
-            right, excess = at.corrected(intervals, fit, trial), more
+            right, excess = at.corrected(there, fit, trial, step), more
         damping = max(10.0 * damping, _FIRST_DAMPING)
-    return fit, solved, damping
+    return _Step(intervals, fit, step.of_fit, damping, 0.0)
 
 
 def _moved(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:

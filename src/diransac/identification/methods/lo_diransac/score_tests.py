@@ -70,6 +70,9 @@ class ScoreTests:
     ----------
     direct, information : (K,) array
         Information of each effect, if all else were known, and given that all else is estimated.
+    score : (K,) array
+        Derivative of the cost after a step of all else: what an unfinished fit, or one whose priors have become
+        narrower, gives up is the effect's.
     scores : (W, K) array
         Score of each interval's measurements, less that of the effect itself: what scatters.
     z, s : (W, k, K) and (n_s, K) array
@@ -78,13 +81,14 @@ class ScoreTests:
 
     direct: FloatArray
     information: FloatArray
+    score: FloatArray
     scores: FloatArray
     z: FloatArray
     s: FloatArray
 
 
 def scores_tested(at: NormalEquations, slopes: Slopes) -> ScoreTests:
-    """Score tests at an optimum.
+    """Score tests at a fit.
 
     Parameters
     ----------
@@ -97,10 +101,11 @@ def scores_tested(at: NormalEquations, slopes: Slopes) -> ScoreTests:
     """
     z, s = at.system.functional(slopes.of_z, slopes.of_s)
     information = slopes.direct - (slopes.of_z * z).sum(axis=(0, 1)) - (slopes.of_s * s).sum(axis=0)
+    score = slopes.score + np.einsum("wk,wke->e", at.right_z, z) + at.right_s @ s
     scores = slopes.rows + np.einsum("wk,wke->we", at.data_z, z) + at.data_s @ s
     # An effect that is there has a score of one sign in each batch; only the rest of the scores scatters.
     scores = scores - slopes.score * slopes.share / np.maximum(slopes.share.sum(axis=0), _TINY)
-    return ScoreTests(slopes.direct, information, scores, z, s)
+    return ScoreTests(slopes.direct, information, score, scores, z, s)
 
 
 def slopes_of_accelerations(

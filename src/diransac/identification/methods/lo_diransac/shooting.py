@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -115,7 +115,7 @@ class RecordingErrors:
         RecordingErrors
         """
         sizes = {**self.sizes, **{kind: self.sizes.get(kind, 0.0) + x for kind, x in more.items()}}
-        return replace(self, sizes={kind: x for kind, x in sizes.items() if x})
+        return replace(self, sizes=sizes)
 
 
 @dataclass(frozen=True)
@@ -360,6 +360,15 @@ class ShootingIntervals:
         ShootingIntervals
         """
         return replace(self, errors=self.all_errors.plus({kind: size}))
+
+    def with_errors(self, kinds: Iterable[ErrorKind]) -> ShootingIntervals:
+        """The intervals with further errors of the recordings, none of a size yet."""
+        return replace(self, errors=self.all_errors.plus(dict.fromkeys(kinds, 0.0)))
+
+    def without_error(self, kind: ErrorKind) -> ShootingIntervals:
+        """The intervals without an error of an input."""
+        errors = self.all_errors
+        return replace(self, errors=replace(errors, sizes={x: size for x, size in errors.sizes.items() if x != kind}))
 
     def split(self, parts: int) -> ShootingIntervals:
         """The same rows in intervals of a fraction of the length."""

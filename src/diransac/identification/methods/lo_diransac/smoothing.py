@@ -62,6 +62,8 @@ _FEWEST, _ENOUGH_SAMPLES = 5, 25
 _ENOUGH = 4000
 # Samples of the running medians beside which inputs have spikes: those of two samples at most.  Passes over them.
 _SPIKE_WINDOW, _SPIKE_PASSES, _MAD_TO_STD = 5, 20, 1.4826
+# Relative change of a signal that is a rounding error; steps of its resolution that are fewer than two.
+_ROUNDING, _ONE_STEP = 1e-9, 1.5
 # Numbers of the windows of chains that are fitted together at most; more would only take memory.
 _NUMBERS_TOGETHER = 100_000
 
@@ -137,6 +139,9 @@ def odd_window(seconds: float, dt: float, most: int) -> int:
 def stuck_rows(measured: FloatArray) -> BoolArray:
     """Rows that repeat the previous row exactly in every signal: nothing new was measured.
 
+    Signals of a coarse resolution repeat by themselves while they move slowly, and change by one step then; rows
+    are not stuck where each signal does.
+
     Parameters
     ----------
     measured : (N, n) array
@@ -145,9 +150,20 @@ def stuck_rows(measured: FloatArray) -> BoolArray:
     -------
     (N,) bool array
     """
-    stuck = np.zeros(len(measured), bool)
+    n, stuck = len(measured), np.zeros(len(measured), bool)
     stuck[1:] = np.all(measured[1:] == measured[:-1], axis=1)
-    return stuck
+    if not stuck.any():
+        return stuck
+    changes = np.abs(np.diff(measured, axis=0))
+    least = _ROUNDING * np.nan_to_num(np.abs(measured)).max(axis=0)
+    resolution = np.where(changes > least, changes, np.inf).min(axis=0)
+    # Of each row, the next one that is not stuck.
+    free = np.where(stuck, n, np.arange(n))
+    following = np.append(np.minimum.accumulate(free[::-1])[::-1], n)[1:]
+    leaps = np.full(measured.shape, np.inf)
+    ends = following < n
+    leaps[ends] = np.abs(measured[following[ends]] - measured[ends])
+    return stuck & ~np.all(leaps < _ONE_STEP * resolution, axis=1)
 
 
 def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[FloatArray, int]:

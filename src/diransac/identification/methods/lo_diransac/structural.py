@@ -33,14 +33,13 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of
-from diransac.identification.methods.lo_diransac.normal_equations import linearize
+from diransac.identification.methods.lo_diransac.normal_equations import linearize, weights_of
 from diransac.identification.methods.lo_diransac.projection import (
     batch_sums,
     equations_of_rows,
     means_of_intervals,
     residuals_of_motion,
 )
-from diransac.identification.methods.lo_diransac.refinement import weights_of
 from diransac.identification.methods.lo_diransac.score_tests import scores_tested, slopes_of_accelerations
 from diransac.identification.structure import PossibleTerm
 
@@ -219,10 +218,8 @@ def _tested(
         tests = scores_tested(at, slopes)
         determined = tests.information > _DETERMINED * tests.direct
         information = np.where(determined, tests.information, 1.0)
-        # Discrepancies are not at the optimum of their narrower prior: what they give up is the term's, too.
-        given_up = np.einsum("wk,wke->e", at.right_z, tests.z) + at.right_s @ tests.s
         scatter = np.square(batch_sums(tests.scores)).sum(axis=0)
-        estimates = np.where(determined, -(slopes.score + given_up) / information, 0.0)
+        estimates = np.where(determined, -tests.score / information, 0.0)
         variances = np.where(determined, np.maximum(information, scatter) / np.square(information), np.inf)
         effects = -(np.einsum("wkp,wke->pe", result.of_z, tests.z, optimize=True) + result.of_s.T @ tests.s)
         found.append((estimates, variances, effects))
