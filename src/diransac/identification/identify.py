@@ -397,10 +397,15 @@ def _explained(dataset: Dataset, fitted: Callable[[], Estimate]) -> Estimate:
 
 
 def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
-    """The result with findings on mistakes of columns: contradictions, and what explains a bad answer."""
+    """The result with findings on mistakes of columns: contradictions, and what explains a bad answer.
+
+    An answer is doubtful, too, where much is unexplained or a parameter that must not be zero may be.
+    """
     left = (x for one in result.logs if one.prediction for x in one.prediction.unexplained.values())
     is_bad, n_tested = result.verdict == "do not rely on this", 0
-    is_doubtful = is_bad or max(left, default=0.0) > _DOUBTFUL
+    parameters = result.model.parameters
+    lost = [n for n, (low, high) in result.intervals().items() if low <= 0.0 <= high and not parameters[n].admits(0.0)]
+    is_doubtful = is_bad or bool(lost) or max(left, default=0.0) > _DOUBTFUL
     if is_doubtful:
         mistakes, n_tested = _mistakes(dataset)
     else:

@@ -163,7 +163,7 @@ def stuck_rows(measured: FloatArray) -> BoolArray:
     leaps = np.full(measured.shape, np.inf)
     ends = following < n
     leaps[ends] = np.abs(measured[following[ends]] - measured[ends])
-    return stuck & ~np.all(leaps < _ONE_STEP * resolution, axis=1)
+    return np.asarray(stuck & ~np.all(leaps < _ONE_STEP * resolution, axis=1))
 
 
 def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[FloatArray, int]:
