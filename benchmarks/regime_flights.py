@@ -71,13 +71,12 @@ class Regime:
 
 @dataclass(frozen=True)
 class Recording:
-    """One seed of a regime: its columns (N,), time (N,), true parameters, exact signals (N,) and set-points (N,)."""
+    """One seed of a regime: its columns (N,), time (N,), true parameters and exact signals (N,)."""
 
     time: Array
     columns: Mapping[str, Array]
     truth: Mapping[str, float]
     exact: Mapping[str, Array]
-    set_points: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def log(self) -> dr.Log:
@@ -90,14 +89,12 @@ def recordings(regime: Regime, seeds: Sequence[int]) -> list[Recording]:
     parameters = regime.machine.drawn(_rngs(regime.machine.name, "parameters", seeds))
     reference = regime.machine.reference(_rngs(regime.machine.name, "reference", seeds))
     time, exact = _simulated(regime, parameters, reference, seeds)
-    wanted = np.stack([reference(t) for t in time])
     noise = _rngs(regime.name, "noise", seeds)
     found = []
     for lane, rng in enumerate(noise):
         own = {name: values[:, lane] for name, values in exact.items()}
         truth = {name: float(getattr(parameters, name)[lane]) for name in regime.machine.model.parameters}
-        set_points = {f"set_point_{i}": values for i, values in enumerate(wanted[:, :, lane].T, start=1)}
-        found.append(Recording(time, _measured(regime, time, own, rng), truth, own, set_points))
+        found.append(Recording(time, _measured(regime, time, own, rng), truth, own))
     return found
 
 

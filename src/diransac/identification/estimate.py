@@ -34,11 +34,9 @@ __all__ = [
     "Estimate",
     "Evaluation",
     "Finding",
-    "HausmanTest",
     "Level",
     "LogEstimate",
     "LogSummary",
-    "Outcome",
     "Prediction",
     "Resolution",
 ]
@@ -154,41 +152,6 @@ class Resolution:
         return f"inputs interpolated {how}" if how else ""
 
 
-Outcome = Literal["passed", "differs", "rejected", "weak", "untested"]
-"""Of a `HausmanTest`: no difference; one at 5 %; one at 0.1 %; instruments that are too weak; no test."""
-
-
-@dataclass(frozen=True)
-class HausmanTest:
-    """A parameter by least squares and with set-points as instruments: different where feedback biases the former.
-
-    Parameters
-    ----------
-    parameter : str
-    plain, instrumented : float
-        Both estimates, the parameter's unit.
-    standard_error : float
-        Of their difference.
-    strength : float
-        First-stage F of the instruments.
-    outcome : str
-        "passed"; "differs" at a level of 5 %, shared by all parameters that are tested; "rejected" at 0.1 %; "weak",
-        where the instruments of the parameter, or of one that shares an equation with it, have an F below 10.
-    """
-
-    parameter: str
-    plain: Number
-    instrumented: Number
-    standard_error: Number
-    strength: Number
-    outcome: Outcome
-
-    @property
-    def distance(self) -> float:
-        """Difference over its standard error."""
-        return abs(self.instrumented - self.plain) / self.standard_error
-
-
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
     """Sensor noise, outliers, unmodelled forces and input delay, as lo-diransac separates them.
@@ -225,8 +188,6 @@ class Diagnosis:
         Names of the parameters that the logs do not determine.
     combinations : tuple of str, optional
         Sentences about these parameters: the combinations that are determined, the reason, the remedy.
-    hausman_tests : tuple of HausmanTest, optional
-        Of each parameter, where set-points are named and the model is not exact.
     suggested_terms : mapping of str to (W,) array, optional
         What suggested terms explain of each unmodelled force, or of each acceleration where there are no forces, beside
         the parameters that would change with them; empty without suggestions.
@@ -246,7 +207,6 @@ class Diagnosis:
     input_delay_significant: bool
     unidentifiable: tuple[str, ...]
     combinations: tuple[str, ...] = ()
-    hausman_tests: tuple[HausmanTest, ...] = ()
     suggested_terms: Series = field(default_factory=dict)
 
     def __post_init__(self) -> None:

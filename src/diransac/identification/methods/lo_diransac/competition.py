@@ -124,7 +124,7 @@ def compete(
         first = likeliest(settings, dataset, seed, callback, whole)
     except (IdentificationError, np.linalg.LinAlgError) as error:
         first, refused = None, error
-    if first is not None and (settings.set_points or is_settled(first.likeliest, first.motion)):
+    if first is not None and is_settled(first.likeliest, first.motion):
         return first
     if first is not None and not first.likeliest.complete:
         return first

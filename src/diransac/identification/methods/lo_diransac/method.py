@@ -17,16 +17,11 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import ModelError, SettingsError
-from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, HausmanTest, Resolution
+from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, Resolution
 from diransac.identification.identifiability import check_structure, unidentifiable
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
-from diransac.identification.methods.lo_diransac.instruments import (
-    Instrumented,
-    check_set_points,
-    instrumented_estimate,
-)
 from diransac.identification.methods.lo_diransac.parts import compared_parts
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate, parameter_units
@@ -102,10 +97,6 @@ class LoDiransac(LoDiransacSettings):
     max_recording_errors : int, optional
         Largest number of unnamed ones of these that are estimated, the timing of all inputs included; where the model
         is exact, only this, and those of groups of sensors and of sensors with a measurement equation.
-    set_points : sequence of str, optional
-        Columns of the logs that disturbances do not change: set-points, or inputs of a machine without feedback.  Where
-        the model is not exact, they are instruments: a parameter that feedback biases is estimated from them, and
-        named.
     substeps : int, optional
         Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
         samples or links are light.
@@ -162,7 +153,7 @@ class LoDiransac(LoDiransacSettings):
         LogError
             The logs are too short, or sampled at different rates.
         SettingsError
-            A signal or an input is named that the logs lack, or a set-point that is no instrument.
+            A signal or an input is named that the logs lack.
         IdentificationError
             No sample gives parameters within their bounds.
         TimeLimitError
@@ -193,7 +184,6 @@ def configured(settings: Settings, **options: Any) -> LoDiransac:
 def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
     """Parameters of the dataset's model, step by step."""
     _check_sensors(settings, dataset)
-    check_set_points(dataset, settings.set_points)
     unknown = [name for name in settings.start or () if name not in dataset.model.parameters]
     if unknown:
         has = ", ".join(dataset.model.parameters)
@@ -208,10 +198,6 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
     refined = likeliest.refinement
     report(callback, "estimating parameters", 0.9)
-    instrumented = Instrumented(result, np.zeros(len(result.parameters)))
-    if settings.set_points and settings.projection and not (likeliest.exact or best.impossible):
-        instrumented = instrumented_estimate(intervals, refined.fit, result, dataset, settings.set_points)
-        result = instrumented.result
     predicts = best.decided is None or best.decided.summary.predicts
     if best.impossible or not predicts or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset, rows_of_logs(intervals, motion))
@@ -220,23 +206,22 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
 
         lacks = missing_terms(intervals, refined.fit, result, settings.candidate_terms)
-    ambiguity = _ambiguity(parts.changes, lacks, instrumented)
+    ambiguity = _ambiguity(parts.changes, lacks, len(result.parameters))
     checks = (
         *_checks(settings, best),
         *_checks_of_bounds(best),
         *_checks_of_unmeasured(best),
-        *instrumented.findings,
         *findings_of_fit(likeliest, parts, best.decided.acting if best.decided else None),
     )
-    found = _Found(dataset, best, result, ambiguity, instrumented.tests, lacks)
+    found = _Found(dataset, best, result, ambiguity, lacks)
     end = "converged" if refined.converged else "limit of steps"
     end = end if likeliest.complete else TIME_LIMIT
     return _estimate(settings, found, end, checks)
 
 
-def _ambiguity(changes: Sequence[Change], lacks: MissingTerms | None, instrumented: Instrumented) -> FloatArray:
-    """Covariance of parameters that change during the log, with terms that the model lacks, or with instruments."""
-    found = np.diag(np.square(instrumented.ambiguity))
+def _ambiguity(changes: Sequence[Change], lacks: MissingTerms | None, n: int) -> FloatArray:
+    """Covariance ``(n, n)`` of parameters that change during the log, or with terms that the model lacks."""
+    found = np.zeros((n, n))
     if lacks is not None:
         found += np.outer(lacks.change, lacks.change)
     for one in changes:
@@ -307,7 +292,6 @@ class _Found:
     best: Searched
     result: ProjectedEstimate
     ambiguity: FloatArray
-    hausman_tests: tuple[HausmanTest, ...]
     lacks: MissingTerms | None
 
     @property
@@ -400,7 +384,6 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
         input_delay_significant=found.is_late,
         unidentifiable=lost,
         combinations=combinations,
-        hausman_tests=found.hausman_tests,
         suggested_terms=per_equation((forces or accelerations)[1]) if len(accelerations) > 1 else {},
     )
 

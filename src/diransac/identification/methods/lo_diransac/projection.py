@@ -5,12 +5,11 @@ parameters and discrepancies together, in proportions that depend on the noise. 
 squares on noise-free data: ``W p = b`` is solved again on the fitted motion, so that the component of the discrepancies
 in the regressor's column space is attributed to the parameters.  Equations are weighted by their inertial forces.
 
-Inputs are no instruments: a controller answers disturbances, and its inputs are correlated with them (Forssell, Ljung
-1999).  Set-points are, where a user names them (`instruments`).  Against noise none are needed: the fitted
-accelerations are posterior means, whose errors are uncorrelated with themselves, so that they do not bias the slopes of
-a regression on them (Berkson 1950).  The motion of a state that nothing measures follows from the equations and from
-its unmodelled accelerations: a regression on it would attenuate its parameters, and these accelerations are not
-attributed to them.
+Noise hardly biases the slopes of a regression on the fitted accelerations: these are posterior means, whose errors are
+uncorrelated with themselves (Berkson 1950).  Where it is not white they follow it, and means over windows of several
+intervals have less of it and less information: estimates over windows of each length compete (`competition`).  The
+motion of a state that nothing measures follows from the equations and from its unmodelled accelerations: a regression
+on it would attenuate its parameters, and these accelerations are not attributed to them.
 
 The covariance has four parts: that of the fit and of the errors of its sensors, propagated through the projection;
 that of the unmodelled forces outside the regressor's column space, as a sample of forces that differ from log to log;
@@ -25,8 +24,7 @@ wide, and the combination has what is left of their precision.
 
 References
 ----------
-Plumlee 2017 (discrepancies orthogonal to the model); White 1982 (inference under a wrong model); Söderström, Stoica
-1983 (instrumental variables).
+Plumlee 2017 (discrepancies orthogonal to the model); White 1982 (inference under a wrong model).
 """
 
 from __future__ import annotations
@@ -34,7 +32,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -57,9 +54,7 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler import Map
 
 __all__ = [
-    "Contrast",
     "EffectOfIntervals",
-    "Instruments",
     "ProjectedEstimate",
     "batch_sums",
     "discrepancy_units",
@@ -69,9 +64,7 @@ __all__ = [
     "fitted_parameters",
     "inertia_slopes",
     "inertial_forces",
-    "instrumented_contrast",
     "least_squares_gains",
-    "mean_regressors",
     "means_of_intervals",
     "means_of_windows",
     "parameter_units",
@@ -88,13 +81,10 @@ _TINY, _UPPER, _NORMAL_UPPER = 1e-300, 0.975, 1.959963984540054
 _DIFFERENCE = 1e-4
 # Factor of the standard deviations of priors in the covariance that is combined with them.
 _WIDER = 100.0
-# Equations per parameter in the longest windows; difference of estimates, standard errors, and relative, that is none;
-# part of a column's power that windows of twice the length keep where it has no noise.
-_EQUATIONS, _CLEAR, _NEGLIGIBLE, _KEPT = 8, 2.5, 0.05, 0.95
+# Equations per parameter in the longest windows.
+_EQUATIONS = 8
 # Steps of reweighting, the width of Cauchy's loss in standard deviations, and what is rounding of an equation's scale.
 _REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
-# Least variance of a regressor's covariance with its instruments: beyond it they are the regressor.
-_EXACT = 1e-9
 # Fewest batches of correlated intervals.
 _BATCHES = 4
 
@@ -128,58 +118,7 @@ class ProjectedEstimate:
     of_fit: FloatArray
 
 
-@dataclass(frozen=True)
-class Instruments:
-    """Regressors without what disturbances contribute to them.
-
-    Parameters
-    ----------
-    means : (W, n_v, n) array
-        Mean over each interval.
-    used : (n,) bool array
-        Parameters whose regressor is replaced; the others are their own instruments.
-    """
-
-    means: FloatArray
-    used: BoolArray
-
-
-@dataclass(frozen=True)
-class Contrast:
-    """Instrumented less plain least squares.
-
-    Parameters
-    ----------
-    instrumented, plain : (n,) array
-        Parameters.
-    covariance : (n, n) array
-        Of their difference, without the assumption that either is efficient.
-    n_batches : int
-        Sums over neighbouring intervals from which the covariance is estimated.
-    strength : (n,) array
-        First-stage F of each parameter: 1 over the variance of its regressor's covariance with the instruments that is
-        not theirs, over that covariance; NaN for a parameter on a bound, or without a regressor.
-    together : (n, n) bool array
-        Parameters that share an equation, directly or by others.
-    """
-
-    instrumented: FloatArray
-    plain: FloatArray
-    covariance: FloatArray
-    n_batches: int
-    strength: FloatArray
-    together: BoolArray
-
-    def critical(self, level: float) -> float:
-        """Standard errors that the difference of a parameter exceeds with a probability of ``level`` by chance."""
-        freedom = max(self.n_batches - 1, 1)
-        usual = student_quantile(freedom, _UPPER) / _NORMAL_UPPER
-        return student_quantile(freedom, 1.0 - 0.5 * level) / usual
-
-
-def estimate_parameters(
-    intervals: ShootingIntervals, fit: Fit, instruments: Instruments | None = None
-) -> ProjectedEstimate:
+def estimate_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
     """Parameters that solve the equations on the fitted motion by least squares, and their covariance.
 
     Parameters
@@ -187,22 +126,20 @@ def estimate_parameters(
     intervals : ShootingIntervals
     fit : Fit
         Most probable motion.
-    instruments : Instruments, optional
 
     Returns
     -------
     ProjectedEstimate
         Within the inclusive bounds; parameters on them have an infinite variance.
     """
-    wide = _with_wide_priors(intervals, fit)
-    found = _of_windows(intervals, wide, instruments)
-    return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
+    _, estimate, _, _ = next(projected_candidates(intervals, fit))
+    return estimate()
 
 
 def projected_candidates(
     intervals: ShootingIntervals, fit: Fit
 ) -> Iterator[tuple[float, Callable[[], ProjectedEstimate], FloatArray, FloatArray]]:
-    """Least squares on the fitted motion over windows of each length, those of `estimate_parameters` first.
+    """Least squares on the fitted motion over windows of one interval, of two, of four, ..., while equations are many.
 
     Parameters
     ----------
@@ -223,9 +160,7 @@ def projected_candidates(
     """
     wide = _with_wide_priors(intervals, fit)
     now, rows = wide.shared[: intervals.n_p], _Rows.of(intervals, wide)
-    lengths = list(_window_lengths(intervals, len(now), rows.latent.shape[1]))
-    preferred = len(_windows(intervals, now, rows)) - 1
-    for windows in (lengths[preferred], *lengths[:preferred], *lengths[preferred + 1 :]):
+    for windows in _windows(intervals, len(now), rows.latent.shape[1]):
         p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
         seconds = intervals.duration * float(np.diff(windows, append=len(intervals)).max())
         yield (
@@ -250,7 +185,7 @@ def _completed(
     return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
 
 
-def _window_lengths(intervals: ShootingIntervals, n: int, n_v: int) -> Iterator[IntArray]:
+def _windows(intervals: ShootingIntervals, n: int, n_v: int) -> Iterator[IntArray]:
     """First intervals of windows of one interval, of two, of four, ..., as long as equations are many."""
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
     size = 1
@@ -262,7 +197,7 @@ def _window_lengths(intervals: ShootingIntervals, n: int, n_v: int) -> Iterator[
         size *= 2
 
 
-def projected_parameters(intervals: ShootingIntervals, fit: Fit, instruments: Instruments | None = None) -> FloatArray:
+def projected_parameters(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     """Parameters ``(n,)`` that solve the equations on the fitted motion by least squares, without priors.
 
     Parameters
@@ -270,62 +205,14 @@ def projected_parameters(intervals: ShootingIntervals, fit: Fit, instruments: In
     intervals : ShootingIntervals
     fit : Fit
         Most probable motion.
-    instruments : Instruments, optional
 
     Returns
     -------
     (n,) array
         Within the inclusive bounds.
     """
-    now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit, instruments)
-    return _bounded_projection(intervals, now, rows, _windows(intervals, now, rows)[-1], _REWEIGHTED)[0]
-
-
-def instrumented_contrast(intervals: ShootingIntervals, fit: Fit, instruments: Instruments) -> Contrast:
-    """Difference between instrumented and plain least squares of the same equations.
-
-    Both are linear in the unmodelled forces, so that the covariance of their difference follows as that of an estimate
-    does: from the fit, and by sums over neighbouring intervals.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-        Most probable motion.
-    instruments : Instruments
-
-    Returns
-    -------
-    Contrast
-
-    References
-    ----------
-    Hausman 1978 (the contrast); Wooldridge 2010, section 6.3 (its covariance without homoscedasticity); Sanderson,
-    Windmeijer 2016 (strength with several regressors).
-    """
-    n, wide = intervals.n_p, _with_wide_priors(intervals, fit)
-    rows = _Rows.of(intervals, wide, instruments)
-    now, plain = wide.shared[:n], replace(rows, instruments=None)
-    windows = _windows(intervals, now, rows)[-1]
-    found, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
-    of_plain, plain_gains, plain_stuck = _bounded_projection(intervals, now, plain, windows, _REWEIGHTED)
-    apart = (gains[0] - plain_gains[0], gains[1] - plain_gains[1])
-    covariance = _covariance_of_fit(intervals, wide, *_slopes(intervals, wide, rows, apart, np.zeros((n, n))))
-    sums = batch_sums(_parts(intervals, rows, gains) - _parts(intervals, plain, plain_gains))
-    free = ~(stuck | plain_stuck) & rows.means.any(axis=(0, 1))
-    strength, acts = np.full(n, np.nan), rows.means.any(axis=0).astype(float)
-    together = acts.T @ acts > 0.0
-    for _ in range(n.bit_length()):
-        together = together.astype(float) @ together > 0.0
-    strength[free] = _strengths(instruments.means[:, :, free], rows.means[:, :, free], gains[1][free])
-    return Contrast(found, of_plain, covariance + sums.T @ sums, len(sums), strength, together)
-
-
-def _strengths(Z: FloatArray, W: FloatArray, gains: FloatArray) -> FloatArray:
-    """First-stage F ``(k,)`` of k parameters from instruments and regressors (W, n_v, k) and gains (k, W, n_v)."""
-    shares = np.linalg.lstsq(np.einsum("pwi,wik->pk", gains, Z), np.eye(Z.shape[2]), rcond=None)[0]
-    parts = np.einsum("pwi,wip->wp", gains, W - Z @ shares)
-    return np.asarray(1.0 / np.maximum(np.square(batch_sums(parts)).sum(axis=0), _EXACT))
+    now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit)
+    return _bounded_projection(intervals, now, rows, np.arange(len(intervals)), _REWEIGHTED)[0]
 
 
 def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -448,8 +335,6 @@ class _Rows:
         Equations of which ``M d`` is attributed to the parameters: those of measured motion.
     inertial : (W, n_v) array
         Mean inertial force of each equation.
-    instruments : (W, n_v, n) array, optional
-        Instruments in the mean over each interval; None: the regressors themselves.
     """
 
     W: FloatArray
@@ -459,10 +344,9 @@ class _Rows:
     latent: FloatArray
     attributed: BoolArray
     inertial: FloatArray
-    instruments: FloatArray | None = None
 
     @classmethod
-    def of(cls, intervals: ShootingIntervals, fit: Fit, instruments: Instruments | None = None) -> _Rows:
+    def of(cls, intervals: ShootingIntervals, fit: Fit) -> _Rows:
         """Equations of the logged rows."""
         evaluate, motion = _residual_map(intervals.model), _motion(intervals, fit)
         logged = intervals.counted[:, None]
@@ -473,16 +357,7 @@ class _Rows:
         inertial = np.einsum("wij,wj->wi", M, means_of_intervals(intervals, motion[2]))
         latent, hidden = np.einsum("wij,wj->wi", M, fit.d), unmeasured_states(intervals)
         attributed = np.array([name not in hidden for name in intervals.model.velocities])
-        means = means_of_intervals(intervals, W)
-        Z = None if instruments is None else np.where(instruments.used, instruments.means, means)
-        return cls(W, push, means, M, latent, attributed, inertial, Z)
-
-
-def _of_windows(intervals: ShootingIntervals, fit: Fit, instruments: Instruments | None = None) -> ProjectedEstimate:
-    """The estimate over the windows of `_windows`."""
-    now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit, instruments)
-    windows = _windows(intervals, now, rows)[-1]
-    return _solution(intervals, fit, rows, windows, *_bounded_projection(intervals, now, rows, windows, _REWEIGHTED))
+        return cls(W, push, means_of_intervals(intervals, W), M, latent, attributed, inertial)
 
 
 def _solution(
@@ -501,7 +376,7 @@ def _solution(
     interval means.
     """
     plain = _bounded_projection(intervals, fit.shared[: intervals.n_p], rows, windows, 0)[0]
-    slopes = _slopes(intervals, fit, rows, gains, np.eye(intervals.n_p))
+    slopes = _slopes(intervals, fit, rows, gains)
     covariance = _covariance_of_fit(intervals, fit, *slopes)
     sums = batch_sums(_parts(intervals, rows, gains))
     covariance = covariance + sums.T @ sums + np.outer(plain - p, plain - p)
@@ -512,17 +387,14 @@ def _solution(
 
 
 def _slopes(
-    intervals: ShootingIntervals, fit: Fit, rows: _Rows, gains: tuple[FloatArray, FloatArray], own: FloatArray
+    intervals: ShootingIntervals, fit: Fit, rows: _Rows, gains: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (W, k, n) and (n_s, n) of projected parameters with respect to the unknowns of the fit.
-
-    ``own (n, n)`` is the effect of the fit's parameters: the identity for an estimate, 0 for a difference of two.
-    """
+    """Derivatives (W, k, n) and (n_s, n) of projected parameters with respect to the unknowns of the fit."""
     n_p, n_s, n_x = intervals.n_p, len(fit.shared), fit.x.shape[1]
     by_rows, by_means = gains
     of_s, of_z = np.zeros((n_s, n_p)), np.zeros((len(intervals), n_x + fit.d.shape[1], n_p))
     level = np.hstack([np.ones((len(rows.push), 1)), intervals.inputs])
-    of_s[:n_p] = own
+    of_s[:n_p] = np.eye(n_p)
     of_s[n_p:] = -np.einsum("pni,nk->ikp", by_rows, level).reshape(-1, n_p)
     of_z[:, n_x:] = -np.einsum("pwi,wij->wjp", by_means * rows.attributed, rows.M)
     return of_z, of_s
@@ -578,7 +450,7 @@ def _gains(
 
     Equations of intervals have the known sides ``known (W, n_v)``.
     """
-    if len(windows) == len(intervals) and rows.instruments is None:
+    if len(windows) == len(intervals):
         weak = WeakForm(rows.means[:, :, free], known)
         weights = _robust_weights(weak, intervals.occupied, _rms(rows.inertial), reweighted)
         every = np.repeat(weights, intervals.length, axis=0)
@@ -586,8 +458,7 @@ def _gains(
     W, b, inertial = (means_of_windows(x, windows) for x in (rows.means[:, :, free], known, rows.inertial))
     sizes = np.diff(windows, append=len(intervals))
     occupied = np.logical_or.reduceat(intervals.occupied, windows)
-    Z = None if rows.instruments is None else means_of_windows(rows.instruments[:, :, free], windows)
-    gains = _gains_of(W, Z, _robust_weights(WeakForm(W, b), occupied, _rms(inertial), reweighted, Z))
+    gains = least_squares_gains(W, _robust_weights(WeakForm(W, b), occupied, _rms(inertial), reweighted))
     of_intervals = np.repeat(gains / sizes[:, None], sizes, axis=1)
     return np.repeat(of_intervals / intervals.length, intervals.length, axis=1), of_intervals
 
@@ -621,86 +492,20 @@ def _rms(inertial: FloatArray) -> FloatArray:
     return np.where(scale > 0.0, scale, 1.0)
 
 
-@dataclass(frozen=True)
-class _Averaged:
-    """Least squares of equations that are averaged over windows.
-
-    Parameters
-    ----------
-    windows : (n_windows,) int array
-        First interval of each.
-    parameters : (n,) array
-    parts : (W, n) array
-        What each interval contributes to their error.
-    power : (n,) array
-        Mean square of each parameter's column.
-    """
-
-    windows: IntArray
-    parameters: FloatArray
-    parts: FloatArray
-    power: FloatArray
-
-    def is_attenuated(self, longer: _Averaged) -> BoolArray:
-        """Mask ``(n,)`` of parameters that are clearly smaller than by longer windows."""
-        missing, parts = np.abs(longer.parameters) - np.abs(self.parameters), self.parts - longer.parts
-        error = np.sqrt(np.square(batch_sums(parts)).sum(axis=0))
-        return np.asarray(missing > np.maximum(_CLEAR * error, _NEGLIGIBLE * np.abs(longer.parameters)))
-
-
-def _windows(intervals: ShootingIntervals, now: FloatArray, rows: _Rows) -> list[IntArray]:
-    """First intervals of the windows over which the equations are averaged: each interval, where that does no harm.
-
-    The last ones are to be taken; before them are windows of half the length, of a quarter, ....
-
-    Unmodelled accelerations that vary fast follow the sensors' noise where it is not white.  Fitted accelerations are
-    then noise, and least squares attenuates what they multiply.  Means over longer windows have less of it and less
-    information.  The shortest windows are taken that attenuate no parameter, in comparison with all longer ones (Lepski
-    1991), whose regressor has such noise: windows of twice the length take a part of its power.
-    """
-    rows = replace(rows, instruments=None)
-    place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
-    tried, size = list[_Averaged](), 1
-    while True:
-        windows = np.flatnonzero(place % size == 0)
-        if tried and len(windows) * rows.latent.shape[1] < _EQUATIONS * len(now):
-            break
-        p, (_, by_means), _ = _bounded_projection(intervals, now, rows, windows, 0)
-        left = rows.latent * rows.attributed + means_of_intervals(intervals, rows.push) + rows.means @ (p - now)
-        power = np.square(means_of_windows(rows.means, windows) / _rms(rows.inertial)[:, None]).sum(axis=1).mean(axis=0)
-        tried.append(_Averaged(windows, p, np.einsum("pwi,wi->wp", by_means, left), power))
-        size *= 2
-    for k, (short, double) in enumerate(pairwise(tried)):
-        noisy = double.power < _KEPT * short.power
-        if not any((noisy & short.is_attenuated(longer)).any() for longer in tried[k + 1 :]):
-            return [x.windows for x in tried[: k + 1]]
-    return [x.windows for x in tried]
-
-
-def _robust_weights(
-    rows: WeakForm, occupied: BoolArray, scale: FloatArray, steps: int, instruments: FloatArray | None = None
-) -> FloatArray:
+def _robust_weights(rows: WeakForm, occupied: BoolArray, scale: FloatArray, steps: int) -> FloatArray:
     """Square roots of the weights ``(W, n_v)``: of the equations by their scales, and of intervals by Cauchy's loss.
 
     Scales are inertial forces, so that unmodelled accelerations count by their share of the motion: an equation that is
     wrong throughout, as by the gain of its input, has its say on the parameters that it shares with others.  A gust of
-    a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.  With
-    instruments, residuals are those of the instrumented estimate: weights by other ones would be correlated with them.
+    a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.
     """
     loss = np.ones(rows.b.shape)
     for _ in range(steps):
-        gains = _gains_of(rows.W, instruments, loss / scale)
+        gains = least_squares_gains(rows.W, loss / scale)
         left = rows.b - rows.W @ np.einsum("pwi,wi->p", gains, rows.b)
         spread = 1.4826 * np.median(np.abs(left[occupied]), axis=0)
         loss = 1.0 / np.sqrt(1.0 + np.square(left / (_CAUCHY * np.maximum(spread, _ROUNDING * scale))))
     return np.asarray(loss / scale)
-
-
-def _gains_of(W: FloatArray, instruments: FloatArray | None, weights: FloatArray) -> FloatArray:
-    """Gains ``(n, N, r)`` of least squares, or with instruments."""
-    if instruments is None:
-        return least_squares_gains(W, weights)
-    return _instrumented_gains(W, instruments, weights)
 
 
 def least_squares_gains(W: FloatArray, weights: FloatArray) -> FloatArray:
@@ -726,18 +531,6 @@ def least_squares_gains(W: FloatArray, weights: FloatArray) -> FloatArray:
         raise np.linalg.LinAlgError("the regressors of the fitted motion are not finite")
     inverse = np.linalg.lstsq(normal, np.eye(len(normal)), rcond=None)[0]
     solved = (inverse / scale[:, None]) @ rows.T
-    return np.asarray(solved.reshape(-1, *W.shape[:2]) * weights)
-
-
-def _instrumented_gains(W: FloatArray, Z: FloatArray, weights: FloatArray) -> FloatArray:
-    """``(Z'VW)^-1 Z'V`` of stacked regressors and as many instruments (N, r, n); as `least_squares_gains`, Z = W."""
-    weights = np.broadcast_to(weights, W.shape[:2])
-    regressors, instruments = ((x * weights[:, :, None]).reshape(-1, W.shape[2]) for x in (W, Z))
-    sizes = [np.linalg.norm(x, axis=0) for x in (regressors, instruments)]
-    of_W, of_Z = (np.where(x > 0.0, x, 1.0) for x in sizes)
-    instruments = instruments / of_Z
-    inverse = np.linalg.lstsq(instruments.T @ (regressors / of_W), np.eye(W.shape[2]), rcond=None)[0]
-    solved = (inverse / of_W[:, None]) @ instruments.T
     return np.asarray(solved.reshape(-1, *W.shape[:2]) * weights)
 
 
@@ -884,25 +677,6 @@ def inertia_slopes(intervals: ShootingIntervals, motion: Sequence[FloatArray], r
         columns.append((inertia(changed) - before) / (changed - p)[:, j : j + 1])
     slopes = _by_log(intervals, np.stack(columns, axis=2), intervals.log_of_row[rows])
     return np.asarray(slopes.reshape(len(rows), model.n_v, model.n_v, -1).swapaxes(1, 2))
-
-
-def mean_regressors(intervals: ShootingIntervals, motion: Sequence[FloatArray], parameters: FloatArray) -> FloatArray:
-    """Mean over each interval of ``dr/dp`` on any motion.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    motion : sequence of (N, ...) array
-        q, v, a and the inputs as they act.
-    parameters : (n,) array
-
-    Returns
-    -------
-    (W, n_v, n) array
-        Rows that do not count are 0.
-    """
-    columns = _residual_map(intervals.model)(*motion, _row_parameters(intervals, parameters))[1]
-    return means_of_intervals(intervals, _regressors(intervals, columns) * intervals.counted[:, None, None])
 
 
 def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:

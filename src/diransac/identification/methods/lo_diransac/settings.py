@@ -45,7 +45,6 @@ class LoDiransacSettings:
     sensor_biases: tuple[str, ...] | None = None
     gain_drifts: tuple[str, ...] | None = None
     max_recording_errors: int = 8
-    set_points: tuple[str, ...] = ()
     substeps: int = 5
     max_steps: int = 60
     outliers: bool = True
@@ -119,7 +118,7 @@ def _check_start(start: object) -> None:
 
 _OBJECTS = ("criteria", "candidate_terms", "start", "horizon")
 _SWITCHES = ("input_delay", "input_lag")
-_NAMES = ("sources", "sensor_delays", "sensor_biases", "gain_drifts", "set_points")
+_NAMES = ("sources", "sensor_delays", "sensor_biases", "gain_drifts")
 _MAY_BE_ZERO = (
     "n_samples",
     "max_recording_errors",
@@ -153,10 +152,10 @@ def _checked(name: str, value: Any, default: Any) -> Any:
 def _checked_names(name: str, value: Any) -> tuple[str, ...] | None:
     """Names of signals or inputs; one name stands for itself.  Raises SettingsError: a value is no name."""
     names = (value,) if isinstance(value, str) else value
-    by_evidence = name not in ("set_points", "sources")
+    by_evidence = name != "sources"
     if names is None and by_evidence:
         return None
     if not isinstance(names, list | tuple) or not all(isinstance(x, str) for x in names):
-        wanted = "signals, () for none, or None for the clear ones" if by_evidence else "columns, or () for none"
+        wanted = "signals, () for none, or None for the clear ones" if by_evidence else "sources, or () for none"
         raise SettingsError(f"{name} is {value!r}; give names of {wanted}")
     return tuple(names)
