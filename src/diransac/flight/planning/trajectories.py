@@ -27,7 +27,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
 from diransac.flight.planning.planner import plan
-from diransac.flight.planning.request import TIME_STEP
+from diransac.flight.planning.task import TIME_STEP, InputLimits
 from diransac.flight.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -75,8 +75,6 @@ _SHORTEST_SEGMENT = 1.0
 
 
 _EQUAL: Mapping[str, float] = MappingProxyType({})
-
-InputLimits = Mapping[str, tuple[float, float]]
 
 
 # The paper's evaluation ----------------------------------------------------------------------------------------------
