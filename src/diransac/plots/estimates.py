@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
-from diransac.plots.figure import INK, MUTED, WIDTH, check_ending, draw_heading, empty_figure, header_height, write
+from diransac.plots.figure import INK, WIDTH, check_ending, draw_heading, empty_figure, header_height, write, write_at
 from diransac.plots.rows import LogAxis, MarkRow, as_marks, draw_rows, name_rows, names_width, row_height
 from diransac.plots.study import axis_label, level_labels, method_looks, n_trials, title_of
 from diransac.study.database import damage
@@ -117,22 +117,18 @@ def _drawn(summary: Summary, title: str) -> Figure:
     methods, rows = methods_and_errors(summary)
     every = as_marks(method_looks(summary.methods))
     looks = {label: every[label] for label in methods}
-    entries = list(looks.items())
-    scale = LogAxis.of(rows, LEAST)
+    scale, heading = LogAxis.of(rows, LEAST), axis_label(summary)
     caption = _caption(summary, scale)
-    header, height = header_height(entries, title), row_height(len(methods)) * len(rows)
-    full = header + _ABOVE + height + _BELOW + _LINE * len(caption) + 0.08
-    figure = empty_figure(full)
-    draw_heading(figure, entries, title)
-    heading = axis_label(summary)
-    what, left = "Error of the worst parameter, %", names_width([row.name for row in rows], heading)
-    figure.text(left / WIDTH, 1.0 - header / full, what, fontsize=9.5, color=INK, va="top")
-    top = header + _ABOVE
+    header = header_height(list(looks.items()), title)
+    top, height = header + _ABOVE, row_height(len(methods)) * len(rows)
+    figure = empty_figure(top + height + _BELOW + _LINE * len(caption) + 0.08)
+    draw_heading(figure, list(looks.items()), title)
+    left = names_width([row.name for row in rows], heading)
+    write_at(figure, left, header, "Error of the worst parameter, %", fontsize=9.5, color=INK)
     name_rows(figure, (left, top), rows, len(methods), heading)
     draw_rows(figure, (left, top, WIDTH - left - 0.12), rows, looks, scale)
     for line, text in enumerate(caption):
-        y = 1.0 - (top + height + _BELOW + line * _LINE) / full
-        figure.text(0.1 / WIDTH, y, text, fontsize=7.5, color=MUTED, va="top")
+        write_at(figure, 0.1, top + height + _BELOW + line * _LINE, text)
     return figure
 
 

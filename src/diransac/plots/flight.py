@@ -29,6 +29,7 @@ from diransac.plots.figure import (
     header_height,
     inches,
     name_panel,
+    round_step,
     write,
 )
 
@@ -348,16 +349,10 @@ def _draw_path(axes: Axes, flights: Sequence[FlightCurve], needed: tuple[Range, 
     _mark_start(axes, flights[0].reference, box)
     axes.set(xlim=box[0], ylim=box[1], aspect="equal")
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MultipleLocator(_round_step(0.6 * scale)))
+        axis.set_major_locator(MultipleLocator(round_step(0.6 * scale)))
     unit = _unit("x", flights)
     axes.xaxis.set_major_formatter(f"{{x:g}} {unit}" if unit else "{x:g}")
     name_panel(axes, "path", f"z over x, {unit}" if unit else "z over x")
-
-
-def _round_step(least: float) -> float:
-    """Smallest of 1, 2 and 5 times a power of ten that is at least this."""
-    decade = 10.0 ** np.floor(np.log10(least))
-    return float(min(step for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= least) * decade)
 
 
 def _mark_start(axes: Axes, reference: Trajectory, box: tuple[Range, Range]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.plots.figure import INK, MUTED, PAPER, RULE, SOFT, WIDTH
-from diransac.study.summary import TrackingErrors
+from diransac.plots.figure import INK, MUTED, PAPER, RULE, SOFT, axes_at, write_at
 from diransac.text_table import superscript
 
 if TYPE_CHECKING:
@@ -22,9 +21,7 @@ __all__ = [
     "LogAxis",
     "MarkRow",
     "as_marks",
-    "draw_flight_rows",
     "draw_rows",
-    "flight_rows_height",
     "name_rows",
     "names_width",
     "row_height",
@@ -137,14 +134,12 @@ def draw_rows(
     looks : style of each method's mark, from `as_marks`; the first is at the top of a row
     """
     left, top, width = place
-    full, n_methods = figure.get_figheight(), len(looks)
-    height = row_height(n_methods) * len(rows)
-    axes = figure.add_axes((left / WIDTH, 1.0 - (top + height) / full, width / WIDTH, height / full), facecolor=PAPER)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    axes.set(xlim=scale.ends, ylim=(len(rows), 0.0), yticks=[])
+    n_methods = len(looks)
+    axes = axes_at(figure, left, top, width, row_height(n_methods) * len(rows))
+    axes.grid(visible=False)
+    axes.set(facecolor=PAPER, xlim=scale.ends, ylim=(len(rows), 0.0), yticks=[])
     axes.set_xticks(*map(list, zip(*scale.names(width).items(), strict=True)))
-    axes.tick_params(length=0, labelsize=7.5, labelcolor=MUTED, pad=3, labeltop=True)
+    axes.tick_params(labeltop=True)
     _shade(axes, rows, scale)
     free = _FREE / row_height(n_methods)
     within = free / 2.0 + (1.0 - free) * (np.arange(n_methods) + 0.5) / n_methods
@@ -192,14 +187,12 @@ def name_rows(
     heading : such as ``outlier magnitude, m/s²``
     """
     left, top = place
-    above: dict[str, Any] = {"fontsize": 7.5, "color": MUTED, "va": "bottom", "ha": "right"}
     # Inches: distance of the heading above the rows' names.
-    y = 1.0 - (top - 0.05) / figure.get_figheight()
-    figure.text((left - 0.1) / WIDTH, y, "\n".join(_lines(heading)), **above)
+    write_at(figure, left - 0.1, top - 0.05, "\n".join(_lines(heading)), va="bottom", ha="right")
     for i, row in enumerate(rows):
-        y = 1.0 - (top + (i + 0.5) * row_height(n_methods)) / figure.get_figheight()
-        look: dict[str, Any] = {"fontsize": 7.5, "color": MUTED} if row.quiet else {"fontsize": 8.0, "color": INK}
-        figure.text((left - 0.1) / WIDTH, y, "\n".join(_lines(row.name)), va="center", ha="right", **look)
+        look: dict[str, Any] = {} if row.quiet else {"fontsize": 8.0, "color": INK}
+        middle = top + (i + 0.5) * row_height(n_methods)
+        write_at(figure, left - 0.1, middle, "\n".join(_lines(row.name)), va="center", ha="right", **look)
 
 
 def _lines(name: str) -> list[str]:
@@ -215,54 +208,3 @@ def _decade(power: int) -> str:
 def _power(power: int) -> str:
     """``0.1``, ``1``, ``10``, and ``10⁻³`` or ``10³`` further out."""
     return _decade(power) if abs(power) < 2 else f"10{superscript(power)}"
-
-
-# Tracking errors -----------------------------------------------------------------------------------------------------
-_COLUMNS = 3
-# Inches: between panels, name of a panel with the values above its rows, values below them.
-_GAP, _ABOVE, _BELOW = 0.26, 0.42, 0.3
-
-
-def flight_rows_height(flights: TrackingErrors, n_levels: int, n_methods: int) -> float:
-    """Height of the panels, inches."""
-    return -(-len(_coordinates(flights.errors)) // _COLUMNS) * (_ABOVE + n_levels * row_height(n_methods) + _BELOW)
-
-
-def draw_flight_rows(
-    figure: Figure,
-    top: float,
-    flights: TrackingErrors,
-    units: Mapping[str, str],
-    levels: Sequence[str],
-    axis: str,
-    looks: Mapping[str, Mapping[str, Any]],
-) -> None:
-    """Draw median and largest RMS tracking error over all trials; that of a failed trial is infinite.
-
-    Parameters
-    ----------
-    top : inches from the figure's top
-    units : of the states
-    levels, axis : names of the levels, and of the quantity that varies
-    looks : style of each method
-    """
-    full, height, beside = figure.get_figheight(), len(levels) * row_height(len(looks)), names_width(levels, axis)
-    width = (WIDTH - beside - 0.1) / _COLUMNS
-    for i, state in enumerate(_coordinates(flights.errors)):
-        row, column = divmod(i, _COLUMNS)
-        left, above = beside + column * width, top + row * (_ABOVE + height + _BELOW)
-        medians, worst = flights.median(state), flights.largest(state)
-        rows = [MarkRow(name, *pair) for name, *pair in zip(levels, medians, worst, strict=True)]
-        y = 1.0 - (above + 0.02) / full
-        figure.text(left / WIDTH, y, state, fontsize=8.5, color=INK, va="top")
-        figure.text((left + width - _GAP) / WIDTH, y, units[state], fontsize=7.5, color=MUTED, va="top", ha="right")
-        if column == 0:
-            name_rows(figure, (left, above + _ABOVE), rows, len(looks), axis)
-        # Power of ten, m or rad, below which errors are not resolved.
-        draw_rows(figure, (left, above + _ABOVE, width - _GAP), rows, looks, LogAxis.of(rows, -3))
-
-
-def _coordinates(states: Iterable[str]) -> list[str]:
-    """Coordinates; velocities repeat them and are in tables."""
-    names = list(states)
-    return [name for name in names if not name.endswith("_dot")] or names
