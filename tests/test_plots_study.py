@@ -302,7 +302,7 @@ def test_the_page_holds_figures_numbers_and_failures_and_loads_nothing(store_wit
     assert "default-src &#39;none&#39;" in text
     assert "<script" not in text
     assert not re.findall(r'(?:src|href)="(?!#)', text), "only references into the page"
-    assert "1 of 5 (20 %)" in text
+    assert "Over all levels and trajectories" in text
     again = tmp_path / "again.html"
     write_study_report(store_with_paths, again)
     assert again.read_text() == text

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import compress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from diransac.arrays import FloatArray
 from diransac.plots.estimates import LEAST, methods_and_errors, plot_estimates
 from diransac.plots.figure import svg
 from diransac.plots.paths import levels_with_paths, plot_paths
 from diransac.plots.study import axis_label, level_labels, plot_study, title_of
 from diransac.report.rendering import Table, write_page
 from diransac.study.summary import ParameterErrors, Summary, TrackingErrors, summarise
-from diransac.text_table import number, percent, plural
+from diransac.text_table import number, plural
 
 __all__ = ["write_study_report"]
 
@@ -55,7 +54,6 @@ def _content(summary: Summary, figures: Sequence[str]) -> dict[str, Any]:
         "summary": summary,
         "figures": [_scoped(figure) for figure in figures],
         **_parameters(summary),
-        "ranges": [table for shape, flights in summary.flights.items() for table in _ranges(summary, shape, flights)],
         "by_level": [(shape, list(_levels(summary, flights))) for shape, flights in summary.flights.items()],
         "failed": _failed(summary),
         "seconds": _seconds(summary),
@@ -118,21 +116,6 @@ def _share(contained: int, total: int) -> str:
 
 
 # Flights -------------------------------------------------------------------------------------------------------------
-def _ranges(summary: Summary, shape: str, flights: TrackingErrors) -> Iterator[Table]:
-    """Smallest and largest mean, and median, of each method over all levels."""
-    header = ["method", "failed", *(f"{state}, {unit}" for state, unit in summary.units.items())]
-    for about, of in (
-        ("mean RMS tracking error of successful flights", flights.mean),
-        ("median RMS tracking error of all trials, failures counted as ∞", flights.median),
-    ):
-        values = [of(state) for state in summary.units]
-        rows = [
-            [label, _failures(flights, k), *(_range(one[:, k]) for one in values)]
-            for k, label in enumerate(summary.methods)
-        ]
-        yield Table(header, rows, f"{shape}: {about}, smallest … largest of all levels")
-
-
 def _levels(summary: Summary, flights: TrackingErrors) -> Iterator[tuple[str, Table]]:
     """A table per state: mean ± standard deviation, and the median."""
     for state, unit in summary.units.items():
@@ -167,17 +150,6 @@ def _seconds(summary: Summary) -> Table:
         "random samples that methods share count for the first of them"
     )
     return Table(["method", *compress(summary.stages, there), "all"], rows, caption)
-
-
-def _failures(flights: TrackingErrors, k: int) -> str:
-    ran, failed = int(flights.ran[:, k].sum()), int(flights.failed[:, k].sum())
-    return f"{failed} of {ran} ({percent(failed / ran)})" if failed else "none"
-
-
-def _range(values: FloatArray) -> str:
-    there: Iterable[float] = values[~np.isnan(values)]
-    found = [number(x, 2) for x in (min(there, default=np.nan), max(there, default=np.nan))]
-    return found[0] if found[0] == found[1] else f"{found[0]} … {found[1]}"
 
 
 def _spread(mean: float, deviation: float, median: float) -> str:
