@@ -10,9 +10,8 @@ from matplotlib.colors import to_hex
 
 from command_line import run
 from diransac.errors import SettingsError
-from diransac.plots.estimates import plot_estimates
+from diransac.plots.estimates import LogAxis, MarkRow, plot_estimates
 from diransac.plots.figure import PAPER
-from diransac.plots.rows import LogAxis, MarkRow
 from diransac.plots.study import method_looks, plot_study
 from diransac.report.study import write_study_report
 from diransac.study import load
