@@ -13,7 +13,7 @@ from diransac.errors import SettingsError
 from diransac.plots.estimates import LogAxis, MarkRow, plot_estimates
 from diransac.plots.figure import PAPER
 from diransac.plots.study import method_looks, plot_study
-from diransac.report.study import write_study_report
+from diransac.report.stores import write_study_report
 from diransac.study import load
 from diransac.study.store import Store
 from diransac.study.summary import summarise

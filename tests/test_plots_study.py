@@ -14,7 +14,7 @@ from diransac.errors import SettingsError, StudyError
 from diransac.plots.figure import PAPER, REFERENCE
 from diransac.plots.paths import levels_with_paths, plot_paths
 from diransac.plots.study import method_looks, plot_study
-from diransac.report.study import write_study_report
+from diransac.report.stores import write_study_report
 from diransac.study import load
 from diransac.study.store import Store
 from diransac.study.summary import summarise
@@ -206,7 +206,7 @@ def test_what_is_missing_of_a_study_is_said_below_its_pictures_and_on_its_page(
     write_study_report(store, tmp_path / "whole.html")
     assert "21 of 24 rows are missing." in texts(plot_study(tmp_path / "half.db"))
     assert texts(plot_paths(store_with_paths))[-1].endswith(". 3 of 18 rows are missing.")
-    assert "<strong>21 of 24 rows are missing.</strong>" in (tmp_path / "half.html").read_text()
+    assert "<p>21 of 24 rows are missing.</p>" in (tmp_path / "half.html").read_text()
     assert not [text for text in texts(plot_study(store)) if "missing" in text]
     assert "missing" not in (tmp_path / "whole.html").read_text()
 
