@@ -100,10 +100,7 @@ def _content(entries: Sequence[Entry], logs: Sequence[Log]) -> dict[str, Any]:
         "competitions": sections.competitions(entries),
         "logs": [figures_of(log, runs, len(logs)) for log, runs in zip(logs, by_log, strict=True)],
         "friction": friction_figures(entries),
-        "scores": [
-            (runs[0].log_name, sections.short_term_scores(runs), [sections.scores(run) for run in runs])
-            for runs in by_log
-        ],
+        "scores": [(runs[0].log_name, [sections.scores(run) for run in runs]) for runs in by_log],
         "equations": [provenance.model_text(model) for model in models],
         "settings": provenance.settings(entries),
         "log_facts": provenance.log_facts(entries, logs),

@@ -27,7 +27,6 @@ __all__ = [
     "log_tables",
     "parameters",
     "scores",
-    "short_term_scores",
     "suggestions",
 ]
 
@@ -362,29 +361,6 @@ def _delay(entry: Entry) -> str:
     lag = entry.result.estimate.resolution.timing.lag
     what = "First-order lag of the inputs, time constant" if lag else "Input delay"
     return f"{what}: {delay} ± {error} ms (standard error). The estimate and the simulations shown include it."
-
-
-def short_term_scores(runs: Sequence[Run]) -> Table | None:
-    """RMS error of the restarted simulations over one log; None without a diagnosis of it."""
-    having = [run for run in runs if np.isfinite(run.restart_period) and run.diagnosis is not None]
-    if not having:
-        return None
-    names = dict.fromkeys(name for run in having for name in run.observations.signals)
-    noise = having[0].noise
-    units = having[0].result.model.units
-    rows = [
-        (name, units[name], number(noise.get(name, np.nan), 3), *(_regular_rms(run, name) for run in having))
-        for name in names
-    ]
-    period = number(having[0].restart_period)
-    caption = f"RMS error without outliers; simulations restart every {period} s from the smoothed state."
-    return Table(("Signal", "Unit", "Noise", *(run.label for run in having)), rows, caption)
-
-
-def _regular_rms(run: Run, name: str) -> str:
-    errors = run.regular_errors.get(name, np.empty(0))
-    with np.errstate(over="ignore"):
-        return number(float(np.sqrt(np.mean(np.square(errors)))) if len(errors) else np.nan, 3)
 
 
 @dataclass(frozen=True)
