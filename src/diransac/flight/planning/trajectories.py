@@ -16,8 +16,9 @@ The paper leaves these choices open; they were fixed before any result was compu
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -239,19 +240,13 @@ def _through(
     fixed: dict[str, Any] = {
         "waypoints": [{"x": float(x), "z": float(z)} for x, z in points],
         "times": times.tolist(),
-        "reference": {name: _route(times, [point[j] for point in points]) for j, name in enumerate(("x", "z"))},
+        "reference": {
+            name: partial(np.interp, xp=times, fp=list(x))
+            for name, x in zip("xz", zip(*points, strict=True), strict=True)
+        },
         "state_weights": {"x": ROUTE_WEIGHT, "z": ROUTE_WEIGHT},
     }
     return plan(plant, **fixed, **_limits(plant.model, input_limits), **options)
-
-
-def _route(times: FloatArray, values: Sequence[float]) -> Callable[[FloatArray], FloatArray]:
-    """Linear interpolation between the waypoints."""
-
-    def along(time: FloatArray) -> FloatArray:
-        return np.interp(time, times, values)
-
-    return along
 
 
 def _limits(model: Model, given: InputLimits | None) -> dict[str, Any]:
