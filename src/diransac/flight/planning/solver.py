@@ -62,7 +62,7 @@ def interior_point(
 
     Raises KeyboardInterrupt: the user stopped it.  Raises whatever a function of the program raises.
     """
-    search = _Search(program, deadline)
+    search = _Functions(program, deadline)
     # Without a file of options; the default, ipopt.opt of the working directory, may load a library.
     fixed = {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, "tol": 1e-9, "option_file_name": ""}
     options: dict[str, Any] = {
@@ -108,7 +108,7 @@ def _interrupts_noted() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
-class _Search:
+class _Functions:
     """Functions of a program for CasADi by its names, and what stops their evaluation."""
 
     def __init__(self, program: Program, deadline: float) -> None:
@@ -117,15 +117,17 @@ class _Search:
         self.stopped: BaseException | None = None
         jacobian = _compressed(*program.jacobian_entries, (m, n))
         hessian = _compressed(*program.hessian_entries, (n, n))
-        f = _Result("f", ca.Sparsity.dense(1, 1), lambda x, *_: program.objective(x))
-        g = _Result("g", ca.Sparsity.dense(m, 1), lambda x, *_: program.constraints(x))
-        slope = _Result("grad_f_x", ca.Sparsity.dense(n, 1), lambda x, *_: program.gradient(x))
-        slopes = _Result("jac_g_x", jacobian[0], lambda x, *_: _summed(program.jacobian(x), jacobian[1]))
+        f = _Result("f", ca.Sparsity.dense(1, 1), lambda x: program.objective(x))
+        g = _Result("g", ca.Sparsity.dense(m, 1), lambda x: program.constraints(x))
+        slope = _Result("grad_f_x", ca.Sparsity.dense(n, 1), lambda x: program.gradient(x))
+        slopes = _Result("jac_g_x", jacobian[0], lambda x: _summed(program.jacobian(x), jacobian[1]))
         curvature = _Result(
-            "triu_hess_gamma_x_x", hessian[0], lambda x, *of: _summed(program.hessian(x, of[0][0], of[1]), hessian[1])
+            "triu_hess_gamma_x_x",
+            hessian[0],
+            lambda x, factor, weights: _summed(program.hessian(x, float(factor[0]), weights), hessian[1]),
         )
         at, weighted = {"x": n, "p": 0}, {"x": n, "p": 0, "lam_f": 1, "lam_g": m}
-        # Derivatives stand before values, which are by-products of them.
+        # Derivatives stand last and are computed first: values are by-products of them.
         self.functions = {
             "nlp": _Evaluation("nlp", at, [f, g], self),
             "nlp_f": _Evaluation("nlp_f", at, [f], self),
@@ -157,7 +159,7 @@ class _Result:
 class _Evaluation(ca.Callback):
     """CasADi callback that fills its buffers with some results of a program."""
 
-    def __init__(self, name: str, sizes: dict[str, int], results: list[_Result], search: _Search) -> None:
+    def __init__(self, name: str, sizes: dict[str, int], results: list[_Result], search: _Functions) -> None:
         ca.Callback.__init__(self)
         self._sizes, self._results, self._search = sizes, results, search
         self.construct(name, {})

@@ -75,14 +75,14 @@ class Program:
 
     def _limits(self, relaxed: bool) -> tuple[FloatArray, FloatArray]:
         """Limits (n_unknowns,) of the unknowns."""
-        task, ends = self.task, []
-        for k, limit in enumerate(("lower", "upper")):
-            end = np.full(self.n_unknowns, (TIME_STEP, np.inf)[k])
-            end[self.states], end[self.inputs] = getattr(task.states, limit), getattr(task.inputs, limit)
-            for knot, waypoint in zip(self.knots, task.waypoints[:1] if relaxed else task.waypoints, strict=False):
-                end[self.states[knot, list(waypoint.states)]] = waypoint.values
-            ends.append(end)
-        return ends[0], ends[1]
+        task = self.task
+        lower, upper = np.full(self.n_unknowns, TIME_STEP), np.full(self.n_unknowns, np.inf)  # those of durations
+        lower[self.states], upper[self.states] = task.states.lower, task.states.upper
+        lower[self.inputs], upper[self.inputs] = task.inputs.lower, task.inputs.upper
+        for knot, waypoint in zip(self.knots, task.waypoints[:1] if relaxed else task.waypoints, strict=False):
+            fixed = self.states[knot, list(waypoint.states)]
+            lower[fixed] = upper[fixed] = waypoint.values
+        return lower, upper
 
     def _objective(self, relaxed: bool) -> Costs:
         """Cost of the knots and intervals."""
