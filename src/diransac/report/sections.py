@@ -304,35 +304,28 @@ def suggestions(entries: Sequence[Entry]) -> list[Table]:
     header = ("Suggested term", "Coefficient", "Unit", "Explained", "Change of the model")
     tables = []
     for entry in entries:
-        rows = [
-            (
-                x.name or f"{x.kind}, {x.equation}",
-                f"{number(x.value)} ± {number(x.standard_error, 2)}",
-                x.unit,
-                percent(x.explained),
-                x.change,
-            )
-            for x in entry.result.suggestions
-        ]
-        caption = "Terms that would explain the unmodelled forces"
+        rows = []
+        for x in entry.result.suggestions:
+            coefficient = f"{number(x.value)} ± {number(x.standard_error, 2)}"
+            rows.append((x.name or f"{x.kind}, {x.equation}", coefficient, x.unit, percent(x.explained), x.change))
         if rows:
-            tables.append(Table(header, rows, f"{caption}, by {entry.label}" if len(entries) > 1 else caption))
+            tables.append(Table(header, rows, f"Terms that would explain the unmodelled forces{_by(entry, entries)}"))
     return tables
 
 
 def competitions(entries: Sequence[Entry]) -> list[Table]:
     """Comparison of estimates by held-out prediction of each result that has one."""
-    tables = []
-    for entry in entries:
-        found = entry.result.competition
-        if found is not None:
-            header, *rows = (tuple(row) for row in found.lines())
-            caption = (
-                "Estimates compared by open-loop prediction of parts of the logs that they were not estimated from: "
-                "error over that of the prediction that nothing changes"
-            )
-            tables.append(Table(header, rows, f"{caption}, by {entry.label}" if len(entries) > 1 else caption))
-    return tables
+    caption = (
+        "Estimates compared by open-loop prediction of parts of the logs that they were not estimated from: error over "
+        "that of the prediction that nothing changes"
+    )
+    having = [(entry, entry.result.competition.lines()) for entry in entries if entry.result.competition is not None]
+    return [Table(lines[0], lines[1:], f"{caption}{_by(entry, entries)}") for entry, lines in having]
+
+
+def _by(entry: Entry, entries: Sequence[Entry]) -> str:
+    """End of a caption that names a result, where there are several."""
+    return f", by {entry.label}" if len(entries) > 1 else ""
 
 
 def _signal_table(entry: Entry, several: bool) -> Table:
@@ -363,24 +356,15 @@ def _delay(entry: Entry) -> str:
     return f"{what}: {delay} ± {error} ms (standard error). The estimate and the simulations shown include it."
 
 
-@dataclass(frozen=True)
-class ScoreTable:
-    """Open-loop scores of one run, a table for each horizon, or the reason why there are none."""
-
-    label: str
-    reason: str = ""
-    tables: tuple[Table, ...] = ()
-
-
-def scores(run: Run) -> ScoreTable:
-    """Open-loop scores of one run."""
+def scores(run: Run) -> tuple[str, list[Table]]:
+    """Open-loop scores of one run, a table for each horizon, or a sentence on why there are none."""
     validation = run.validation
     if isinstance(validation, str):
-        return ScoreTable(run.label, reason=validation)
+        return f"{run.label}: no scores: {validation}", []
     tables = [_horizon_table(run.label, at, validation) for at in validation.horizons]
     tables += [_innovation_table(run.label, one, validation) for one in validation.innovations]
     forces = _force_table(run.label, validation)
-    return ScoreTable(run.label, "", (*tables, forces) if forces else tuple(tables))
+    return "", [*tables, forces] if forces else tables
 
 
 def _horizon_table(label: str, at: HorizonScores, validation: Validation) -> Table:
