@@ -1,22 +1,16 @@
 """How fast plans are made: the paper's square, star and sine.
 
 Times are medians of 15 solves that take turns; `again` starts from the straight way, `near` from the solution for
-parameters that are 2 % off.  The last rows show what one Runge-Kutta step an interval instead of ten would save, and
-where its inputs lead in a simulation at 100 Hz.
+parameters that are 2 % off.
 """
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 
 import diransac as dr
-from diransac.flight.planning import planner, solvers
-from diransac.flight.planning.transcription import Program
-from diransac.simulation import RolloutBatch, rollouts
 
 FLIGHTS: dict[str, Callable[..., dr.Trajectory]] = {"square": dr.square, "star": dr.star, "sine": dr.sine}
 REPETITIONS = 15
@@ -47,45 +41,13 @@ def compare(name: str) -> None:
     print(f"{name:<8}{1e3 * taken['again']:>11.0f}{1e3 * taken['near']:>11.0f}", flush=True)
 
 
-def coarse(name: str) -> None:
-    """Print what one integration step an interval saves, and how far its inputs fly past the last waypoint."""
-    with patch.object(planner, "fixed_program", wraps=planner.fixed_program) as built:
-        found = FLIGHTS[name](PLANT)
-    fine = planner.fixed_program(*built.call_args.args)
-    steps = fine.numbers.steps.sum(axis=1, keepdims=True)
-    program = Program(fine.stage, fine.layout, replace(fine.numbers, steps=steps))
-    guess = np.zeros(program.layout.n_unknowns)
-    states, inputs = found.states, found.inputs
-    counts = (fine.numbers.steps > 0).sum(axis=1)
-    knots = np.concatenate([[0], np.cumsum(counts)])
-    guess[program.layout.states], guess[program.layout.inputs] = states[knots], inputs[knots[:-1]]
-    calls = {
-        "one": lambda: solvers.interior_point(program, guess, solvers.SearchLimits(200, 60.0)),
-        "ten": lambda: solvers.interior_point(fine, guess, solvers.SearchLimits(200, 60.0)),
-    }
-    outcome = calls["one"]()
-    flown_inputs = np.repeat(program.split(outcome.unknowns)[1], counts, axis=0)
-    p = np.array([list(PLANT.parameters.values())])
-    batch = RolloutBatch(p, states[0], np.concatenate([flown_inputs, flown_inputs[-1:]]), 0.01)
-    flown = rollouts(PLANT.model).trajectories(batch)
-    taken = medians(calls, REPETITIONS)
-    miss = np.abs(np.asarray(flown[0])[-1, :2] - states[-1, :2]).max()
-    print(
-        f"{name}: one step an interval takes {taken['one'] / taken['ten']:.2f} of the time of ten "
-        f"({1e3 * taken['one']:.0f} and {1e3 * taken['ten']:.0f} ms); flown, its inputs end {miss:.1e} m off"
-    )
-
-
 def main() -> None:
-    """Print the table, and what shorter steps cost."""
+    """Print the table."""
     taken = seconds(lambda: dr.square(PLANT))[0]
     print(f"the first plan of a model, which compiles it: {taken:.1f} s\n")
     print(f"{'':<8}{'again, ms':>11}{'near, ms':>11}")
     for name in FLIGHTS:
         compare(name)
-    print()
-    for name in FLIGHTS:
-        coarse(name)
 
 
 if __name__ == "__main__":

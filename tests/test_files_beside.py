@@ -42,7 +42,7 @@ def main():
     vehicle = dr.models.underwater_vehicle()
     found["workers"] = identify_each(vehicle, ["swim.csv"], "ols", store="fleet.db", jobs=1).done
     result = dr.identify(vehicle, dr.read_log("swim.csv"), "ols")
-    from diransac.plots.prediction import plot_prediction
+    from diransac.plots.flight import plot_prediction
     log = dr.read_log("swim.csv")
     plot_prediction(dr.simulate(result, log), log, result.model.state, tuple(result.model.inputs), "out.png")
     import matplotlib

@@ -11,7 +11,7 @@ import pytest
 
 import diransac as dr
 from diransac.report import write_report
-from diransac.report.fleet import write_fleet_report
+from diransac.report.stores import write_fleet_report
 from diransac.study import FleetRows, FleetStatus, summarise_fleet
 from simulated import MACHINES, as_log, flight
 

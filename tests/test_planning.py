@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
-import diransac.flight.planning.solvers
+from diransac.flight.planning.stage import stage_of
 from diransac.flight.planning.trajectories import CORNERS, ROTORCRAFT_LIMITS
 from diransac.simulation import RolloutBatch, rollouts
 from planned import LIMITS, ROTORCRAFT, across, defects, mass, rotorcraft
@@ -182,16 +182,15 @@ def test_a_nearer_plan_costs_more_effort():
     assert np.var(near["moment"]) > np.var(far["moment"])
 
 
-# ---------------------------------------------------------------------- one problem, many numbers
+# ---------------------------------------------------------------------- one model, many numbers
 
 
-def test_a_problem_is_built_once_for_many_parameters(monkeypatch):
+def test_a_model_is_compiled_once_for_many_parameters():
     across(ROTORCRAFT)
-    built, plain = [], diransac.flight.planning.solvers.ca.nlpsol
-    monkeypatch.setattr(diransac.flight.planning.solvers.ca, "nlpsol", lambda *a: built.append(a) or plain(*a))
+    before = stage_of.cache_info().misses
     costs = [across(rotorcraft(mass=m), input_limits=LIMITS, trim={"thrust": 2.4, "moment": 0.0}).cost
              for m in (0.24, 0.25, 0.26)]  # fmt: skip
-    assert not built
+    assert stage_of.cache_info().misses == before
     assert len(set(costs)) == 3
 
 
@@ -218,7 +217,7 @@ def test_plans_do_not_depend_on_what_was_planned_before():
 
 
 def test_threads_plan_alike():
-    """Two shapes of problem, so that two solver objects run at a time."""
+    """Several solves run at a time."""
     tasks = [(rotorcraft(mass=m), [0.0, 0.8, end]) for m in (0.24, 0.25, 0.26) for end in (2.0, 2.6)]
 
     def planned(task):

@@ -1,14 +1,18 @@
 """The nonlinear program's derivatives against central differences, and where its unknowns stand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from diransac.flight.planning.stage import Costs, stage_of
-from diransac.flight.planning.transcription import Layout, Numbers, Program
+import diransac as dr
+from diransac.flight.planning.task import task_of
+from diransac.flight.planning.transcription import Program
 from planned import ROTORCRAFT
 from rolling import BODY
 
-CASES = {"fixed times": (ROTORCRAFT.model, False), "free times": (ROTORCRAFT.model, True), "quaternion": (BODY, False)}
+QUATERNION = dr.Plant(BODY, {"p0": 1.0, "p1": 1.5, "p2": 2.0})
+CASES = {"fixed times": (ROTORCRAFT, False), "free times": (ROTORCRAFT, True), "quaternion": (QUATERNION, False)}
 
 
 def dense(entries, values, shape):
@@ -21,19 +25,20 @@ def dense(entries, values, shape):
 @pytest.fixture(params=CASES.values(), ids=CASES)
 def problem(request):
     """A small program with uneven intervals and every kind of cost, and a point that solves nothing."""
-    model, free_time = request.param
-    rng, n_x = np.random.default_rng(1), len(model.state)
-    layout = Layout(n_x, model.n_u, (2, 1, 3), (tuple(range(n_x)), (0,), (1, 2), (0, 1)), free_time)
-    steps = np.where(np.arange(4) < np.array([4, 3, 2, 4, 4, 1])[:, None], 0.05, 0.0)
-    costs = Costs(
-        rng.standard_normal((7, n_x)), rng.uniform(0, 2, (7, n_x)), rng.uniform(0.5, 2, model.n_u),
-        rng.standard_normal(model.n_u), 0.7,
+    plant, free_time = request.param
+    rng, model = np.random.default_rng(1), plant.model
+    first = dict.fromkeys(model.state, 0.0) | {model.state[four[0]]: 1.0 for four in model.quaternions}
+    waypoints = [first, {model.state[0]: 1.0}, {model.state[-1]: 2.0}]
+    reference = {name: rng.standard_normal(9) for name in model.state[:2]}
+    task = task_of(
+        plant, waypoints=waypoints, times=None if free_time else [0.0, 0.14, 0.37], duration=None,
+        reference=None if free_time else reference, input_limits=None, input_limit_fraction=1.0, state_limits=None,
+        input_weights=dict(zip(model.inputs, rng.uniform(0.5, 2, model.n_u), strict=True)), state_weights=None,
+        time_weight=0.7, trim=dict(zip(model.inputs, rng.standard_normal(model.n_u), strict=True)),
+        start_end_at_rest=False,
     )  # fmt: skip
-    values = rng.standard_normal(len(layout.pins))
-    unlimited = np.full(layout.n_unknowns, np.inf)
-    numbers = Numbers(rng.uniform(0.5, 2.0, model.n_p), steps, values, costs, -unlimited, unlimited)
-    unknowns = rng.uniform(0.5, 1.5, layout.n_unknowns)
-    return Program(stage_of(model, free_time), layout, numbers), unknowns, rng
+    program = Program(replace(task, parameters=rng.uniform(0.5, 2.0, model.n_p)), task.rows)
+    return program, rng.uniform(0.5, 1.5, program.n_unknowns), rng
 
 
 def differences(function, at, step=1e-6):
@@ -48,16 +53,15 @@ def differences(function, at, step=1e-6):
 
 def test_first_derivatives_are_those_of_the_values(problem):
     program, at, _ = problem
-    shape = (program.layout.n_constraints, program.layout.n_unknowns)
-    jacobian = dense(program.jacobian_entries, program.jacobian(at), shape)
+    jacobian = dense(program.jacobian_entries, program.jacobian(at), (program.n_constraints, program.n_unknowns))
     np.testing.assert_allclose(jacobian, differences(program.constraints, at), atol=1e-7)
     np.testing.assert_allclose(program.gradient(at), differences(program.objective, at), atol=1e-6)
 
 
 def test_second_derivatives_are_those_of_the_first(problem):
     program, at, rng = problem
-    n, factor = program.layout.n_unknowns, 0.6
-    multipliers = rng.standard_normal(program.layout.n_constraints)
+    n, factor = program.n_unknowns, 0.6
+    multipliers = rng.standard_normal(program.n_constraints)
 
     def gradient(x):
         jacobian = dense(program.jacobian_entries, program.jacobian(x), (len(multipliers), n))
@@ -68,21 +72,15 @@ def test_second_derivatives_are_those_of_the_first(problem):
     np.testing.assert_allclose(triangle, np.triu(differences(gradient, at)), atol=1e-6)
 
 
-def test_every_unknown_and_constraint_stands_in_one_place(problem):
-    layout = problem[0].layout
-    unknowns = np.concatenate([layout.states.ravel(), layout.inputs.ravel(), layout.next_durations])
-    np.testing.assert_array_equal(np.sort(unknowns), np.arange(layout.n_unknowns))
-    constraints = np.concatenate([layout.defects.ravel(), layout.pin_rows])
-    np.testing.assert_array_equal(np.sort(constraints), np.arange(layout.n_constraints))
-
-
-def test_nothing_reaches_beyond_the_next_stage(problem):
-    """What makes the program's factorisation cheap: its matrices are banded by stages."""
+def test_every_unknown_stands_in_one_place(problem):
     program = problem[0]
-    rows, columns = program.hessian_entries
-    stage_size = program.layout.n_s + program.layout.n_u + 1
-    assert np.abs(rows - columns).max() < stage_size
-    first_defect = program.layout.defects[:, 0]
-    rows, columns = program.jacobian_entries
-    stage = np.searchsorted(first_defect, rows, side="right") - 1
-    assert np.abs(columns - program.layout.states[stage, 0]).max() < 2 * stage_size
+    unknowns = np.concatenate([program.states.ravel(), program.inputs.ravel(), program.durations])
+    np.testing.assert_array_equal(np.sort(unknowns), np.arange(program.n_unknowns))
+
+
+def test_states_of_waypoints_are_fixed_and_no_others(problem):
+    program = problem[0]
+    fixed = np.flatnonzero(program.lower == program.upper)
+    knots, waypoints = program.knots, program.task.waypoints
+    expected = [program.states[k, list(waypoint.states)] for k, waypoint in zip(knots, waypoints, strict=True)]
+    np.testing.assert_array_equal(fixed, np.sort(np.concatenate(expected)))

@@ -100,20 +100,6 @@ def test_the_path_is_drawn_with_x_and_z_to_one_scale():
     assert right[0] - origin[0] == pytest.approx(up[1] - origin[1], rel=1e-6)
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 2, -2.0])
-def test_bars_along_the_path_have_the_attitude(angle):
-    log = flown(theta=np.full(N, angle))
-    axes = panels(plot_flight(trajectory(), log))["path"]
-    bars, ticks = (collection.get_segments() for collection in axes.collections)
-    assert 10 <= len(bars) <= 30
-    for bar, tick in zip(bars, ticks, strict=True):
-        along, up = bar[1] - bar[0], tick[1] - tick[0]
-        assert np.arctan2(along[1], along[0]) == pytest.approx(angle, abs=1e-9)
-        # Thrust acts along the body's z axis: theta from 0 to pi/2 turns it from world z to world -x.
-        assert up / np.hypot(*up) == pytest.approx([-np.sin(angle), np.cos(angle)], abs=1e-9)
-        assert np.hypot(log["x"] - bar.mean(axis=0)[0], log["z"] - bar.mean(axis=0)[1]).min() < 1e-9
-
-
 def test_start_and_end_of_the_reference_are_named():
     def texts(reference):
         return [text.get_text() for text in panels(plot_flight(reference, flown()))["path"].texts if text.get_text()]

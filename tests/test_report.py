@@ -129,7 +129,7 @@ def test_page_names_model_method_log_and_every_parameter_with_its_interval(resul
 def test_page_holds_what_repeats_the_identification(model, log, tmp_path):
     settings = dr.Settings(max_iterations=7, stop_inlier_fraction=None)
     text = Page(written(dr.identify(model, log, "i-diransac", seed=5, settings=settings), log, tmp_path)).text
-    assert "dr.identify(model, log, method='i-diransac', seed=5, settings=dr.Settings(max_iterations=7" in text
+    assert all(words in text for words in ("method i-diransac", "seed 5", "max_iterations 7"))
     assert log.fingerprint in text
     assert "llvmlite" in text
 
@@ -266,13 +266,12 @@ def test_another_log_makes_it_a_held_out_validation_with_inliers_of_its_own(mode
     assert "Held-out" not in Page(written(result, log, tmp_path)).text
 
 
-def test_rows_with_missing_samples_are_counted(model, log, tmp_path):
+def test_rows_with_missing_samples_are_counted(model, log):
     gappy = log["x_dot"].copy()
     gappy[50:70] = np.nan
     holed = with_signals(log, x_dot=gappy)
     found = dr.identify(model, holed, "ols")
     assert level_of(found, holed, "20 of 600 rows are excluded") == "note"
-    assert Page(written(found, holed, tmp_path)).all("path", "bar uncounted")
 
 
 def test_stretches_that_are_left_out_are_bands_with_their_reasons(model, log, tmp_path):
@@ -332,7 +331,6 @@ def test_several_logs_have_a_table_and_a_block_each_of_which_the_first_is_open(r
     assert ["open" in a for a in page.all("details")] == [True, False]
     labels = [a["aria-label"] for a in page.all("svg")]
     assert sum(label.startswith("x_dot in ") for label in labels) == 2
-    assert sum(label.startswith("Percentage of rows") for label in labels) == 2
     assert f"Identified by ols from {log.source}; held-out validation on another dive (21.96 s in all, 1,100 rows)" in (
         page.text
     )
@@ -526,7 +524,7 @@ def test_positions_alone_are_simulated_from_the_smoothed_states(model, log, tmp_
     found = dr.identify(model, bare)
     page = Page(written(found, bare, tmp_path))
     assert "x_ddot m/s^2 not measured" in page.text
-    assert "method='lo-diransac', seed=0)" in page.text
+    assert "method lo-diransac" in page.text
 
 
 @pytest.mark.parametrize(("size", "level"), [(0.0, "good"), (0.2, "care"), (2.0, "bad")])
@@ -692,8 +690,6 @@ def test_outliers_are_marked_at_the_rows_that_are_no_inliers(result, log, tmp_pa
     marked = page.all("path", "dots outlier")
     assert marked
     assert all(vertices(a["d"])[:, 0].tolist() == [7, 300, 301] for a in marked)
-    bars = page.all("path", "bar m0")[0]["d"]
-    assert bars == "M7 1000v-1000h1v1000zM300 1000v-1000h2v1000z"
 
 
 def test_a_log_of_25_000_rows_stays_light(model, tmp_path):

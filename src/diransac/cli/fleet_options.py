@@ -87,7 +87,7 @@ class FleetOptions:
         summary = summarise_fleet(self.store)
         with staged([report], [*files, self.store]) as (page,):
             if report:
-                from diransac.report.fleet import write_fleet_report
+                from diransac.report.stores import write_fleet_report
 
                 write_fleet_report(summary, page)
         screen.show(summary, as_json)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, TypeVar, get_type_hints
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_type_hints
 
 import typer
 
@@ -20,7 +20,6 @@ from diransac.model.library import TABLE_I, extended_rotorcraft, planar_rotorcra
 from diransac.model.plant import Plant, check_possible
 
 __all__ = [
-    "SHAPES",
     "FlightPicture",
     "FlightSeed",
     "LogOutput",
@@ -33,19 +32,8 @@ __all__ = [
 
 T = TypeVar("T")
 
-SHAPES = ("star", "square", "sine")
+Shape: TypeAlias = Literal["star", "square", "sine"]
 EXTENDED = "extended-rotorcraft"
-
-
-def _one_of(*choices: str) -> Callable[[str | None], str | None]:
-    """Callback that accepts None and these words."""
-
-    def check(word: str | None) -> str | None:
-        if word is not None and word not in choices:
-            raise typer.BadParameter(f"{word!r} is not one of {', '.join(choices)}")
-        return word
-
-    return check
 
 
 def _finite(number: float | None) -> float | None:
@@ -87,15 +75,10 @@ def _picture_file(text: str) -> Path:
     return path
 
 
-_SHAPE = "|".join(SHAPES)
 _LOG_NAMES: dict[str, Any] = {"parser": _log_file, "metavar": "FILE.csv|-"}
 
-TrajectoryArgument = Annotated[
-    str, typer.Argument(metavar=_SHAPE, callback=_one_of(*SHAPES), help="Trajectory, section V of the paper.")
-]
-TrajectoryOption = Annotated[
-    str, typer.Option("--trajectory", metavar=_SHAPE, callback=_one_of(*SHAPES), help="Trajectory.")
-]
+TrajectoryArgument = Annotated[Shape, typer.Argument(help="Trajectory, section V of the paper.")]
+TrajectoryOption = Annotated[Shape, typer.Option("--trajectory", help="Trajectory.")]
 LogOutput = Annotated[Path, typer.Option("--output", "-o", help=f"Log to write: {', '.join(ENDINGS)}.", **_LOG_NAMES)]
 OptionalLogOutput = Annotated[
     Path | None, typer.Option("--output", "-o", help="Log of the flight to write.", **_LOG_NAMES)
@@ -136,11 +119,6 @@ def _given(group: Any) -> dict[str, Any]:
     return {f.name: value for f in fields(group) if (value := getattr(group, f.name)) is not None}
 
 
-def _word(*choices: str) -> dict[str, Any]:
-    """One of some words, by default the first."""
-    return {"metavar": "|".join(choices), "callback": _one_of(*choices), "show_default": choices[0]}
-
-
 _PROBABILITY = {"min": 0.0, "max": 1.0, "metavar": "P"}
 _LENGTH = {"min": 1.0, "metavar": "ROWS", "show_default": "10"}
 
@@ -156,17 +134,18 @@ def _number(unit: str) -> dict[str, Any]:
 
 
 _PLANT: Options = {
-    "plant": (str, "", "Plant with disturbances; the model itself by default.",
-              {"metavar": EXTENDED, "callback": _one_of(EXTENDED)}),
+    "plant": (Literal["extended-rotorcraft"], "", "Plant with disturbances; the model itself by default.", {}),
     "assignments": (list[str], "--parameter",
                     "True parameter, repeatable; by default Table I for the planar rotorcraft.",
                     {"metavar": "NAME=VALUE"}),
     "aerodynamic_imbalance": (float, "", "Aerodynamic imbalance of each rotor; Table II: 1.0e-6 to 1.8e-6.",
                               _number("M4")),
     "mass_imbalance": (float, "", "Mass imbalance of each rotor; Table II: 6e-5 to 1.4e-4.", _number("KG")),
-    "convention": (str, "", "Imbalance as forces and torques, or added to accelerations as in eq. (20).",
-                   _word("physical", "printed")),
-    "phase": (str, "", "Rotor phase: integrated speed, or as in eq. (14).", _word("integrated", "instantaneous")),
+    "convention": (Literal["physical", "printed"], "",
+                   "Imbalance as forces and torques, or added to accelerations as in eq. (20).",
+                   {"show_default": "physical"}),
+    "phase": (Literal["integrated", "instantaneous"], "", "Rotor phase: integrated speed, or as in eq. (14).",
+              {"show_default": "integrated"}),
     "blade_flapping": (float, "", "Tilt of the rotor disc per unit of advance ratio.", _number("RAD")),
     "rotor_phase": (Any, "", "Initial rotor phase; any: drawn with the seed.",
                     {"parser": _angle, "metavar": "RAD|any", "show_default": "0"}),
@@ -223,13 +202,16 @@ _NOISE: Options = {
     "outlier_probability": (float, "--outliers", "Probability of an outlier per sample; with --magnitude.",
                             _PROBABILITY),
     "outlier_magnitude": (float, "--magnitude", "Outliers add uniform(-A, A).", _size("A")),
-    "outliers": (str, "--outliers-hit", "Each signal by itself, or all signals of a row.", _word("signals", "rows")),
+    "outliers": (Literal["signals", "rows"], "--outliers-hit", "Each signal by itself, or all signals of a row.",
+                 {"show_default": "signals"}),
     "acceleration_std": (float, "--acceleration-noise", "Standard deviation.", _size("M/S2")),
     "rate_std": (float, "--rate-noise", "Standard deviation.", _size("RAD/S")),
     "angular_acceleration_std": (float, "--angular-acceleration-noise", "Standard deviation.",
                                  _size("RAD/S2", show_default="--rate-noise over the sampling time")),
-    "integrated": (str, "--integrated-noise", "Noise of velocities and positions.", _word("white", "random-walk")),
-    "first_row": (str, "", "First row: without noise and faults, or like the others.", _word("clean", "corrupted")),
+    "integrated": (Literal["white", "random-walk"], "--integrated-noise", "Noise of velocities and positions.",
+                   {"show_default": "white"}),
+    "first_row": (Literal["clean", "corrupted"], "", "First row: without noise and faults, or like the others.",
+                  {"show_default": "clean"}),
     "burst_probability": (float, "--bursts",
                           "Probability per sample that a burst of outliers starts; with --magnitude.",
                           _PROBABILITY),

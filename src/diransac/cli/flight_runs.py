@@ -160,9 +160,7 @@ class FlightTest:
             f"flight of {_size(self.plant, self.flight.log)}, seed {self.seed}",
             *aligned(self._parameters()),
             "",
-            *aligned(self._errors()),
-            "",
-            *aligned(self._limits()),
+            *aligned(self._signals()),
         ]
         if not same_equations(self.result.model, self.plant.model):
             lines.append(f"! the model has other equations than the plant's {self.plant.model.name}")
@@ -178,23 +176,17 @@ class FlightTest:
             [name, units[name], *(f"{x[name]:.5g}" if name in x else "-" for x in (found, true))] for name in units
         ]
 
-    def _errors(self) -> list[list[str]]:
-        ideal = self.ideal.errors if isinstance(self.ideal, TrackedFlight) else {}
-        rows = [["state", "unit", "tracking error", "with the true parameters"]]
+    def _signals(self) -> list[list[str]]:
+        """Tracking error of each state, and share of the samples of each input at a limit."""
+        units, controller = self.flight.log.units, self.flight.controller
+        ideal = self.ideal if isinstance(self.ideal, TrackedFlight) else None
+        rows = [["signal", "unit", "limits", "tracking error, or at a limit", "with the true parameters"]]
         for name, error in self.flight.errors.items():
-            other = f"{ideal[name]:.4g}" if name in ideal else "-"
-            rows.append([name, self.flight.log.units[name], f"{error:.4g}", other])
-        return rows
-
-    def _limits(self) -> list[list[str]]:
-        controller = self.flight.controller
-        ideal = self.ideal.at_limit if isinstance(self.ideal, TrackedFlight) else {}
-        rows = [["input", "unit", "limits", "at a limit", "with the true parameters"]]
+            rows.append([name, units[name], "", f"{error:.4g}", f"{ideal.errors[name]:.4g}" if ideal else "-"])
         edges = zip(controller.u_min, controller.u_max, strict=True)
         for (name, share), (low, high) in zip(self.flight.at_limit.items(), edges, strict=True):
             limits = f"{low:g} .. {high:g}" if np.isfinite([low, high]).any() else "none"
-            other = _percent(ideal[name]) if name in ideal else "-"
-            rows.append([name, self.flight.log.units[name], limits, _percent(share), other])
+            rows.append([name, units[name], limits, _percent(share), _percent(ideal.at_limit[name]) if ideal else "-"])
         return rows
 
 

@@ -71,14 +71,12 @@ def fly(
     """
     plant = as_plant(plant)
     start = _start(plant, trajectory, initial_state or {})
+    if dt is not None and not 0.0 < dt < np.inf:
+        raise SettingsError(f"dt is {dt}; give positive seconds")
+    time = trajectory.time
     if dt is not None:
-        n_steps = round((trajectory.time[-1] - trajectory.time[0]) / _positive("dt", dt))
-        steering = controller.at(trajectory.time[0] + dt * np.arange(n_steps + 1))
-    elif _same_instants(controller.time, trajectory.time):
-        steering = controller
-    else:
-        steering = controller.at(trajectory.time)
-    return fly_batch([plant], [steering], start[None], substeps=substeps, seeds=[seed], threads=1)[0]
+        time = time[0] + dt * np.arange(round((time[-1] - time[0]) / dt) + 1)
+    return fly_batch([plant], [controller.at(time)], start[None], substeps=substeps, seeds=[seed], threads=1)[0]
 
 
 def fly_batch(
@@ -205,18 +203,6 @@ def _start(plant: Plant, trajectory: Trajectory, changes: Mapping[str, float]) -
     if not np.isfinite(start).all():
         raise SettingsError("initial_state holds a NaN or an infinity; give finite numbers")
     return start
-
-
-def _positive(name: str, value: float) -> float:
-    """The value itself.  Raises SettingsError: it is not a positive number."""
-    if not (np.isfinite(value) and value > 0):
-        raise SettingsError(f"{name} is {value}; give positive seconds")
-    return value
-
-
-def _same_instants(a: FloatArray, b: FloatArray) -> bool:
-    """True if two time grids are equal."""
-    return len(a) == len(b) and bool(np.allclose(a, b, rtol=0.0, atol=_SAME_INSTANT * (b[1] - b[0])))
 
 
 def _engine(plants: Sequence[Plant], substeps: int) -> Rollouts:

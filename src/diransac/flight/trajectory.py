@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +72,9 @@ class Trajectory:
                 raise SettingsError(f"the trajectory has {array.shape[1]} {name}s and {len(names)} {name}_names")
         object.__setattr__(self, "state_names", tuple(self.state_names))
         object.__setattr__(self, "input_names", tuple(self.input_names))
-        object.__setattr__(self, "input_limits", MappingProxyType(dict(self.input_limits)))
+        for name, value in self._values():
+            if isinstance(value, Mapping):
+                object.__setattr__(self, name, MappingProxyType(dict(value)))
 
     @property
     def dt(self) -> float:
@@ -103,5 +106,8 @@ class Trajectory:
         return self.columns([name])[:, 0]
 
     def __reduce__(self) -> tuple[object, ...]:
-        names = (self.state_names, self.input_names, dict(self.input_limits))
-        return (Trajectory, (self.time, self.states, self.inputs, *names, self.cost))
+        return (type(self), tuple(dict(x) if isinstance(x, Mapping) else x for _, x in self._values()))
+
+    def _values(self) -> list[tuple[str, Any]]:
+        """Name and value of each field."""
+        return [(x.name, getattr(self, x.name)) for x in fields(self)]

@@ -242,25 +242,29 @@ def tvlqr_batch(
     for trajectory in trajectories:
         _check_columns(model, trajectory)
     trajectories = [_with_continuous_attitude(model, trajectory) for trajectory in trajectories]
-    costs = _CostMatrices(model, Q, R, Qf)
-    limits_of_each = [_limits_of(model, trajectory, limits) for trajectory in trajectories]
+    of_states, of_inputs, at_end = _cost_matrices(model, Q, R, Qf)
+    edges = [_limits_of(model, trajectory, limits) for trajectory in trajectories]
     problems = [
-        Problem(np.array(list(plant.parameters.values())), trajectory, costs.Q, costs.R(low, high), costs.Qf)
-        for plant, trajectory, (low, high) in zip(known, trajectories, limits_of_each, strict=True)
-    ]
-    names = (model.state, tuple(model.inputs))
-    return [
-        Controller(reference.time, reference.states, reference.inputs, K, low, high, *names)
-        for reference, K, (low, high) in zip(
-            trajectories, gains_of(model, problems, threads), limits_of_each, strict=True
+        Problem(
+            np.array(list(plant.parameters.values())),
+            trajectory,
+            of_states,
+            _full_use(*ends) if of_inputs is None else of_inputs,
+            at_end,
         )
+        for plant, trajectory, ends in zip(known, trajectories, edges, strict=True)
+    ]
+    names, gains = (model.state, tuple(model.inputs)), gains_of(model, problems, threads)
+    return [
+        Controller(reference.time, reference.states, reference.inputs, K, *ends, *names)
+        for reference, K, ends in zip(trajectories, gains, edges, strict=True)
     ]
 
 
 # Arguments -----------------------------------------------------------------------------------------------------------
 def check_weights(model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None) -> None:
     """Raise SettingsError: weights of `tvlqr` of wrong shape, names or definiteness for this model."""
-    _CostMatrices(model, Q, R, Qf)
+    _cost_matrices(model, Q, R, Qf)
 
 
 def _check_columns(model: Model, trajectory: Trajectory) -> None:
@@ -303,30 +307,34 @@ def _limits_of(model: Model, trajectory: Trajectory, limits: InputLimits | None)
     return low, high
 
 
-class _CostMatrices:
-    """Matrices Q, Qf and R."""
+def _cost_matrices(
+    model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None
+) -> tuple[FloatArray, FloatArray | None, FloatArray]:
+    """Matrices Q, R and Qf; R is None by default, where it depends on limits.
 
-    def __init__(self, model: Model, Q: Weights | None, R: Weights | None, Qf: Weights | None) -> None:
-        # Default weights, explained in `tvlqr`; they are not tuned to any plant.
-        errors = np.repeat([0.5, 1.0], [model.n_q, model.n_v])
-        for four in model.quaternions:
-            # Error of a quaternion per error of the attitude, 1/rad.
-            errors[list(four)] *= 0.5
-        weights = errors**-2.0
-        if model.n_q:
-            weights[len(weights) - len(model.first_order) :] = 0.0
-        self.Q = _matrix("Q", weights if Q is None else Q, model.state)
-        self.Qf = self.Q if Qf is None else _matrix("Qf", Qf, model.state)
-        self._R = None if R is None else _matrix("R", R, tuple(model.inputs))
-        if self._R is not None and np.linalg.eigvalsh(self._R).min(initial=np.inf) <= 0:
-            found = self._R.tolist()
-            raise SettingsError(f"R must be positive definite: each input needs a positive weight; found {found}")
+    Raises SettingsError: weights of wrong shape, names or definiteness.
+    """
+    # Default weights, explained in `tvlqr`; they are not tuned to any plant.
+    errors = np.repeat([0.5, 1.0], [model.n_q, model.n_v])
+    for four in model.quaternions:
+        # Error of a quaternion per error of the attitude, 1/rad.
+        errors[list(four)] *= 0.5
+    weights = errors**-2.0
+    if model.n_q:
+        weights[len(weights) - len(model.first_order) :] = 0.0
+    of_states = _matrix("Q", weights if Q is None else Q, model.state)
+    of_inputs = None if R is None else _matrix("R", R, tuple(model.inputs))
+    if of_inputs is not None and np.linalg.eigvalsh(of_inputs).min(initial=np.inf) <= 0:
+        raise SettingsError(
+            f"R must be positive definite: each input needs a positive weight; found {of_inputs.tolist()}"
+        )
+    return of_states, of_inputs, of_states if Qf is None else _matrix("Qf", Qf, model.state)
 
-    def R(self, low: FloatArray, high: FloatArray) -> FloatArray:
-        """R as given; by default full use of each input within these limits costs 1."""
-        half = (high - low) / 2
-        use = np.where(np.isfinite(half) & (half > 0), half, 1.0)
-        return np.diag(use**-2.0) if self._R is None else self._R
+
+def _full_use(low: FloatArray, high: FloatArray) -> FloatArray:
+    """R by which full use of each input within these limits costs 1."""
+    half = (high - low) / 2
+    return np.diag(np.where(np.isfinite(half) & (half > 0), half, 1.0) ** -2.0)
 
 
 def _matrix(name: str, weights: Weights, names: Sequence[str]) -> FloatArray:

@@ -6,11 +6,9 @@ In come logs, or a store; out comes a figure, and a file that is the same byte f
 | file | content |
 |---|---|
 | `figure.py` | colours, panels, heading, files |
-| `flight.py` | `plot_flight`: path, states and inputs of flights |
-| `prediction.py` | simulated signals beside the measured ones |
+| `flight.py` | `plot_flight`: path, states and inputs of flights; simulated signals beside measured ones |
 | `study.py`, `estimates.py`, `paths.py` | tracking errors and failures, parameter errors, and flown paths of a study |
 | `fleet.py` | parameters of a fleet |
-| `rows.py` | rows of marks on a logarithmic axis, for levels that are words |
 """
 
 from diransac.plots.flight import plot_flight

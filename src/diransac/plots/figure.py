@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -30,6 +31,7 @@ __all__ = [
     "WIDTH",
     "LegendEntry",
     "Range",
+    "axes_at",
     "check_ending",
     "draw_heading",
     "empty_figure",
@@ -39,8 +41,10 @@ __all__ = [
     "inches",
     "name_panel",
     "panel",
+    "round_step",
     "svg",
     "write",
+    "write_at",
 ]
 
 Range = tuple[float, float]
@@ -127,23 +131,41 @@ def _halves(states: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
     return [name for name in states if name not in velocities], velocities
 
 
+def axes_at(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
+    """Axes without a frame in a rectangle, inches from the figure's top left."""
+    full = figure.get_figheight()
+    place = (left / WIDTH, 1.0 - (top + height) / full, width / WIDTH, height / full)
+    axes = figure.add_axes(place, facecolor=SOFT)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    axes.tick_params(length=0, labelsize=7.5, labelcolor=MUTED, pad=3)
+    axes.grid(color=RULE, linewidth=0.7)
+    axes.set_axisbelow(True)
+    return axes
+
+
 def panel(figure: Figure, left: float, top: float, width: float, height: float, *, last: bool = True) -> Axes:
     """Panel in a rectangle, inches from the figure's top left; only the last of a column has time labels."""
     from matplotlib.ticker import MaxNLocator
 
-    full = figure.get_figheight()
     inner_width, inner_height = width - _VALUES - _EDGE, height - _NAME - _GAP
-    bottom = full - top - _NAME - inner_height
-    place = ((left + _VALUES) / WIDTH, bottom / full, inner_width / WIDTH, inner_height / full)
-    axes = figure.add_axes(place, facecolor=SOFT)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    axes.tick_params(length=0, labelsize=7.5, labelcolor=MUTED, labelbottom=last, pad=3)
-    axes.grid(color=RULE, linewidth=0.7)
-    axes.set_axisbelow(True)
+    axes = axes_at(figure, left + _VALUES, top + _NAME, inner_width, inner_height)
+    axes.tick_params(labelbottom=last)
     axes.yaxis.set_major_locator(MaxNLocator(max(4, round(1.7 * inner_height)), steps=_STEPS))
     axes.xaxis.set_major_locator(MaxNLocator(max(4, round(2.2 * inner_width)), steps=_STEPS))
     return axes
+
+
+def write_at(figure: Figure, x: float, top: float, text: str, **look: Any) -> None:
+    """Write a text at a place, inches from the figure's top left."""
+    at: dict[str, Any] = {"fontsize": 7.5, "color": MUTED, "va": "top"}
+    figure.text(x / WIDTH, 1.0 - top / figure.get_figheight(), text, **(at | look))
+
+
+def round_step(least: float) -> float:
+    """Smallest of 1, 2 and 5 times a power of ten that is at least this."""
+    decade = 10.0 ** math.floor(math.log10(least))
+    return next(step * decade for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= least)
 
 
 def name_panel(axes: Axes, name: str, detail: str) -> None:

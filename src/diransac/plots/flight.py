@@ -29,6 +29,7 @@ from diransac.plots.figure import (
     header_height,
     inches,
     name_panel,
+    round_step,
     write,
 )
 
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_flight"]
+__all__ = ["plot_flight", "plot_prediction"]
 
 
 def plot_flight(
@@ -62,9 +63,9 @@ def plot_flight(
     Returns
     -------
     matplotlib.figure.Figure
-        The path in the XZ plane, if there are states x and z, with the attitude of a single flight with a theta; a
-        panel per state; a panel per input, held from row to row, with its limits. References are broad and grey, or
-        pale in the flight's colour where each flight has its own.
+        The path in the XZ plane, if there are states x and z; a panel per state; a panel per input, held from row to
+        row, with its limits. References are broad and grey, or pale in the flight's colour where each flight has its
+        own.
 
     Raises
     ------
@@ -85,9 +86,9 @@ def plot_flight(
     entries, box = _legend_entries(flights), _path_box(flights)
     figure, panels, path_panel = flight_panels(states, inputs, box, header_height(entries, title))
     for name in states:
-        _draw_state(panels[name], name, flights)
+        _draw_signal(panels[name], name, flights)
     for name in inputs:
-        _draw_input(panels[name], name, flights)
+        _draw_signal(panels[name], name, flights, drawstyle="steps-post")
     if path_panel is not None and box is not None:
         _draw_path(path_panel, flights, box)
     draw_heading(figure, entries, title)
@@ -272,49 +273,35 @@ def _draw_references(axes: Axes, x: str, y: str, flights: Sequence[FlightCurve],
 
 
 # Over time -----------------------------------------------------------------------------------------------------------
-def _draw_state(axes: Axes, name: str, flights: Sequence[FlightCurve]) -> None:
-    """Draw a state over time, each flight over its reference."""
-    visible = _visible(name, flights)
-    _draw_references(axes, "t", name, flights)
+def _draw_signal(axes: Axes, name: str, flights: Sequence[FlightCurve], **held: Any) -> None:
+    """Draw a state or an input over time, each flight over its reference, and limits where they are in the range."""
+    visible, unit = _visible(name, flights), _unit(name, flights)
+    _draw_references(axes, "t", name, flights, **held)
     for flight in flights:
-        axes.plot(flight.log.time, _near(flight.log[name], visible), **_style(flight), zorder=2.5)
-        _mark_end(axes, flight, flight.log[name], visible)
-    _frame(axes, name, _unit(name, flights), visible, flights)
-
-
-def _draw_input(axes: Axes, name: str, flights: Sequence[FlightCurve]) -> None:
-    """Draw an input over time, held from row to row, and its limits where they are in the range."""
-    visible = _visible(name, flights)
-    _draw_references(axes, "t", name, flights, drawstyle="steps-post")
-    for flight in flights:
-        values = _near(flight.log[name], visible)
-        axes.plot(flight.log.time, values, drawstyle="steps-post", **_style(flight), zorder=2.5)
-        _mark_end(axes, flight, flight.log[name], visible)
-    detail = _unit(name, flights)
+        time, values = flight.log.time, flight.log[name]
+        axes.plot(time, _near(values, visible), **_style(flight), **held, zorder=2.5)
+        _mark_end(axes, flight, time, values, ((-np.inf, np.inf), visible))
     limits = flights[0].reference.input_limits.get(name)
     if limits is not None:
         for limit in limits:
             if visible[0] <= limit <= visible[1]:
                 axes.axhline(limit, **_LIMIT_STYLE, zorder=2.2)
-        detail = f"{detail}, limits {_number(limits[0])} to {_number(limits[1])}".removeprefix(", ")
-    _frame(axes, name, detail, visible, flights)
-
-
-def _frame(axes: Axes, name: str, detail: str, visible: Range, flights: Sequence[FlightCurve]) -> None:
+        unit = f"{unit}, limits {_number(limits[0])} to {_number(limits[1])}".removeprefix(", ")
     times = [time for flight in flights for time in (flight.reference.time, flight.log.time)]
     axes.set(xlim=(min(float(t[0]) for t in times), max(float(t[-1]) for t in times)), ylim=visible)
     axes.xaxis.set_major_formatter("{x:g} s")
-    name_panel(axes, name, detail)
+    name_panel(axes, name, unit)
 
 
-def _mark_end(axes: Axes, flight: FlightCurve, values: FloatArray, visible: Range) -> None:
-    """Draw a triangle where a flight first leaves the panel, else a cross at its last finite value."""
-    time = flight.log.time
-    if (row := _first_outside(values, visible)) is not None:
-        above = values[row] > visible[1]
-        _mark(axes, time[row], visible[1] if above else visible[0], "^" if above else "v", flight)
-    elif (row := _last_finite(values)) is not None:
-        _mark(axes, time[row], values[row], "X", flight)
+def _mark_end(axes: Axes, flight: FlightCurve, x: FloatArray, y: FloatArray, box: tuple[Range, Range]) -> None:
+    """Draw a triangle where a curve first leaves a box, over the edge it exceeds most, else a cross at its end."""
+    beyond = np.array([x - box[0][1], box[0][0] - x, y - box[1][1], box[1][0] - y])
+    rows = np.flatnonzero((beyond > 0.0).any(axis=0))
+    if len(rows):
+        row, marker = int(rows[0]), "><^v"[int(np.argmax(beyond[:, rows[0]]))]
+        _mark(axes, float(np.clip(x[row], *box[0])), float(np.clip(y[row], *box[1])), marker, flight)
+    elif (last := _last_finite(x + y)) is not None:
+        _mark(axes, x[last], y[last], "X", flight)
 
 
 def _mark(axes: Axes, x: float, y: float, marker: str, flight: FlightCurve) -> None:
@@ -332,7 +319,7 @@ def _number(x: float) -> str:
 
 # The path ------------------------------------------------------------------------------------------------------------
 def _draw_path(axes: Axes, flights: Sequence[FlightCurve], needed: tuple[Range, Range]) -> None:
-    """Draw the paths in the XZ plane at equal scale, and the attitude of a single flight with a theta."""
+    """Draw the paths in the XZ plane at equal scale."""
     from matplotlib.ticker import MultipleLocator
 
     width, height = inches(axes)
@@ -342,22 +329,14 @@ def _draw_path(axes: Axes, flights: Sequence[FlightCurve], needed: tuple[Range, 
     for flight in flights:
         x, z = (_near(flight.log[name], visible) for name, visible in zip(("x", "z"), box, strict=True))
         axes.plot(x, z, **_style(flight), zorder=2.5)
-        _mark_path_end(axes, flight, box)
-    if len(flights) == 1 and "theta" in flights[0].reference.state_names:
-        _draw_attitudes(axes, flights[0], box, reach=0.085 * scale)
+        _mark_end(axes, flight, flight.log["x"], flight.log["z"], box)
     _mark_start(axes, flights[0].reference, box)
     axes.set(xlim=box[0], ylim=box[1], aspect="equal")
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MultipleLocator(_round_step(0.6 * scale)))
+        axis.set_major_locator(MultipleLocator(round_step(0.6 * scale)))
     unit = _unit("x", flights)
     axes.xaxis.set_major_formatter(f"{{x:g}} {unit}" if unit else "{x:g}")
     name_panel(axes, "path", f"z over x, {unit}" if unit else "z over x")
-
-
-def _round_step(least: float) -> float:
-    """Smallest of 1, 2 and 5 times a power of ten that is at least this."""
-    decade = 10.0 ** np.floor(np.log10(least))
-    return float(min(step for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= least) * decade)
 
 
 def _mark_start(axes: Axes, reference: Trajectory, box: tuple[Range, Range]) -> None:
@@ -372,30 +351,49 @@ def _mark_start(axes: Axes, reference: Trajectory, box: tuple[Range, Range]) -> 
         axes.annotate(text, (x, z), **place, fontsize=8, color=INK, zorder=5)
 
 
-def _mark_path_end(axes: Axes, flight: FlightCurve, box: tuple[Range, Range]) -> None:
-    """Draw the mark of `_mark_end` on the path; the triangle points over the edge that is exceeded most."""
-    x, z = flight.log["x"], flight.log["z"]
-    beyond = np.array([x - box[0][1], box[0][0] - x, z - box[1][1], box[1][0] - z])
-    rows = np.flatnonzero((beyond > 0.0).any(axis=0))
-    if len(rows):
-        row = int(rows[0])
-        marker = "><^v"[int(np.argmax(beyond[:, row]))]
-        _mark(axes, float(np.clip(x[row], *box[0])), float(np.clip(z[row], *box[1])), marker, flight)
-    elif (last := _last_finite(x + z)) is not None:
-        _mark(axes, x[last], z[last], "X", flight)
+# Simulations beside measurements -------------------------------------------------------------------------------------
+_MEASURED: dict[str, Any] = {"color": REFERENCE, "linestyle": "none", "marker": ".", "markersize": 2.5}
+_SIMULATED: dict[str, Any] = {"color": COLOURS[0], "linewidth": 1.3}
 
 
-def _draw_attitudes(axes: Axes, flight: FlightCurve, box: tuple[Range, Range], reach: float) -> None:
-    """Draw the body's x axis as a bar and its z axis as a tick at evenly spaced times."""
-    from matplotlib.collections import LineCollection
+def plot_prediction(
+    simulated: Log, measured: Log, states: Sequence[str], inputs: Sequence[str], path: str | Path | None = None
+) -> Figure:
+    """Figure of simulated states over the measured ones, and of the inputs, over time.
 
-    # Number of attitudes; inches: length of each arm of a bar, least distance between grid lines of the path.
-    rows = np.linspace(0, len(flight.log) - 1, 20).astype(int)
-    x, z, theta = (flight.log[name][rows] for name in ("x", "z", "theta"))
-    seen = (x > box[0][0]) & (x < box[0][1]) & (z > box[1][0]) & (z < box[1][1]) & np.isfinite(theta)
-    centre = np.column_stack([x, z])[seen]
-    along = np.column_stack([np.cos(theta), np.sin(theta)])[seen] * reach
-    up = 0.7 * np.column_stack([-along[:, 1], along[:, 0]])
-    bars, ticks = np.stack([centre - along, centre + along], axis=1), np.stack([centre, centre + up], axis=1)
-    for lines, width in ((bars, 1.4), (ticks, 0.9)):
-        axes.add_collection(LineCollection(list(lines), colors=INK, linewidths=width, zorder=3), autolim=False)
+    Parameters
+    ----------
+    simulated : Log
+        As `diransac.simulate` returns it.
+    measured : Log
+        The log that was simulated.
+    states, inputs : sequence of str
+        Signals to draw.
+    path : str or Path, optional
+        File to be written: .png, .svg or .pdf.
+
+    Raises
+    ------
+    SettingsError
+        The ending is unknown, or the file cannot be written.
+    """
+    check_ending(path)
+    entries = [("simulated", _SIMULATED), ("measured", _MEASURED)]
+    figure, panels, _ = flight_panels(states, inputs, None, header_height(entries, None))
+    draw_heading(figure, entries, None)
+    for name, axes in panels.items():
+        name_panel(axes, name, simulated.units.get(name, ""))
+        if name in inputs:
+            axes.plot(simulated.time, simulated[name], color=MUTED, linewidth=1.0)
+            continue
+        axes.plot(simulated.time, simulated[name], zorder=3, **_SIMULATED)
+        low, high = float(np.nanmin(simulated[name])), float(np.nanmax(simulated[name]))
+        if name in measured:
+            axes.plot(measured.time, measured[name], zorder=2, **_MEASURED)
+            finite = _finite(measured[name])
+            if len(finite):
+                bulk = np.quantile(finite, [0.01, 0.99])
+                low, high = min(low, float(bulk[0])), max(high, float(bulk[1]))
+        margin = 0.06 * (high - low) or 1.0
+        axes.set_ylim(low - margin, high + margin)
+    return write(figure, path)

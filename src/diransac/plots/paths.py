@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -12,18 +12,18 @@ import numpy.typing as npt
 from diransac.errors import SettingsError
 from diransac.plots.figure import (
     INK,
-    MUTED,
     REFERENCE,
-    RULE,
-    SOFT,
     WIDTH,
     Range,
+    axes_at,
     check_ending,
     draw_heading,
     empty_figure,
     extent,
     header_height,
+    round_step,
     write,
+    write_at,
 )
 from diransac.plots.study import method_looks, title_of
 from diransac.study.method_choice import TRUE
@@ -118,6 +118,8 @@ def _at(found: Mapping[tuple[str, int, str], Path2], level: str, methods: Sequen
 
 # Panels --------------------------------------------------------------------------------------------------------------
 def _drawn(summary: Summary, level: str, flown: _Paths, planned: _Paths, title: str) -> Figure:
+    from matplotlib.ticker import MultipleLocator
+
     looks = method_looks(summary.methods)
     entries = [("flown with the true parameters", looks[TRUE])] if TRUE in looks else []
     if any(some for by_method in planned.values() for some in by_method.values()):
@@ -130,23 +132,25 @@ def _drawn(summary: Summary, level: str, flown: _Paths, planned: _Paths, title: 
     figure = empty_figure(full)
     top = header
     for shape, by_method in flown.items():
-        _write(figure, 0.1, top + 0.03, shape, fontsize=9.5, color=INK)
+        write_at(figure, 0.1, top + 0.03, shape, fontsize=9.5, color=INK)
         counts = _counts(summary, shape, level)
         for k, (label, look) in enumerate(looks.items()):
             left, below = _LEFT + k * (width + _GAP), top + _NAME + heights[shape]
-            place = (left / WIDTH, 1.0 - below / full, width / WIDTH, heights[shape] / full)
-            axes = figure.add_axes(place, facecolor=SOFT)
+            axes = axes_at(figure, left, top + _NAME, width, heights[shape])
             _draw_flights(axes, by_method[label], by_method.get(TRUE, []), look["color"], label == TRUE)
             _draw_references(axes, planned[shape][label])
-            _dress(axes, boxes[shape], first=k == 0)
-            _write(figure, left + width, top + 0.06, label, fontsize=8, color=look["color"], ha="right")
+            axes.set(xlim=boxes[shape][0], ylim=boxes[shape][1])
+            axes.tick_params(labelleft=k == 0)
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_major_locator(MultipleLocator(round_step(extent(boxes[shape][0]) / 5.0)))
+            write_at(figure, left + width, top + 0.06, label, fontsize=8, color=look["color"], ha="right")
             unseen = _unseen(by_method[label], boxes[shape], *counts[label])
-            _write(figure, left + width, below + 0.17, unseen, fontsize=7, color=MUTED, ha="right")
+            write_at(figure, left + width, below + 0.17, unseen, fontsize=7, ha="right")
         top += _NAME + heights[shape] + _BELOW
     draw_heading(figure, entries, title)
     caption = f"Every trial's path in the XZ plane, m; {summary.axis} {level} {summary.unit}".rstrip()
     caption += f". {summary.remark}" if summary.remark else ""
-    _write(figure, 0.1, full - _CAPTION + 0.06, caption, fontsize=7.5, color=MUTED)
+    write_at(figure, 0.1, full - _CAPTION + 0.06, caption)
     return figure
 
 
@@ -182,22 +186,6 @@ def _draw_references(axes: Axes, planned: Sequence[Path2]) -> None:
     )
 
 
-def _dress(axes: Axes, box: tuple[Range, Range], first: bool) -> None:
-    from matplotlib.ticker import MultipleLocator
-
-    axes.set(xlim=box[0], ylim=box[1])
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    axes.tick_params(length=0, labelsize=7, labelcolor=MUTED, labelleft=first, pad=2)
-    axes.grid(color=RULE, linewidth=0.6)
-    axes.set_axisbelow(True)
-    # Largest number of grid lines across a panel.
-    least = extent(box[0]) / 5.0
-    decade = 10.0 ** np.floor(np.log10(least))
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MultipleLocator(next(n * decade for n in (1.0, 2.0, 5.0, 10.0) if n * decade >= least)))
-
-
 # Text ----------------------------------------------------------------------------------------------------------------
 def _counts(summary: Summary, shape: str, level: str) -> dict[str, tuple[int, int]]:
     """Trials of each method at the level, and how many failed."""
@@ -212,7 +200,3 @@ def _unseen(flown: Sequence[Path2], box: tuple[Range, Range], ran: int, failed: 
     leaving = sum(bool(((path[:, :2] < low) | (path[:, :2] > high)).any()) for path in flown)
     lines = [f"{leaving} of {ran} leave the panel"] * (leaving > 0) + [f"{failed} of {ran} failed"] * (failed > 0)
     return "\n".join(lines)
-
-
-def _write(figure: Figure, x: float, top: float, text: str, **look: Any) -> None:
-    figure.text(x / WIDTH, 1.0 - top / figure.get_figheight(), text, va="top", **look)

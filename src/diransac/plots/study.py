@@ -16,11 +16,11 @@ from diransac.plain_text import printable
 from diransac.plots.figure import (
     COLOURS,
     INK,
-    MUTED,
     PAPER,
     REFERENCE,
     SOFT,
     WIDTH,
+    axes_at,
     check_ending,
     draw_heading,
     empty_figure,
@@ -28,8 +28,8 @@ from diransac.plots.figure import (
     name_panel,
     panel,
     write,
+    write_at,
 )
-from diransac.plots.rows import as_marks, draw_flight_rows, flight_rows_height
 from diransac.study.method_choice import TRUE
 from diransac.study.summary import Summary, TrackingErrors, summarise
 from diransac.text_table import superscript
@@ -44,6 +44,8 @@ __all__ = ["axis_label", "level_labels", "method_looks", "n_trials", "plot_study
 # Inches: height of a row of panels, of a trajectory's name, of the axis below the panels, of a line of the caption.
 _ROW, _NAME, _AXIS, _LINE = 1.5, 0.24, 0.36, 0.155
 _COLUMNS = 3
+# Width of a letter of a level's name, inches.
+_LETTER = 0.06
 # Letters per line of a title, and largest difference between its lines.
 _LETTERS, _RAGGED = 92, 12
 
@@ -56,7 +58,6 @@ _CAPTION = (
     "has an infinite error. A trial without a flight (no plan, or one that diverged) has failed: means exclude it, and "
     "are then hollow.",
 )
-_CAPTION_OF_ROWS = ("Marks are medians of the RMS tracking error over {trials} of a level, lines end at the largest.",)
 
 
 def plot_study(store: str | Path, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -88,8 +89,7 @@ def plot_study(store: str | Path, path: str | Path | None = None, *, title: str 
     Points are means over the flights, bars one standard deviation to either side (clipped at 0), dashes medians over
     all trials. A trial without a flight has failed: the fraction of such trials is shown below the panels, and a mean
     that excludes some is hollow. Where means differ by orders of magnitude the scale is linear up to a first decade and
-    logarithmic above. Levels that are words are rows, with a panel per coordinate on a logarithmic axis: marks are
-    medians over all trials, lines end at the largest value.
+    logarithmic above. No line joins levels that are words.
     """
     check_ending(path)
     summary = summarise(store)
@@ -102,57 +102,32 @@ def plot_study(store: str | Path, path: str | Path | None = None, *, title: str 
 
 
 def _drawn(summary: Summary, title: str) -> Figure:
-    looks = _looks(summary)
-    entries = list(looks.items())
-    header = header_height(entries, title)
-    heights = [_block_height(summary, flights) for flights in summary.flights.values()]
-    words = _caption(summary)
-    caption = _LINE * len(words) + 0.14
-    figure = empty_figure(header + sum(heights) + caption)
+    looks = method_looks(summary.methods)
+    header = header_height(list(looks.items()), title)
+    words = [line.format(trials=n_trials(summary)) for line in (*_CAPTION, summary.remark) if line]
+    names = 0.0 if summary.is_numeric else _LETTER * max(map(len, summary.levels))
+    n_rows = -(-len(summary.units) // _COLUMNS)
+    heights = {
+        shape: _NAME + n_rows * _ROW + _AXIS + _HEADING + 2.0 * names + _CELL * len(_failing(flights.failure_share))
+        for shape, flights in summary.flights.items()
+    }
+    figure = empty_figure(header + sum(heights.values()) + _LINE * len(words) + 0.14)
     top = header
-    for (shape, flights), height in zip(summary.flights.items(), heights, strict=True):
-        _draw_block(figure, summary, shape, flights, top)
-        top += height
-    draw_heading(figure, entries, title)
+    for shape, flights in summary.flights.items():
+        _draw_block(figure, summary, shape, flights, top, names)
+        top += heights[shape]
+    draw_heading(figure, list(looks.items()), title)
     for row, line in enumerate(words):
-        y = (caption - 0.04 - row * _LINE) / figure.get_figheight()
-        figure.text(0.1 / WIDTH, y, line, fontsize=7.5, color=MUTED, va="top")
+        write_at(figure, 0.1, top + 0.1 + row * _LINE, line)
     return figure
 
 
-def _caption(summary: Summary) -> list[str]:
-    """Lines of the caption."""
-    some_failed = any(flights.failed.any() for flights in summary.flights.values())
-    of_rows = [
-        *_CAPTION_OF_ROWS,
-        "none: no flight (no plan, or one that diverged), counted as an infinite error." if some_failed else "",
-    ]
-    lines = [*(_CAPTION if summary.is_numeric else of_rows), summary.remark]
-    return [line.format(trials=n_trials(summary)) for line in lines if line]
-
-
 # Panels of one trajectory ------------------------------------------------------------------------------------------
-def _looks(summary: Summary) -> dict[str, dict[str, Any]]:
-    """Styles of lines, or of marks if levels are words."""
-    looks = method_looks(summary.methods)
-    return looks if summary.is_numeric else as_marks(looks)
-
-
-def _block_height(summary: Summary, flights: TrackingErrors) -> float:
-    """Height of a trajectory's panels, inches."""
-    if not summary.is_numeric:
-        return _NAME + flight_rows_height(flights, len(summary.levels), len(summary.methods))
-    n_rows = -(-len(summary.units) // _COLUMNS)
-    return _NAME + n_rows * _ROW + _AXIS + _failures_height(flights.failure_share)
-
-
-def _draw_block(figure: Figure, summary: Summary, shape: str, flights: TrackingErrors, top: float) -> None:
-    full = figure.get_figheight()
-    figure.text(0.1 / WIDTH, 1.0 - (top + 0.05) / full, f"Flown: {shape}", fontsize=9.5, color=INK, va="top")
-    if not summary.is_numeric:
-        names = level_labels(summary), axis_label(summary)
-        draw_flight_rows(figure, top + _NAME, flights, summary.units, *names, _looks(summary))
-        return
+def _draw_block(
+    figure: Figure, summary: Summary, shape: str, flights: TrackingErrors, top: float, names: float
+) -> None:
+    """Draw the panels of a trajectory, whose levels' names have this height, inches, and its failures."""
+    write_at(figure, 0.1, top + 0.05, f"Flown: {shape}", fontsize=9.5, color=INK)
     width, states = WIDTH / _COLUMNS, list(summary.units)
     for i, state in enumerate(states):
         row, column = divmod(i, _COLUMNS)
@@ -160,10 +135,9 @@ def _draw_block(figure: Figure, summary: Summary, shape: str, flights: TrackingE
         axes = panel(figure, column * width, top + _NAME + row * _ROW, width, _ROW, last=last)
         _draw_state(axes, summary, flights, state, _spans_decades(flights))
         name_panel(axes, state, summary.units[state])
-    below = top + _NAME + -(-len(states) // _COLUMNS) * _ROW
-    figure.text(0.5, 1.0 - (below + 0.2) / full, axis_label(summary), fontsize=8.5, color=INK, va="top", ha="center")
-    rows = [(label, look["color"]) for label, look in method_looks(summary.methods).items()]
-    _draw_failures(figure, below + _AXIS, rows, level_labels(summary), flights.failure_share)
+    below = top + _NAME + -(-len(states) // _COLUMNS) * _ROW + names
+    write_at(figure, WIDTH / 2.0, below + 0.2, axis_label(summary), fontsize=8.5, color=INK, ha="center")
+    _draw_failures(figure, below + _AXIS, summary, flights.failure_share, names)
 
 
 def _draw_state(axes: Axes, summary: Summary, flights: TrackingErrors, state: str, logarithmic: bool) -> None:
@@ -179,20 +153,16 @@ def _draw_state(axes: Axes, summary: Summary, flights: TrackingErrors, state: st
         axes.errorbar(
             x, y, bars, fmt="none", ecolor=colour, elinewidth=0.8, capsize=1.6, capthick=0.8, zorder=2.2 + k / 9
         )
-        axes.plot(x, y, **{**look, "marker": ""}, zorder=2.3 + k / 9)
+        if summary.is_numeric:
+            axes.plot(x, y, **{**look, "marker": ""}, zorder=2.3 + k / 9)
         for is_hollow in (False, True):
             chosen = hollow[:, k] == is_hollow
             face = PAPER if is_hollow else colour
             style = {**look, "linestyle": "none", "markerfacecolor": face, "markeredgewidth": 0.9}
             axes.plot(x[chosen], y[chosen], **style, zorder=2.4 + k / 9)
-        dashes: dict[str, Any] = {
-            "linestyle": "none",
-            "marker": "_",
-            "markersize": 7,
-            "markeredgewidth": 1.1,
-            "alpha": 0.75,
-        }
-        axes.plot(x, np.where(np.isfinite(median[:, k]), median[:, k], np.nan), color=colour, **dashes, zorder=2.1)
+        dashes: dict[str, Any] = {"linestyle": "none", "marker": "_", "markersize": 7, "markeredgewidth": 1.1}
+        finite = np.where(np.isfinite(median[:, k]), median[:, k], np.nan)
+        axes.plot(x, finite, color=colour, alpha=0.75, **dashes, zorder=2.1)
     highest = np.fmax(mean + spread, np.where(np.isfinite(median), median, np.nan))
     _scale(axes, mean, highest, logarithmic)
     _name_levels(axes, summary)
@@ -228,11 +198,13 @@ def _positions(summary: Summary) -> tuple[FloatArray, int]:
 def _name_levels(axes: Axes, summary: Summary) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    positions, _ = _positions(summary)
+    positions, labels = _positions(summary)[0], [printable(label) for label in level_labels(summary)]
     margin = 0.6 * (float(np.diff(positions).min()) if len(positions) > 1 else 1.0)
     axes.set_xlim(positions[0] - margin, positions[-1] + margin)
-    if len(positions) <= _COLUMNS * 2:
-        axes.set_xticks(positions, [printable(label) for label in level_labels(summary)])
+    if not summary.is_numeric:
+        axes.set_xticks(positions, labels, rotation=90)
+    elif len(positions) <= _COLUMNS * 2:
+        axes.set_xticks(positions, labels)
     else:
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
 
@@ -307,39 +279,42 @@ def n_trials(summary: Summary) -> str:
 
 # Failed trials -------------------------------------------------------------------------------------------------------
 
-# Inches: height of a row of cells, of the heading, of the margin below; left and right ends of the cells.
-_CELL, _HEADING, _FREE, _LEFT, _RIGHT = 0.19, 0.21, 0.1, 1.75, 8.83
+# Inches: height of a row of cells, of the heading; left end and width of the cells.
+_CELL, _HEADING, _LEFT, _WIDTH = 0.19, 0.31, 1.75, 7.08
 
 
-def _failures_height(share: FloatArray) -> float:
-    """Height of the table of failures, inches: a row per method with failures, one line without any."""
-    return _HEADING + _FREE + _CELL * len(_failing(share))
-
-
-def _draw_failures(
-    figure: Figure, top: float, methods: Sequence[tuple[str, str]], levels: Sequence[str], share: FloatArray
-) -> None:
-    """Draw the table of failures: fraction of the trials without a flight, by method and level.
+def _draw_failures(figure: Figure, top: float, summary: Summary, share: FloatArray, names: float) -> None:
+    """Draw a table of the fraction of trials without a flight, by method and level, the darker the more there are.
 
     Parameters
     ----------
     top : inches from the figure's top
-    methods : label and colour of each
-    levels : their labels
     share : (n_levels, n_methods)   fraction of the trials; NaN without trials
+    names : height of the names of levels, inches
     """
-    rows = _failing(share)
-    text = "Trials that failed, %" if rows else "No trial failed."
-    _write(figure, 0.1, top + 0.05, text, color=INK, ha="left")
-    width = (_RIGHT - _LEFT) / len(levels)
-    if rows:
-        for i, level in enumerate(levels):
-            _write(figure, _LEFT + (i + 0.5) * width, top + 0.05, level, color=MUTED, ha="center")
-    for line, k in enumerate(rows):
-        y = top + _HEADING + line * _CELL
-        _write(figure, 0.1, y + 0.03, methods[k][0], color=methods[k][1], ha="left")
-        for i, fraction in enumerate(share[:, k]):
-            _draw_cell(figure, _LEFT + i * width, y, width, fraction)
+    failing, looks = _failing(share), method_looks(summary.methods)
+    if not failing:
+        write_at(figure, 0.1, top + 0.05, "No trial failed.", color=INK)
+        return
+    write_at(figure, 0.1, top + 0.05, "Trials that failed, %", color=INK)
+    axes = axes_at(figure, _LEFT, top + 0.21 + names, _WIDTH, _CELL * len(failing))
+    shown = np.nan_to_num(share[:, failing].T)
+    edges = [np.arange(n + 1) - 0.5 for n in shown.T.shape]
+    axes.pcolormesh(*edges, np.where(shown > 0.0, 0.12 + 0.6 * shown, 0.0), cmap=_failure_colours(), vmin=0.0, vmax=1.0,
+                    edgecolors=PAPER, linewidth=1.4)  # fmt: skip
+    axes.grid(visible=False)
+    axes.invert_yaxis()
+    axes.tick_params(labeltop=True, labelbottom=False)
+    axes.set_xticks(range(len(share)), level_labels(summary), rotation=0 if summary.is_numeric else 90)
+    axes.set_yticks([])
+    for row, k in enumerate(failing):
+        label = summary.methods[k]
+        write_at(figure, 0.1, top + 0.24 + names + row * _CELL, label, color=looks[label]["color"])
+        for level in np.flatnonzero(shown[row] > 0.0).tolist():
+            # Whole percent; 0 and 100 only if exact.
+            percent = 100 if shown[row, level] == 1.0 else min(99, max(1, round(100.0 * shown[row, level])))
+            ink = PAPER if shown[row, level] > 0.5 else INK
+            axes.text(level, row, str(percent), fontsize=7.5, color=ink, ha="center", va="center")
 
 
 def _failing(share: FloatArray) -> list[int]:
@@ -347,27 +322,8 @@ def _failing(share: FloatArray) -> list[int]:
     return [int(k) for k in np.flatnonzero((np.nan_to_num(share) > 0.0).any(axis=0))]
 
 
-def _draw_cell(figure: Figure, left: float, top: float, width: float, fraction: float) -> None:
-    """Draw a cell with the percentage of failures, the darker the more there are."""
-    from matplotlib.patches import Rectangle
+def _failure_colours() -> Any:
+    """Colours from that of an empty cell to that of failures, as in the report."""
+    from matplotlib.colors import LinearSegmentedColormap
 
-    full = figure.get_figheight()
-    place = ((left + 0.015) / WIDTH, 1.0 - (top + _CELL - 0.02) / full)
-    size = ((width - 0.03) / WIDTH, (_CELL - 0.02) / full)
-    look: dict[str, Any] = {"transform": figure.transFigure, "linewidth": 0.0}
-    figure.add_artist(Rectangle(place, *size, facecolor=SOFT, **look))
-    if not fraction > 0.0:
-        return
-    # Colour of failures, as in the report.
-    figure.add_artist(Rectangle(place, *size, facecolor="#b42318", alpha=0.12 + 0.6 * fraction, **look))
-    dark = fraction > 0.5
-    _write(figure, left + width / 2.0, top + 0.025, _percent(fraction), color="#ffffff" if dark else INK, ha="center")
-
-
-def _percent(fraction: float) -> str:
-    """Whole percent; 0 and 100 only if exact."""
-    return str(100 if fraction == 1.0 else min(99, max(1, round(100.0 * fraction))))
-
-
-def _write(figure: Figure, x: float, top: float, text: str, **look: Any) -> None:
-    figure.text(x / WIDTH, 1.0 - top / figure.get_figheight(), text, fontsize=7.5, va="top", **look)
+    return LinearSegmentedColormap.from_list("failures", [SOFT, "#b42318"])

@@ -13,7 +13,6 @@ from diransac.report import provenance, sections
 from diransac.report.friction import friction_figures
 from diransac.report.over_time import figures_of
 from diransac.report.rendering import numbered, write_page
-from diransac.report.residual_spectra import spectrum_figures
 from diransac.report.runs import Entry, simulate_all
 
 __all__ = ["write_report"]
@@ -96,23 +95,16 @@ def _content(entries: Sequence[Entry], logs: Sequence[Log]) -> dict[str, Any]:
         "cards": [sections.card(entry) for entry in entries],
         "log_tables": sections.log_tables(entries, logs),
         "parameters": sections.parameters(entries),
-        "sensitivity": sections.sensitivity(entries),
-        "correlations": sections.correlations(entries),
         "diagnosis": sections.diagnosis(entries),
         "suggestions": sections.suggestions(entries),
         "competitions": sections.competitions(entries),
         "logs": [figures_of(log, runs, len(logs)) for log, runs in zip(logs, by_log, strict=True)],
         "friction": friction_figures(entries),
-        "spectra": spectrum_figures(entries),
-        "scores": [
-            (runs[0].log_name, sections.short_term_scores(runs), [sections.scores(run) for run in runs])
-            for runs in by_log
-        ],
+        "scores": [(runs[0].log_name, [sections.scores(run) for run in runs]) for runs in by_log],
         "equations": [provenance.model_text(model) for model in models],
         "settings": provenance.settings(entries),
         "log_facts": provenance.log_facts(entries, logs),
         "preparation": provenance.preparation(entries),
         "notes": provenance.notes(entries),
-        "snippet": provenance.snippet(entries),
         "versions": provenance.versions(),
     }

@@ -28,7 +28,6 @@ __all__ = [
     "extremes",
     "padded",
     "path_data",
-    "strip",
     "ticks",
     "time_axis",
     "time_plot",
@@ -39,7 +38,6 @@ Tick = tuple[str, str]
 
 _HEIGHT = 1000
 _FARTHEST = 10**6
-_STRIP_CELLS = 3000
 _MARGIN = 0.06
 
 
@@ -174,7 +172,7 @@ class Plot:
     width : x of the last row
     start, dt : time of the first row and sampling time, s
     paths : ``(CSS classes, name, d)`` of each path; the name is empty for paths without values
-    scale : range of values; None for a strip
+    scale : range of values
     y_ticks : texts of the values
     full : y of the highest and lowest measured sample, if outside of the scale
     still : True if its x axis is no time, so that it does not zoom with plots of the log
@@ -186,8 +184,8 @@ class Plot:
     start: float
     dt: float
     paths: tuple[tuple[str, str, str], ...]
-    scale: Scale | None = None
-    y_ticks: tuple[Tick, ...] = ()
+    scale: Scale
+    y_ticks: tuple[Tick, ...]
     full: str = ""
     still: bool = False
 
@@ -272,28 +270,6 @@ def time_plot(
         full="" if full is None else " ".join(str(y) for y in scale.height([full[1], full[0]])),
         still=still,
     )
-
-
-def strip(layers: Iterable[tuple[FloatArray, str]], timeline: Timeline, label: str) -> Plot:
-    """Strip of bars over time; of a long log, a bar is the mean over several rows.
-
-    Parameters
-    ----------
-    layers : ``(fractions (n_rows,), CSS classes)`` of each layer; each row's bar is as high as its fraction
-    timeline, label : as of `time_plot`
-    """
-    paths = tuple((look, "", _bars(fractions)) for fractions, look in layers if fractions.any())
-    return Plot(label, "strip", max(1, timeline.n_rows - 1), timeline.start, timeline.dt, paths)
-
-
-def _bars(fractions: FloatArray) -> str:
-    """Attribute ``d`` of bars as high as the fractions; neighbours of equal height are joined."""
-    edges = np.unique(np.linspace(0, len(fractions), min(len(fractions), _STRIP_CELLS) + 1).astype(int))
-    heights = np.rint(_HEIGHT * np.add.reduceat(fractions, edges[:-1]) / np.diff(edges)).astype(int)
-    changes = np.concatenate([[0], np.flatnonzero(np.diff(heights)) + 1, [len(heights)]])
-    begins, ends = edges[changes[:-1]].tolist(), edges[changes[1:]].tolist()
-    bars = zip(begins, ends, heights[changes[:-1]].tolist(), strict=True)
-    return "".join(f"M{x} {_HEIGHT}v-{height}h{end - x}v{height}z" for x, end, height in bars if height)
 
 
 def time_axis(timeline: Timeline) -> tuple[Tick, ...]:

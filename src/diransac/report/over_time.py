@@ -1,4 +1,4 @@
-"""Figures over time of one log: measured and simulated signals, residuals, unmodelled forces, inliers."""
+"""Figures over time of one log: measured and simulated signals, residuals, unmodelled forces."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import segment
 from diransac.data.log import Log
 from diransac.identification.estimate import Diagnosis
-from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, strip, time_axis, time_plot
+from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, time_axis, time_plot
 from diransac.report.runs import Run
 from diransac.text_table import number, percent, plural, share
 
@@ -39,7 +39,6 @@ class LogFigures:
     legend : ``(CSS class, text)`` of each series
     signals : a figure per signal
     unmodelled_about, unmodelled : description and figures of unmodelled forces; empty without a diagnosis
-    inliers : figure of the rows that agree
     """
 
     name: str
@@ -49,7 +48,6 @@ class LogFigures:
     signals: tuple[Figure, ...]
     unmodelled_about: str
     unmodelled: tuple[Figure, ...]
-    inliers: Figure
 
 
 def figures_of(log: Log, runs: Sequence[Run], n_logs: int) -> LogFigures:
@@ -74,7 +72,6 @@ def figures_of(log: Log, runs: Sequence[Run], n_logs: int) -> LogFigures:
         signals=tuple(_signal(name, runs, marking, log, timeline) for name in names),
         unmodelled_about=_unmodelled_about(diagnosed[0][2]) if diagnosed else "",
         unmodelled=tuple(figure for i, run, found in diagnosed for figure in _unmodelled(run, found, i, log, timeline)),
-        inliers=_inliers(runs, timeline),
     )
 
 
@@ -347,37 +344,3 @@ def _steps(found: Diagnosis, values: FloatArray, timeline: Timeline) -> tuple[In
     begins = np.rint((found.smoothed_time - timeline.start) / timeline.dt).astype(np.int64)
     ends = np.append(begins[1:] - 1, timeline.n_rows - 1)
     return np.column_stack([begins, ends]).ravel(), np.repeat(values, 2)
-
-
-# ---------------------------------------------------------------------- inliers
-
-
-def _inliers(runs: Sequence[Run], timeline: Timeline) -> Figure:
-    """Fraction of rows that agree with each simulation over time, and a strip of those that do not."""
-    traces = [_fraction_trace(run, i) for i, run in enumerate(runs)]
-    label = "Percentage of rows that agree with the simulation, in windows over the log"
-    fractions = time_plot(traces, Scale(-3.0, 103.0), timeline, label)
-    return Figure(
-        title="Rows that agree",
-        unit="%",
-        facts=("Below: rows that disagree, one strip per simulation; grey rows are excluded (missing signals).",),
-        panels=(Panel(fractions), *(_rejected(run, i, timeline) for i, run in enumerate(runs))),
-        time_ticks=time_axis(timeline),
-    )
-
-
-def _fraction_trace(run: Run, i: int) -> Trace:
-    """The inlier fraction as steps over the log's rows."""
-    edges, fractions = run.windows()
-    rows = run.first_row + np.column_stack([edges[:-1], edges[1:] - 1]).ravel()
-    return Trace(run.label, f"m{i}", "line", rows, np.repeat(100.0 * fractions, 2))
-
-
-def _rejected(run: Run, i: int, timeline: Timeline) -> Panel:
-    rejected, excluded = np.zeros(timeline.n_rows), np.zeros(timeline.n_rows)
-    rejected[run.rows] = run.observations.valid & ~run.inliers
-    excluded[run.rows] = ~run.observations.valid
-    excluded[: run.first_row] = 1.0
-    excluded[run.rows[-1] + 1 :] = 1.0
-    text = f"{run.label}: {plural(int(rejected.sum()), 'row')} of {run.observations.n_rows:,} disagree"
-    return Panel(strip([(rejected, f"bar m{i}"), (excluded, "bar uncounted")], timeline, text), text)

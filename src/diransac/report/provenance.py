@@ -1,8 +1,7 @@
-"""Equations and provenance: settings, data and the code that repeats the identifications."""
+"""Equations and provenance: settings, data and versions."""
 
 from __future__ import annotations
 
-import dataclasses
 import platform
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,15 +11,13 @@ from diransac.identification.estimate import Resolution
 from diransac.identification.methods import default_options
 from diransac.identification.settings import Settings
 from diransac.model import Model
-from diransac.plain_text import one_line
 from diransac.report.rendering import numbered
-from diransac.report.runs import Entry, summaries
+from diransac.report.runs import Entry
 from diransac.text_table import number, percent, plural
 
-__all__ = ["log_facts", "model_text", "notes", "preparation", "settings", "snippet", "unique_models", "versions"]
+__all__ = ["log_facts", "model_text", "notes", "preparation", "settings", "unique_models", "versions"]
 
 _PACKAGES = ("diransac", "numpy", "scipy", "casadi", "llvmlite")
-_DEFAULT_ESTIMATORS = ("OrdinaryLeastSquares", "NonlinearLeastSquares")
 _HOLD = Resolution().hold
 
 
@@ -85,7 +82,7 @@ def _value(x: Any) -> str:
 
 def log_facts(entries: Sequence[Entry], logs: Sequence[Log]) -> list[tuple[str, str]]:
     """Description and fingerprint of every log that was used for identification, or is shown."""
-    used = {s.fingerprint: s for entry in entries for s in summaries(entry.result)}
+    used = {s.fingerprint: s for entry in entries for s in entry.result.logs}
     facts = [(f"{s.source}: {_rows(s.n_rows, s.start, s.dt)}", s.fingerprint) for s in used.values()]
     names = numbered(log.source for log in logs)
     return facts + [
@@ -114,47 +111,6 @@ def notes(entries: Sequence[Entry]) -> list[str]:
     """Notes on the identification and on the logs."""
     found = (note for e in entries for run in e.runs for note in (*e.result.notes, *run.observations.notes))
     return list(dict.fromkeys(found))
-
-
-def snippet(entries: Sequence[Entry]) -> str:
-    """Python that repeats the identifications."""
-    lines = ["import diransac as dr", ""]
-    groups = dict.fromkeys(tuple(s.source for s in summaries(entry.result)) for entry in entries)
-    for sources in groups:
-        if len(sources) == 1:
-            lines.append(f"log = dr.read_log(...)  # {one_line(sources[0])}, prepared as above")
-        else:
-            reads = [f"    dr.read_log(...),  # {one_line(source)}" for source in sources]
-            lines += ["log = [  # prepared as above", *reads, "]"]
-    lines += [f"model = ...  # {one_line(model.name)}" for model in unique_models(entries)]
-    return "\n".join([*lines, *(_call(entry) for entry in entries)])
-
-
-def _call(entry: Entry) -> str:
-    """The call of `identify` that gave a result."""
-    result, steps = entry.result, entry.runs[0].view.preparation
-    arguments = [f"method={result.method!r}", f"seed={result.seed}"]
-    default = Settings()
-    names = [field.name for field in dataclasses.fields(Settings)]
-    chosen = [(n, getattr(result.settings, n)) for n in names if getattr(result.settings, n) != getattr(default, n)]
-    own = {n: x for n, x in result.options.items() if x != default_options(result.method).get(n)}
-    if own:
-        criteria = f"dr.Settings({', '.join(f'{name}={value!r}' for name, value in chosen)}), " if chosen else ""
-        arguments[0] = f"dr.LoDiransac({criteria}{', '.join(f'{name}={value!r}' for name, value in own.items())})"
-    elif chosen:
-        arguments.append(f"settings=dr.Settings({', '.join(f'{name}={value!r}' for name, value in chosen)})")
-    if result.iterations and result.diagnosis is None and result.estimator not in _DEFAULT_ESTIMATORS:
-        arguments.append(f"estimator={result.estimator}(...)")
-    if steps and steps[-1].get("step") == "differentiate":
-        arguments.append(f"differentiate=True, bandwidth={steps[-1]['bandwidth']!r}")
-    if result.estimate.resolution.hold != _HOLD:
-        arguments.append(f"input_hold={result.estimate.resolution.hold!r}")
-    if result.fixed:
-        values = {n: result.parameters[n] for n in result.fixed}
-        arguments.append(f"fixed={values!r}")
-    if result.priors:
-        arguments.append(f"priors={dict(result.priors)!r}")
-    return f"result = dr.identify(model, log, {', '.join(arguments)})"
 
 
 def versions() -> str:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from diransac.atomic import write_text
 from diransac.errors import ResultError
@@ -17,7 +17,7 @@ from diransac.text_table import number, percent, plural
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["Table", "encodable", "environment", "numbered", "write_page"]
+__all__ = ["Block", "Section", "Table", "embedded", "encodable", "environment", "numbered", "write_page"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,25 @@ class Table:
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str
+
+
+Block: TypeAlias = "str | Table | list[str] | Mapping[str, Table]"
+"""Paragraph or embedded figure, table, list of sentences, or tables that a reader unfolds by their names."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading, empty for none, and what stands below it."""
+
+    heading: str
+    blocks: Sequence[Block]
+
+
+def embedded(figure: str) -> str:
+    """A figure of Matplotlib as markup, with style rules that are limited to figures."""
+    from markupsafe import Markup
+
+    return Markup(figure.replace("*{stroke-linejoin", "svg *{stroke-linejoin"))
 
 
 # ---------------------------------------------------------------------- pages

@@ -39,7 +39,6 @@ __all__ = [
     "log_view",
     "simulate_all",
     "simulate_on",
-    "summaries",
 ]
 
 
@@ -52,66 +51,34 @@ class LogView:
 
     Parameters
     ----------
-    index : number of the log among the result's logs; None for a held-out log
+    summary : of the log in the identification; None for a held-out log
     parameters : name -> value that holds in this log
-    per_log : the parameters among these that have one value per log
     inliers : (N,)   over the rows of the log; None for a held-out log
     preparation : preprocessing steps of the log, in order; of a held-out log, those to repeat
     diagnosis : restricted to the rows and windows of this log; None if there is none, and for a held-out log
     departures : stretches of this log in which the model does not hold
-    fit_error : of this log; NaN for a held-out log
-    remark : disagreement with the other logs, empty if there is none
     """
 
-    index: int | None
+    summary: LogSummary | None
     parameters: Mapping[str, float]
-    per_log: tuple[str, ...]
     inliers: BoolArray | None
     preparation: Sequence[Mapping[str, Any]]
-    diagnosis: Diagnosis | None
-    departures: Sequence[Departure]
-    fit_error: float
-    remark: str
-
-    @property
-    def held_out(self) -> bool:
-        """True if the result was identified from other logs."""
-        return self.index is None
-
-
-def summaries(result: Result) -> tuple[LogSummary, ...]:
-    """Summary of every log that the result was identified from."""
-    return result.logs
+    diagnosis: Diagnosis | None = None
+    departures: Sequence[Departure] = ()
 
 
 def log_view(result: Result, log: Log) -> LogView:
-    """The part of a result that belongs to one log.
-
-    This function and `summaries` alone read the attributes of a result that have one entry per log.
-    """
+    """The part of a result that belongs to one log."""
     own = (i for i, summary in enumerate(result.logs) if summary.fingerprint == log.fingerprint)
     index = next(own, None)
     if index is None:
-        return LogView(None, result.parameters, (), None, result.logs[0].preparation, None, (), np.nan, "")
+        return LogView(None, result.parameters, None, result.logs[0].preparation)
     summary, rows = result.logs[index], result.log_rows(index)
-    parameters = result.parameters_in(log)
-    diagnosis, departing = None, list[Departure]()
-    if result.diagnosis is not None:
-        diagnosis = result.diagnosis.of_log(index, rows)
-        departing = departures(result.diagnosis, index, summary.prediction.unexplained if summary.prediction else {})
-    inliers = result.inliers[rows]
-    steps = summary.preparation
-    return LogView(
-        index,
-        parameters,
-        tuple(result.per_log),
-        inliers,
-        steps,
-        diagnosis,
-        departing,
-        summary.fit_error,
-        summary.remark,
-    )
+    view = LogView(summary, result.parameters_in(log), result.inliers[rows], summary.preparation)
+    if result.diagnosis is None:
+        return view
+    departing = departures(result.diagnosis, index, summary.prediction.unexplained if summary.prediction else {})
+    return replace(view, diagnosis=result.diagnosis.of_log(index, rows), departures=departing)
 
 
 # ---------------------------------------------------------------------- runs
@@ -148,7 +115,7 @@ class Run(SimulatedLog):
     @property
     def held_out(self) -> bool:
         """True if the result was identified from other logs."""
-        return self.view.held_out
+        return self.view.summary is None
 
     @property
     def restart_state(self) -> str:
@@ -257,7 +224,7 @@ def _simulate(
     observations, parameters = dataset.segments[0], result.model.parameter_vector(view.parameters)
     first_row = observations.first_row_in(given)
     validation = _validation(result, given, horizon)
-    held_out = OpenLoop(dataset, 0, view.parameters, result.estimate.resolution) if view.held_out else None
+    held_out = OpenLoop(dataset, 0, view.parameters, result.estimate.resolution) if view.summary is None else None
     begin = None if held_out is None else _estimated_starts(held_out, len(observations))
     whole = simulated_rows(simulation, 0, parameters, observations, begin)
     restarts = _restarts(observations, diagnosis, held_out, validation)
@@ -317,7 +284,7 @@ def _inliers(run: Run, scoring: Scoring) -> BoolArray:
 def _thresholds(result: Result, view: LogView, dataset: Dataset, scoring: Scoring) -> FloatArray:
     """Inlier thresholds (n_s,): the result's own in a log that it was identified from."""
     own = result.evaluation.thresholds
-    return scoring.thresholds if view.held_out else np.array([own.get(name, 0.0) for name in dataset.signals])
+    return scoring.thresholds if view.summary is None else np.array([own.get(name, 0.0) for name in dataset.signals])
 
 
 def _prepared(result: Result, view: LogView, log: Log) -> Log:

@@ -15,21 +15,18 @@ from diransac.identification.innovations import Innovations
 from diransac.identification.validation import Validation
 from diransac.report.figures import Scale, Tick, padded, ticks
 from diransac.report.rendering import Table
-from diransac.report.runs import Entry, Run, summaries
+from diransac.report.runs import Entry, Run
 from diransac.text_table import number, percent, plural, telling_digits
 
 __all__ = [
     "card",
     "competitions",
-    "correlations",
     "diagnosis",
     "differences",
     "lead",
     "log_tables",
     "parameters",
     "scores",
-    "sensitivity",
-    "short_term_scores",
     "suggestions",
 ]
 
@@ -37,7 +34,6 @@ _LEVELS: Mapping[Verdict, Level] = {"usable": "good", "usable with care": "care"
 """Look of each verdict."""
 _WIDEST = 2.0
 _LONG = 6
-_CORRELATED, _FEW_PAIRS = 0.5, 8
 
 
 # ---------------------------------------------------------------------- summary
@@ -63,7 +59,7 @@ def _sources(entries: Sequence[Entry]) -> str:
     groups = dict.fromkeys(
         tuple(
             _with_time(x.source, x.start, x.start + (x.n_rows - 1) * x.dt) if x.source in held_out else x.source
-            for x in summaries(entry.result)
+            for x in entry.result.logs
         )
         for entry in entries
     )
@@ -112,7 +108,7 @@ def _findings_on(run: Run) -> tuple[Finding, ...]:
 def _name(run: Run) -> str:
     """Name of a log, with its time where the result was identified from a log of the same name."""
     time = run.observations.log.time
-    same = run.log_name in (one.source for one in summaries(run.result))
+    same = run.log_name in (one.source for one in run.result.logs)
     return _with_time(run.log_name, float(time[0]), float(time[-1])) if run.held_out and same else run.log_name
 
 
@@ -150,15 +146,16 @@ def log_tables(entries: Sequence[Entry], logs: Sequence[Log]) -> list[Table]:
 
 
 def _log_table(entry: Entry, logs: Sequence[Log], several: bool) -> Table:
-    own = list(dict.fromkeys(name for run in entry.runs for name in run.view.per_log))
-    remarks = ["held out" if run.held_out else run.view.remark for run in entry.runs]
+    own = list(dict.fromkeys(n for run in entry.runs if not run.held_out for n in run.result.per_log))
+    remarks = ["held out" if run.view.summary is None else run.view.summary.remark for run in entry.runs]
     header = ["Log", "Duration, s", "Rate, Hz", "Rows", "Inliers", "Fit error"]
     header += [f"{name}, {entry.result.units[name]}" for name in own]
     rows = []
     for log, run in zip(logs, entry.runs, strict=True):
         duration, rate = number(log.dt * (len(log) - 1)), number(1.0 / log.dt)
-        measures = (percent(run.inlier_fraction), number(run.view.fit_error))
-        values = (number(run.view.parameters[name], 6) if name in run.view.per_log else "–" for name in own)
+        fit_error = np.nan if run.view.summary is None else run.view.summary.fit_error
+        measures = (percent(run.inlier_fraction), number(fit_error))
+        values = ("–" if run.held_out else number(run.view.parameters[name], 6) for name in own)
         rows.append((run.log_name, duration, rate, f"{len(log):,}", *measures, *values))
     if any(remarks):
         header.append("Remark")
@@ -294,32 +291,6 @@ def _at(value: float, scale: Scale) -> str:
     return f"{np.clip(100.0 * (value - scale.low) / (scale.high - scale.low), 0.0, 100.0):.2f}%"
 
 
-def sensitivity(entries: Sequence[Entry]) -> Table | None:
-    """Relative change of each parameter at other bandwidths of the differentiating filter."""
-    rows = [
-        (name, entry.label, percent(half), percent(twice))
-        for entry in entries
-        for name, (half, twice) in (entry.result.bandwidth_sensitivity or {}).items()
-    ]
-    caption = "Change of each parameter at half and at twice the bandwidth of the differentiating filter."
-    return Table(("Parameter", "By", "at half", "at twice"), rows, caption) if rows else None
-
-
-def correlations(entries: Sequence[Entry]) -> Table | None:
-    """Strongest correlations of the estimates; None where all are weak."""
-    rows = []
-    for entry in entries:
-        covariance, names = entry.result.covariance, list(entry.result.parameters)
-        known = [i for i, name in enumerate(names) if entry.identifies(name) and 0.0 < covariance[i, i] < np.inf]
-        deviations = np.sqrt(np.diag(covariance)[known])
-        matrix = covariance[np.ix_(known, known)] / np.outer(deviations, deviations)
-        pairs = [(i, j) for i in range(len(known)) for j in range(i) if abs(matrix[i, j]) >= _CORRELATED]
-        for i, j in sorted(pairs, key=lambda x: -abs(matrix[x]))[:_FEW_PAIRS]:
-            rows.append((f"{names[known[j]]}, {names[known[i]]}", entry.label, number(float(matrix[i, j]), 2)))
-    caption = "Strongest correlations: the log determines a combination of such a pair better than either."
-    return Table(("Parameters", "By", "Correlation"), rows, caption) if rows else None
-
-
 # ---------------------------------------------------------------------- diagnosis and scores
 
 
@@ -333,35 +304,28 @@ def suggestions(entries: Sequence[Entry]) -> list[Table]:
     header = ("Suggested term", "Coefficient", "Unit", "Explained", "Change of the model")
     tables = []
     for entry in entries:
-        rows = [
-            (
-                x.name or f"{x.kind}, {x.equation}",
-                f"{number(x.value)} ± {number(x.standard_error, 2)}",
-                x.unit,
-                percent(x.explained),
-                x.change,
-            )
-            for x in entry.result.suggestions
-        ]
-        caption = "Terms that would explain the unmodelled forces"
+        rows = []
+        for x in entry.result.suggestions:
+            coefficient = f"{number(x.value)} ± {number(x.standard_error, 2)}"
+            rows.append((x.name or f"{x.kind}, {x.equation}", coefficient, x.unit, percent(x.explained), x.change))
         if rows:
-            tables.append(Table(header, rows, f"{caption}, by {entry.label}" if len(entries) > 1 else caption))
+            tables.append(Table(header, rows, f"Terms that would explain the unmodelled forces{_by(entry, entries)}"))
     return tables
 
 
 def competitions(entries: Sequence[Entry]) -> list[Table]:
     """Comparison of estimates by held-out prediction of each result that has one."""
-    tables = []
-    for entry in entries:
-        found = entry.result.competition
-        if found is not None:
-            header, *rows = (tuple(row) for row in found.lines())
-            caption = (
-                "Estimates compared by open-loop prediction of parts of the logs that they were not estimated from: "
-                "error over that of the prediction that nothing changes"
-            )
-            tables.append(Table(header, rows, f"{caption}, by {entry.label}" if len(entries) > 1 else caption))
-    return tables
+    caption = (
+        "Estimates compared by open-loop prediction of parts of the logs that they were not estimated from: error over "
+        "that of the prediction that nothing changes"
+    )
+    having = [(entry, entry.result.competition.lines()) for entry in entries if entry.result.competition is not None]
+    return [Table(lines[0], lines[1:], f"{caption}{_by(entry, entries)}") for entry, lines in having]
+
+
+def _by(entry: Entry, entries: Sequence[Entry]) -> str:
+    """End of a caption that names a result, where there are several."""
+    return f", by {entry.label}" if len(entries) > 1 else ""
 
 
 def _signal_table(entry: Entry, several: bool) -> Table:
@@ -377,7 +341,7 @@ def _signal_table(entry: Entry, several: bool) -> Table:
         rows.append((name, units[name], noise, outliers, unmodelled))
     caption = f"By {entry.label}" if several else "By signal"
     if any(run.held_out for run in entry.runs):
-        caption = f"{caption}, in the identification ({', '.join(s.source for s in summaries(entry.result))})"
+        caption = f"{caption}, in the identification ({', '.join(s.source for s in entry.result.logs)})"
     return Table(("Signal", "Unit", "Noise", "Outliers", "Unmodelled"), rows, caption)
 
 
@@ -392,47 +356,15 @@ def _delay(entry: Entry) -> str:
     return f"{what}: {delay} ± {error} ms (standard error). The estimate and the simulations shown include it."
 
 
-def short_term_scores(runs: Sequence[Run]) -> Table | None:
-    """RMS error of the restarted simulations over one log; None without a diagnosis of it."""
-    having = [run for run in runs if np.isfinite(run.restart_period) and run.diagnosis is not None]
-    if not having:
-        return None
-    names = dict.fromkeys(name for run in having for name in run.observations.signals)
-    noise = having[0].noise
-    units = having[0].result.model.units
-    rows = [
-        (name, units[name], number(noise.get(name, np.nan), 3), *(_regular_rms(run, name) for run in having))
-        for name in names
-    ]
-    period = number(having[0].restart_period)
-    caption = f"RMS error without outliers; simulations restart every {period} s from the smoothed state."
-    return Table(("Signal", "Unit", "Noise", *(run.label for run in having)), rows, caption)
-
-
-def _regular_rms(run: Run, name: str) -> str:
-    errors = run.regular_errors.get(name, np.empty(0))
-    with np.errstate(over="ignore"):
-        return number(float(np.sqrt(np.mean(np.square(errors)))) if len(errors) else np.nan, 3)
-
-
-@dataclass(frozen=True)
-class ScoreTable:
-    """Open-loop scores of one run, a table for each horizon, or the reason why there are none."""
-
-    label: str
-    reason: str = ""
-    tables: tuple[Table, ...] = ()
-
-
-def scores(run: Run) -> ScoreTable:
-    """Open-loop scores of one run."""
+def scores(run: Run) -> tuple[str, list[Table]]:
+    """Open-loop scores of one run, a table for each horizon, or a sentence on why there are none."""
     validation = run.validation
     if isinstance(validation, str):
-        return ScoreTable(run.label, reason=validation)
+        return f"{run.label}: no scores: {validation}", []
     tables = [_horizon_table(run.label, at, validation) for at in validation.horizons]
     tables += [_innovation_table(run.label, one, validation) for one in validation.innovations]
     forces = _force_table(run.label, validation)
-    return ScoreTable(run.label, "", (*tables, forces) if forces else tuple(tables))
+    return "", [*tables, forces] if forces else tables
 
 
 def _horizon_table(label: str, at: HorizonScores, validation: Validation) -> Table:

@@ -67,7 +67,7 @@ def _report(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.html", help="File to write.")],
 ) -> None:
     """Write a store as one HTML page: findings, figures, tables and failures."""
-    from diransac.report.fleet import write_fleet_report
+    from diransac.report.stores import write_fleet_report
 
     checked([output], [store])
     check_ending(output, PAGE)

@@ -47,7 +47,7 @@ def _predict(
         simulated = simulate(result, log, initial_state=start, horizon=horizon)
         simulated.write(written)
         if plot:
-            from diransac.plots.prediction import plot_prediction
+            from diransac.plots.flight import plot_prediction
 
             plot_prediction(
                 simulated, in_units(log, result.model), result.model.state, tuple(result.model.inputs), picture

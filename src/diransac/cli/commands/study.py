@@ -158,7 +158,7 @@ def _report(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.html", help="File to write.")],
 ) -> None:
     """Write a store as one HTML page: figures, tables, failures and run times."""
-    from diransac.report.study import write_study_report
+    from diransac.report.stores import write_study_report
 
     checked([output], [store])
     check_ending(output, PAGE)

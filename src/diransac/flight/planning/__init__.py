@@ -7,11 +7,10 @@ Begin with `plan` in `planner.py`.
 |---|---|
 | `planner.py` | `plan`: the search for a solution, and the explanation where there is none |
 | `trajectories.py` | square, star, sine, random waypoints, multisine |
-| `request.py` | the arguments of a plan, checked; the trim at its start |
-| `problem.py` | the nonlinear program of a task, a first guess, the trajectory of a solution |
-| `transcription.py` | the program: index of each unknown, values and exact derivatives |
+| `task.py` | the arguments of a plan, checked; the trim at its start |
+| `transcription.py` | the nonlinear program of a task: unknowns, values and exact derivatives |
 | `stage.py` | one stage of it, compiled |
-| `solvers.py` | its solution by IPOPT |
+| `solver.py` | its solution by IPOPT |
 | `experiment.py` | `design_experiment`: excitation within limits that is optimal for identification |
 | `excitation.py`, `optimisation.py` | its Fourier series, limits and information; their optimisation |
 """

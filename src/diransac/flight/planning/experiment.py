@@ -6,8 +6,6 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from functools import cached_property
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import casadi as ca
@@ -91,11 +89,6 @@ class Experiment(Trajectory):
     extremes: Mapping[str, tuple[tuple[float, float], tuple[float, float]]] = field(default_factory=dict)
     stop_reason: str = ""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("standard_errors", "multisine_standard_errors", "units", "noise", "extremes"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
-
     @property
     def ratios(self) -> dict[str, float]:
         """Predicted standard error over that of the multisine, of each parameter; NaN where both are infinite."""
@@ -151,10 +144,6 @@ class Experiment(Trajectory):
             at = near < 0.03 * (0.5 * width if math.isfinite(width) else max(map(abs, found)))
             rows.append([n, self.units.get(n, ""), *texts, "at a limit" if at else ""])
         return rows
-
-    def __reduce__(self) -> tuple[object, ...]:
-        values = [getattr(self, x.name) for x in fields(self)]
-        return (Experiment, tuple(dict(x) if isinstance(x, Mapping) else x for x in values))
 
 
 def design_experiment(
@@ -236,11 +225,10 @@ def design_experiment(
     check_numbers(seed, duration, frequency=frequency, rate=rate, time_limit=time_limit, max_iterations=max_iterations)
     deadline, steps = time.monotonic() + min(time_limit, time_left()), round(duration * rate)
     machine = _Machine(plant.model, plant.model.parameter_vector(plant.parameters), outputs)
-    rows = _Rows(_series(steps / rate, frequency, harmonics), steps + 1, rate)
+    series = _series(steps / rate, frequency, harmonics)
     search = Search(int(max_iterations), deadline, progress)
     with single_threaded():  # the same sums, and the same design, however many cores there are
-        task = _task(machine, rows, limits, noise, np.random.default_rng(seed))
-        return task.solved(search)
+        return _Design(machine, series, limits, noise, seed).solved(np.arange(steps + 1) / rate, search)
 
 
 # Task ----------------------------------------------------------------------------------------------------------------
@@ -310,143 +298,98 @@ class _Machine:
         return Observed.of(ca.Function("observed", [self.x], [ca.cse(ca.densify(at))]), motions)
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """Rows of a log of some periods, and the denser ones at which limits are checked."""
+class _Design:
+    """Limits, observations and first motions of a design.
 
-    series: FourierSeries
-    n_rows: int
-    rate: float
+    Raises SettingsError, PlanningError: as `design_experiment`.
+    """
 
-    @cached_property
-    def time(self) -> FloatArray:
-        """Time of each row, s."""
-        return np.arange(self.n_rows) / self.rate
+    def __init__(
+        self,
+        machine: _Machine,
+        series: FourierSeries,
+        limits: Mapping[str, Limit],
+        noise: Mapping[str, float] | None,
+        seed: int,
+    ) -> None:
+        model, rng = machine.model, np.random.default_rng(seed)
+        self.machine, self.series = machine, series
+        self.limits = ranges_of(limits, model)
+        self.limited = machine.limited(self.limits)
+        lower, upper = np.array([self.limits.get(n, (-np.inf, np.inf)) for n in model.coordinates]).T
+        self.bounded = np.isfinite(upper - lower)
+        self.sizes = _sizes(model, self.limits, series)
+        self.pose = resting_pose(self.limited, lower, upper, rng)
+        check_rest(model, self.limited, self.pose)
+        # Amplitude of the sines of a drawn motion over half the range of the coordinate, before limits reduce it.
+        draws = [drawn_motion(series, self.limited, self.pose, 4.0 * self.sizes, rng) for _ in range(_N_DRAWS)]
+        plain = [motion_of(z, series.basis(grid(series))) for z in draws]
+        self.noise = _noise_of(machine, noise, np.hstack(plain))
+        self.observed = machine.observed(self.noise, _random_motions(self.pose, self.sizes, series, rng))
+        scores = [self.observed.log_determinant(x) for x in plain]
+        if not max(scores) > -np.inf:
+            raise PlanningError("no plain multisine within the limits shows what motions can show; widen the limits")
+        self.draws = [draws[k] for k in np.argsort(scores, kind="stable")]
 
-    @cached_property
-    def check_times(self) -> FloatArray:
-        """Times at which limits are checked, s: rows, between them, and more often if the fastest sine needs it."""
-        # Rows of the check per period of the fastest sine, at least.
-        wanted = 64 * self.series.highest / (2.0 * np.pi)
-        per_row = 2 * math.ceil(max(wanted / self.rate, 1.0) / 2.0 + 0.5)
-        return np.arange(per_row * self.n_rows) / (per_row * self.rate)
-
-    @cached_property
-    def check(self) -> FloatArray:
-        """Basis at these times."""
-        return self.series.basis(self.check_times)
-
-    @cached_property
-    def _basis(self) -> FloatArray:
-        return self.series.basis(self.time)
-
-    def motion(self, z: FloatArray) -> FloatArray:
-        """Motion (3 n, K) in the rows."""
-        return motion_of(z, self._basis)
-
-    def trajectory(self, machine: _Machine, z: FloatArray, limits: Mapping[str, tuple[float, float]]) -> Trajectory:
-        """Trajectory of coefficients."""
-        model = machine.model
-        between = motion_of(z, self.series.basis(self.time + 0.5 / self.rate))
-        states, inputs = self.motion(z)[: 2 * model.n_v].T, np.array(machine.inputs(between)).T
-        of_inputs = {n: limits[n] for n in model.inputs if n in limits}
-        return Trajectory(self.time, states, inputs, model.state, tuple(model.inputs), of_inputs)
-
-
-@dataclass(frozen=True)
-class _Task:
-    """Limits, observations and first motions of a design."""
-
-    machine: _Machine
-    rows: _Rows
-    limits: Mapping[str, tuple[float, float]]
-    limited: Limited
-    noise: Mapping[str, float]
-    observed: Observed
-    sizes: FloatArray
-    bounded: BoolArray
-    pose: FloatArray
-    draws: list[FloatArray]
-
-    def solved(self, search: Search) -> Experiment:
-        """The best motion that is found, beside the median of the plain multisines."""
-        times, found = grid(self.rows.series, 2), self.draws[-1]
+    def solved(self, time: FloatArray, search: Search) -> Experiment:
+        """The best motion that is found, beside the median of the plain multisines, in rows at some times, s."""
+        times, found, check_times = grid(self.series, 2), self.draws[-1], _check_times(time, self.series)
+        in_rows, check = self.series.basis(time), self.series.basis(check_times)
+        within = check_times < self.series.period
         # First barrier parameters of the optimisation, and of those that follow with the times at which
         # limits are exceeded. They are also the fractions of the limits that the first motions leave.
         for barrier in (3e-2, 1e-3, 1e-3, 1e-3):
-            found = self._optimised(found, times, search, barrier)
-            more = self._exceeding(found)
-            if not len(more):
+            start = self.limited.shrunk(found, self.pose, self.series.basis(times), _NARROWED + barrier)
+            free = np.ones(start.shape, bool)
+            free[-1] = self.bounded
+            problem = DesignProblem(self.series, self.limited, self.observed, self.sizes, free, start, times, _NARROWED)
+            found = best_motion(problem, search, barrier)
+            exceeding = self._exceeding(motion_of(found, check[:, within]))
+            if not exceeding.any():
                 break
-            times = np.union1d(times, more)
+            times = np.union1d(times, check_times[within][exceeding])
         multisine, *others = (
-            self.limited.shrunk(z, self.pose, self.rows.check, _ROOM)
-            for z in (self.draws[_N_DRAWS // 2], self.draws[-1], found)
+            self.limited.shrunk(z, self.pose, check, _ROOM) for z in (self.draws[_N_DRAWS // 2], self.draws[-1], found)
         )
-        best = max(others, key=lambda z: self.observed.log_determinant(self.rows.motion(z)))
-        return self.experiment(best, multisine, search)
-
-    def _optimised(self, first: FloatArray, times: FloatArray, search: Search, barrier: float) -> FloatArray:
-        """Motion of least objective within limits at some times, from one that may exceed them."""
-        series = self.rows.series
-        start = self.limited.shrunk(first, self.pose, series.basis(times), _NARROWED + barrier)
-        free = np.ones(start.shape, bool)
-        free[-1] = self.bounded
-        problem = DesignProblem(series, self.limited, self.observed, self.sizes, free, start, times, _NARROWED)
-        return best_motion(problem, search, barrier)
-
-    def _exceeding(self, z: FloatArray) -> FloatArray:
-        """Times of a period, s, at which a quantity is farthest beyond a limit."""
-        t = self.rows.check_times
-        t = t[t < self.rows.series.period]
-        d = self.limited.distances(motion_of(z, self.rows.series.basis(t)))
-        around = np.pad(d, ((0, 0), (1, 1)), constant_values=np.inf)
-        extreme = (d < _ROOM) & (d <= around[:, :-2]) & (d <= around[:, 2:])
-        return np.asarray(t[extreme.any(axis=0)])
-
-    def experiment(self, best: FloatArray, multisine: FloatArray, search: Search) -> Experiment:
-        """Result of the coefficients of the best motion and of the multisine for comparison."""
-        model, rows = self.machine.model, self.rows
-        errors = [self.observed.standard_errors(rows.motion(z)).tolist() for z in (best, multisine)]
-        designed, plain = (rows.trajectory(self.machine, z, self.limits) for z in (best, multisine))
-        extremes = self.limited.extremes(motion_of(best, rows.check))
+        best = max(others, key=lambda z: self.observed.log_determinant(motion_of(z, in_rows)))
+        extremes = self.limited.extremes(motion_of(best, check))
+        model, designed = self.machine.model, self._trajectory(best, time, in_rows)
+        errors, plain = (
+            dict(zip(model.parameters, self.observed.standard_errors(motion_of(z, in_rows)).tolist(), strict=True))
+            for z in (best, multisine)
+        )
         return Experiment(
             **{x.name: getattr(designed, x.name) for x in fields(Trajectory)},
-            standard_errors=dict(zip(model.parameters, errors[0], strict=True)),
-            multisine_standard_errors=dict(zip(model.parameters, errors[1], strict=True)),
-            multisine=plain,
+            standard_errors=errors,
+            multisine_standard_errors=plain,
+            multisine=self._trajectory(multisine, time, in_rows),
             units={**model.units, **{n: x.unit for n, x in model.parameters.items()}},
             noise=self.noise,
             extremes={n: (extremes[n], self.limits[n]) for n in self.limits},
             stop_reason=search.reason,
         )
 
+    def _exceeding(self, motion: FloatArray) -> BoolArray:
+        """Mask (K,) of the times at which a quantity of a motion (3 n, K) is farthest beyond a limit."""
+        d = self.limited.distances(motion)
+        around = np.pad(d, ((0, 0), (1, 1)), constant_values=np.inf)
+        return np.asarray(((d < _ROOM) & (d <= around[:, :-2]) & (d <= around[:, 2:])).any(axis=0))
 
-def _task(
-    machine: _Machine,
-    rows: _Rows,
-    limits: Mapping[str, Limit],
-    noise: Mapping[str, float] | None,
-    rng: np.random.Generator,
-) -> _Task:
-    """Task of a design.  Raises SettingsError, PlanningError: as `design_experiment`."""
-    pairs = ranges_of(limits, machine.model)
-    limited, unlimited = machine.limited(pairs), (-np.inf, np.inf)
-    lower, upper = np.array([pairs.get(n, unlimited) for n in machine.model.coordinates]).T
-    sizes = _sizes(machine.model, pairs, rows.series)
-    pose = resting_pose(limited, lower, upper, rng)
-    check_rest(machine.model, limited, pose)
-    # Amplitude of the sines of a drawn motion over half the range of the coordinate, before limits reduce it.
-    draws = [drawn_motion(rows.series, limited, pose, 4.0 * sizes, rng) for _ in range(_N_DRAWS)]
-    basis = rows.series.basis(grid(rows.series))
-    plain = [motion_of(z, basis) for z in draws]
-    sigma = _noise_of(machine, noise, np.hstack(plain))
-    observed = machine.observed(sigma, _random_motions(pose, sizes, rows.series, rng))
-    scores = [observed.log_determinant(x) for x in plain]
-    if not max(scores) > -np.inf:
-        raise PlanningError("no plain multisine within the limits shows what motions can show; widen the limits")
-    draws = [draws[k] for k in np.argsort(scores, kind="stable")]
-    return _Task(machine, rows, pairs, limited, sigma, observed, sizes, np.isfinite(upper - lower), pose, draws)
+    def _trajectory(self, z: FloatArray, time: FloatArray, in_rows: FloatArray) -> Trajectory:
+        """Trajectory of coefficients, and its inputs in the middle between rows."""
+        model = self.machine.model
+        between = motion_of(z, self.series.basis(time + 0.5 * time[1]))
+        states, inputs = motion_of(z, in_rows)[: 2 * model.n_v].T, np.array(self.machine.inputs(between)).T
+        of_inputs = {n: self.limits[n] for n in model.inputs if n in self.limits}
+        return Trajectory(time, states, inputs, model.state, tuple(model.inputs), of_inputs)
+
+
+def _check_times(time: FloatArray, series: FourierSeries) -> FloatArray:
+    """Times at which limits are checked, s: rows, between them, and more often if the fastest sine needs it."""
+    # Rows of the check per period of the fastest sine, at least.
+    wanted = 64 * series.highest / (2.0 * np.pi)
+    per_row = 2 * math.ceil(max(wanted * time[1], 1.0) / 2.0 + 0.5)
+    return np.asarray(np.arange(per_row * len(time)) * (time[1] / per_row))
 
 
 def _series(duration: float, frequency: float, harmonics: int) -> FourierSeries:

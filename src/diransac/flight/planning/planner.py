@@ -2,50 +2,28 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.errors import PlanningError
-from diransac.flight.planning.problem import (
-    InitialGuess,
-    Task,
-    fixed_program,
-    free_program,
-    guess_along,
-    straight_guess,
-    stretched_guess,
-    trajectory_of,
-    unknowns_of,
-)
-from diransac.flight.planning.request import (
-    TIME_STEP,
-    Limits,
-    Signal,
-    Waypoint,
-    check_search,
-    check_weights,
-    check_within,
-    limits_of,
-    reference_weights,
-    route_of,
-    start_at_rest,
-    trim_at,
-    weights_of,
-)
-from diransac.flight.planning.solvers import TIME_LIMIT, SearchLimits, Solution, Strategy, interior_point
-from diransac.flight.planning.transcription import Program
+from diransac.errors import PlanningError, SettingsError
+from diransac.flight.planning.solver import TIME_LIMIT, Solution, Strategy, interior_point
+from diransac.flight.planning.task import TIME_STEP, InputLimits, Reference, Task, sampled, task_of
+from diransac.flight.planning.transcription import Guess, Program
 from diransac.flight.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
+    from diransac.model import Model
     from diransac.model.plant import ModelWithParameters
 
 __all__ = ["plan"]
+
+_DIGITS = 9
+"""Decimals of a time in s, within which equal moments computed in different ways agree."""
 
 
 def plan(
@@ -53,11 +31,11 @@ def plan(
     *,
     waypoints: Sequence[Mapping[str, float]] | None = None,
     times: Sequence[float] | None = None,
-    reference: Mapping[str, Signal | ArrayLike] | None = None,
+    reference: Reference | None = None,
     duration: float | None = None,
-    input_limits: Mapping[str, tuple[float, float]] | None = None,
+    input_limits: InputLimits | None = None,
     input_limit_fraction: float = 1.0,
-    state_limits: Mapping[str, tuple[float, float]] | None = None,
+    state_limits: InputLimits | None = None,
     input_weights: Mapping[str, float] | None = None,
     state_weights: Mapping[str, float] | None = None,
     time_weight: float = 1.0,
@@ -129,126 +107,146 @@ def plan(
     ----------
     Betts 2010, "Practical Methods for Optimal Control and Estimation", chapter 4; Dimmig et al. 2023, section V-A.
     """
-    model, limits = plant.model, limits_of("input", input_limits, tuple(plant.model.inputs))
-    route = route_of(model, waypoints, times, reference, duration, start_end_at_rest)
-    check_weights(state_weights, route, input_limit_fraction)
-    check_search(time_weight, max_iterations, time_limit)
-    parameters = model.parameter_vector(plant.parameters)
-    trim_inputs = trim_at(model, parameters, route.waypoints[0], limits, trim)
-    if start_end_at_rest and model.first_order:
-        begin = start_at_rest(model, parameters, route.waypoints[0], trim_inputs)
-        route = replace(route, waypoints=(begin, *route.waypoints[1:]))
-    states = limits_of("state", state_limits, model.state)
-    check_within(model, route.waypoints, states)
-    task = Task(
-        model=model,
-        parameters=parameters,
-        waypoints=route.waypoints,
-        reference=route.reference,
-        state_weights=reference_weights(model, route.reference, state_weights),
-        input_weights=weights_of("input_weights", "input", input_weights, tuple(model.inputs), np.ones(model.n_u))
-        / limits.half_ranges**2,
-        trim=trim_inputs,
-        time_weight=float(time_weight) if route.rows is None else 0.0,
-        inputs=limits.around(trim_inputs, input_limit_fraction),
-        states=states,
-        dt=TIME_STEP,
+    task = task_of(
+        plant,
+        waypoints=waypoints,
+        times=times,
+        reference=reference,
+        duration=duration,
+        input_limits=input_limits,
+        input_limit_fraction=input_limit_fraction,
+        state_limits=state_limits,
+        input_weights=input_weights,
+        state_weights=state_weights,
+        time_weight=time_weight,
+        trim=trim,
+        start_end_at_rest=start_end_at_rest,
     )
-    search = _Search(task, SearchLimits(int(max_iterations), float(time_limit)), route.start, limits)
-    initial = None if guess is None else guess_along(model, guess)
-    return search.free(initial) if route.rows is None else search.fixed(route.rows, initial)
+    if not max_iterations >= 1 or not time_limit >= 0.0:
+        raise SettingsError(
+            f"max_iterations is {max_iterations} and time_limit {time_limit} s; give at least 1 iteration and 0 s"
+        )
+    search = _Search(task, int(max_iterations), float(time_limit), time.monotonic() + time_limit)
+    initial = None if guess is None else _along(plant.model, guess)
+    return search.free(initial) if task.rows is None else search.fixed(task.rows, initial)
 
 
 # Search --------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class _Search:
-    """Search for the solution of one task."""
+    """Search for the solution of one task, by one attempt after the other until a deadline."""
 
     task: Task
-    search_limits: SearchLimits
-    start: float
-    limits: Limits
+    max_iterations: int
+    time_limit: float
+    deadline: float
 
-    def fixed(self, rows: tuple[int, ...], guess: InitialGuess | None) -> Trajectory:
-        """Plan whose segments have these numbers of rows."""
-        program = fixed_program(self.task, rows)
-        solution = self._solved(program, rows, guess)
-        if not solution.success:
-            raise PlanningError(_explanation(self.task, rows, solution, self.search_limits))
-        return self._trajectory(program, solution)
+    def fixed(self, rows: tuple[int, ...], guess: Guess | None) -> Trajectory:
+        """Plan whose segments have these numbers of rows, from a guess, else straight lines, else full Newton steps.
 
-    def free(self, guess: InitialGuess | None) -> Trajectory:
+        Parameters far from plausible ones, such as an inertia of a fiftieth of the true one, make the constraints so
+        curved that line searches stall; full steps converge.
+        """
+        program = Program(self.task, rows)
+        straight = program.unknowns_of(_straight(self.task, TIME_STEP * np.array(rows)))
+        attempts: list[tuple[FloatArray, Strategy]] = [(straight, "line search"), (straight, "full steps")]
+        if guess is not None:
+            attempts.insert(0, (program.unknowns_of(guess), "warm start"))
+        for k, (unknowns, strategy) in enumerate(attempts, start=1):
+            # Fraction of the iterations for every attempt but the last: most plans take a tenth of them.
+            share = 1.0 if k == len(attempts) else 0.4
+            iterations = max(1, round(share * self.max_iterations))
+            solution = interior_point(program, unknowns, iterations, self.deadline, strategy)
+            if solution.success:
+                return program.trajectory(solution.unknowns)
+            if solution.summary == TIME_LIMIT:
+                break
+        raise PlanningError(_explanation(self.task, rows, solution, self.time_limit))
+
+    def free(self, guess: Guess | None) -> Trajectory:
         """Plan of optimal durations, rounded up to whole rows for which there is a plan, too."""
-        task, program = self.task, free_program(self.task)
-        n = len(program.layout.intervals)
-        durations = None if guess is None else np.full(n, guess.time[-1] / n)
-        straight = straight_guess(task, np.ones(n) if durations is None else durations)
+        program = Program(self.task, None)
+        n = len(program.intervals)
+        durations = np.full(n, 1.0 if guess is None else guess[0][-1] / n)
+        unknowns = program.unknowns_of(guess or _straight(self.task, durations), durations)
         strategy: Strategy = "line search" if guess is None else "warm start"
-        unknowns = unknowns_of(program, guess or straight, durations)
-        solution = interior_point(program, unknowns, self.search_limits, strategy)
+        solution = interior_point(program, unknowns, self.max_iterations, self.deadline, strategy)
         if not solution.success:
             raise PlanningError(
                 f"no durations were found for which the plan works: {solution.summary}; "
                 "give times=, for which the message names the binding limits"
             )
-        found = program.split(solution.unknowns)[0][program.layout.waypoint_knots[:-1], -1]
-        shortest = np.maximum(np.ceil(found / task.dt - 1e-6), 1).astype(int)
+        optimal = solution.unknowns[program.durations]
+        shortest = np.maximum(np.ceil(optimal / TIME_STEP - 1e-6), 1).astype(int)
         # Rows added to optimal durations in turn until there is a plan on the grid of the inputs.
         for more in (0, 1, 2, 4, 8):
             rows = tuple(int(k) + more for k in shortest)
-            whole = fixed_program(task, rows)
-            along = stretched_guess(program, solution.unknowns, task.dt * np.array(rows))
-            rounded = interior_point(whole, unknowns_of(whole, along), self.search_limits, "warm start")
+            whole = Program(self.task, rows)
+            along = whole.unknowns_of(program.stretched(solution.unknowns, TIME_STEP * np.array(rows)))
+            rounded = interior_point(whole, along, self.max_iterations, self.deadline, "warm start")
             if rounded.success:
-                return self._trajectory(whole, rounded)
-        raise PlanningError(_explanation(task, rows, rounded, self.search_limits))
+                return whole.trajectory(rounded.unknowns)
+        raise PlanningError(_explanation(self.task, rows, rounded, self.time_limit))
 
-    def _solved(self, program: Program, rows: tuple[int, ...], guess: InitialGuess | None) -> Solution:
-        """Solution from the guess, if there is one, else from straight lines, else by full Newton steps.
 
-        Parameters far from plausible ones, such as an inertia of a fiftieth of the true one, make the constraints so
-        curved that line searches stall; full steps converge.
-        """
-        straight = unknowns_of(program, straight_guess(self.task, self.task.dt * np.array(rows)))
-        attempts: list[tuple[FloatArray, Strategy]] = [(straight, "line search")]
-        if guess is not None:
-            attempts.insert(0, (unknowns_of(program, guess), "warm start"))
-        attempts.append((straight, "full steps"))
-        whole = self.search_limits
-        # Fraction of the iterations for every attempt but the last: most plans take a tenth of them.
-        short = replace(whole, iterations=max(1, round(0.4 * whole.iterations)))
-        for k, (unknowns, strategy) in enumerate(attempts, start=1):
-            solution = interior_point(program, unknowns, whole if k == len(attempts) else short, strategy)
-            if solution.success or solution.status == TIME_LIMIT:
-                break
-        return solution
+# Guesses -------------------------------------------------------------------------------------------------------------
+def _along(model: Model, guess: Trajectory) -> Guess:
+    """Guess along a trajectory.  Raises SettingsError: it has other states or inputs than the model."""
+    if guess.state_names != model.state or guess.input_names != tuple(model.inputs):
+        raise SettingsError(
+            f"guess= is a trajectory of {', '.join((*guess.state_names, *guess.input_names))}, but model "
+            f'"{model.name}" has {", ".join((*model.state, *model.inputs))}'
+        )
+    return guess.time - guess.time[0], guess.states, guess.inputs
 
-    def _trajectory(self, program: Program, solution: Solution) -> Trajectory:
-        kept = np.clip(solution.unknowns, program.numbers.lower, program.numbers.upper)
-        return trajectory_of(self.task, program, kept, self.start, self.limits)
+
+def _straight(task: Task, durations: FloatArray) -> Guess:
+    """Straight lines between waypoints, or along the reference, with trim inputs.
+
+    Velocities are slopes of the coordinates where neither a waypoint nor the reference gives them.
+    """
+    model, n_q = task.model, task.model.n_q
+    at_waypoints = np.round(np.concatenate([[0.0], np.cumsum(durations)]), _DIGITS)
+    rows = np.linspace(0.0, at_waypoints[-1], 1 + int(np.rint(at_waypoints[-1] / TIME_STEP)))
+    time = np.union1d(np.round(rows, _DIGITS), at_waypoints)
+    states, followed = np.zeros((len(time), len(model.state))), sampled(task.reference, time)
+    fixed = np.full((len(at_waypoints), len(model.state)), np.nan)
+    for known, waypoint in zip(fixed, task.waypoints, strict=True):
+        known[list(waypoint.states)] = waypoint.values
+    for j, name in enumerate(model.state):
+        known = np.isfinite(fixed[:, j])
+        if name in followed:
+            states[:, j] = followed[name]
+        elif model.kinematics is None and n_q <= j < 2 * n_q:
+            states[:, j] = np.gradient(states[:, j - n_q], time)
+            states[np.searchsorted(time, at_waypoints[known]), j] = fixed[known, j]
+        elif known.any():
+            states[:, j] = np.interp(time, at_waypoints[known], fixed[known, j])
+    for four in model.quaternions:
+        lengths = np.linalg.norm(states[:, list(four)], axis=1, keepdims=True)
+        states[:, list(four)] /= np.where(lengths > 0.0, lengths, 1.0)
+    return time, states, np.broadcast_to(task.trim, (len(time), len(task.trim)))
 
 
 # Infeasible plans ----------------------------------------------------------------------------------------------------
-
-
-def _explanation(task: Task, rows: tuple[int, ...], solution: Solution, limits: SearchLimits) -> str:
+def _explanation(task: Task, rows: tuple[int, ...], solution: Solution, time_limit: float) -> str:
     """Sentence on the waypoint that is missed by most, the limits that bind, and what to relax.
 
     It describes the plan nearest to a feasible one: the start and all limits hold, and the squared distances from the
     later waypoints are least.
     """
-    if solution.status == TIME_LIMIT:
-        return f"no plan was found within {limits.seconds:g} s; raise time_limit=, or give a guess="
-    program = _relaxed(task, rows)
-    guess = unknowns_of(program, straight_guess(task, task.dt * np.array(rows)))
-    nearest = interior_point(program, guess, SearchLimits(500, limits.seconds))
+    if solution.summary == TIME_LIMIT:
+        return f"no plan was found within {time_limit:g} s; raise time_limit=, or give a guess="
+    program = Program(task, rows, relaxed=True)
+    guess = program.unknowns_of(_straight(task, TIME_STEP * np.array(rows)))
+    nearest = interior_point(program, guess, 500, time.monotonic() + time_limit)
     if not nearest.success:
         return (
             f"there is no plan: {solution.summary}, and none was found that may miss its waypoints; "
             "check the parameters, or give more time"
         )
-    missed = _largest_miss(task, program, nearest.unknowns)
-    binding = _binding(task, program, nearest.unknowns)
+    states, inputs = (nearest.unknowns[places] for places in (program.states, program.inputs))
+    missed, binding = _largest_miss(task, program, states), _binding(task, states, inputs)
     if missed is None:
         remedy = f"relax {binding}" if binding else "give guess= or more max_iterations="
         return (
@@ -259,49 +257,28 @@ def _explanation(task: Task, rows: tuple[int, ...], solution: Solution, limits: 
     return f"the plan cannot be flown: {missed}; give it more time, or {remedy}"
 
 
-def _relaxed(task: Task, rows: tuple[int, ...]) -> Program:
-    """Program with a penalty on the distance from every waypoint but the first in place of a constraint."""
-    free = Waypoint((), np.zeros(0))
-    relaxed = replace(
-        task,
-        waypoints=(task.waypoints[0], *(free for _ in task.waypoints[1:])),
-        state_weights=np.zeros_like(task.state_weights),
-    )
-    program = fixed_program(relaxed, rows)
-    costs = program.numbers.costs
-    reference, weights = costs.reference.copy(), costs.weights.copy()
-    for knot, waypoint in zip(program.layout.waypoint_knots[1:], task.waypoints[1:], strict=True):
-        states = list(waypoint.states)
-        # Penalty on the distance from a waypoint, one over the state's unit squared.
-        reference[knot, states], weights[knot, states] = waypoint.values, 1e4
-    numbers = replace(program.numbers, costs=replace(costs, reference=reference, weights=weights))
-    return Program(program.stage, program.layout, numbers)
-
-
-def _largest_miss(task: Task, program: Program, unknowns: FloatArray) -> str | None:
+def _largest_miss(task: Task, program: Program, states: FloatArray) -> str | None:
     """Waypoint state that is missed by most; None where every waypoint is reached."""
-    states, names = program.split(unknowns)[0], task.model.state
-    ends = np.concatenate([[0.0], np.cumsum(program.numbers.steps.sum(axis=1))])
+    ends = np.concatenate([[0.0], np.cumsum(program.steps.sum(axis=1))])
     # Distance within which a waypoint counts as reached, state's unit: the penalty is finite.
     worst, text = 1e-2, None
-    for k, (knot, waypoint) in enumerate(zip(program.layout.waypoint_knots, task.waypoints, strict=True)):
+    for k, (knot, waypoint) in enumerate(zip(program.knots, task.waypoints, strict=True)):
         misses = np.abs(states[knot, list(waypoint.states)] - waypoint.values)
         if len(misses) and misses.max() > worst:
-            worst, name = misses.max(), names[waypoint.states[int(misses.argmax())]]
+            worst, name = misses.max(), task.model.state[waypoint.states[int(misses.argmax())]]
             text = (
-                f"waypoint {k} ({waypoint.text(names)}) at t = {ends[knot]:.2f} s is missed by {worst:.2g} "
+                f"waypoint {k} ({waypoint.text(task.model.state)}) at t = {ends[knot]:.2f} s is missed by {worst:.2g} "
                 f"{task.model.units[name]} in {name}"
             )
     return text
 
 
-def _binding(task: Task, program: Program, unknowns: FloatArray) -> str:
+def _binding(task: Task, states: FloatArray, inputs: FloatArray) -> str:
     """Names of the inputs and states that reach a limit."""
-    states, inputs = program.split(unknowns)
     names = []
     for values, limits, known in (
         (inputs, task.inputs, tuple(task.model.inputs)),
-        (states[1:, : len(task.model.state)], task.states, task.model.state),
+        (states[1:], task.states, task.model.state),
     ):
         # Fraction of a range, or of a unit, within which a value is at its limit.
         slack = 1e-3 * limits.half_ranges

@@ -16,8 +16,9 @@ The paper leaves these choices open; they were fixed before any result was compu
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
 from diransac.flight.planning.planner import plan
-from diransac.flight.planning.request import TIME_STEP
+from diransac.flight.planning.task import TIME_STEP, InputLimits
 from diransac.flight.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -75,8 +76,6 @@ _SHORTEST_SEGMENT = 1.0
 
 
 _EQUAL: Mapping[str, float] = MappingProxyType({})
-
-InputLimits = Mapping[str, tuple[float, float]]
 
 
 # The paper's evaluation ----------------------------------------------------------------------------------------------
@@ -241,19 +240,13 @@ def _through(
     fixed: dict[str, Any] = {
         "waypoints": [{"x": float(x), "z": float(z)} for x, z in points],
         "times": times.tolist(),
-        "reference": {name: _route(times, [point[j] for point in points]) for j, name in enumerate(("x", "z"))},
+        "reference": {
+            name: partial(np.interp, xp=times, fp=list(x))
+            for name, x in zip("xz", zip(*points, strict=True), strict=True)
+        },
         "state_weights": {"x": ROUTE_WEIGHT, "z": ROUTE_WEIGHT},
     }
     return plan(plant, **fixed, **_limits(plant.model, input_limits), **options)
-
-
-def _route(times: FloatArray, values: Sequence[float]) -> Callable[[FloatArray], FloatArray]:
-    """Linear interpolation between the waypoints."""
-
-    def along(time: FloatArray) -> FloatArray:
-        return np.interp(time, times, values)
-
-    return along
 
 
 def _limits(model: Model, given: InputLimits | None) -> dict[str, Any]:
