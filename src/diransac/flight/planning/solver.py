@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import casadi as ca
@@ -115,8 +116,10 @@ class _Functions:
         n, m = program.n_unknowns, program.n_constraints
         self.deadline, self.interrupts = deadline, list[int]()
         self.stopped: BaseException | None = None
-        jacobian = _compressed(*program.jacobian_entries, (m, n))
-        hessian = _compressed(*program.hessian_entries, (n, n))
+        jacobian, hessian = (
+            _compressed((columns * height + rows).tobytes(), (height, n))
+            for (rows, columns), height in ((program.jacobian_entries, m), (program.hessian_entries, n))
+        )
         f = _Result("f", ca.Sparsity.dense(1, 1), lambda x: program.objective(x))
         g = _Result("g", ca.Sparsity.dense(m, 1), lambda x: program.constraints(x))
         slope = _Result("grad_f_x", ca.Sparsity.dense(n, 1), lambda x: program.gradient(x))
@@ -200,9 +203,13 @@ class _Evaluation(ca.Callback):
         return 0
 
 
-def _compressed(rows: IntArray, columns: IntArray, shape: tuple[int, int]) -> tuple[ca.Sparsity, IntArray]:
-    """Column-compressed sparsity of entries, and the nonzero of each."""
-    places, position = np.unique(columns * shape[0] + rows, return_inverse=True)
+@lru_cache(maxsize=64)
+def _compressed(entries: bytes, shape: tuple[int, int]) -> tuple[ca.Sparsity, IntArray]:
+    """Column-compressed sparsity of entries at places in column order, and the nonzero of each.
+
+    Plans of a study share it.
+    """
+    places, position = np.unique(np.frombuffer(entries, np.int64), return_inverse=True)
     starts = np.searchsorted(places // shape[0], np.arange(shape[1] + 1))
     return ca.Sparsity(*shape, starts.tolist(), (places % shape[0]).tolist()), position
 
