@@ -183,7 +183,7 @@ def test_texts_of_a_store_stay_in_their_lines(folder):
     with Store("a.db", load(tiny(trials=2))) as kept:
         kept.add([row(trial=0, status="failed", error=LINE), row(trial=1, method="true")])
     with closing(sqlite3.connect("a.db")) as connection, connection:
-        connection.execute("UPDATE cells SET level = ?, method = ? WHERE rowid = 1", (LINE, LINE))
+        connection.execute("UPDATE asked SET level = ?, method = ? WHERE rowid = 1", (LINE, LINE))
         connection.execute("UPDATE trials SET level = ?, method = ? WHERE rowid = 1", (LINE, LINE))
         connection.execute("UPDATE about SET value = ? WHERE key = 'name'", (json.dumps(LINE),))
     check_lines("study", "status", "a.db")
@@ -194,7 +194,7 @@ def test_texts_of_a_fleet_stay_in_their_lines(folder):
     model, logs = dr.models.underwater_vehicle(), ["swim.csv", "missing.csv"]
     identify_each(model, logs, "ols", store="a.db", executor=ThreadPoolExecutor(1))
     with closing(sqlite3.connect("a.db")) as connection, connection:
-        connection.execute("UPDATE logs SET error = ? WHERE status = 'failed'", (LINE,))
+        connection.execute("UPDATE trials SET error = ? WHERE status = 'failed'", (LINE,))
         connection.execute("UPDATE asked SET vehicle = ?, time = ?", (LINE, LINE))
         for table in ("asked", "logs"):
             connection.execute(f"UPDATE {table} SET log = ? WHERE log = 'swim.csv'", (LINE,))

@@ -13,9 +13,8 @@ from diransac.errors import SettingsError
 from diransac.plots.figure import INK, MUTED, WIDTH, check_ending, draw_heading, empty_figure, header_height, write
 from diransac.plots.rows import LogAxis, MarkRow, as_marks, draw_rows, name_rows, names_width, row_height
 from diransac.plots.study import axis_label, level_labels, method_looks, n_trials, title_of
-from diransac.study.database import damage
 from diransac.study.method_choice import TRUE
-from diransac.study.store import Store
+from diransac.study.store import Store, damage
 from diransac.study.summary import ParameterErrors, Summary, summarise
 
 if TYPE_CHECKING:

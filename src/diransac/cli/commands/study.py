@@ -184,7 +184,7 @@ class _Studies:
         rows = [["study", "varies", "levels", "evaluated by", "trials", "about"]]
         for name in builtin_names():
             one = load(name)
-            levels = [level.text for level in one.axis.levels]
+            levels = list(one.axis.levels)
             span = levels[0] if len(levels) == 1 else f"{levels[0]} .. {levels[-1]} ({len(levels)})"
             criteria = [*(["parameters"] if one.evaluate_parameters else []), *one.evaluation.trajectories]
             rows.append([name, one.axis.name, span, ", ".join(criteria), str(one.trials), one.description])
