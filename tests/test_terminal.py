@@ -14,7 +14,8 @@ import pytest
 
 import diransac as dr
 from command_line import MODEL, run, swim
-from diransac.cli import screen, workers
+from diransac.cli import rows as workers
+from diransac.cli import screen
 from diransac.identification.method import Progress
 from diransac.plain_text import printable
 from diransac.study import identify_each, load
@@ -85,7 +86,6 @@ def test_a_result_with_control_characters_prints_none(folder):
         ["export", f"{HARMFUL}.json", "-o", "a.c"],
         [HARMFUL],
         ["inspect", f"--{HARMFUL}"],
-        ["inspect", "swim.csv", "--config", HARMFUL],
     ],
     ids=lambda words: " ".join(words).replace(HARMFUL, "TEXT").replace("\0", ""),
 )
@@ -196,7 +196,7 @@ def test_texts_of_a_fleet_stay_in_their_lines(folder):
     with closing(sqlite3.connect("a.db")) as connection, connection:
         connection.execute("UPDATE trials SET error = ? WHERE status = 'failed'", (LINE,))
         connection.execute("UPDATE asked SET vehicle = ?, time = ?", (LINE, LINE))
-        for table in ("asked", "logs"):
+        for table in ("asked", "trials"):
             connection.execute(f"UPDATE {table} SET log = ? WHERE log = 'swim.csv'", (LINE,))
     for words in ("status a.db", "show a.db"):
         check_lines("fleet", *words.split())

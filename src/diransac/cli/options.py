@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf, isnan
 from pathlib import Path
 from typing import Annotated, Any
@@ -166,9 +167,7 @@ TimeLimit = Annotated[
 ]
 
 
-def _option(*names: str, **about: Any) -> Any:
-    """An option on the preparation of the log."""
-    return typer.Option(*names, rich_help_panel="Preparation of the log, in this order", **about)
+_option = partial(typer.Option, rich_help_panel="Preparation of the log, in this order")
 
 
 @dataclass(frozen=True)
