@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.data.preprocessing.continuity import interpolated
+from diransac.data.preprocessing.spikes import despike
 from diransac.data.units import conversion, same_unit
 from diransac.errors import LogError, SettingsError
 from diransac.limits import MOST_ROWS
@@ -29,6 +30,7 @@ __all__ = [
     "keep_while",
     "leave_out",
     "origins_of",
+    "prepared",
     "rename",
     "rename_columns",
     "resample",
@@ -229,6 +231,31 @@ def _kept(log: Log, kept: npt.NDArray[np.bool_], step: dict[str, Any], why: str,
     said = ", ".join(f"{a:.4g} to {b:.4g} s" for a, b in stretches[:5]) + ", ..." * (len(stretches) > 5)
     note = f"{int((~kept).sum())} of {len(kept)} rows are left out, {why}: {said}"
     return part.with_step(step, notes=[note], signals=signals)
+
+
+def prepared(log: Log, steps: Mapping[str, Any] | None) -> Log:
+    """Log after steps that need no model, by the keys of a mapping file; others are not done.
+
+    Parameters
+    ----------
+    log : Log
+    steps : mapping of str to object
+        In this order: ``from`` and ``until`` (s), ``while`` (events), ``leave_out`` (stretches), ``despike`` (signals,
+        or ``"all"``) and ``shift`` (delays by signal); None is none.
+
+    Raises
+    ------
+    LogError, SettingsError
+        As each step.
+    """
+    found = {name: x for name, x in (steps or {}).items() if x is not None}
+    named = {name: [x] if isinstance(x, str) else x for name, x in found.items() if name in ("while", "despike")}
+    if "from" in found or "until" in found:
+        log = log.between(found.get("from", -math.inf), found.get("until", math.inf))
+    log = keep_while(log, named["while"]) if "while" in named else log
+    log = leave_out(log, found["leave_out"]) if "leave_out" in found else log
+    log = despike(log, None if named["despike"] == ["all"] else named["despike"]) if "despike" in named else log
+    return shift(log, found["shift"]) if found.get("shift") else log
 
 
 def check_factor(name: str, factor: float) -> None:

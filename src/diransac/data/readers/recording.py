@@ -12,6 +12,7 @@ from diransac.arrays import FloatArray
 from diransac.data.checks import check_time_order
 from diransac.data.preprocessing.steps import describe_resampling, interpolate_at, resampling_grid
 from diransac.errors import LogError
+from diransac.text_table import some
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -95,7 +96,7 @@ def find_field(path: str, fields: Mapping[str, Iterable[str]], source: str) -> t
         return topic, path[len(topic) + 1 :]
     if len(fields) == 1:
         return next(iter(fields)), path
-    raise LogError(f'{source}: "{path}" names no topic; found {_some(fields)}. Name it as topic.field')
+    raise LogError(f'{source}: "{path}" names no topic; found {some(fields, 40)}. Name it as topic.field')
 
 
 def shortened(fields: Iterable[str]) -> list[str]:
@@ -132,12 +133,6 @@ def _together(whole: str, kind: str, parts: list[str]) -> str:
     if kind == "[":
         return f"{whole}[{parts[0]}..{parts[-1]}]" if len(parts) > 1 else f"{whole}[{parts[0]}]"
     return f"{whole}.{{{', '.join(parts)}}}" if len(parts) > 1 else f"{whole}.{parts[0]}"
-
-
-def _some(names: Iterable[str], most: int = 40) -> str:
-    """Names in one line, cut where they are many."""
-    listed = list(names)
-    return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
 
 
 # ---------------------------------------------------------------------- one clock

@@ -14,7 +14,7 @@ from diransac.data.readers.recording import Recording, Samples, align, find_fiel
 from diransac.data.readers.table import Table
 from diransac.errors import LogError
 from diransac.plain_text import one_line
-from diransac.text_table import aligned
+from diransac.text_table import aligned, some
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -100,8 +100,8 @@ def table_of_topics(
         entries.append(MappedSignals((name,), (label,), topic))
     if not entries:
         raise LogError(
-            f"{source}: it has {len(fields)} topics, {_some(fields)}; say what they are: --mapping NAME|FILE.toml, or "
-            "--map thrust=topic.field"
+            f"{source}: it has {len(fields)} topics, {some(fields, 12)}; say what they are: "
+            "--mapping NAME|FILE.toml, or --map thrust=topic.field"
         )
     wanted: dict[str, tuple[str, ...]] = {}
     for entry in entries:
@@ -178,11 +178,6 @@ def _origins(entries: Sequence[MappedSignals]) -> dict[str, str]:
         for entry in entries
         for name, label in zip(entry.names, entry.fields, strict=True)
     }
-
-
-def _some(names: Mapping[str, Any], most: int = 12) -> str:
-    listed = list(names)
-    return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
 
 
 # ---------------------------------------------------------------------- listing
