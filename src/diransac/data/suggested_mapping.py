@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Coverage", "suggest_mapping"]
 
-_LEAST, _LISTED, _MOST_LISTED = 0.5, 3, 60
+_LEAST, _LISTED = 0.5, 3
 _STATES = frozenset(
     {"mode", "state", "status", "armed", "airborne", "landed", "flying", "enabled", "contact", "battery"}
 )

@@ -28,7 +28,7 @@ from diransac.data.log import Log
 from diransac.errors import DiransacError, PlanningError, StudyError
 from diransac.flight.closed_loop import tracking_error
 from diransac.flight.trajectory import Trajectory
-from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
+from diransac.flight.tvlqr import Controller, tvlqr_batch
 from diransac.identification.identify import Identification
 from diransac.model.plant import Plant
 from diransac.process import single_threaded
@@ -337,26 +337,30 @@ def _planned(point: _Point, shape: str, parameters: tuple[float, ...]) -> Trajec
 
 
 def _controllers(cases: Sequence[_Case], plans: dict[int, Trajectory], control: ControlChoice) -> dict[int, Controller]:
-    """Controller of each case that has one: all in one sweep, or each on its own if that fails."""
+    """Controller of each case that has one."""
     begin = time.perf_counter()
     plants = [case.found for case in cases if case.found is not None]
-    try:
-        steering = tvlqr_batch(plants, [plans[id(case)] for case in cases], **control.weights, threads=1)
-    except Exception:  # noqa: BLE001  it is raised again for the case that it belongs to
-        return _controllers_alone(cases, plans, control)
+    steering = _steering(plants, [plans[id(case)] for case in cases], control.weights)
     _share(cases, "steer", time.perf_counter() - begin)
-    return {id(case): control.limited(controller) for case, controller in zip(cases, steering, strict=True)}
-
-
-def _controllers_alone(
-    cases: Sequence[_Case], plans: dict[int, Trajectory], control: ControlChoice
-) -> dict[int, Controller]:
     found = {}
-    for case in cases:
-        assert case.found is not None
-        with case.attempt("steer"):
-            found[id(case)] = control.limited(tvlqr(case.found, plans[id(case)], **control.weights))
+    for case, one in zip(cases, steering, strict=True):
+        if isinstance(one, Exception):
+            case.fail(one)
+        else:
+            found[id(case)] = control.limited(one)
     return found
+
+
+def _steering(
+    plants: Sequence[Plant], plans: Sequence[Trajectory], weights: Mapping[str, Any]
+) -> Sequence[Controller | Exception]:
+    """Controllers, or their errors: all in one sweep, or each on its own if that fails."""
+    try:
+        return tvlqr_batch(plants, plans, **weights, threads=1)
+    except Exception as error:  # noqa: BLE001  its row says what it was; other flights go on
+        if len(plants) == 1:
+            return [error]
+        return [_steering([plant], [plan], weights)[0] for plant, plan in zip(plants, plans, strict=True)]
 
 
 # Values of a row ----------------------------------------------------------------------------------------------------

@@ -42,11 +42,9 @@ __all__ = [
 
 Column = TypeVar("Column")
 
-_BRIDGED_INTERVALS = 3.5
 # New rows per old one, of more than so many, that only a damaged time takes.
 _MOST_NEW, _MANY_ROWS = 1000, 100_000
 _ROUNDING = 1e-6
-_FOLDING = 0.9
 
 
 # ---------------------------------------------------------------------- names and factors
@@ -344,7 +342,8 @@ def interpolate_at(
 def _gaps(time: FloatArray, hertz: float) -> npt.NDArray[np.bool_]:
     """Intervals (N - 1,) that are not bridged."""
     steps = np.diff(time)
-    return np.asarray(steps > max(_BRIDGED_INTERVALS * float(np.median(steps)), 1.0 / hertz))
+    # More than three and a half median intervals, and more than one new sample.
+    return np.asarray(steps > max(3.5 * float(np.median(steps)), 1.0 / hertz))
 
 
 def _in_gaps(
@@ -381,7 +380,7 @@ def _resampling_notes(
     time: FloatArray, gaps: npt.NDArray[np.bool_], blank: npt.NDArray[np.bool_], hertz: float
 ) -> list[str]:
     notes = [f"resampled from {len(time)} to {len(blank)} rows at {hertz:.6g} Hz, by linear interpolation"]
-    if hertz * np.median(np.diff(time)) < _FOLDING:
+    if hertz * np.median(np.diff(time)) < 0.9:
         notes.append(f"no filter went before it: motion and noise above {hertz / 2.0:.4g} Hz now appear below")
     if gaps.any():
         steps = np.where(gaps, np.diff(time), 0.0)

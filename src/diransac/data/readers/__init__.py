@@ -58,8 +58,6 @@ _REMEDIES = {
 """Ending that is not read -> what to do."""
 _FOLDERS = {"metadata.yaml": "bags:open_bag"}
 """File in a folder -> what opens the folder."""
-_LEROBOT = "meta/info.json"
-"""File in a folder of episodes."""
 _ENDINGS = (*_TEXTS, *_TABLES, *_RECORDINGS)
 
 
@@ -205,7 +203,7 @@ def _named(path: Path) -> str:
 
 def _dataset(path: Path) -> LerobotDataset | None:
     """A folder of episodes; None for anything else."""
-    if not (path / _LEROBOT).exists():
+    if not (path / "meta/info.json").exists():
         return None
     from diransac.data.readers.lerobot import LerobotDataset
 

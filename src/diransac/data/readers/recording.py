@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,8 +21,6 @@ __all__ = ["Aligned", "Recording", "Samples", "Stamps", "align", "find_field", "
 
 Stamps = str
 """``"header"``: time at which a message says it was sampled; ``"message"``: time at which it was recorded."""
-
-_SLOW = 1.5
 
 
 @dataclass(frozen=True)
@@ -56,28 +54,55 @@ class Samples:
         return Samples(self.time[rows], {name: x[rows] for name, x in self.columns.items()}, self.unusable)
 
 
-class Recording(Protocol):
-    """An opened file with one or more topics; `read` may be called again."""
+class Recording:
+    """An opened file with one or more topics; `read` may be called again.
 
-    source: str
-    """Name in messages, such as ``log "flight.ulg"``."""
-    metadata: dict[str, Any]
-    """Facts beside the samples, that JSON can hold: the machine, its parameters, messages in words."""
-    elements: dict[str, tuple[str, ...]]
-    """Names of the elements of arrays, such as joints, of the topics that have some."""
-    texts: dict[str, tuple[str, ...]]
-    """Names of the fields that hold texts, such as a mode, of the topics that have some."""
+    Parameters
+    ----------
+    source : str
+        Name in messages, such as ``log "flight.ulg"``.
+
+    Attributes
+    ----------
+    metadata : dict
+        Facts beside the samples, that JSON can hold: the machine, its parameters, messages in words.
+    elements : dict of str to tuple of str
+        Names of the elements of arrays, such as joints, of the topics that have some.
+    texts : dict of str to tuple of str
+        Names of the fields that hold texts, such as a mode, of the topics that have some.
+    found : list of str
+        Findings about the file; complete after a `read`.
+    """
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self.metadata: dict[str, Any] = {}
+        self.elements: dict[str, tuple[str, ...]] = {}
+        self.texts: dict[str, tuple[str, ...]] = {}
+        self.found: list[str] = []
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Findings about the file, a sentence each."""
+        return tuple(dict.fromkeys(self.found))
 
     @property
     def fields(self) -> Mapping[str, tuple[str, ...]]:
         """Names of the fields of each topic."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Findings about the file, a sentence each; complete after a `read`."""
+        raise NotImplementedError
 
     def read(self, wanted: Mapping[str, Sequence[str]], stamps: Stamps) -> dict[str, Samples]:
-        """Samples of some fields of some topics.  Raises LogError: a topic has no message, or is damaged."""
+        """Samples of some fields of some topics.  Raises LogError: there is no such topic or field, or damage."""
+        raise NotImplementedError
+
+    def check(self, topic: str, fields: Sequence[str] = ()) -> None:
+        """Raise LogError: there is no such topic, or it has no such field."""
+        if topic not in self.fields:
+            raise LogError(f'{self.source}: there is no topic "{topic}"; found {", ".join(self.fields)}')
+        for label in fields:
+            if label not in self.fields[topic]:
+                listed = ", ".join(self.fields[topic])
+                raise LogError(f'{self.source}: topic "{topic}" has no field "{label}"; it has {listed}')
 
 
 def seconds_since(origin: int, nanoseconds: npt.NDArray[np.int64]) -> FloatArray:
@@ -199,7 +224,7 @@ def _on_rows(
     """Columns of a topic on the rows of the log, and sentences about samples that moved or found no row."""
     if samples.time is time or np.array_equal(samples.time, time):
         return dict(samples.columns), []
-    if hertz is not None and samples.interval <= _SLOW / hertz:
+    if hertz is not None and samples.interval <= 1.5 / hertz:  # about as fast
         return interpolate_at(samples.time, samples.columns, time, hertz), []
     return _nearest_rows(samples, time, float(np.median(np.diff(time))), topic)
 

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import math
 import re
+import struct
+import zipfile
+import zlib
 from collections import Counter
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +25,31 @@ from diransac.limits import MOST_COLUMNS, MOST_NUMBERS, MOST_ROWS, beyond
 from diransac.plain_text import one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Mapping, Sequence
+    from collections.abc import Container, Iterator, Mapping, Sequence
 
 __all__ = [
-    "Table", "check_shapes", "check_size", "check_unique", "seconds", "table_of_arrays", "time_column", "unit_of_name",
-    "with_metadata",
+    "DAMAGE", "Table", "check_shapes", "check_size", "check_unique", "seconds", "table_of_arrays", "time_column",
+    "undamaged", "unit_of_name", "with_metadata",
 ]  # fmt: skip
+
+
+DAMAGE: tuple[type[Exception], ...] = (
+    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError, NotImplementedError),
+    *(OSError, EOFError, MemoryError, RuntimeError, struct.error, zlib.error, zipfile.BadZipFile),
+)
+"""Errors that damaged files lead to in the libraries that read them, and here."""
+
+
+@contextmanager
+def undamaged(what: str, errors: tuple[type[Exception], ...] = DAMAGE) -> Iterator[None]:
+    """Context in which a file is read.  Raises LogError: it is damaged; the message begins with a clause on it."""
+    try:
+        yield
+    except LogError:
+        raise
+    except errors as error:
+        why = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise LogError(f"{what} ({why:.150})") from error
 
 
 @dataclass(frozen=True)

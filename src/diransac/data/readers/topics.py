@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["TopicFacts", "TopicTable", "is_one_table", "list_topics", "mapped_table", "table_of_topics", "whole_topic"]
 
-_GAP = 3.5
 _FIELDS_SHOWN = 6
 
 
@@ -118,7 +117,8 @@ def table_of_topics(
     step |= {"renamed": dict(rename)} if rename else {}
     step["signals"] = _origins(entries)
     information = recording.metadata.get("information", {})
-    step |= {"log": {name: information[name] for name in _KEPT if name in information}} if information else {}
+    kept = ("sys_name", "ver_hw", "ver_sw", "ver_sw_branch", "sys_uuid")
+    step |= {"log": {name: information[name] for name in kept if name in information}} if information else {}
     flags = {} if mapping is None else _flags(recording, mapping, made.time)
     step |= {"events": list(flags)} if flags else {}
     history = (step,) if made.step is None else (step, made.step)
@@ -127,10 +127,6 @@ def table_of_topics(
     return Table({"t": made.time, **made.signals, **unusable, **flags}, units | {"t": "s"}, said, history), None if len(
         parts
     ) > 1 else resample
-
-
-_KEPT = ("sys_name", "ver_hw", "ver_sw", "ver_sw_branch", "sys_uuid")
-"""Facts of the machine's description that a log's history keeps."""
 
 
 def _flags(recording: Recording, mapping: LogMapping, rows: FloatArray) -> dict[str, FloatArray]:
@@ -273,7 +269,7 @@ def list_topics(recording: Recording) -> TopicTable:
 def _facts(time: FloatArray, fields: tuple[str, ...]) -> TopicFacts:
     steps = np.diff(time)
     usual = float(np.median(steps)) if len(steps) else np.nan
-    n_gaps = int((steps > _GAP * usual).sum()) if usual > 0.0 else 0
+    n_gaps = int((steps > 3.5 * usual).sum()) if usual > 0.0 else 0
     longest = float(steps.max()) if len(steps) else np.nan
     rate = 1.0 / usual if usual > 0.0 else np.nan
     return TopicFacts(len(time), rate, float(time[0]), float(time[-1]), n_gaps, longest, fields)

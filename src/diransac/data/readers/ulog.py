@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.data.checks import as_doubles
-from diransac.data.readers.recording import Samples, Stamps, seconds_since
+from diransac.data.readers.recording import Recording, Samples, Stamps, seconds_since
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["UlogRecording"]
 
-_MAGIC = b"ULog\x01\x12\x35"
-_SYNC = b"\x08\x00S\x2f\x73\x13\x20\x25\x0c\xbb\x12"
 _HEADER = struct.Struct("<HB")
 _KNOWN = frozenset(b"FDIMPQARSOLCB")
 _TYPES = {
@@ -57,7 +55,7 @@ class _Topic:
     places: array[int] = field(default_factory=lambda: array("Q"))
 
 
-class UlogRecording:
+class UlogRecording(Recording):
     """Topics of a ULog file.
 
     Raises LogError: the file is no ULog, or is cut off before its first record.
@@ -70,11 +68,8 @@ class UlogRecording:
     """
 
     def __init__(self, path: Path, source: str) -> None:
-        self.source = source
-        self.metadata: dict[str, Any] = {"information": {}, "parameters": {}, "messages": [], "dropouts": []}
-        self.elements: dict[str, tuple[str, ...]] = {}
-        self.texts: dict[str, tuple[str, ...]] = {}
-        self._notes: list[str] = []
+        super().__init__(source)
+        self.metadata = {"information": {}, "parameters": {}, "messages": [], "dropouts": []}
         self._formats: dict[str, str] = {}
         self._subscriptions: dict[int, _Topic] = {}
         self._found: list[_Topic] = []
@@ -82,7 +77,7 @@ class UlogRecording:
         self._last: _Topic | None = None
         with path.open("rb") as file:
             head = file.read(16)
-            if head[:7] != _MAGIC:
+            if head[:7] != b"ULog\x01\x12\x35":
                 raise LogError(f"{source}: it is not a ULog file (its first bytes are {head[:7].hex(' ')})")
             if len(head) < 16:
                 raise LogError(f"{source}: it is cut off in its header")
@@ -123,7 +118,7 @@ class UlogRecording:
             yield kind, at + 3, size
             at = after
         if at < end:
-            self._notes.append(f"the file is cut off in the middle of a message: {end - at} bytes left out")
+            self.found.append(f"the file is cut off in the middle of a message: {end - at} bytes left out")
 
     def _doubt_last(self) -> None:
         """Leave out the record before a damage, in which the damage may have begun."""
@@ -141,7 +136,7 @@ class UlogRecording:
     def _resume(self, at: int) -> int:
         """Place of the next mark or message that is plausible, -1 where there is none."""
         data, end = self._data, len(self._data)
-        mark = data.find(_SYNC, at)
+        mark = data.find(b"\x08\x00S\x2f\x73\x13\x20\x25\x0c\xbb\x12", at)
         last = min(end, at + _SEARCHED) if mark < 0 else mark
         for place in range(at, last - 5):
             if data[place + 2] == ord("D"):
@@ -262,33 +257,24 @@ class UlogRecording:
         dropouts = self.metadata["dropouts"]
         if dropouts:
             n = len(dropouts)
-            self._notes.append(f"{n} dropout{'s' * (n > 1)} of the logger, {sum(dropouts):.3g} s in all")
+            self.found.append(f"{n} dropout{'s' * (n > 1)} of the logger, {sum(dropouts):.3g} s in all")
         if self._skipped:
-            self._notes.append(f"the file is damaged: {self._skipped} bytes left out")
+            self.found.append(f"the file is damaged: {self._skipped} bytes left out")
 
     @property
     def fields(self) -> dict[str, tuple[str, ...]]:
         """Fields of each topic."""
         return {name: tuple(topic.layout) for name, topic in self._topics.items()}
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Damages and dropouts."""
-        return tuple(self._notes)
-
     def read(self, wanted: Mapping[str, Sequence[str]], stamps: Stamps) -> dict[str, Samples]:
         """Samples of some fields.  Raises LogError: there is no such topic or field."""
         return {name: self._samples(name, fields, stamps) for name, fields in wanted.items()}
 
     def _samples(self, name: str, fields: Sequence[str], stamps: Stamps) -> Samples:
-        topic = self._topics.get(name) or self._topics.get(f"{name}_0")
-        if topic is None:
-            raise LogError(f'{self.source}: there is no topic "{name}"; found {", ".join(self._topics)}')
-        for label in fields:
-            if label not in topic.layout:
-                raise LogError(
-                    f'{self.source}: topic "{name}" has no field "{label}"; it has {", ".join(topic.layout)}'
-                )
+        first = f"{name}_0"
+        known = first if name not in self._topics and first in self._topics else name
+        self.check(known, fields)
+        topic = self._topics[known]
         clock = "timestamp_sample" if stamps == "header" and "timestamp_sample" in topic.layout else "timestamp"
         times = self._column(topic, clock, topic.places)
         if clock != "timestamp" and not times.all():  # some publishers leave it zero
