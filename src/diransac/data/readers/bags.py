@@ -32,7 +32,6 @@ __all__ = ["BagRecording", "McapFile", "RosBag", "open_bag", "open_mcap"]
 INSTALL = 'install them with pip install "diransac[logs]"'
 _LARGEST_CHUNK, _MAGIC_SIZE = 1 << 29, 8
 _MOST_FIELDS, _MOST_ELEMENTS = 2000, 64
-_STEP = re.compile(r"([^.\[\]]+)|\[([^\]]*)\]")
 _OTHER_CLOCK, _LATEST = 3600 * 10**9, 1 << 62
 _NUMBERS = (bool, int, float, np.number, np.bool_)
 
@@ -180,7 +179,7 @@ def _decoded(raw: Raw, source: str) -> Any:
 def _steps(path: str) -> list[str | int]:
     """``a.b[2]`` as names and indices; an element's name stays a text, ``[elbow]``."""
     found: list[str | int] = []
-    for name, index in _STEP.findall(path):
+    for name, index in re.findall(r"([^.\[\]]+)|\[([^\]]*)\]", path):
         found.append(name or (int(index) if index.isdecimal() and len(index) < 10 else f"[{index}]"))
     return found
 

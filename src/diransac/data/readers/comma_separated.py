@@ -35,7 +35,6 @@ _COMMENTS = ("#", "%", "//")
 _ISO = re.compile(
     r"(?P<date>(?:19|20|21)\d\d-\d\d-\d\d)[T ](?P<clock>\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)(?P<zone>Z|[+-]\d\d:?\d\d)?"
 )
-_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
 def read_csv_gz(data: bytes, source: str, names: Sequence[str] | None = None, repairs: Repairs | None = None) -> Table:
@@ -259,7 +258,7 @@ def _decoded(data: bytes, source: str) -> tuple[str, list[str]]:
     except UnicodeDecodeError as error:
         with suppress(UnicodeDecodeError):
             text = data.decode("cp1252")
-            if not _CONTROL.search(text):
+            if not re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]", text):
                 return text, ["its text is not UTF-8, and is read as that of Windows (1252)"]
         raise LogError(
             f"{source}: it is not UTF-8 text (byte 0x{data[error.start]:02x} at offset {error.start}); save it as UTF-8"

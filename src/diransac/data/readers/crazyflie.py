@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = ["MAGIC", "CrazyflieRecording"]
 
 MAGIC = b"\xbc"
-_VARIABLE = re.compile(r"(.+)\(([bBhHiIqQfd?])\)")
 _STAMPS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}
 _MOST_EVENTS, _MOST_VARIABLES = 256, 1024
 
@@ -61,7 +60,7 @@ class CrazyflieRecording(Recording):
             fields = []
             for _ in range(min(n, _MOST_VARIABLES)):
                 text, at = _text(data, at)
-                match = _VARIABLE.fullmatch(text)
+                match = re.fullmatch(r"(.+)\(([bBhHiIqQfd?])\)", text)
                 if match is None:
                     raise ValueError(f'"{text}" names no type')
                 fields.append((match[1], np.dtype(f"<{match[2]}")))

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = ["LerobotDataset"]
 
-_FORMATS = re.compile(r"v[23]\.\d{1,3}")
-_CHUNK = re.compile(r"chunk-\d{1,9}")
 _EPISODE = re.compile(r"(?:episode_|train-)(\d{1,9})(?:-of-\d{1,9})?\.parquet")
 _FILE = re.compile(r"file-\d{1,9}\.parquet")
 _INDEX = "episode_index"
@@ -152,7 +150,8 @@ class LerobotDataset:
         """Files with episodes.  Raises LogError: they cannot be listed."""
         data, n = self.folder / "data", 0
         try:
-            chunks = [chunk for chunk in data.iterdir() if _CHUNK.fullmatch(chunk.name)] if data.is_dir() else []
+            folders = data.iterdir() if data.is_dir() else ()
+            chunks = [chunk for chunk in folders if re.fullmatch(r"chunk-\d{1,9}", chunk.name)]
             for chunk in map(self._inside, chunks):
                 for file in chunk.iterdir() if chunk.is_dir() else ():
                     if _EPISODE.fullmatch(file.name) or _FILE.fullmatch(file.name):
@@ -233,7 +232,7 @@ def _information(path: Path, source: str) -> Mapping[str, Any]:
     except ValueError as error:
         raise LogError(f"{source}: its meta/info.json is not JSON that can be read ({error!s:.100})") from error
     version = found.get("codebase_version") if isinstance(found, dict) else None
-    if not isinstance(version, str) or not _FORMATS.fullmatch(version):
+    if not isinstance(version, str) or not re.fullmatch(r"v[23]\.\d{1,3}", version):
         what = "no dataset of LeRobot" if version is None else f"a dataset of LeRobot's format {version!s:.20}"
         raise LogError(f"{source}: by its meta/info.json it is {what}; formats v2.0 to v3.0 are read, convert it")
     return dict(found)

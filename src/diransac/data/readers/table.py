@@ -185,16 +185,15 @@ def _pieces(name: str, array: npt.NDArray[Any]) -> list[tuple[str, FloatArray | 
 
 
 # The time -------------------------------------------------------------------------------------------------------------
-_UNITS = {
-    "s": ("s", "sec", "secs", "seconds"),
-    "ms": ("ms", "msec", "millis", "milliseconds"),
-    "us": ("us", "usec", "micros", "microseconds"),
-    "ns": ("ns", "nsec", "nanos", "nanoseconds"),
+_UNIT_OF_ENDING = {
+    **dict.fromkeys(("s", "sec", "secs", "seconds"), "s"),
+    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "usec", "micros", "microseconds"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
 }
-_UNIT_OF_ENDING = {ending: unit for unit, endings in _UNITS.items() for ending in endings}
-_ENDING = "|".join(_UNIT_OF_ENDING)
 _NAME = re.compile(
-    rf"(?:t[ _.-]|(?i:time|time[ _.-]?stamps?|stamp)[ _.-]?)(?P<unit>(?i:{_ENDING}))|(?i:time|time[ _]?stamps?|stamp)"
+    rf"(?:t[ _.-]|(?i:time|time[ _.-]?stamps?|stamp)[ _.-]?)(?P<unit>(?i:{'|'.join(_UNIT_OF_ENDING)}))"
+    r"|(?i:time|time[ _]?stamps?|stamp)"
 )
 
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["TopicFacts", "TopicTable", "is_one_table", "list_topics", "mapped_table", "table_of_topics", "whole_topic"]
 
-_FIELDS_SHOWN = 6
-
 
 # ---------------------------------------------------------------------- tables
 
@@ -243,7 +241,7 @@ class TopicTable:
         for name, x in self.topics.items():
             gaps = [str(x.n_gaps or "-"), f"{x.longest_gap:.3g}" if x.n_gaps else "-"]
             listed = [*shortened(x.fields), *(f"{name} (text)" for name in shortened(x.texts))]
-            shown = ", ".join(listed[:_FIELDS_SHOWN]) + (", ..." if len(listed) > _FIELDS_SHOWN else "")
+            shown = ", ".join(listed[:6]) + (", ..." if len(listed) > 6 else "")
             rate = f"{x.rate:.4g}" if np.isfinite(x.rate) else "-"
             rows.append([name, str(x.n_messages), rate, f"{x.start:.6g}", f"{x.end:.6g}", *gaps, shown])
         machine = self.metadata.get("information", {})

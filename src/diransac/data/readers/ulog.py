@@ -35,10 +35,8 @@ _TYPES = {
     "bool": "<u1",
     "char": "<u1",
 }
-_FIELD = re.compile(r"(\w+)(?:\[(\d{1,5})\])? (\w+)")
 _NANOSECONDS, _LATEST_START = 1000, 60_000_000
 _LARGEST_RECORD, _DEEPEST = 0xFFFF, 8
-_LATEST_STAMP = 1 << 53
 _MOST_DAMAGES, _SEARCHED = 100, 1 << 20
 _MOST_TEXTS = 1000
 _ROWS_AT_ONCE = 1 << 16
@@ -192,7 +190,7 @@ class UlogRecording(Recording):
         if depth > _DEEPEST:
             raise ValueError("formats contain each other")
         for text in filter(None, self._formats[name].split(";")):
-            match = _FIELD.fullmatch(text)
+            match = re.fullmatch(r"(\w+)(?:\[(\d{1,5})\])? (\w+)", text)
             if match is None:
                 raise ValueError(text)
             kind, count, label = match.groups()
@@ -279,7 +277,8 @@ class UlogRecording(Recording):
         times = self._column(topic, clock, topic.places)
         if clock != "timestamp" and not times.all():  # some publishers leave it zero
             times = self._column(topic, "timestamp", topic.places)
-        since = np.minimum(times, np.uint64(_LATEST_STAMP)).astype(np.int64) - min(self._start, _LATEST_STAMP)
+        latest = 1 << 53
+        since = np.minimum(times, np.uint64(latest)).astype(np.int64) - min(self._start, latest)
         columns = {label: as_doubles(self._column(topic, label, topic.places)) for label in fields}
         return Samples(seconds_since(0, since * _NANOSECONDS), columns)
 
