@@ -57,7 +57,7 @@ def run_work(
     tasks: int | None,
     time_limit: float | None,
     progress: Progress | None,
-    stale: Callable[[Store], Iterable[Key]] = lambda _: (),
+    stale: Callable[[Store, Iterable[Key]], Iterable[Key]] = lambda *_: (),
 ) -> None:
     """Compute the rows of a work that a store lacks.
 
@@ -67,7 +67,7 @@ def run_work(
     compute : of a batch of rows; a row that fails says so, an error ends the run
     batch_size : trials or logs of a batch
     store, executor, jobs, tasks, time_limit, progress : as in `run_study`
-    stale : rows of the store that are to be computed again
+    stale : those of some rows of the store that are to be computed again
 
     Raises
     ------
@@ -88,7 +88,7 @@ def run_work(
     tasks = tasks or (64 if executor else 2 * jobs)
     with Store(store, work) as kept, time_limited(time_limit):
         asked = work.asked
-        kept.forget(key for key in stale(kept) if key in asked)
+        kept.forget(stale(kept, asked))
         finished = kept.finished()
         missing = [key for key in asked if key not in finished]
         batches = _batches(missing, batch_size)

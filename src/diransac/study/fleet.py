@@ -7,7 +7,7 @@ import pickle
 import platform
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
@@ -286,10 +286,10 @@ def _files(path: Path) -> list[Path]:
     return sorted(x for x in path.rglob("*") if x.is_file()) if path.is_dir() else [path]
 
 
-def _changed(store: Store) -> list[Key]:
-    """Rows of logs whose files differ from those that were read; files that are not here stay."""
-    rows = store.select("SELECT log, file_stamp, file_hash FROM trials")
-    return [(name,) for name, stamp, content in rows if _differs(Path(name), stamp, content)]
+def _changed(store: Store, logs: Iterable[Key]) -> list[Key]:
+    """Logs whose files differ from those that were read; files that are not here stay."""
+    kept = {name: marks for name, *marks in store.select("SELECT log, file_stamp, file_hash FROM trials")}
+    return [(name,) for (name,) in logs if name in kept and _differs(Path(name), *kept[name])]
 
 
 def _differs(path: Path, stamp: str | None, content: str | None) -> bool:
