@@ -80,8 +80,7 @@ def read_log(
     Parameters
     ----------
     path : str or Path
-        Its ending names the format.  A folder is a ROS 2 bag, a LeRobot dataset, or has one CSV file for each group of
-        signals.
+        Its ending names the format; a folder is a ROS 2 bag, a LeRobot dataset, or has a CSV file per group of signals.
     episode : int, optional
         Of a dataset with several; `read_logs` reads them all.
     mapping : str or Path, optional
@@ -103,9 +102,8 @@ def read_log(
     unmeasured : iterable of str, optional
         Coordinates that the log lacks although a column has a name like theirs.
     like : iterable of dict, optional
-        History of a log of the same recorder, such as ``result.logs[0].preparation``.  Its mapping, names, factors,
-        rates, repairs, delays and despiking apply where the arguments above give none.  What the history in the file
-        itself has is not done again.
+        History of a log of the same recorder, such as ``result.logs[0].preparation``, whose mapping, names, factors,
+        rates, repairs, delays and despiking apply where none is given and the history in the file itself has none.
 
     Returns
     -------
@@ -121,13 +119,10 @@ def read_log(
 
     Notes
     -----
-    The time column is ``t``, else the only one with a name such as ``time``, ``timestamp`` or ``t_ms``; it is converted
-    to seconds from the unit of its header or name.  Every other column is a signal; a column that does not hold numbers
-    is left out, with a note.  A header ``theta [deg]`` or ``theta (deg)`` is the signal ``theta`` in degrees, which a
-    model in radians converts.  Rows count from 0, lines of text from 1.
-
-    Topics have clocks of their own.  The rows of the log are those of the fastest topic, or at ``resample`` Hz; a
-    sample of a slower topic stands in the row nearest to it, and the rows between are NaN.
+    The time is the column ``t``, else the only one with a name such as ``time`` or ``t_ms``, in the unit of its header
+    or name.  Every other column is a signal; one without numbers is left out, with a note.  A header ``theta [deg]`` is
+    the signal ``theta`` in degrees.  Rows count from 0, lines of text from 1.  Of topics, the rows are those of the
+    fastest, or at ``resample`` Hz; a sample of a slower one stands in the nearest row, and rows between are NaN.
     """
     path = Path(path)
     given = Reading.given(
@@ -142,13 +137,7 @@ def read_log(
     )
     history, dataset = list(like), _dataset(path)
     if dataset is not None:
-        files = list(dataset.files)
-        if episode is None and len(files) > 1:
-            raise LogError(
-                f"{dataset.source}: it has {dataset.listed}; choose one (episode={files[0]}, --episodes {files[0]}), "
-                "or read them all with read_logs"
-            )
-        return _episode(dataset, files[0] if episode is None else episode, given, history)
+        return _episode(dataset, _only(dataset) if episode is None else episode, given, history)
     if episode is not None:
         raise LogError(f"{_named(path)}: it is one log without episodes; leave out the episode")
     return given.log(partial(_opened, path, _named(path)), _named(path), history)
@@ -208,6 +197,17 @@ def _dataset(path: Path) -> LerobotDataset | None:
     from diransac.data.readers.lerobot import LerobotDataset
 
     return LerobotDataset(path, _named(path))
+
+
+def _only(dataset: LerobotDataset) -> int:
+    """The episode of a dataset that has one.  Raises LogError: it has several."""
+    first, *more = dataset.files
+    if more:
+        raise LogError(
+            f"{dataset.source}: it has {dataset.listed}; choose one (episode={first}, --episodes {first}), "
+            "or read them all with read_logs"
+        )
+    return first
 
 
 def _episode(dataset: LerobotDataset, episode: int, given: Reading, history: Sequence[Mapping[str, Any]]) -> Log:
