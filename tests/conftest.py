@@ -3,7 +3,7 @@
 import gc
 import os
 import tempfile
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -42,10 +42,4 @@ def shared_data() -> Path:
 @pytest.fixture
 def trials_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run trials of studies, and logs of fleets, in a thread of this process in place of processes."""
-    from diransac.study.engine import Given, Workers, workers_of
-
-    def workers(executor: Executor | None, jobs: int | None, tasks: int | None) -> Workers:
-        return Given(ThreadPoolExecutor(1), 1) if executor is None else workers_of(executor, jobs, tasks)
-
-    for module in ("run", "fleet"):
-        monkeypatch.setattr(f"diransac.study.{module}.workers_of", workers)
+    monkeypatch.setattr("diransac.study.engine.Processes", lambda _jobs: ThreadPoolExecutor(1))

@@ -67,7 +67,6 @@ SETTINGS = {
     ".dask/dask.yaml": "planted: true\n",
     ".config/dask/dask.yaml": "planted: true\n",
     ".sqliterc": ".system touch ran-sqlite\n",
-    "diransac.toml": "[identify]\nmethod = 'planted'\n",
     ".numba_config.yaml": "disable_jit: 1\n",
     "polars.toml": "verbose = 1\n",
     "pyvenv.cfg": "home = .\n",

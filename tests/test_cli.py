@@ -339,7 +339,7 @@ def test_interrupt_ends_with_130_and_one_line(folder: Path, monkeypatch: pytest.
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("diransac.cli.commands.identify.identify", interrupt)
+    monkeypatch.setattr("diransac.cli.commands.identification.identify", interrupt)
     before = contents(folder)
     done = run("identify", "swim.csv", *MODEL, "-o", "model.json")
     assert (done.exit_code, done.stderr) == (130, "interrupted\n")

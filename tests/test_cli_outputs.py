@@ -77,7 +77,9 @@ def test_outputs_take_their_places_together_or_not_at_all(folder: Path):
 def test_outputs_are_checked_before_the_work(
     folder: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], message: str
 ):
-    monkeypatch.setattr("diransac.cli.commands.identify.identify", lambda *_, **__: pytest.fail("the work has begun"))
+    monkeypatch.setattr(
+        "diransac.cli.commands.identification.identify", lambda *_, **__: pytest.fail("the work has begun")
+    )
     Path("s.toml").write_text("sample_size = 20\n")
     before = contents(folder)
     done = run("identify", "swim.csv", *MODEL, *words)

@@ -11,7 +11,7 @@ import pytest
 
 import diransac as dr
 from command_line import MODEL, QUICK, run, working_folder
-from diransac.cli.group import _NAMES
+from diransac.cli.group import _MODULES
 from diransac.data.files import place_of_metadata
 from studies import TINY_TOML
 
@@ -46,7 +46,7 @@ def made(tmp_path_factory):
 
 
 def test_every_command_is_among_those_that_are_run():
-    assert {words[0] for words in (*LOGS.values(), *TABLES.values())} | OTHERS == set(_NAMES)
+    assert {words[0] for words in (*LOGS.values(), *TABLES.values())} | OTHERS == set(_MODULES)
 
 
 def first_line(path: Path) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from command_line import MODEL, run, swim
+from command_line import swim
 from hostile import LIBRARIES, MODULES, SETTINGS, URDF
 
 RAN = "ran-"
@@ -174,13 +174,6 @@ def test_hdf5_and_casadi_search_no_folder_by_a_relative_name(folder):
     places = [Path(place) for line in done.stdout.splitlines() for place in line.split(os.pathsep)]
     assert places
     assert all(place.is_absolute() for place in places)
-
-
-def test_the_configuration_of_the_package_is_read_where_it_is_named_alone(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    words = ["identify", "swim.csv", *MODEL]
-    assert run(*words, "--method", "ols").exit_code == 0
-    assert "planted" in run(*words, "--config", "diransac.toml").stderr
 
 
 @pytest.mark.parametrize(

@@ -230,9 +230,9 @@ def test_endless_toml_is_refused_in_words(text):
         ("CREATE VIEW more AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) SELECT i FROM n", "has view"),
         ("CREATE TRIGGER later AFTER INSERT ON trials BEGIN DELETE FROM trials; END", "has trigger"),
         ("CREATE INDEX fast ON trials (abs(trial))", "has index"),
-        ("DROP TABLE cells", "has no cells"),
-        ("INSERT INTO cells VALUES ('0', 'ols', 99999999999)", "damaged"),
-        ("INSERT INTO cells VALUES ('0', 'x', 'many')", "damaged"),
+        ("DROP TABLE asked", "has no asked"),
+        ("INSERT INTO asked VALUES (x'00', 0, 'ols', 9)", "damaged"),
+        ("INSERT INTO asked VALUES ('0', 0, x'ff', 9)", "damaged"),
         ("UPDATE about SET value = '[[[' WHERE key = 'name'", "damaged"),
     ],
 )

@@ -103,7 +103,7 @@ def test_each_log_is_a_row_a_failed_one_with_its_reason_and_a_store_resumes(logs
         options = {"store": store, "vehicle": PATTERN, "executor": threads, "batch_size": 2}
         identify_each(MODEL, logs[1:3], "ols", **options)
         found = identify_each(MODEL, logs[::-1], "ols", progress=lambda *n: counts.append(n), **options)
-        with pytest.raises(StudyError, match="has another arguments"):
+        with pytest.raises(StudyError, match=r"another configuration: fleet\.arguments is"):
             identify_each(MODEL, logs, "ols", seed=1, **options)
         for pattern in ("(?P<vehicle>z+)", "(?P<vehicle>z*)"):
             with pytest.raises(SettingsError, match="finds no vehicle in log"):
@@ -173,15 +173,15 @@ def test_a_store_resumes_with_other_threads_and_a_method_by_name_or_as_an_object
     identified(store, logs[:1], "i-diransac", settings=dr.Settings(max_iterations=20, threads=1), seed=3)
     same = dr.IDiransac(dr.Settings(max_iterations=20, threads=2, batch_size=64))
     assert identified(store, logs[:2], same, seed=3).done == 2
-    with pytest.raises(StudyError, match="has another method"):
+    with pytest.raises(StudyError, match=r"another configuration: fleet\.method is"):
         identified(store, logs[:2], "i-diransac", seed=3)
-    with pytest.raises(StudyError, match="has another preparation"):
+    with pytest.raises(StudyError, match=r"another configuration: fleet\.preparation is"):
         identified(store, logs[:2], same, seed=3, configuration={"preparation": {}})
     with pytest.raises(TypeError, match="seeed"):
         identified(store, logs[:2], same, seeed=3)
     prepared = tmp_path / "prepared.db"
     identified(prepared, logs[:1], configuration={"preparation": {}})
-    with pytest.raises(StudyError, match="has another preparation"):
+    with pytest.raises(StudyError, match=r"another configuration: fleet\.preparation is"):
         identified(prepared, logs[:1])
 
 
@@ -192,7 +192,7 @@ def test_a_store_of_an_earlier_format_is_refused_and_stays_as_it_is(logs, tmp_pa
         connection.execute("PRAGMA user_version = 1")
     before = store.read_bytes()
     for use in (lambda: identified(store, logs[:1]), lambda: read_fleet(store)):
-        with pytest.raises(StudyError, match="has format 1, this version reads 2; begin another"):
+        with pytest.raises(StudyError, match="has format 1, this version reads 3; begin another"):
             use()
     assert store.read_bytes() == before
 

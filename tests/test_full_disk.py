@@ -54,10 +54,10 @@ COMMANDS = {
 """Command lines, and the files that each writes."""
 
 STORES = {
-    "trials": ("study run tiny.toml --store out.db --trials 1", "study run tiny.toml --store out.db"),
-    "logs": (f"identify a.csv {FIT} --each --store out.db", f"identify a.csv b.csv {FIT} --each --store out.db"),
+    "study": ("study run tiny.toml --store out.db --trials 1", "study run tiny.toml --store out.db"),
+    "fleet": (f"identify a.csv {FIT} --each --store out.db", f"identify a.csv b.csv {FIT} --each --store out.db"),
 }
-"""Command lines that write a part of the rows of a table, and all of them."""
+"""Command lines that write a part of the rows of a store, and all of them."""
 
 
 def moving(model: dr.Model) -> dr.Log:
@@ -123,30 +123,30 @@ def test_an_output_on_a_full_disk_is_an_error_and_all_files_stay_as_they_were(fo
             assert contents(folder) == before
 
 
-def rows(store: Path, table: str) -> list[dict[str, object]]:
-    """Rows of a table without times and places; none of a file that holds nothing yet."""
+def rows(store: Path) -> list[dict[str, object]]:
+    """Rows of a store without times and places; none of a file that holds nothing yet."""
     with closing(sqlite3.connect(store)) as connection:
         connection.row_factory = sqlite3.Row
         if not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             return []
-        found = [dict(row) for row in connection.execute(f"SELECT * FROM {table} ORDER BY 1, 2, 3")]
+        found = [dict(row) for row in connection.execute("SELECT * FROM trials ORDER BY 1, 2, 3")]
     return [{name: value for name, value in row.items() if name not in ("seconds", "host")} for row in found]
 
 
 @pytest.mark.parametrize("begun", [False, True])
-@pytest.mark.parametrize("table", STORES)
-def test_a_store_on_a_full_disk_keeps_its_rows_and_is_completed_later(folder: Path, table: str, begun: bool):
-    part, all_of_it = (words.split() for words in STORES[table])
+@pytest.mark.parametrize("kind", STORES)
+def test_a_store_on_a_full_disk_keeps_its_rows_and_is_completed_later(folder: Path, kind: str, begun: bool):
+    part, all_of_it = (words.split() for words in STORES[kind])
     store = folder / "out.db"
     assert run(*all_of_it).exit_code == 0
-    whole, largest = rows(store, table), store.stat().st_size
+    whole, largest = rows(store), store.stat().st_size
     for size in {0, 512, *range(4096, largest, 4096)}:
         store.unlink()
         if begun:
             assert run(*part).exit_code == 0
         elif size:
             store.touch()
-        before, kept = contents(folder), rows(store, table) if begun else []
+        before, kept = contents(folder), rows(store) if begun else []
         if begun and size < store.stat().st_size:  # no disk refuses what is there already
             continue
         with full_after(size):
@@ -154,7 +154,7 @@ def test_a_store_on_a_full_disk_keeps_its_rows_and_is_completed_later(folder: Pa
         assert (done.exit_code, len(done.stderr.splitlines())) == (1, 1), (size, done.stderr)
         assert "is the disk full? Rows that it has are kept" in done.stderr
         assert {*contents(folder)} - {*before} <= {"out.db"}
-        assert all(row in whole for row in rows(store, table))
-        assert all(row in rows(store, table) for row in kept)
+        assert all(row in whole for row in rows(store))
+        assert all(row in rows(store) for row in kept)
         assert run(*all_of_it).exit_code == 0
-        assert rows(store, table) == whole
+        assert rows(store) == whole

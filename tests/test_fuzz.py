@@ -76,11 +76,6 @@ stop_inlier_fraction = 0.9
 acceptance_weights = [1.0, 0.06]
 inlier_thresholds = { x = 0.1, x_dot = 0.2 }
 """
-CONFIG = """[identify]
-model = "underwater-vehicle"
-method = "ols"
-log = "swim.csv"
-"""
 MAPPING = """repair = "safe"
 despike = "all"
 [[signals]]
@@ -333,7 +328,6 @@ KINDS = {
     "crazyflie": (8, lambda _: log("log", crazyflie(), options="--map x=fixed.x,thrust=fixed.u")),
     "mapping": (8, lambda _: options("m.toml", MAPPING, f"identify swim.csv {MODEL} --mapping m.toml")),
     "settings": (8, lambda _: options("s.toml", SETTINGS, f"identify swim.csv {SEARCH} --settings s.toml")),
-    "configuration": (8, lambda _: options("c.toml", CONFIG, "identify --config c.toml")),
     "robot": (8, robot),
     "sizes of npz": (6, lambda folder: sizes("log.npz", columns(".npz", folder), sized_npz)),
     "sizes of hdf5": (6, lambda folder: sizes("log.h5", hdf5(folder), sized_hdf5)),
@@ -389,7 +383,7 @@ def no_code(monkeypatch):
     monkeypatch.setattr(ca.Function, "deserialize", read)
     for name in ("external", "Importer", "StringDeserializer", "FileDeserializer"):
         monkeypatch.setattr(ca, name, refused)
-    monkeypatch.setattr("diransac.cli.commands.study.run_study", kept)
+    monkeypatch.setattr("diransac.cli.commands.stores.run_study", kept)
 
 
 @pytest.mark.slow

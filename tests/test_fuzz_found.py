@@ -100,7 +100,7 @@ def test_a_store_with_a_write_ahead_log_is_refused_and_nothing_is_left_beside_it
         pass
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("UPDATE cells SET trials = 3")
+        connection.execute("UPDATE asked SET place = place + 1")
         connection.commit()
     before = listing(tmp_path)
     assert before.keys() == {"a.db"}
@@ -140,7 +140,7 @@ def test_a_store_of_the_first_format_is_refused(tmp_path):
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("PRAGMA user_version = 1")
         connection.commit()
-    with pytest.raises(dr.StudyError, match="has format 1, this version reads 2; begin another"):
+    with pytest.raises(dr.StudyError, match="has format 1, this version reads 3; begin another"):
         status(path)
 
 

@@ -135,7 +135,7 @@ def test_a_log_is_that_of_the_study():
 def test_the_benchmark_judges_and_flies_what_the_study_does(vehicle, level, flown, tmp_path):
     study = studies.study_of(vehicle).subset(trials=1, levels=[level], methods=["ols", "tls"])
     with Store(tmp_path / "a.db", study) as kept:
-        rows = run_trials(json.dumps(study.to_dict()), level, [0], list(study.methods))
+        rows = run_trials(json.dumps(study.to_dict()), [(level, 0, label) for label in study.methods])
         kept.add(rows)
     found = dr.study.summarise(tmp_path / "a.db").estimates
     records = judging.run(judging.Trial(vehicle, "drawn", level, 0), study.methods)

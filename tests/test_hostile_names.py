@@ -258,7 +258,7 @@ def fleet(tmp_path):
     with closing(sqlite3.connect(store)) as connection, connection:
         texts = [text for text in TEXTS.values() if text == whole(text)]
         connection.executemany("INSERT INTO asked VALUES (?, ?, ?, ?)", [(x, k + 1, x, x) for k, x in enumerate(texts)])
-        connection.execute("UPDATE logs SET error = ?, verdict = ?", [TEXTS["formula"], TEXTS["c1"]])
+        connection.execute("UPDATE trials SET error = ?, verdict = ?", [TEXTS["formula"], TEXTS["c1"]])
     return store
 
 
@@ -284,7 +284,7 @@ def test_a_cell_is_no_longer_than_spreadsheets_and_python_read(letter):
 
 def test_bytes_in_a_store_of_a_fleet_are_damage(fleet, tmp_path):
     with closing(sqlite3.connect(fleet)) as connection, connection:
-        connection.execute("UPDATE logs SET verdict = zeroblob(100000)")
+        connection.execute("UPDATE trials SET verdict = zeroblob(100000)")
     with pytest.raises(dr.StudyError, match=r"is damaged: TypeError: .* is no text; begin a new one"):
         export_fleet(fleet, tmp_path / "fleet.csv")
     assert not (tmp_path / "fleet.csv").exists()
@@ -293,7 +293,7 @@ def test_bytes_in_a_store_of_a_fleet_are_damage(fleet, tmp_path):
 @pytest.mark.parametrize("number", [1.1e150, -1e308])
 def test_an_estimate_whose_square_overflows_is_damage(fleet, number):
     with closing(sqlite3.connect(fleet)) as connection, connection:
-        connection.execute("UPDATE logs SET parameter_mass = ?", (number,))
+        connection.execute("UPDATE trials SET parameter_mass = ?", (number,))
     with pytest.raises(dr.StudyError, match="the square of an estimate overflows"):
         summarise_fleet(fleet)
 

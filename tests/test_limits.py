@@ -245,7 +245,6 @@ READING = {
     "a log without ending": "inspect PIPE",
     "a mapping": "inspect swim.csv --mapping PIPE.toml",
     "settings": "identify swim.csv --model underwater-vehicle --settings PIPE.toml",
-    "a configuration": "identify --config PIPE.toml",
     "a model": "identify swim.csv --model PIPE.py",
     "a robot": "models PIPE.xml",
 }

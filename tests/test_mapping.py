@@ -10,7 +10,8 @@ import scipy.io
 
 import diransac as dr
 from command_line import run
-from diransac.data.mapping import BUILT_IN, LogMapping, MappedSignals, load_mapping
+from diransac.data.mapping import LogMapping, MappedSignals
+from diransac.data.mapping_file import BUILT_IN, load_mapping
 from diransac.data.readers import read_fields
 from diransac.data.readers.recording import Samples
 from diransac.data.readers.repair import REPAIRS, Repairs
@@ -99,21 +100,21 @@ WRONG = {
     "no scale at all": (f"{ENTRY}scale = 0", "scale is 0; give a factor other than 0"),
     "infinite": (f"{ENTRY}offset = inf", "offset is inf; write a finite number"),
     "sign": (f"{ENTRY}sign = -2", "sign is -2; it is 1 or -1"),
-    "frame": (f'{ENTRY}frame = "ned"', 'frame "ned" is not known; use one of ned-to-enu'),
+    "frame": (f'{ENTRY}frame = "ned"', "frame is 'ned'; use one of ned-to-enu"),
     "frame of one": (f'{ENTRY}frame = "ned-to-enu"', "changes the 3 components of a vector; there are 1"),
     "order": (f'{ENTRY}order = "xyzw"', "a quaternion has 4"),
     "attitude without order": (
         '[[signals]]\nname = ["a", "b", "c", "d"]\nfield = ["a", "b", "c", "d"]\nframe = "ned-frd-to-enu-flu"',
         "give its order",
     ),
-    "where": (f"{ENTRY}where = 3", "where must be a table"),
+    "where": (f"{ENTRY}where = 3", "where is 3; write a table"),
     "where without limit": (
         f'{ENTRY}where = {{ field = "b" }}',
         "where needs a field, and above, below or both, or equals",
     ),
     "time": (f'time = "noon"\n{ENTRY}', 'time is \'noon\'; write "header", "message"'),
-    "time without column": (f"time = {{ scale = 2 }}\n{ENTRY}", "time needs a column"),
-    "shift": (f"shift = 3\n{ENTRY}", "shift must be a table"),
+    "time without column": (f"time = {{ scale = 2 }}\n{ENTRY}", "time: column is missing"),
+    "shift": (f"shift = 3\n{ENTRY}", "shift is 3; write a table"),
     "resample": (f'resample = "often"\n{ENTRY}', "resample is 'often'"),
     "absent field": ('[[signals]]\nname = "x"\nfield = "b"', r'has "x" from field "b" .*say optional = true'),
     "nothing fits": ('[[signals]]\nname = "x"\nfield = "b"\noptional = true', "fits none of its columns"),

@@ -26,7 +26,7 @@ JUDGED = tiny(
     plant={"kind": "extended-rotorcraft"},
     evaluation={"trajectories": [], "parameters": True},
     trials=3,
-    axis={"name": "scenario", "levels": ["clean", "pushed"], "values": {"plant.aerodynamic_imbalance": [0.0, 1.4e-6]}},
+    axis={"name": "scenario", "levels": {"clean": {}, "pushed": {"plant.aerodynamic_imbalance": 1.4e-6}}},
 )
 
 
@@ -147,7 +147,7 @@ def test_levels_stand_below_what_varies_with_its_unit_and_power_of_ten(tmp_path:
 
 
 def test_none_is_explained_where_it_is_drawn_alone(tmp_path: Path):
-    wordy = {"name": "scenario", "levels": ["calm"], "values": {"noise.outlier_magnitude": [0]}}
+    wordy = {"name": "scenario", "levels": {"calm": {"noise.outlier_magnitude": 0}}}
     with Store(tmp_path / "w.db", load(tiny(trials=2, axis=wordy, evaluation__parameters=True))) as kept:
         kept.add([judged("calm", 0, method, 0.01) for method in METHODS])
         assert "none:" not in " ".join(texts(plot_estimates(tmp_path / "w.db")))
@@ -181,7 +181,7 @@ def test_names_along_an_axis_do_not_touch(width: float):
 
 
 def test_long_names_of_many_levels_are_within_the_picture_and_beside_their_panel(tmp_path: Path):
-    wordy = {"name": "scenario", "levels": WORDS, "values": {"noise.outlier_magnitude": list(range(len(WORDS)))}}
+    wordy = {"name": "scenario", "levels": {x: {"noise.outlier_magnitude": k} for k, x in enumerate(WORDS)}}
     with Store(tmp_path / "w.db", load(tiny(trials=1, axis=wordy, evaluation__parameters=True))) as kept:
         kept.add([judged(name, 0, method, 0.01) for name in WORDS for method in METHODS])
     figure = plot_estimates(tmp_path / "w.db")
@@ -198,7 +198,7 @@ def test_long_names_of_many_levels_are_within_the_picture_and_beside_their_panel
 
 
 def test_no_line_joins_levels_that_are_words_however_few(tmp_path: Path):
-    wordy = {"name": "scenario", "levels": ["calm", "gusts"], "values": {"noise.outlier_magnitude": [0, 1]}}
+    wordy = {"name": "scenario", "levels": {"calm": {}, "gusts": {"noise.outlier_magnitude": 1}}}
     with Store(tmp_path / "w.db", load(tiny(trials=1, axis=wordy))) as kept:
         kept.add(
             [
@@ -214,7 +214,7 @@ def test_no_line_joins_levels_that_are_words_however_few(tmp_path: Path):
 
 
 def test_long_names_of_levels_and_the_table_of_failures_stand_clear_of_the_panels(tmp_path: Path):
-    wordy = {"name": "scenario", "levels": WORDS, "values": {"noise.outlier_magnitude": list(range(len(WORDS)))}}
+    wordy = {"name": "scenario", "levels": {x: {"noise.outlier_magnitude": k} for k, x in enumerate(WORDS)}}
     with Store(tmp_path / "w.db", load(tiny(trials=3, axis=wordy))) as kept:
         flown = {f"square_{s}": 0.1 for s in ("x", "z", "theta", "x_dot", "z_dot", "theta_dot")}
         kept.add([row(name, k, m, **flown) for name in WORDS for k in (1, 2) for m in METHODS])

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from command_line import contents, run, run_both
-from diransac.cli.workers import _bar
+from diransac.cli.rows import _bar
 from diransac.study import builtin_names, load, template
 from studies import TINY_TOML, rows
 

@@ -136,7 +136,7 @@ PUSHED = tiny(
     methods={"true": {}, "ols": {}},
     evaluation={"trajectories": [], "parameters": True},
     trials=3,
-    axis={"name": "imbalance", "levels": ["none", "some"], "values": {"plant.mass_imbalance": [0.0, 1e-4]}},
+    axis={"name": "imbalance", "levels": {"none": {}, "some": {"plant.mass_imbalance": 1e-4}}},
 )
 BEST = {"none": {"mass": 0.25, "inertia": 0.004, "drag": 0.025}, "some": {"mass": 0.2, "inertia": 0.004, "drag": 0.025}}
 

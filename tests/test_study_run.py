@@ -271,7 +271,6 @@ def test_a_controller_that_cannot_be_takes_no_other_with_it(
     def together(plants: list, trajectories: list, **more: object) -> list:
         return [alone(*pair) for pair in zip(plants, trajectories, strict=True)]
 
-    monkeypatch.setattr(trials, "tvlqr", alone)
     monkeypatch.setattr(trials, "tvlqr_batch", together)
     found = run(tmp_path)
     assert found["40", 0, "ols"]["error"] == "no controller"

@@ -28,9 +28,7 @@ def test_a_built_in_study_survives_being_written_as_json(name: str):
 
 
 def test_the_figures_of_the_paper_vary_what_they_say():
-    levels = {
-        name: [float(level.text) for level in load(name).axis.levels] for name in ("fig2", "fig3", "fig4", "fig5")
-    }
+    levels = {name: list(map(float, load(name).axis.levels)) for name in ("fig2", "fig3", "fig4", "fig5")}
     assert levels == {
         "fig2": [0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100],
         "fig3": pytest.approx([1.0e-6, 1.2e-6, 1.4e-6, 1.6e-6, 1.8e-6], rel=1e-12),
@@ -83,7 +81,7 @@ def test_every_trial_of_the_gauntlet_flies_another_flight_and_is_judged_by_its_p
 def test_runs_of_faults_strike_about_a_fifth_of_the_gauntlets_samples(name: str):
     study = load(name)
     log = dr.fly(plant := study.plant.plant, flown := study.data.planned(plant, 5), dr.tvlqr(plant, flown))
-    assert {"bursts", "frozen", "missing"} <= {level.text for level in study.axis.levels}
+    assert {"bursts", "frozen", "missing"} <= set(study.axis.levels)
     for level in ("bursts", "frozen", "missing"):
         shares = [np.mean([*dr.corrupt(log, study.at(level).noise, seed).fault_mask.values()]) for seed in range(20)]
         assert np.mean(shares) == pytest.approx(0.2, abs=0.02)
@@ -93,8 +91,8 @@ def test_the_gauntlet_goes_to_the_ends_of_the_papers_ranges():
     study = load("gauntlet")
     most = study.at("everything at its maximum")
     assert (most.noise.acceleration_std, most.noise.rate_std, most.noise.outlier_probability) == (2.5, 1.0, 0.5)
-    assert most.plant.arguments["aerodynamic_imbalance"] == float(load("fig3").axis.levels[-1].text)
-    assert most.plant.arguments["mass_imbalance"] == float(load("fig4").axis.levels[-1].text)
+    assert most.plant.arguments["aerodynamic_imbalance"] == float([*load("fig3").axis.levels][-1])
+    assert most.plant.arguments["mass_imbalance"] == float([*load("fig4").axis.levels][-1])
 
 
 def test_the_template_is_a_study_and_comments_every_table():
@@ -106,7 +104,7 @@ def test_the_template_is_a_study_and_comments_every_table():
 
 def test_levels_are_the_same_however_they_are_written():
     study = load(tiny(axis__levels=[0, 0.0000010, 80.0, -0.0000010 + 0.0000010 + 3]))
-    assert [level.text for level in study.axis.levels] == ["0", "1e-06", "80", "3"]
+    assert list(study.axis.levels) == ["0", "1e-06", "80", "3"]
     assert study.subset(levels=["80.00", 3]).axis.levels == study.subset(levels=[80, "3"]).axis.levels
 
 
@@ -125,7 +123,7 @@ WORDS = {
 
 def test_levels_that_are_words_may_each_change_something_else():
     study = load(tiny(axis={"name": "scenario", "levels": WORDS}))
-    assert [level.text for level in study.axis.levels] == ["calm", "some", "much"]
+    assert list(study.axis.levels) == ["calm", "some", "much"]
     assert [study.at(level).noise.outlier_probability for level in WORDS] == [0.1, 0.2, 0.5]
     assert [study.at(level).noise.delay for level in WORDS] == [0.0, 0.02, 0.0]
     for some in (study, study.subset(levels=["calm"])):
@@ -135,7 +133,7 @@ def test_levels_that_are_words_may_each_change_something_else():
 def test_levels_that_are_words_may_look_like_numbers():
     study = load(tiny(axis={"levels": {"1e3": {"noise.delay": 0.01}, "1000": {"noise.delay": 0.02}, "007": {}}}))
     assert [study.at(text).noise.delay for text in ("1e3", "1000", "007")] == [0.01, 0.02, 0.0]
-    assert [level.text for level in study.subset(levels=["007", "1e3"]).axis.levels] == ["007", "1e3"]
+    assert list(study.subset(levels=["007", "1e3"]).axis.levels) == ["007", "1e3"]
 
 
 def test_a_level_may_fly_another_trajectory_which_takes_over_what_was_given_but_no_defaults():
@@ -218,14 +216,6 @@ def test_a_drawn_flight_is_that_of_its_seed_and_any_other_that_of_its_own():
     assert not np.array_equal(drawn.planned(plant, 8).states, expected)
 
 
-def test_a_store_of_before_there_were_drawn_flights_and_judged_parameters_is_still_the_same_study():
-    """What such stores keep as their configuration: further keys would have them refused."""
-    parts = STUDY.configuration["study"]
-    assert {path for path in parts if not path.startswith(("noise.", "plant."))} == {
-        "seed", "data.trajectory", "evaluation.trajectories", "evaluation.keep_paths",
-    }  # fmt: skip
-
-
 def test_where_parameters_are_judged_no_flight_need_be():
     study = load(tiny(evaluation={"trajectories": [], "parameters": True}))
     assert study.evaluate_parameters
@@ -305,8 +295,7 @@ def test_what_people_call_things_and_how_many_there_are_decide_nothing():
         ({"axis.path": "noise.magnitude"}, 'axis: at level 0, there is no key "noise.magnitude"; in noise there are'),
         ({"axis.path": "trials"}, r'axis: at level 0, "trials" cannot vary; there are plant\.\*'),
         ({"axis.path": "data.trajectory.x"}, "leads nowhere: trajectory is 'square', not a table"),
-        ({"axis": {"levels": [1, 2], "values": {"noise.rate_std": [1]}}}, "axis.values.noise.rate_std is .*2 values"),
-        ({"axis": {"levels": [1, 2], "values": {}}}, "axis.values is empty"),
+        ({"axis": {"levels": [1, 2]}}, "axis.path is missing; give the dotted path"),
         ({"axis": 3}, "axis is 3; give a table"),
         ({"axis": {"levels": {}}}, "axis.levels is empty; give a table, or a list, of one or more"),
         ({"axis": {"levels": {"a,b": {}}}}, 'axis.levels has "a,b"; give numbers, or words without commas'),

@@ -14,7 +14,8 @@ import pytest
 
 import diransac as dr
 from command_line import MODEL, run, swim
-from diransac.cli import screen, workers
+from diransac.cli import rows as workers
+from diransac.cli import screen
 from diransac.identification.method import Progress
 from diransac.plain_text import printable
 from diransac.study import identify_each, load
@@ -85,7 +86,6 @@ def test_a_result_with_control_characters_prints_none(folder):
         ["export", f"{HARMFUL}.json", "-o", "a.c"],
         [HARMFUL],
         ["inspect", f"--{HARMFUL}"],
-        ["inspect", "swim.csv", "--config", HARMFUL],
     ],
     ids=lambda words: " ".join(words).replace(HARMFUL, "TEXT").replace("\0", ""),
 )
@@ -183,7 +183,7 @@ def test_texts_of_a_store_stay_in_their_lines(folder):
     with Store("a.db", load(tiny(trials=2))) as kept:
         kept.add([row(trial=0, status="failed", error=LINE), row(trial=1, method="true")])
     with closing(sqlite3.connect("a.db")) as connection, connection:
-        connection.execute("UPDATE cells SET level = ?, method = ? WHERE rowid = 1", (LINE, LINE))
+        connection.execute("UPDATE asked SET level = ?, method = ? WHERE rowid = 1", (LINE, LINE))
         connection.execute("UPDATE trials SET level = ?, method = ? WHERE rowid = 1", (LINE, LINE))
         connection.execute("UPDATE about SET value = ? WHERE key = 'name'", (json.dumps(LINE),))
     check_lines("study", "status", "a.db")
@@ -194,9 +194,9 @@ def test_texts_of_a_fleet_stay_in_their_lines(folder):
     model, logs = dr.models.underwater_vehicle(), ["swim.csv", "missing.csv"]
     identify_each(model, logs, "ols", store="a.db", executor=ThreadPoolExecutor(1))
     with closing(sqlite3.connect("a.db")) as connection, connection:
-        connection.execute("UPDATE logs SET error = ? WHERE status = 'failed'", (LINE,))
+        connection.execute("UPDATE trials SET error = ? WHERE status = 'failed'", (LINE,))
         connection.execute("UPDATE asked SET vehicle = ?, time = ?", (LINE, LINE))
-        for table in ("asked", "logs"):
+        for table in ("asked", "trials"):
             connection.execute(f"UPDATE {table} SET log = ? WHERE log = 'swim.csv'", (LINE,))
     for words in ("status a.db", "show a.db"):
         check_lines("fleet", *words.split())

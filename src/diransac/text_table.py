@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from diransac.plain_text import one_line
 
-__all__ = ["aligned", "duration", "listed", "number", "percent", "plural", "share", "superscript", "telling_digits"]
+__all__ = [
+    "aligned", "duration", "listed", "number", "percent", "plural", "share", "some", "superscript", "telling_digits",
+]  # fmt: skip
 
 _LEAST_PERCENT = 0.01
 
@@ -68,6 +70,12 @@ def share(x: float, whole: str) -> str:
 def listed(names: Sequence[str]) -> str:
     """Names in a sentence: ``x``, ``x and z``, ``x, y and z``."""
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
+
+
+def some(names: Iterable[str], most: int = 25) -> str:
+    """Names with commas, those beyond a number counted: ``x, y and 3 more``."""
+    whole = list(names)
+    return ", ".join(whole[:most]) + (f" and {len(whole) - most} more" if len(whole) > most else "")
 
 
 def plural(count: int, noun: str) -> str:

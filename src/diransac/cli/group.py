@@ -16,56 +16,54 @@ import typer
 from typer.core import TyperGroup
 
 from diransac.cli import INTERRUPTED, screen
-from diransac.cli.config import config_defaults
-from diransac.errors import DiransacError, SettingsError
+from diransac.errors import DiransacError
 
 __all__ = ["Group", "grouped"]
 
 UsageError: type[Any] = typer.BadParameter.__mro__[1]
 
 
-_NAMES = (
-    "identify",
-    "compare",
-    "validate",
-    "predict",
-    "view",
-    "cross-validate",
-    "inspect",
-    "map",
-    "simulate",
-    "fly",
-    "design",
-    "export",
-    "models",
-    "cache",
-    "fleet",
-    "study",
-)
-"""Commands, in the order of ``--help``."""
+_MODULES = {
+    "identify": "identification",
+    "compare": "identification",
+    "validate": "results",
+    "predict": "results",
+    "view": "results",
+    "cross-validate": "identification",
+    "inspect": "inspection",
+    "map": "inspection",
+    "simulate": "simulate",
+    "fly": "fly",
+    "design": "design",
+    "export": "results",
+    "models": "inspection",
+    "cache": "inspection",
+    "fleet": "stores",
+    "study": "stores",
+}
+"""Commands, in the order of ``--help``, and their modules in `diransac.cli.commands`."""
 
 _VERBOSITY = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 
 
 class _Commands(Mapping[str, Any]):
-    """Commands by name; the module of each, `diransac.cli.commands.*`, is imported on first use."""
+    """Commands by name; the module of each is imported on first use."""
 
     def __init__(self) -> None:
         self._made = dict[str, Any]()
 
     def __getitem__(self, name: str) -> Any:
-        if name not in _NAMES:
-            raise KeyError(name)
         if name not in self._made:
-            module = importlib.import_module(f"diransac.cli.commands.{name.replace('-', '_')}")
-            self._made[name] = typer.main.get_command(module.app)
+            module = importlib.import_module(f"diransac.cli.commands.{_MODULES[name]}")
+            made = typer.main.get_command(module.app)
+            self._made[name] = getattr(made, "commands", {}).get(name, made)
         return self._made[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(_NAMES)
+        return iter(_MODULES)
 
     def __len__(self) -> int:
-        return len(_NAMES)
+        return len(_MODULES)
 
 
 class Group(TyperGroup):
@@ -90,7 +88,7 @@ class Group(TyperGroup):
         return super().parse_args(ctx, args)
 
     def main(self, args: Sequence[str] | None = None, *positional: Any, **extra: Any) -> NoReturn:
-        """Run the command line; ``--debug``, ``--config FILE``, ``-q`` and ``-v`` may stand anywhere."""
+        """Run the command line; ``--debug``, ``-q`` and ``-v`` may stand anywhere."""
         given = list(sys.argv[1:] if args is None else args)
         words = [word for word in given if word not in ("--debug", *_VERBOSITY)]
         extra["standalone_mode"] = False
@@ -99,9 +97,6 @@ class Group(TyperGroup):
         screen.set_verbosity(levels[-1] if levels else 0)
         debugging = "--debug" in given
         try:
-            words, file = _without_config(words)
-            if file is not None:
-                extra["default_map"] = config_defaults(file, self.commands)
             code = super().main(words, *positional, **extra)
         except UsageError as error:
             where = error.ctx.command_path if error.ctx else "diransac"
@@ -115,21 +110,6 @@ class Group(TyperGroup):
         if code == INTERRUPTED:
             screen.note("interrupted")
         sys.exit(code or 0)
-
-
-def _without_config(words: Sequence[str]) -> tuple[list[str], Path | None]:
-    """The words without ``--config FILE``, and the file.  Raises SettingsError: not one file."""
-    left, files, rest = list[str](), list[str](), iter(words)
-    for word in rest:
-        if word == "--config":
-            files.append(next(rest, ""))
-        elif word.startswith("--config="):
-            files.append(word.removeprefix("--config="))
-        else:
-            left.append(word)
-    if len(files) > 1 or "" in files:
-        raise SettingsError("--config takes one file, such as --config diransac.toml")
-    return left, Path(files[0]) if files else None
 
 
 def _convert_plainly(command: Any, ctx: Any) -> None:

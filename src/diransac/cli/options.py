@@ -5,7 +5,8 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf, isnan
+from functools import partial
+from math import isnan
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -166,9 +167,7 @@ TimeLimit = Annotated[
 ]
 
 
-def _option(*names: str, **about: Any) -> Any:
-    """An option on the preparation of the log."""
-    return typer.Option(*names, rich_help_panel="Preparation of the log, in this order", **about)
+_option = partial(typer.Option, rich_help_panel="Preparation of the log, in this order")
 
 
 @dataclass(frozen=True)
@@ -355,16 +354,17 @@ class Preparation:
 
     def _prepared(self, log: Log) -> Log:
         """The log after the steps that follow its reading."""
-        delays = numbers("--shift", self.shift or ())
-        if self.start is not None or self.stop is not None:
-            log = log.between(-inf if self.start is None else self.start, inf if self.stop is None else self.stop)
-        if self.events is not None:
-            log = preprocessing.keep_while(log, names(self.events))
-        if self.left_out is not None:
-            log = preprocessing.leave_out(log, _stretches(self.left_out))
-        if self.despike is not None:
-            log = preprocessing.despike(log, None if self.despike == "all" else names(self.despike))
-        return preprocessing.shift(log, delays) if delays else log
+        return preprocessing.prepared(
+            log,
+            {
+                "from": self.start,
+                "until": self.stop,
+                "while": None if self.events is None else names(self.events),
+                "leave_out": None if self.left_out is None else _stretches(self.left_out),
+                "despike": None if self.despike is None else names(self.despike),
+                "shift": numbers("--shift", self.shift or ()),
+            },
+        )
 
     def _of_stdin(self, like: Sequence[Mapping[str, Any]]) -> Log:
         """The prepared log of CSV text on stdin.  Raises LogError: as `read`, or there is none."""
@@ -386,7 +386,7 @@ class Preparation:
         """
         if self.mapping is None:
             return derivation
-        from diransac.data.mapping import load_mapping
+        from diransac.data.mapping_file import load_mapping
 
         mapping = load_mapping(self.mapping)
         bandwidth = derivation.bandwidth if derivation.bandwidth is not None else mapping.option("bandwidth")

@@ -26,9 +26,7 @@ Drives = TypeVar("Drives", "PositionControl", "MotorCurrents")
 _NUMBERS = {"kp", "kd", "limit", "constant", "gear"}
 
 
-def _option(*declarations: str, **about: Any) -> Any:
-    """An option on the model of a robot."""
-    return typer.Option(*declarations, rich_help_panel="Robot, for --model FILE.xml or FILE.urdf", **about)
+_option = partial(typer.Option, rich_help_panel="Robot, for --model FILE.xml or FILE.urdf")
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,6 @@ _ROUNDING = 1e-6
 # Common part of two spellings of one name, and what counts as that of an abbreviation, of so many letters; names, and
 # letters of each, that are compared.
 _ALIKE, _ABBREVIATED, _SHORT, _MOST_COMPARED, _LONGEST_NAME = 0.8, 0.9, 3, 1000, 100
-# Samples of a signal from which its rate is taken.
-_FEWEST_SAMPLES = 5
 
 # Seconds from row to row: the least that are accepted, likely ones, and the most that are accepted.  Clocks that
 # explain longer ones: their tick in seconds, and the number of ticks from row to row above which it is this clock
@@ -159,7 +157,8 @@ def _letters_and_digits(name: str) -> tuple[str, str]:
 def rows_per_sample(known: npt.NDArray[np.bool_]) -> int:
     """Median number of rows from one sample of a signal to the next; 1 for a signal with a sample in most rows."""
     rows = np.flatnonzero(known)
-    return int(np.median(np.diff(rows))) if len(rows) >= _FEWEST_SAMPLES else 1
+    # Samples of a signal from which its rate is taken.
+    return int(np.median(np.diff(rows))) if len(rows) >= 5 else 1
 
 
 def describe_gaps(time: FloatArray, signals: Mapping[str, FloatArray]) -> list[str]:

@@ -23,10 +23,6 @@ T = TypeVar("T")
 __all__ = ["Dataset", "ParameterLayout", "as_logs", "distinct_logs", "usable_sensors"]
 
 
-# Relative difference of two sampling times below which they are one rate with another jitter.
-_SAME_RATE = 1e-3
-
-
 class ParameterLayout:
     """Positions of every log's parameters in one vector: shared ones once, per-log ones once per log.
 
@@ -326,7 +322,8 @@ class Dataset:
         """
         steps = [one.log.dt for one in self.segments]
         for one in self.segments:
-            if abs(one.log.dt - steps[0]) > _SAME_RATE * steps[0]:
+            # Relative difference of two sampling times below which they are one rate with another jitter.
+            if abs(one.log.dt - steps[0]) > 1e-3 * steps[0]:
                 raise LogError(
                     f"{self.segments[0].log.source} is sampled at {1.0 / steps[0]:.6g} Hz, {one.log.source} at "
                     f"{1.0 / one.log.dt:.6g} Hz; resample them to one rate (--resample)"

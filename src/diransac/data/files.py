@@ -49,7 +49,6 @@ __all__ = [
 
 KEY, MEMBER, COMMENT = "diransac", "diransac.json", "# diransac:"
 """Place of the metadata in a Parquet file, in an NPZ archive and, of earlier versions, in CSV text."""
-_BESIDE = "-metadata.json"
 _CSV_ON_THE_WEB, _UNIT = "http://www.w3.org/ns/csvw", "schema:unitText"
 
 _VERSION = 1
@@ -86,7 +85,7 @@ class Metadata:
 
 def place_of_metadata(table: Path) -> Path:
     """The file beside a CSV file that describes it."""
-    return table.with_name(table.name + _BESIDE)
+    return table.with_name(table.name + "-metadata.json")
 
 
 def put_in_place(written: Path, target: Path) -> None:

@@ -24,7 +24,6 @@ __all__ = ["REACH", "FilterSpecification", "convolve", "half_length", "kernels",
 
 
 REACH = 2.5
-_KAISER_BETA = 7.857
 _ROWS_AT_A_TIME = 20_000
 """Rows whose windows are copied together."""
 
@@ -107,7 +106,7 @@ def kernels(bandwidth: float, dt: float) -> FloatArray:
     """
     L = half_length(bandwidth, dt)
     t = np.arange(-L, L + 1) * dt
-    smooth = np.sinc(2.0 * bandwidth * t) * np.kaiser(2 * L + 1, _KAISER_BETA)
+    smooth = np.sinc(2.0 * bandwidth * t) * np.kaiser(2 * L + 1, 7.857)
     smooth /= smooth.sum()
     first, second = (_derivative(smooth, order, dt) for order in (1, 2))
     first = first - first[::-1]

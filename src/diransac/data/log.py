@@ -27,11 +27,6 @@ if TYPE_CHECKING:
 __all__ = ["Log"]
 
 
-_LARGEST = 1e150
-_LOWEST_BANDWIDTH = 4e-7
-_ROUNDING = 1e-6
-
-
 class Frame(Protocol):
     """Common interface of polars and pandas data frames."""
 
@@ -104,7 +99,7 @@ class Log:
                 raise LogError(f'{self.source}: signal "{name}" has {len(values)} rows, the time has {len(time)}')
         checks.check_time_order(time, self.source)
         checks.check_even(time, self.source)
-        if self.filter is not None and self.filter.bandwidth * np.mean(np.diff(time)) < _LOWEST_BANDWIDTH:
+        if self.filter is not None and self.filter.bandwidth * np.mean(np.diff(time)) < 4e-7:
             raise LogError(f"{self.source}: a filter of {self.filter.bandwidth:.3g} Hz is too long for its rate")
         units = {name: unit for name, unit in self.units.items() if name in signals}
         for key, value in (("time", time), ("signals", signals), ("units", units), ("unusable", dict(self.unusable))):
@@ -268,7 +263,7 @@ class Log:
             where = f"row {row} (t = {self.time[row]:.6g} s)"
             if np.isinf(values[row]):
                 raise LogError(f'{self.source}: signal "{name}" is infinite at {where}; give NaN for a missing sample')
-            if np.abs(values[row]) > _LARGEST:
+            if np.abs(values[row]) > 1e150:
                 raise LogError(f'{self.source}: signal "{name}" is {values[row]:.3g} at {where}: its square overflows')
 
     # ------------------------------------------------------------------ parts
@@ -313,7 +308,7 @@ class Log:
         LogError
             Fewer than 2 rows lie there.
         """
-        slack = _ROUNDING * self.dt
+        slack = 1e-6 * self.dt  # rounding
         first, last = np.searchsorted(self.time, [start - slack, end + slack])
         if last - first < 2:
             raise LogError(

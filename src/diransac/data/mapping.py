@@ -1,71 +1,34 @@
-"""Mapping files: which field of which topic is which signal of a model, in which unit and frame.
-
-A mapping is TOML.  Built-in ones, in ``mappings/``, are named without an ending: ``px4-multirotor``.
-
-::
-
-    time = "header"                   # or "message"; for a table: { column = "t_ms", scale = 0.001 }
-    resample = 100.0                  # Hz, or "median"; without it the rows are those of the fastest topic
-
-    [[signals]]
-    name = "x"                        # or several: ["x", "y", "z"]
-    topic = "vehicle_local_position"  # not for a table
-    field = "x"                       # as many as names
-    scale = 1.0                       # value = sign * scale * field + offset
-    unit = "m"
-
-A list of ``names`` may have one ``scale``, ``sign`` or ``offset`` for each.  ``frame`` then changes the axes of three
-components, or of the four of a quaternion whose ``order`` in the file is given.  ``where`` leaves samples out.
-
-::
-
-    while = ["airborne"]              # above the signals: rows where it does not hold are left out
-
-    [[events]]
-    name = "airborne"                 # a signal that is 1 where the conditions held last, else 0
-    topic = "vehicle_land_detected"
-    where = { field = "landed", below = 0.5 } # above, below, or equals: a number or a text
-"""
+"""Mappings: which field of which topic is which signal of a model, in which unit and frame."""
 
 from __future__ import annotations
 
 import json
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import LogError
-from diransac.limits import LARGEST_TABLE
-from diransac.plain_data import read_text, toml_table
+from diransac.text_table import some
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["BUILT_IN", "Condition", "Event", "LogMapping", "MappedSignals", "held", "load_mapping", "parse_mapping"]
+__all__ = ["ATTITUDES", "AXES", "Condition", "Event", "LogMapping", "MappedSignals", "held"]
 
 TextArray = np.ndarray[Any, np.dtype[np.object_]]
 
 _HALF = math.sqrt(0.5)
-_AXES: dict[str, FloatArray] = {
+AXES: dict[str, FloatArray] = {
     **dict.fromkeys(("ned-to-enu", "enu-to-ned"), np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])),
     **dict.fromkeys(("frd-to-flu", "flu-to-frd"), np.diag([1.0, -1.0, -1.0])),
 }
 """Matrices of the changes of frame of a vector."""
-_ATTITUDES = ("ned-frd-to-enu-flu", "enu-flu-to-ned-frd")
-_ORDERS = ("wxyz", "xyzw")
+ATTITUDES = ("ned-frd-to-enu-flu", "enu-flu-to-ned-frd")
 
-_KEYS = {"name", "topic", "field", "unit", "scale", "sign", "offset", "frame", "order", "optional", "where"}
-_STEPS = {"resample", "repair", "from", "until", "while", "despike", "shift", "differentiate", "bandwidth"}
-_TOP = {"description", "time", "signals", "events", *_STEPS}
 _ANY = "{joint}"
-_FOLDER = Path(__file__).parent / "mappings"
-
-BUILT_IN = ("px4-multirotor", "crazyflie", "ros-joint-states", "ros-odometry-imu", "lerobot")
-"""Names of the mappings that come with the package."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +71,7 @@ class MappedSignals:
     factors, offsets : tuple of float
         ``value = factor * field + offset``, before the change of frame.
     frame : str, optional
-        Change of frame, a key of `_AXES` or one of `_ATTITUDES`.
+        Change of frame, a key of `AXES` or one of `ATTITUDES`.
     optional : bool
         True if a log may lack the topic or the field.
     where : tuple of Condition
@@ -136,8 +99,8 @@ class MappedSignals:
         if self.factors or self.offsets:
             factors, offsets = self.factors or (1.0,) * len(rows), self.offsets or (0.0,) * len(rows)
             rows = [x if f == 1.0 and b == 0.0 else f * x + b for x, f, b in zip(rows, factors, offsets, strict=True)]
-        if self.frame in _AXES:
-            rows = _signed_permutation(_AXES[self.frame], rows)
+        if self.frame in AXES:
+            rows = _signed_permutation(AXES[self.frame], rows)
         elif self.frame is not None:
             rows = _other_attitude(rows)
         if self.where:
@@ -292,7 +255,7 @@ class LogMapping:
                 )
         if not found:
             what, there = ("columns", fields[""]) if set(fields) == {""} else ("topics", list(fields))
-            raise LogError(f"{source}: {self.source} fits none of its {what}; found {_some(there)}")
+            raise LogError(f"{source}: {self.source} fits none of its {what}; found {some(there)}")
         notes = [f"{self.source}: no {', '.join(n for n in absent if absent[n] == w)}: {w}" for w in _unique(absent)]
         entries = list(dict.fromkeys(found.values()))
         for entry in entries:
@@ -335,238 +298,5 @@ def _why_not(
         start = path.find("[")
         listed = path[:start] + indices.get(path[start:], path[start:]) if start >= 0 else path
         if listed not in known:
-            return f'field "{path}" of topic "{topic}", which has {_some(known)}'
+            return f'field "{path}" of topic "{topic}", which has {some(known)}'
     return None
-
-
-def _some(names: Sequence[str] | Mapping[str, Any], most: int = 25) -> str:
-    listed = list(names)
-    return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
-
-
-# ---------------------------------------------------------------------- reading
-
-
-def load_mapping(mapping: str | Path) -> LogMapping:
-    """Mapping of a built-in name or of a file.
-
-    Raises
-    ------
-    LogError
-        There is no such file, or it is no valid mapping; the sentence names the entry and what it may be.
-    """
-    if isinstance(mapping, str) and mapping in BUILT_IN:
-        source = f'mapping "{mapping}"'
-        text = (_FOLDER / f"{mapping}.toml").read_text(encoding="utf-8")
-    else:
-        path = Path(mapping)
-        source = f'mapping "{path}"'
-        text = _text(path, source)
-    return parse_mapping(text, source)
-
-
-def parse_mapping(text: str, source: str) -> LogMapping:
-    """Mapping of TOML text, by its name in messages.  Raises LogError: as `load_mapping`."""
-    try:
-        content = toml_table(text)
-    except ValueError as error:
-        raise LogError(f"{source}: it is not TOML ({' '.join(str(error).split()):.120})") from error
-    return replace(_parse(content, source), text=text)
-
-
-def _text(path: Path, source: str) -> str:
-    try:
-        return read_text(path, LARGEST_TABLE)
-    except FileNotFoundError as error:
-        built_in = ", ".join(BUILT_IN)
-        raise LogError(f"{source}: there is no such file; built in are {built_in}") from error
-    except OSError as error:
-        raise LogError(f"{source}: it cannot be read: {error.strerror or error}") from error
-    except ValueError as error:
-        raise LogError(f"{source}: {error}") from error
-
-
-def _parse(content: Mapping[str, Any], source: str) -> LogMapping:
-    _check_keys(content, _TOP, source)
-    entries = content.get("signals", [])
-    if not isinstance(entries, list) or not all(isinstance(x, dict) for x in entries):
-        raise LogError(f"{source}: signals must be tables; write [[signals]] before each")
-    if not entries:
-        raise LogError(f"{source}: it maps no signal; write [[signals]] with name, topic and field")
-    time = content.get("time", "header")
-    column, scale = None, 1.0
-    if isinstance(time, dict):
-        _check_keys(time, {"column", "scale"}, f"{source}: time")
-        column = _string(time, "column", f"{source}: time")
-        scale = _number(time.get("scale", 1.0), "scale", f"{source}: time")
-        if scale == 0.0 or column is None:
-            raise LogError(f"{source}: time needs a column, and a scale other than 0")
-        time = "header"
-    if time not in ("header", "message"):
-        raise LogError(
-            f'{source}: time is {time!r}; write "header", "message", or {{ column = "t_ms", scale = 0.001 }}'
-        )
-    preparation = {name: content[name] for name in sorted(_STEPS) if name in content}
-    _check_preparation(preparation, source)
-    return LogMapping(
-        source,
-        tuple(_entry(x, f"{source}: signal {k + 1}") for k, x in enumerate(entries)),
-        _events(content.get("events", []), source),
-        time,
-        column,
-        scale,
-        preparation,
-    )
-
-
-def _check_keys(table: Mapping[str, Any], known: set[str], source: str) -> None:
-    unknown = [key for key in table if key not in known]
-    if unknown:
-        raise LogError(f'{source} has "{unknown[0]}", which is not known; it may have {", ".join(sorted(known))}')
-
-
-def _check_preparation(steps: Mapping[str, Any], source: str) -> None:
-    if not isinstance(steps.get("differentiate", False), bool):
-        raise LogError(f"{source}: differentiate is {steps['differentiate']!r:.60}; it is true or false")
-    for name in ("from", "until", "bandwidth"):
-        if name in steps:
-            _number(steps[name], name, source)
-    if "resample" in steps and steps["resample"] != "median":
-        _number(steps["resample"], "resample", source)
-    if not isinstance(steps.get("shift", {}), dict):
-        raise LogError(f"{source}: shift must be a table of seconds: shift = {{ thrust = 0.02 }}")
-    for name, delay in steps.get("shift", {}).items():
-        _number(delay, f"shift of {name}", source)
-    if "despike" in steps and steps["despike"] != "all":
-        _strings(steps["despike"], "despike", source)
-    if "while" in steps:
-        _strings(steps["while"], "while", source)
-    if "repair" in steps and not isinstance(steps["repair"], bool):
-        _strings(steps["repair"], "repair", source)
-
-
-def _entry(table: Mapping[str, Any], source: str) -> MappedSignals:
-    _check_keys(table, _KEYS, source)
-    names = _strings(table.get("name"), "name", source)
-    source = f'{source} ("{names[0]}")'
-    fields = _strings(table.get("field"), "field", source)
-    if len(fields) != len(names):
-        raise LogError(f"{source} has {len(names)} names and {len(fields)} fields; give as many")
-    if "t" in names:
-        raise LogError(f'{source}: "t" is the time of every log; it needs no entry')
-    if len(set(names)) < len(names):
-        raise LogError(f"{source} names a signal twice")
-    fields, frame = _ordered(table, fields, source)
-    units = table.get("unit")
-    factors = _numbers(table.get("scale"), "scale", len(names), source, 1.0)
-    signs = _numbers(table.get("sign"), "sign", len(names), source, 1.0)
-    if any(abs(x) != 1.0 for x in signs):
-        raise LogError(f"{source}: sign is {table['sign']}; it is 1 or -1")
-    if 0.0 in factors:
-        raise LogError(f"{source}: scale is {table['scale']}; give a factor other than 0")
-    optional = table.get("optional", False)
-    if not isinstance(optional, bool):
-        raise LogError(f"{source}: optional is {optional!r}; it is true or false")
-    return MappedSignals(
-        names=names,
-        fields=fields,
-        topic=_string(table, "topic", source) or "",
-        units=() if units is None else _units(units, len(names), source),
-        factors=tuple(f * s for f, s in zip(factors, signs, strict=True)),
-        offsets=_numbers(table.get("offset"), "offset", len(names), source, 0.0),
-        frame=frame,
-        optional=optional,
-        where=_conditions(table.get("where", []), source),
-    )
-
-
-def _events(tables: Any, source: str) -> tuple[Event, ...]:
-    if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
-        raise LogError(f"{source}: events must be tables; write [[events]] before each")
-    found = []
-    for table in tables:
-        _check_keys(table, {"name", "topic", "where"}, f"{source}: events")
-        name = _string(table, "name", f"{source}: events")
-        where = _conditions(table.get("where", []), f'{source}: event "{name}"')
-        if name in (None, "t") or not where:
-            raise LogError(f'{source}: an event needs a name, and where = {{ field = "landed", below = 0.5 }}')
-        found.append(Event(name or "", _string(table, "topic", source) or "", where))
-    return tuple(found)
-
-
-def _ordered(table: Mapping[str, Any], fields: tuple[str, ...], source: str) -> tuple[tuple[str, ...], str | None]:
-    """Fields in the order of the names, and the change of frame."""
-    frame, order = _string(table, "frame", source), _string(table, "order", source)
-    if frame is not None and frame not in (*_AXES, *_ATTITUDES):
-        raise LogError(f'{source}: frame "{frame}" is not known; use one of {", ".join((*_AXES, *_ATTITUDES))}')
-    if order is not None and (order not in _ORDERS or len(fields) != 4):
-        raise LogError(
-            f'{source}: order is "{order}", of {len(fields)} fields; a quaternion has 4, in "wxyz" or "xyzw"'
-        )
-    if frame in _AXES and len(fields) != 3:
-        raise LogError(
-            f'{source}: frame "{frame}" changes the 3 components of a vector; there are {len(fields)} fields'
-        )
-    if frame in _ATTITUDES and order is None:
-        raise LogError(f'{source}: frame "{frame}" is that of a quaternion; give its order, "wxyz" or "xyzw"')
-    if order == "xyzw":
-        fields = (fields[3], *fields[:3])
-    return fields, frame
-
-
-def _conditions(tables: Any, source: str) -> tuple[Condition, ...]:
-    if isinstance(tables, dict):
-        tables = [tables]
-    if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
-        raise LogError(f'{source}: where must be a table: where = {{ field = "xy_valid", above = 0.5 }}')
-    conditions = []
-    for table in tables:
-        _check_keys(table, {"field", "above", "below", "equals"}, f"{source}: where")
-        name, given = _string(table, "field", f"{source}: where"), {"above", "below", "equals"} & set(table)
-        if name is None or not given or ("equals" in given and len(given) > 1):
-            raise LogError(f"{source}: where needs a field, and above, below or both, or equals")
-        limits = {key: _number(table[key], key, f"{source}: where") for key in ("above", "below") if key in table}
-        equals = table.get("equals")
-        if isinstance(equals, bool):
-            equals = float(equals)
-        if equals is not None and not (isinstance(equals, str) and equals):
-            equals = _number(equals, "equals", f"{source}: where")
-        conditions.append(Condition(name, **limits, equals=equals))
-    return tuple(conditions)
-
-
-def _units(value: Any, n: int, source: str) -> tuple[str, ...]:
-    units = _strings(value, "unit", source)
-    if len(units) not in (1, n):
-        raise LogError(f"{source} has {n} names and {len(units)} units; give one, or as many")
-    return units * n if len(units) == 1 else units
-
-
-def _string(table: Mapping[str, Any], key: str, source: str) -> str | None:
-    value = table.get(key)
-    if value is not None and (not isinstance(value, str) or not value.strip()):
-        raise LogError(f"{source}: {key} is {value!r:.60}; write a text")
-    return value
-
-
-def _strings(value: Any, key: str, source: str) -> tuple[str, ...]:
-    listed = [value] if isinstance(value, str) else value
-    if not isinstance(listed, list) or not listed or not all(isinstance(x, str) and x.strip() for x in listed):
-        what = "is missing" if value is None else f"is {value!r:.60}"
-        raise LogError(f'{source}: {key} {what}; write a text, or a list of texts: {key} = "x" or ["x", "y"]')
-    return tuple(listed)
-
-
-def _number(value: Any, key: str, source: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise LogError(f"{source}: {key} is {value!r:.60}; write a finite number")
-    return float(value)
-
-
-def _numbers(value: Any, key: str, n: int, source: str, default: float) -> tuple[float, ...]:
-    if value is None:
-        return (default,) * n
-    listed = value if isinstance(value, list) else [value] * n
-    if len(listed) != n:
-        raise LogError(f"{source} has {n} names and {len(listed)} of {key}; give one, or as many")
-    return tuple(_number(x, key, source) for x in listed)

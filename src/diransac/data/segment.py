@@ -25,13 +25,10 @@ __all__ = ["Segment", "bind_log", "spelling_notes"]
 # A line through seven samples bears two outliers, and is short against any motion that is sampled well; the slope that
 # stands for a missing velocity needs a longer one.
 _ROWS_FOR_VALUE, _ROWS_FOR_SLOPE = 7, 25
-_FAR = 5.0
 # Rows that an input is held for, beyond which the motion is no longer the one that it made.
 _LONG_HOLD = 3
 # Time, rows, and usual intervals between samples, without a sample of any signal: then the motion is found anew.
 _LONG_SILENCE, _FEWEST_SILENT, _SILENT_INTERVALS = 0.25, 8, 4
-# Fraction of the rows with a sample below which a signal is a slow one.
-_SLOW = 0.5
 
 
 @dataclass(frozen=True)
@@ -180,7 +177,7 @@ class Segment:
         rows = np.flatnonzero(np.isfinite(column))[:_ROWS_FOR_VALUE]
         value, slope = self._line(name, _ROWS_FOR_VALUE)
         distances = np.abs(column[rows] - value - slope * rows * self.log.dt)
-        return float(column[rows[0]]) if distances[0] <= _FAR * np.median(distances) else value
+        return float(column[rows[0]]) if distances[0] <= 5.0 * np.median(distances) else value
 
     def _line(self, name: str, n_rows: int) -> tuple[float, float]:
         """Value and slope at row 0 of the line through a signal's first samples, by Theil and Sen."""
@@ -292,7 +289,7 @@ def _complete(known: BoolArray, is_sensor: BoolArray, pointwise: bool) -> BoolAr
     Sensors are compared where they have a sample.  Without equations at each row, so are slow signals, which have
     samples in fewer than half of the rows.  A row without a sample of any signal does not count.
     """
-    slow = is_sensor if pointwise else is_sensor | (known.mean(axis=0) < _SLOW)
+    slow = is_sensor if pointwise else is_sensor | (known.mean(axis=0) < 0.5)
     if not slow.any():
         return np.asarray(known.all(axis=1))
     return np.asarray(known.any(axis=1) & (known | slow).all(axis=1))

@@ -6,11 +6,13 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from diransac.data.mapping import BUILT_IN, LogMapping, MappedSignals, load_mapping
+from diransac.data.mapping import LogMapping, MappedSignals
+from diransac.data.mapping_file import BUILT_IN, load_mapping
 from diransac.data.readers.recording import shortened
 from diransac.data.units import conversion
 from diransac.errors import LogError
 from diransac.plain_text import comment, literal, one_line
+from diransac.text_table import some
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Coverage", "suggest_mapping"]
 
-_LEAST, _LISTED, _MOST_LISTED = 0.5, 3, 60
+_LEAST, _LISTED = 0.5, 3
 _STATES = frozenset(
     {"mode", "state", "status", "armed", "airborne", "landed", "flying", "enabled", "contact", "battery"}
 )
@@ -110,7 +112,7 @@ class Coverage:
         parts += self._event()
         if self.missing:
             rest = {topic: shortened(labels) for topic, labels in self.unused.items()}
-            others = (f"Other fields{_of(t)}: {_some(labels)}" for t, labels in rest.items() if labels)
+            others = (f"Other fields{_of(t)}: {some(labels, 60)}" for t, labels in rest.items() if labels)
             parts.append("".join(f"# {comment(line)}\n" for line in others))
         return "\n".join(part for part in parts if part)
 
@@ -130,11 +132,6 @@ class Coverage:
 
 def _of(topic: str) -> str:
     return f" of {topic}" if topic else ""
-
-
-def _some(labels: Sequence[str]) -> str:
-    more = f" and {len(labels) - _MOST_LISTED} more" if len(labels) > _MOST_LISTED else ""
-    return ", ".join(labels[:_MOST_LISTED]) + more
 
 
 def suggest_mapping(

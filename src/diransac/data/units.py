@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["conversion", "one_turn", "same_unit", "split_unit"]
 
-_NEGLIGIBLE = 1e-9
-_STANDARD_GRAVITY = 9.80665
 
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 _TOKEN = re.compile(r"\s*([*/^()]|[+-]?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?|[^\W\d_]+|[°%])")
@@ -75,11 +73,9 @@ _PREFIXABLE = {
     "ohm": _si("kg m2 s-3 A-2"),
     "Ω": _si("kg m2 s-3 A-2"),
 }
-_DEGREE = _si("rad", math.pi / 180.0)
-_TURN = _si("rad", 2.0 * math.pi)
 _NAMED = {
-    **dict.fromkeys(("deg", "degree", "degrees", "°"), _DEGREE),
-    **dict.fromkeys(("rev", "turn", "turns"), _TURN),
+    **dict.fromkeys(("deg", "degree", "degrees", "°"), _si("rad", math.pi / 180.0)),
+    **dict.fromkeys(("rev", "turn", "turns"), _si("rad", 2.0 * math.pi)),
     "rpm": _si("rad s-1", 2.0 * math.pi / 60.0),
     "min": _si("s", 60.0),
     "h": _si("s", 3600.0),
@@ -110,7 +106,7 @@ def split_unit(header: str) -> tuple[str, str | None]:
 def same_unit(a: str, b: str) -> bool:
     """True for two spellings of one unit, such as ``m/s^2`` and ``m s^-2``; unknown units match literally."""
     factor = conversion(a, b)
-    return factor is not None and math.isclose(factor, 1.0, rel_tol=_NEGLIGIBLE)
+    return factor is not None and math.isclose(factor, 1.0, rel_tol=1e-9)
 
 
 def conversion(a: str, b: str) -> float | None:
@@ -142,7 +138,7 @@ def _meanings(text: str) -> list[_Unit]:
     """Units that a text can mean; none if it cannot be read."""
     units = [] if (unit := _parse(text)) is None else [unit]
     if text.strip() == "g":
-        units.append(_si("m s-2", _STANDARD_GRAVITY))
+        units.append(_si("m s-2", 9.80665))
     return units
 
 

@@ -29,9 +29,8 @@ from diransac.plots.figure import (
     write_at,
 )
 from diransac.plots.study import axis_label, level_labels, method_looks, n_trials, title_of
-from diransac.study.database import damage
 from diransac.study.method_choice import TRUE
-from diransac.study.store import Store
+from diransac.study.store import Store, damage
 from diransac.study.summary import ParameterErrors, Summary, summarise
 from diransac.text_table import superscript
 

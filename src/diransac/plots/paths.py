@@ -96,7 +96,7 @@ def plot_paths(
 def levels_with_paths(store: str | Path) -> list[str]:
     """Levels with paths in a store.  Raises StudyError: there is no such store."""
     with Store.existing(store) as kept:
-        query = "SELECT DISTINCT level FROM trials JOIN cells USING (level, method) WHERE paths NOT NULL"
+        query = "SELECT DISTINCT level FROM trials JOIN asked USING (level, trial, method) WHERE paths NOT NULL"
         return [level for (level,) in kept.select(query)]
 
 

@@ -1,19 +1,18 @@
 """Studies: grids of Monte-Carlo trials from a TOML file, run on any executor, kept in a store that can be resumed.
 
-In comes a study file, or a fleet of logs; out comes a store, one SQLite file, and its summary.  Begin with `run.py`,
-and `trials.py`, the work of a worker.
+In comes a study file, or a fleet of logs; out comes a store, one SQLite file, and its summary.  Begin with `trials.py`.
 
 | file | contents |
 |---|---|
-| `run.py`, `engine.py` | `run_study`; batches on processes of this machine, an executor or a cluster |
+| `engine.py`, `store.py` | rows by batches on processes, an executor or a cluster; the SQLite file that keeps them |
 | `specification.py`, `axis.py`, `plants.py`, `method_choice.py`, `tables.py` | a study as pydantic models |
 | `library.py`, `builtin/`, `template.toml` | sources of studies; those of the paper's figures |
 | `machines.py` | plants with effects that their models leave out |
-| `trials.py`, `data.py` | a trial; its data |
+| `trials.py`, `data.py` | `run_study`; a trial; its data |
 | `assessment.py` | pseudo-true parameters and errors relative to them |
-| `fleet.py`, `fleet_store.py` | `identify_each`: one result per log; its rows |
+| `fleet.py` | `identify_each`: one result per log |
 | `fleet_findings.py` | vehicles that differ, change or drift |
-| `database.py`, `store.py`, `reading.py`, `summary.py` | one SQLite file, its rows, and their summary |
+| `reading.py`, `summary.py` | rows of a study and their summary |
 """
 
 from diransac.study.data import TrialData, trial_data
@@ -23,9 +22,9 @@ from diransac.study.fleet_findings import Change, Drift, FleetSummary, Parameter
 from diransac.study.library import builtin_names, load, template
 from diransac.study.method_choice import MethodChoice
 from diransac.study.reading import Status, TrialCounts, about, export, paths, read, status
-from diransac.study.run import run_study
 from diransac.study.specification import FlightChoice, Study
 from diransac.study.summary import ParameterErrors, Summary, TrackingErrors, summarise
+from diransac.study.trials import run_study
 
 __all__ = [
     "Change",

@@ -4,40 +4,26 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import Field, model_serializer, model_validator
 
 from diransac.errors import SettingsError
 from diransac.study.tables import Table, Text, flat, is_number, unknown_key
 
-__all__ = ["Axis", "Level"]
-
-
-class Level(NamedTuple):
-    """One level of an axis.
-
-    Parameters
-    ----------
-    text : canonical text, the same for equal values; seeds of trials derive from it
-    changes : dotted path in the study -> value at this level
-    """
-
-    text: str
-    changes: Mapping[str, Any]
+__all__ = ["Axis"]
 
 
 class Axis(Table):
     """The quantity that varies in a study, the table ``[axis]``.
 
-    A file has one of three forms: a ``path``, whose key takes each of a list of ``levels``; a list of ``levels`` and a
-    table of ``values``, in which each path has a list of as many; or a table of ``levels``, each with its changes.
+    A file has a ``path``, whose key takes each of a list of ``levels``, or a table of ``levels`` with their changes.
 
     Parameters
     ----------
     name, unit : for tables and figures; the name is the path by default
     path : dotted path of the key that takes the levels, of the first form
-    tables : text of each level -> changes by dotted path; ``levels`` in a file
+    levels : canonical text of each level, from which seeds of trials derive -> changes by dotted path, in order
     """
 
     PLACE: ClassVar[str] = "axis"
@@ -45,43 +31,35 @@ class Axis(Table):
     name: Text = "level"
     unit: Text = ""
     path: Text = ""
-    tables: dict[str, dict[str, Any]] = Field(alias="levels", description="a list of one or more")
+    levels: dict[str, dict[str, Any]] = Field(description="a list of one or more")
 
     @model_validator(mode="before")
     @classmethod
     def _by_level(cls, table: Any) -> Any:
         if not isinstance(table, Mapping) or "levels" not in table:
             return table
-        given, levels = dict(table), table["levels"]
+        levels, path = table["levels"], table.get("path")
         if isinstance(levels, Mapping):
-            for key in ("path", "values"):
-                if key in given:
-                    raise SettingsError(unknown_key("axis", key, ["levels", "name", "unit"]))
-            return {**given, "levels": _of_words(levels)}
+            if "path" in table:
+                raise SettingsError(unknown_key("axis", "path", ["levels", "name", "unit"]))
+            return {**table, "levels": _of_words(levels)}
         if not isinstance(levels, list | tuple) or not levels:
             raise SettingsError(f"axis.levels is {levels!r:.60}; give a list of one or more")
-        texts = [_level_text(_level_value(level)) for level in levels]
+        values = [_level_value(level) for level in levels]
+        texts = [_level_text(value) for value in values]
         if len(set(texts)) < len(texts):
             raise SettingsError(f"axis.levels has a level twice; found {', '.join(texts)}")
-        if "values" in given:
-            rows = _of_columns(given.pop("values"), len(levels))
-        elif isinstance(path := given.get("path"), str):
-            given, rows = {"name": path, **given}, [{path: _as_whole(_level_value(level))} for level in levels]
-        else:
+        if not isinstance(path, str):
             found = "is missing" if path is None else f"is {path!r:.60}"
             raise SettingsError(f"axis.path {found}; give the dotted path of the key that takes the levels")
-        return {**given, "levels": dict(zip(texts, rows, strict=True))}
+        changes = [{path: _as_whole(value)} for value in values]
+        return {"name": path, **table, "levels": dict(zip(texts, changes, strict=True))}
 
     @model_serializer
     def _as_written(self) -> dict[str, Any]:
         own = {"path": self.path} if self.path else {}
-        levels = [changes[self.path] for changes in self.tables.values()] if self.path else self.tables
+        levels = [changes[self.path] for changes in self.levels.values()] if self.path else self.levels
         return {"name": self.name, "unit": self.unit, **own, "levels": levels}
-
-    @property
-    def levels(self) -> tuple[Level, ...]:
-        """Levels in the order of the file."""
-        return tuple(Level(text, changes) for text, changes in self.tables.items())
 
     def subset(self, texts: Sequence[str]) -> Self:
         """The same axis at some levels; those of a path may be new.
@@ -92,21 +70,21 @@ class Axis(Table):
             No level is named, or one does not exist.
         """
         if not texts:
-            raise SettingsError(f"no level is named; there are {', '.join(self.tables)}")
-        return self.model_copy(update={"tables": dict(map(self._level, texts))})
+            raise SettingsError(f"no level is named; there are {', '.join(self.levels)}")
+        return self.model_copy(update={"levels": dict(map(self._level, texts))})
 
     def _level(self, given: str) -> tuple[str, dict[str, Any]]:
         """Text and changes of a level.  Raises SettingsError: it does not exist."""
-        if given in self.tables:  # the text itself: a word may look like a number, such as 1e3
-            return given, self.tables[given]
+        if given in self.levels:  # the text itself: a word may look like a number, such as 1e3
+            return given, self.levels[given]
         value = _level_value(_number_or_word(given), "a level")
         text = _level_text(value)
-        if text in self.tables:
-            return text, self.tables[text]
-        first = next(iter(self.tables.values()))
+        if text in self.levels:
+            return text, self.levels[text]
+        first = next(iter(self.levels.values()))
         if self.path and isinstance(value, str) == isinstance(first[self.path], str):
             return text, {self.path: _as_whole(value)}
-        raise SettingsError(f'there is no level "{text}" of {self.name}; there are {", ".join(self.tables)}')
+        raise SettingsError(f'there is no level "{text}" of {self.name}; there are {", ".join(self.levels)}')
 
 
 def _of_words(levels: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -120,21 +98,6 @@ def _of_words(levels: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
                 f'axis.levels."{word}" is {changes!r:.60}; give a table of what it changes, {{}} for nothing'
             )
     return {word: dict(flat(changes)) for word, changes in levels.items()}
-
-
-def _of_columns(values: Any, n_levels: int) -> list[dict[str, Any]]:
-    """Changes of each level from a list of values for each path."""
-    if not isinstance(values, Mapping):
-        raise SettingsError(f"axis.values is {values!r:.60}; give a table")
-    columns = dict(flat(values))
-    for path, column in columns.items():
-        if not isinstance(column, list | tuple) or len(column) != n_levels:
-            raise SettingsError(
-                f"axis.values.{path} is {column!r:.60}; give a list of {n_levels} values, one per level"
-            )
-    if not columns:
-        raise SettingsError("axis.values is empty; give a list of values, one per level, for a dotted path")
-    return [{path: column[k] for path, column in columns.items()} for k in range(n_levels)]
 
 
 def _level_value(value: object, where: str = "axis.levels") -> float | str:

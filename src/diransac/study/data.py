@@ -77,9 +77,9 @@ def trial_data(study: Study | Mapping[str, Any] | str | Path, level: str | float
         The trial has no data: there is no plan, or the flight diverged. Unexpected errors are raised as they are.
     """
     known = load(study)
-    (point,) = known.axis.subset([str(level)]).levels
+    (text,) = known.axis.subset([str(level)]).levels
     check_whole("trial", trial, least=0)
-    (found,) = trial_data_batch(known.at(point.text), point.text, [trial])
+    (found,) = trial_data_batch(known.at(text), text, [trial])
     if isinstance(found, Exception):
         raise found
     return found

@@ -1,4 +1,4 @@
-"""Work in batches: handed to workers, kept as rows, and repeated where a worker was lost.
+"""`run_work`: rows computed in batches by workers, kept in a store, and computed again where a worker was lost.
 
 Workers are processes of this machine or those of an executor. Work never runs in the process that receives Ctrl-C:
 solvers swallow the interrupt and report that there is no plan.
@@ -12,9 +12,8 @@ import os
 import random
 import signal
 import threading
-from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from collections.abc import Set as AbstractSet
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -25,210 +24,184 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import contextmanager
+from itertools import chain
 from multiprocessing.context import SpawnContext, SpawnProcess
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 from diransac.errors import SettingsError, StudyError
 from diransac.process import module_path_safe
 from diransac.simulation import default_threads
-from diransac.time_limit import time_left
+from diransac.study.store import Key, Store, Work
+from diransac.time_limit import time_left, time_limited
 
-__all__ = ["Batch", "Given", "Progress", "Rows", "Workers", "connected", "distribute", "workers_of"]
+__all__ = ["Computation", "Progress", "connected", "run_work"]
 
 Progress = Callable[[int, int], None]
 """Called with (rows present, rows asked for)."""
 
+Computation = Callable[[Sequence[Key]], Sequence[dict[str, Any]]]
+"""Rows of some keys, which differ in one trial or log; called in a worker, to which it is pickled."""
+
 _ATTEMPTS = 3
 
 
-class Batch(Protocol):
-    """Rows that one call in a worker returns."""
-
-    @property
-    def rows(self) -> Iterable[Hashable]:
-        """Key of each row."""
-
-    @property
-    def task(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        """Function of a module, and its arguments, all of which can be pickled; it returns the rows."""
-
-    def without(self, finished: AbstractSet[Any]) -> Sequence[Batch]:
-        """Batches of the rows that are not finished."""
-
-    def __str__(self) -> str:
-        """Subject of a sentence about the batch, in the plural."""
-
-
-class Rows(Protocol):
-    """A store, as the engine uses it."""
-
-    def finished_in(self, batch: Any) -> AbstractSet[Any]:
-        """Keys of the rows of a batch that are present."""
-
-    def add(self, rows: Any) -> int:
-        """Number of new rows, written in one transaction."""
-
-
-def distribute(
-    batches: Iterable[Batch], store: Rows, workers: Workers, *, asked: int, progress: Progress | None = None
+def run_work(
+    work: Work,
+    compute: Computation,
+    *,
+    store: str | Path,
+    executor: Executor | None,
+    jobs: int | None,
+    batch_size: int,
+    tasks: int | None,
+    time_limit: float | None,
+    progress: Progress | None,
+    stale: Callable[[Store, Iterable[Key]], Iterable[Key]] = lambda *_: (),
 ) -> None:
-    """Run batches, or those that end within the time limit of the context, and keep their rows.
+    """Compute the rows of a work that a store lacks.
 
     Parameters
     ----------
-    batches : of the rows that the store lacks; another process may add some of them meanwhile
-    store : takes the rows of a batch as it ends
-    workers : run the batches; they are stopped at the end
-    asked : rows that the store has or shall have
-    progress : called with (rows present, rows asked for) at the start and whenever rows are added
+    work : study or fleet
+    compute : of a batch of rows; a row that fails says so, an error ends the run
+    batch_size : trials or logs of a batch
+    store, executor, jobs, tasks, time_limit, progress : as in `run_study`
+    stale : those of some rows of the store that are to be computed again
 
     Raises
     ------
+    SettingsError
+        Both an executor and a number of jobs, or numbers below one.
     StudyError
-        A batch is lost repeatedly, or a worker cannot do the work at all.
+        The store has another configuration, a batch is lost repeatedly, or a worker cannot do the work at all.
     """
-    try:
-        _Work(batches, store, asked, progress or (lambda _done, _asked: None)).run(workers)
-    finally:
-        workers.stop()
+    for name, number in (("jobs", jobs), ("batch_size", batch_size), ("tasks", tasks)):
+        if number is not None and number < 1:
+            raise SettingsError(f"{name} is {number}; give at least 1")
+    if executor is not None and jobs is not None:
+        raise SettingsError(
+            "jobs is the number of processes on this machine, but an executor is given; give one of them"
+        )
+    jobs = default_threads() if jobs is None else jobs
+    # Tasks handed out: to an executor of unknown size 64, to a process one that runs and one that waits.
+    tasks = tasks or (64 if executor else 2 * jobs)
+    with Store(store, work) as kept, time_limited(time_limit):
+        asked = work.asked
+        kept.forget(stale(kept, asked))
+        finished = kept.finished()
+        missing = [key for key in asked if key not in finished]
+        batches = _batches(missing, batch_size)
+        run = _Run(compute, batches, kept, len(asked), progress or (lambda _done, _asked: None))
+        if executor is not None:
+            run.on(executor, tasks)
+            return
+        processes = Processes(jobs)
+        try:
+            run.on(processes, tasks)
+        finally:
+            processes.shutdown()
 
 
-class _Work:
+def _batches(keys: Iterable[Key], size: int) -> list[tuple[Key, ...]]:
+    """Keys in batches of one level and `size` trials at most; a log is a trial."""
+    levels: dict[Key, dict[Key, list[Key]]] = defaultdict(lambda: defaultdict(list))
+    for key in keys:
+        levels[key[:1] if len(key) > 1 else ()][key[:2]].append(key)
+    of_trials = [list(trials.values()) for trials in levels.values()]
+    return [tuple(chain(*some[k : k + size])) for some in of_trials for k in range(0, len(some), size)]
+
+
+class _Run:
     """Batches that wait and batches that run."""
 
-    def __init__(self, batches: Iterable[Batch], store: Rows, asked: int, progress: Progress) -> None:
-        self._store, self._progress, self._n_asked = store, progress, asked
-        waiting = list(batches)
-        self._missing = {row for batch in waiting for row in batch.rows}
+    def __init__(
+        self, compute: Computation, batches: Sequence[tuple[Key, ...]], store: Store, asked: int, progress: Progress
+    ) -> None:
+        self._compute, self._store, self._progress, self._n_asked = compute, store, progress, asked
+        self._missing = set(chain(*batches))
         # Another process on the same store has another order, so that both seldom run the same batch.
-        random.SystemRandom().shuffle(waiting)
-        self._waiting = deque((batch, 0) for batch in waiting)
-        self._running: dict[Future[Any], tuple[Batch, int]] = {}
+        self._waiting = deque((batch, 0) for batch in random.SystemRandom().sample(batches, len(batches)))
+        self._running: dict[Future[Any], tuple[tuple[Key, ...], int]] = {}
         self._note(())
 
-    def run(self, workers: Workers) -> None:
-        """Run all batches, or those that end within the time limit.
+    def on(self, executor: Executor, tasks: int) -> None:
+        """Run all batches, or those that end within the time limit of the context; others are cancelled.
 
         Raises StudyError: a batch is lost repeatedly, or a worker cannot do the work.
         """
-        while (self._waiting or self._running) and (left := time_left()) > 0.0:
-            while self._waiting and len(self._running) < workers.tasks:
-                self._hand_out(workers, *self._waiting.popleft())
-            timeout = left if math.isfinite(left) else None
-            for future in wait(self._running, timeout, return_when=FIRST_COMPLETED).done:
-                self._keep(*self._running.pop(future), future)
+        try:
+            while (self._waiting or self._running) and (left := time_left()) > 0.0:
+                while self._waiting and len(self._running) < tasks:
+                    self._hand_out(executor, *self._waiting.popleft())
+                timeout = left if math.isfinite(left) else None
+                for future in wait(self._running, timeout, return_when=FIRST_COMPLETED).done:
+                    self._keep(*self._running.pop(future), future)
+        finally:
+            for future in self._running:
+                future.cancel()
 
-    def _hand_out(self, workers: Workers, batch: Batch, attempts: int) -> None:
+    def _hand_out(self, executor: Executor, batch: tuple[Key, ...], attempts: int) -> None:
         """Submit a batch, without rows that another process has kept meanwhile."""
-        finished = self._store.finished_in(batch)
-        if not self._missing.isdisjoint(finished):
+        finished = self._store.finished(batch)
+        if finished:
             self._note(finished)
-        for left in batch.without(finished):
-            function, arguments = left.task
-            self._running[workers.submit(function, *arguments)] = left, attempts
+        left = tuple(key for key in batch if key not in finished)
+        if left:
+            self._running[executor.submit(self._compute, left)] = left, attempts
 
-    def _keep(self, batch: Batch, attempts: int, future: Future[Any]) -> None:
+    def _keep(self, batch: tuple[Key, ...], attempts: int, future: Future[Any]) -> None:
         """Keep the rows of a batch, or queue it again if its worker was lost."""
         error = CancelledError("the executor cancelled it") if future.cancelled() else future.exception()
         if error is None:
             self._store.add(future.result())
-            self._note(batch.rows)
+            self._note(batch)
             return
         if isinstance(error, StudyError):  # the worker is alive and would fail again
             raise StudyError(f"{error}; finished rows are kept") from error
         if attempts + 1 == _ATTEMPTS:
             guard = "" if not isinstance(error, BrokenExecutor) else ' (in a script, under if __name__ == "__main__":)'
             raise StudyError(
-                f"{batch} were lost {_ATTEMPTS} times, at last by {type(error).__name__}: {error}; "
+                f"{_named(batch)} were lost {_ATTEMPTS} times, at last by {type(error).__name__}: {error}; "
                 f"finished rows are kept: look at the workers, then run again{guard}"
             ) from error
         self._waiting.append((batch, attempts + 1))
 
-    def _note(self, finished: Iterable[Hashable]) -> None:
+    def _note(self, finished: Iterable[Key]) -> None:
         """Report the number of rows, these included."""
         self._missing.difference_update(finished)
         self._progress(self._n_asked - len(self._missing), self._n_asked)
 
 
-# Workers --------------------------------------------------------------------------------------------------------------
+def _named(batch: Sequence[Key]) -> str:
+    """Subject of a sentence about a batch, in the plural."""
+    return f"rows {', '.join(' '.join(map(str, key)) for key in batch)}"
 
 
-class Workers(Protocol):
-    """Runs tasks; `stop` drops those that are not done."""
-
-    tasks: int
-    """Number of tasks handed out at a time."""
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Future of a task."""
-
-    def stop(self) -> None:
-        """Drop the tasks that run or wait."""
-
-
-def workers_of(executor: Executor | None, jobs: int | None, tasks: int | None) -> Workers:
-    """Workers of an executor, or processes of this machine.
-
-    Raises SettingsError: both an executor and a number of jobs, or numbers below one.
-    """
-    for name, number in (("jobs", jobs), ("tasks", tasks)):
-        if number is not None and number < 1:
-            raise SettingsError(f"{name} is {number}; give at least 1")
-    if executor is not None:
-        if jobs is not None:
-            raise SettingsError(
-                "jobs is the number of processes on this machine, but an executor is given; give one of them"
-            )
-        # Tasks that are handed to an executor of unknown size.
-        return Given(executor, tasks or 64)
-    jobs = default_threads() if jobs is None else jobs
-    # Tasks per worker that are handed out: one that runs and one that waits.
-    return Processes(jobs, tasks or 2 * jobs)
-
-
-class Given:
-    """An executor of the caller, who also shuts it down."""
-
-    def __init__(self, executor: Executor, tasks: int) -> None:
-        self.tasks, self._executor = tasks, executor
-        self._futures: set[Future[Any]] = set()
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Future of a task in the executor."""
-        future = self._executor.submit(function, *arguments)
-        self._futures.add(future)
-        future.add_done_callback(self._futures.discard)
-        return future
-
-    def stop(self) -> None:
-        """Cancel tasks that have not begun."""
-        for future in list(self._futures):
-            future.cancel()
-
-
-class Processes:
+# Processes of this machine --------------------------------------------------------------------------------------------
+class Processes(Executor):
     """Processes of this machine; those that die are replaced."""
 
-    def __init__(self, jobs: int, tasks: int) -> None:
-        self.tasks, self._jobs = tasks, jobs
+    def __init__(self, jobs: int) -> None:
+        self._jobs = jobs
         self._pool = self._new_pool()
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
         """Future of a task in a process; a pool with a dead process is replaced, as it takes no more tasks."""
         with _interrupts_held(), module_path_safe():
             try:
-                return self._pool.submit(function, *arguments)
+                return self._pool.submit(function, *arguments, **named)
             except BrokenExecutor:
                 self._pool.shutdown(wait=True)
                 self._pool = self._new_pool()
-                return self._pool.submit(function, *arguments)
+                return self._pool.submit(function, *arguments, **named)
 
-    def stop(self) -> None:
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
         """Terminate the processes."""
         for process in self._begun.processes:
             if process.pid is not None:  # it was started
                 process.terminate()
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool.shutdown(wait=wait, cancel_futures=cancel_futures)
 
     def _new_pool(self) -> ProcessPoolExecutor:
         self._begun = _Begun()

@@ -7,11 +7,11 @@ import pickle
 import platform
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
+from hashlib import sha256
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -28,14 +28,13 @@ from diransac.identification.method import Method
 from diransac.identification.methods import DEFAULT
 from diransac.identification.result import Result
 from diransac.identification.settings import EXECUTION, Settings
+from diransac.limits import check_ordinary
 from diransac.model import Model
 from diransac.plain_text import cell
 from diransac.process import single_threaded
-from diransac.study.database import AGAIN, LARGEST, damage, quoted, word
-from diransac.study.engine import Progress, distribute, workers_of
-from diransac.study.fleet_store import ERROR, FleetStore, columns_of, marks_of
+from diransac.study.engine import Progress, run_work
+from diransac.study.store import AGAIN, FLEET, LARGEST, Key, Kind, Store, damage, quoted, word
 from diransac.study.trials import versions
-from diransac.time_limit import time_limited
 
 __all__ = ["FleetRows", "FleetStatus", "export_fleet", "fleet_status", "identify_each", "read_fleet"]
 
@@ -73,7 +72,7 @@ def identify_each(
         order of the files is not that of time, ``(?P<time>...)``: a number, or a text that sorts by time.  None: the
         identity that a log's own metadata has (``sys_uuid`` of a ULog), else ``"unknown"``.
     read : callable, optional
-        Log of a file; a function of a module or an object that can be pickled, as workers call it.
+        Log of a file; it can be pickled.
     configuration : mapping of str to object, optional
         Further values on which rows depend, ready for JSON, such as those of `read`; a store is resumed only with the
         same.
@@ -96,31 +95,68 @@ def identify_each(
     Notes
     -----
     The row of a log depends on its file and the configuration alone.  A log that cannot be read or identified is a row
-    with the reason.  Rows are committed as batches end; the same call after an interruption runs the others, and those
-    whose files have changed since.  Logs that a store lacks follow those it has, whose order only a call that names all
-    of them changes.  To run logs that failed again, delete their rows or begin another store.
+    with the reason.  The same call after an interruption runs the others, and those whose files have changed since.
+    Logs that a store lacks follow those it has, whose order only a call that names all of them changes.
     """
-    if batch_size < 1:
-        raise SettingsError(f"batch_size is {batch_size}; give at least 1")
     chosen = method_object(method, arguments.pop("settings", None), arguments.pop("estimator", None))
     signature(identify).bind(model, None, chosen, **arguments)  # a name that it lacks fails here, not once per log
-    asked = _asked(logs, vehicle)
-    work = pickle.dumps((model, chosen, read, arguments))
     wanted = {
         "model": model.fingerprint,
         "method": [chosen.name, _without_execution(chosen)],
         "arguments": repr(sorted(arguments.items())),
         **(configuration or {}),
     }
-    workers = workers_of(executor, jobs, tasks)
-    with FleetStore(store, model, wanted) as kept, time_limited(time_limit):
-        kept.ask_for(asked)
-        kept.forget_changed(name for name, *_ in asked)
-        finished = kept.finished()
-        missing = [name for name, *_ in asked if name not in finished]
-        batches = [_Batch(work, tuple(missing[k : k + batch_size])) for k in range(0, len(missing), batch_size)]
-        distribute(batches, kept, workers, asked=len(asked), progress=progress)
+    run_work(
+        Fleet(model, {"fleet": wanted}, _asked(logs, vehicle)),
+        partial(identify_logs, pickle.dumps((model, chosen, read, arguments))),
+        store=store,
+        executor=executor,
+        jobs=jobs,
+        batch_size=batch_size,
+        tasks=tasks,
+        time_limit=time_limit,
+        progress=progress,
+        stale=_changed,
+    )
     return fleet_status(store)
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Logs to be identified.
+
+    Parameters
+    ----------
+    configuration : as `Work.configuration`
+    asked : name of each log -> its vehicle and time
+    """
+
+    model: Model
+    configuration: Mapping[str, Mapping[str, Any]]
+    asked: Mapping[Key, tuple[str | None, str | None]]
+
+    @property
+    def kind(self) -> Kind:
+        """Kind of the store."""
+        return FLEET
+
+    @property
+    def columns(self) -> dict[str, str]:
+        """SQL type of each column of a row."""
+        return {
+            **dict.fromkeys(("own_vehicle", "verdict", "findings"), "TEXT"),
+            "duration": "REAL",
+            **{f"{kind}_{name}": "REAL" for name in self.model.parameters for kind in ("parameter", "standard_error")},
+            **dict.fromkeys(("fit_error", "inlier_fraction"), "REAL"),
+            **dict.fromkeys(("stop_reason", "file_stamp", "file_hash"), "TEXT"),
+            "seconds": "REAL NOT NULL",
+        }
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """Name of the model, and units of its parameters."""
+        units = {name: parameter.unit for name, parameter in self.model.parameters.items()}
+        return {"model_name": self.model.name, "units": units}
 
 
 def _without_execution(method: Method) -> str:
@@ -129,34 +165,8 @@ def _without_execution(method: Method) -> str:
     return repr(replace(method, criteria=replace(method.criteria, **defaults)))  # type: ignore[type-var]
 
 
-@dataclass(frozen=True)
-class _Batch:
-    """Logs that one call identifies, one after the other."""
-
-    work: bytes
-    logs: tuple[str, ...]
-
-    @property
-    def rows(self) -> tuple[str, ...]:
-        """Name of each log."""
-        return self.logs
-
-    @property
-    def task(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        """The call that identifies them."""
-        return identify_logs, (self.work, self.logs)
-
-    def without(self, finished: AbstractSet[str]) -> list[_Batch]:
-        """The batch of the logs that are not finished, if any."""
-        left = tuple(name for name in self.logs if name not in finished)
-        return [_Batch(self.work, left)] if left else []
-
-    def __str__(self) -> str:
-        return f"logs {', '.join(self.logs)}"
-
-
-def _asked(logs: Sequence[str | Path], pattern: str | None) -> list[tuple[str, int, str | None, str | None]]:
-    """Name, place, vehicle and time of each file, as far as the pattern finds them.
+def _asked(logs: Sequence[str | Path], pattern: str | None) -> dict[Key, tuple[str | None, str | None]]:
+    """Vehicle and time of each file, as far as the pattern finds them.
 
     Raises SettingsError: the pattern is wrong, or a file is named twice.
     """
@@ -165,31 +175,31 @@ def _asked(logs: Sequence[str | Path], pattern: str | None) -> list[tuple[str, i
     if twice or not names:
         raise SettingsError(f'log "{twice[0]}" is named twice' if twice else "no log is named; give files")
     if pattern is None:
-        return [(name, k, None, None) for k, name in enumerate(names)]
+        return {(name,): (None, None) for name in names}
     try:
         search = re.compile(pattern)
     except re.error as error:
         raise SettingsError(f"vehicle pattern {pattern!r}: {error}; see Python's re") from error
     if "vehicle" not in search.groupindex:
         raise SettingsError(f"vehicle pattern {pattern!r} has no group (?P<vehicle>...); add one")
-    found = []
-    for k, name in enumerate(names):
+    found: dict[Key, tuple[str | None, str | None]] = {}
+    for name in names:
         match = search.search(name)
         groups = match.groupdict() if match else {"vehicle": ""}
         if groups["vehicle"] == "":
             raise SettingsError(f'vehicle pattern {pattern!r} finds no vehicle in log "{name}"')
-        found.append((name, k, groups["vehicle"], groups.get("time")))
+        found[name,] = groups["vehicle"], groups.get("time")
     return found
 
 
 # Worker --------------------------------------------------------------------------------------------------------------
-def identify_logs(work: bytes, logs: Sequence[str]) -> list[dict[str, Any]]:
+def identify_logs(work: bytes, keys: Sequence[Key]) -> list[dict[str, Any]]:
     """One row per log, by column of the store; a log that fails is a row with the error.
 
     Parameters
     ----------
     work : pickle of model, method, reader and arguments of `identify`
-    logs : names of files
+    keys : name of each log
 
     Raises
     ------
@@ -198,7 +208,7 @@ def identify_logs(work: bytes, logs: Sequence[str]) -> list[dict[str, Any]]:
     """
     model, method, read, arguments = _unpickled(work)
     with single_threaded():  # all cores run logs
-        return [_row(name, model, method, read, arguments) for name in logs]
+        return [_row(name, model, method, read, arguments) for (name,) in keys]
 
 
 @lru_cache(maxsize=4)
@@ -218,7 +228,7 @@ def _row(
     arguments: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The row of one log."""
-    begin, row = time.perf_counter(), dict[str, Any](log=name, status="done", error=None, **marks_of(Path(name)))
+    begin, row = time.perf_counter(), dict[str, Any](log=name, status="done", error=None, **_marks(Path(name)))
     try:
         log = read(Path(name))
         row |= {"own_vehicle": _identity(log), "duration": float(log.time[-1] - log.time[0])}
@@ -243,6 +253,51 @@ def _figures(result: Result) -> dict[str, Any]:
     finite = {name: float(x) if np.isfinite(x) else None for name, x in values.items()}
     against = "; ".join(finding for finding in result.findings if finding.level == "bad")
     return {**finite, "verdict": result.verdict, "stop_reason": result.stop_reason, "findings": against or None}
+
+
+# Files -------------------------------------------------------------------------------------------------------------
+def _marks(path: Path) -> dict[str, str | None]:
+    """Marks of a file, or of a folder with all of its files: of sizes and times, and of contents; None without it."""
+    try:
+        return {"file_stamp": _stamp(path), "file_hash": _hash(path)}
+    except OSError:
+        return {"file_stamp": None, "file_hash": None}
+
+
+def _stamp(path: Path) -> str:
+    """Sizes and times of the files of a log.  Raises OSError: it cannot be read."""
+    about = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in _files(path)]
+    return sha256(repr(about).encode()).hexdigest()
+
+
+def _hash(path: Path) -> str:
+    """Contents of the files of a log.  Raises OSError: it cannot be read."""
+    found = sha256()
+    for file in _files(path):
+        found.update(repr((file.name, file.stat().st_size)).encode())
+        check_ordinary(file)
+        with file.open("rb") as data:
+            while block := data.read(2**20):
+                found.update(block)
+    return found.hexdigest()
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(x for x in path.rglob("*") if x.is_file()) if path.is_dir() else [path]
+
+
+def _changed(store: Store, logs: Iterable[Key]) -> list[Key]:
+    """Logs whose files differ from those that were read; files that are not here stay."""
+    kept = {name: marks for name, *marks in store.select("SELECT log, file_stamp, file_hash FROM trials")}
+    return [(name,) for (name,) in logs if name in kept and _differs(Path(name), *kept[name])]
+
+
+def _differs(path: Path, stamp: str | None, content: str | None) -> bool:
+    """True if a file is here and is not the one with these marks."""
+    try:
+        return path.exists() and _stamp(path) != stamp and _hash(path) != content
+    except OSError:
+        return False
 
 
 # Reading -------------------------------------------------------------------------------------------------------------
@@ -303,15 +358,15 @@ class FleetRows:
 
 def fleet_status(store: str | Path) -> FleetStatus:
     """Number of logs that a store has, lacks, or that failed.  Raises StudyError: there is no such store."""
-    with FleetStore.existing(store) as kept:
+    with Store.existing(store, FLEET) as kept:
         return _status(kept)
 
 
-def _status(kept: FleetStore) -> FleetStatus:
-    counts = dict(kept.select("SELECT status, count(*) FROM logs JOIN asked USING (log) GROUP BY status"))
+def _status(kept: Store) -> FleetStatus:
+    counts = dict(kept.select("SELECT status, count(*) FROM trials JOIN asked USING (log) GROUP BY status"))
     ((asked,),) = kept.select("SELECT count(*) FROM asked")
     failures = kept.select(
-        "SELECT replace(error, log, 'LOG') AS reason, count(*) AS n FROM logs WHERE status = 'failed' "
+        "SELECT replace(error, log, 'LOG') AS reason, count(*) AS n FROM trials WHERE status = 'failed' "
         "GROUP BY reason ORDER BY n DESC, reason LIMIT 20"
     )
     with damage(kept.path):
@@ -327,17 +382,17 @@ def read_fleet(store: str | Path) -> FleetRows:
     StudyError
         There is no such store, or it is damaged.
     """
-    with FleetStore.existing(store) as kept:
-        about, status = kept.configuration, _status(kept)
+    with Store.existing(store, FLEET) as kept:
+        about, columns, status = kept.about, kept.columns, _status(kept)
         with damage(kept.path):
             units = {word(name): word(unit) for name, unit in about["units"].items()}
             model = word(about["model_name"])
-        of_parameters = columns_of(units)
-        columns = [quoted(of_parameters[f"{kind}_{name}"]) for kind in ("parameter", ERROR) for name in units]
+            names = [f"{kind}_{name}" for kind in ("parameter", "standard_error") for name in units]
+            values = [quoted(columns[name][0]) for name in names]
         # Vehicle of a log that names none.
         rows = kept.select(
             "SELECT log, coalesce(vehicle, own_vehicle, ?), time, place, verdict, "
-            f"{', '.join(columns)} FROM logs JOIN asked USING (log) WHERE status = 'done'",
+            f"{', '.join(values)} FROM trials JOIN asked USING (log) WHERE status = 'done'",
             ("unknown",),
         )
     with damage(Path(store)):
@@ -376,16 +431,16 @@ def export_fleet(store: str | Path, path: str | Path) -> None:
     StudyError
         There is no such store, or it has values that are neither numbers nor texts.
     """
-    with FleetStore.existing(store) as kept:
+    with Store.existing(store, FLEET) as kept:
         # Columns that are not exported.
         names = [
             name
-            for _, name, *_ in kept.select("PRAGMA table_info(logs)")
+            for _, name, *_ in kept.select("PRAGMA table_info(trials)")
             if name not in ("own_vehicle", "file_stamp", "file_hash")
         ]
         columns = ", ".join(map(quoted, names[1:]))
         rows = kept.select(
-            f"SELECT log, coalesce(vehicle, own_vehicle), time, {columns} FROM asked LEFT JOIN logs USING (log) "
+            f"SELECT log, coalesce(vehicle, own_vehicle), time, {columns} FROM asked LEFT JOIN trials USING (log) "
             "ORDER BY place"
         )
     with damage(Path(store)):

@@ -35,8 +35,6 @@ __all__ = ["Change", "Drift", "FleetSummary", "ParameterInFleet", "VehicleOutlie
 _HUBER = 1.345
 """Standardised residual from which on Huber's mean bounds the influence of a value: 95 % efficiency."""
 _EFFICIENCY = 0.95
-_MEDIAN_OF_CHI2 = 0.454936
-"""Median of a squared standard normal variable."""
 _SHORTEST = 3
 """Logs on either side of a change."""
 _FEWEST_VEHICLES = 8
@@ -354,7 +352,7 @@ def scale_beyond(
     deviations: FloatArray,
     variances: FloatArray,
     average: Callable[[FloatArray], Any] = np.median,
-    target: float = _MEDIAN_OF_CHI2,
+    target: float = 0.454936,  # median of a squared standard normal variable
 ) -> float:
     """Scale sigma with ``average(deviations^2 / (variances + sigma^2)) = target``; 0 where variances suffice.
 

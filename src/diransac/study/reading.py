@@ -16,11 +16,11 @@ import numpy.typing as npt
 
 from diransac.atomic import write_bytes
 from diransac.errors import SettingsError, StudyError
+from diransac.limits import MOST_COUNTED
 from diransac.plain_data import json_data
 from diransac.plain_text import cell
-from diransac.study.database import LARGEST, damage, quoted, word
 from diransac.study.specification import planned_path
-from diransac.study.store import Store, whole
+from diransac.study.store import LARGEST, Store, damage, quoted, word
 from diransac.text_table import aligned
 
 if TYPE_CHECKING:
@@ -54,8 +54,8 @@ def read(store: str | Path) -> pl.DataFrame:
         columns = {name: column for name, column in kept.columns.items() if name != "paths"}
         names = ", ".join(f"t.{quoted(column)}" for column, _ in columns.values())
         rows = kept.select(
-            f"SELECT {names} FROM trials t JOIN cells c USING (level, method) "
-            "ORDER BY (SELECT min(rowid) FROM cells WHERE level = t.level), t.trial, c.rowid"
+            f"SELECT {names} FROM trials t JOIN asked a USING (level, trial, method) ORDER BY "
+            "min(place) OVER (PARTITION BY t.level), t.trial, min(place) OVER (PARTITION BY t.level, t.method)"
         )
     with damage(Path(store)):
         kinds: dict[str, type] = {"TEXT": str, "INTEGER": int, "REAL": float}
@@ -83,7 +83,8 @@ def _checked(columns: Mapping[str, Sequence[Any]], schema: Mapping[str, type]) -
         if kind is float:
             _check_squares(name, columns[name])
     for trial in columns["trial"]:
-        whole(trial)
+        if not 0 <= trial <= MOST_COUNTED:
+            raise ValueError(f"trial is {trial}")
     times = [json_data(text) for text in columns["seconds"]]
     stages = list(times[0]) if times else []
     for time in times:
@@ -108,7 +109,9 @@ def about(store: str | Path) -> dict[str, str]:
         There is no such store.
     """
     with Store.existing(store) as kept:
-        return kept.about
+        noted = kept.about
+    with damage(Path(store)):
+        return {key: word(noted[key]) for key in ("name", "description", "axis", "unit")}
 
 
 def paths(
@@ -267,20 +270,18 @@ def status(store: str | Path) -> Status:
         There is no such store.
     """
     with Store.existing(store) as kept:
-        name = kept.about["name"]
+        noted = kept.about
         rows = kept.select(
-            "SELECT c.level, c.method, c.trials, coalesce(sum(t.status = 'done'), 0), "
+            "SELECT a.level, a.method, count(*), coalesce(sum(t.status = 'done'), 0), "
             "coalesce(sum(t.status = 'failed'), 0), min(t.error) "
-            "FROM cells c LEFT JOIN trials t USING (level, method) GROUP BY c.level, c.method ORDER BY c.rowid"
+            "FROM asked a LEFT JOIN trials t USING (level, trial, method) GROUP BY 1, 2 ORDER BY min(place)"
         )
     with damage(Path(store)):
         cells = {
-            (word(level), word(method)): TrialCounts(
-                whole(asked), whole(done), whole(failed), None if error is None else word(error)
-            )
+            (word(level), word(method)): TrialCounts(asked, done, failed, None if error is None else word(error))
             for level, method, asked, done, failed, error in rows
         }
-    return Status(str(store), name, cells)
+        return Status(str(store), word(noted["name"]), cells)
 
 
 def _text(cell: TrialCounts | None) -> str:

@@ -23,12 +23,14 @@ from diransac.flight.planning import multisine, random_waypoints, sine, square, 
 from diransac.flight.planning.trajectories import MAX_DURATION, check_fully_actuated, check_plane
 from diransac.flight.trajectory import Trajectory
 from diransac.flight.tvlqr import Controller, check_weights
-from diransac.identification.settings import MOST_SUBSTEPS
+from diransac.identification.settings import EXECUTION, MOST_SUBSTEPS
 from diransac.model import Model
 from diransac.model.plant import ModelWithParameters
+from diransac.study.assessment import PlantFacts
 from diransac.study.axis import Axis
 from diransac.study.method_choice import MethodChoice, methods_of
 from diransac.study.plants import PlantChoice
+from diransac.study.store import STUDY, Key, Kind
 from diransac.study.tables import (
     RANDOM,
     Count,
@@ -315,9 +317,9 @@ class Study(Table):
         study = super().from_dict(table)
         for level in study.axis.levels:
             try:
-                study.at(level.text)
+                study.at(level)
             except DiransacError as error:
-                raise SettingsError(f"axis: at level {level.text}, {error}") from error
+                raise SettingsError(f"axis: at level {level}, {error}") from error
         return study
 
     @property
@@ -336,7 +338,7 @@ class Study(Table):
         SettingsError
             There is no such level, or its changes have no meaning.
         """
-        changes = self.axis.subset([level]).levels[0].changes
+        (changes,) = self.axis.subset([level]).levels.values()
         own = {path: value for path, value in changes.items() if self._concerns(path)}
         return Study.model_validate(changed(self._without_defaults(own), own))
 
@@ -391,40 +393,59 @@ class Study(Table):
             }
         )
 
+    # Members of `Work` -----------------------------------------------------------------------------------------------
+    @property
+    def kind(self) -> Kind:
+        """Kind of the store."""
+        return STUDY
+
+    @property
+    def asked(self) -> dict[Key, tuple[str | None, ...]]:
+        """Level, trial and method of each row.  Raises SettingsError: there are too many."""
+        n_rows, most = len(self.axis.levels) * self.trials * len(self.methods), 1_000_000
+        if n_rows > most:
+            raise SettingsError(f"the study has {n_rows:,} rows, {most:,} at most are run; give fewer trials")
+        trials = range(self.trials)
+        return {(x, k, label): () for x in self.axis.levels for k in trials for label in self.methods}
+
+    @property
+    def columns(self) -> dict[str, str]:
+        """SQL type of each column of a row."""
+        model = self.plant.plant.model
+        kinds = ("parameter", "pseudo_true", "low", "high") if self.evaluate_parameters else ("parameter",)
+        return {
+            "seed": "INTEGER NOT NULL",
+            **{f"{kind}_{name}": "REAL" for kind in kinds for name in model.parameters},
+            **dict.fromkeys(("fit_error", "inlier_fraction"), "REAL"),
+            "iterations": "INTEGER",
+            "stop_reason": "TEXT",
+            **{f"{shape}_{state}": "REAL" for shape in self.evaluation.trajectories for state in model.state},
+            "paths": "BLOB",
+            "seconds": "TEXT NOT NULL",
+        }
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """Names and descriptions, and properties of each level's plant."""
+        plants = {x: dataclasses.asdict(PlantFacts.of(self.at(x).plant.plant)) for x in self.axis.levels}
+        about = {"name": self.name, "description": self.description, "axis": self.axis.name, "unit": self.axis.unit}
+        return {**about, "plants": plants}
+
     @property
     def configuration(self) -> dict[str, dict[str, Any]]:
         """The values that determine rows, by part and dotted path: ``study``, ``methods.<label>``, ``levels.<text>``.
 
-        The number of trials, names and descriptions do not. Keys that studies did not always have stand here where they
-        differ from their defaults, so that earlier stores remain those of the same study.
+        The number of trials, names and descriptions do not.
         """
         table = self.to_dict()
-        if not self.evaluate_parameters:
-            del table["evaluation"]["parameters"]
-        if table["noise"]["outliers"] == Noise.outliers:
-            del table["noise"]["outliers"]
+        decisive = {name: table[name] for name in ("seed", "plant", "data", "noise", "evaluation", "control")}
         missions = {name: table["missions"][name] for name in self.evaluation.trajectories}
-        later = {
-            "missions": {name: _changes(name, arguments) for name, arguments in missions.items()},
-            "control": self.control.model_dump(exclude_defaults=True),
-        }
-        if self.data.trajectory in MISSIONS:
-            own = {"trajectory": self.data.trajectory, "substeps": self.data.substeps}
-            given = {name: value for name, value in own.items() if value is not None}
-            table["data"] = given | _changes(self.data.trajectory, self.data.arguments)
-        decisive = {name: table[name] for name in ("seed", "plant", "data", "noise", "evaluation")}
-        parts = {"study": dict(flat(decisive)) | {path: value for path, value in flat(later) if value != {}}}
+        parts = {"study": dict(flat({**decisive, "missions": missions}))}
         for label, method in table["methods"].items():
-            silent = [f"settings.{name}" for name in ("threads", "batch_size")]
+            silent = [f"settings.{name}" for name in EXECUTION]
             parts[f"methods.{label}"] = {path: value for path, value in flat(method) if path not in silent}
-        changes = {level.text: dict(level.changes) or {"changes": "none"} for level in self.axis.levels}
+        changes = {level: dict(some) or {"changes": "none"} for level, some in self.axis.levels.items()}
         return parts | {f"levels.{text}": some for text, some in changes.items()}
-
-
-def _changes(mission: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of a mission that differ from their defaults."""
-    defaults = _trajectory_arguments(MISSIONS[mission], {}, "")
-    return {name: value for name, value in arguments.items() if value != defaults[name]}
 
 
 def _check_flown(trajectory: str, model: Model, arguments: Mapping[str, Any]) -> None:

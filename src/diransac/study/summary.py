@@ -15,9 +15,8 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import StudyError
 from diransac.study.assessment import PlantFacts, covers, differ, relative_errors
-from diransac.study.database import damage
-from diransac.study.reading import Status, read, status
-from diransac.study.store import Store
+from diransac.study.reading import Status, about, read, status
+from diransac.study.store import Store, damage
 
 if TYPE_CHECKING:
     import polars as pl
@@ -181,13 +180,14 @@ def summarise(store: str | Path) -> Summary:
     StudyError
         There is no such store, or it has no rows yet.
     """
-    rows, progress = read(store), status(store)
+    rows, progress, words = read(store), status(store), about(store)
     with Store.existing(store) as kept:
-        words, parts, noted, cells = kept.about, kept.configuration, kept.plants, kept.cells
+        noted, parts = kept.about, kept.configuration
     if not len(rows):
         raise StudyError(f'store "{store}" has no rows yet; run its study first')
     with damage(Path(store)):
-        return _summary(rows, progress, words, parts, noted, cells)
+        plants = {level: PlantFacts.from_dict(one) for level, one in noted["plants"].items()}
+        return _summary(rows, progress, words, parts, plants)
 
 
 def _summary(
@@ -196,14 +196,13 @@ def _summary(
     words: Mapping[str, str],
     parts: Mapping[str, Mapping[str, Any]],
     noted: Mapping[str, PlantFacts],
-    cells: Sequence[tuple[str, str, int]],
 ) -> Summary:
     """Summary of what a store holds.  Raises LookupError, TypeError, ValueError: its parts do not fit together."""
-    levels = _in_order(list(dict.fromkeys(level for level, *_ in cells)))
+    levels = _in_order(list(dict.fromkeys(level for level, _ in progress.cells)))
     values = [value for value in map(_value, levels) if value is not None]
     if len(set(values)) < len(values):
         raise ValueError(f"levels {', '.join(levels)} have equal values")
-    methods = tuple(dict.fromkeys(method for _, method, _ in cells))
+    methods = tuple(dict.fromkeys(method for _, method in progress.cells))
     plants = [noted[level] for level in levels]
     if any((list(x.units), list(x.parameters)) != (list(plants[0].units), list(plants[0].parameters)) for x in plants):
         raise ValueError("plants of several models")

@@ -10,11 +10,9 @@ import inspect
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import (
-    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -24,10 +22,8 @@ from pydantic import (
     StrictBool,
     StrictInt,
     StrictStr,
-    TypeAdapter,
     ValidationError,
     ValidationInfo,
-    conlist,
     model_serializer,
     model_validator,
 )
@@ -58,7 +54,6 @@ __all__ = [
 RANDOM = "random"
 """Value of an argument that is drawn anew for each trial."""
 
-_LARGEST = int(sys.float_info.max)
 _OWN_WORDS = "own_words"
 """Type of a validation error whose message says what to give."""
 
@@ -67,9 +62,6 @@ Text = Annotated[StrictStr, Field(description="text")]
 Flag = Annotated[StrictBool, Field(description="true or false")]
 Whole = Annotated[StrictInt, Field(ge=0, description="a whole number of at least 0")]
 Count = Annotated[StrictInt, Field(ge=1, le=MOST_COUNTED, description=f"a whole number from 1 to {MOST_COUNTED:,}")]
-_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-_Unconverted = Annotated[StrictInt, Field(ge=-_LARGEST, le=_LARGEST)] | _Number
-"""A finite number; a whole number stays one."""
 
 
 class Table(BaseModel):
@@ -221,55 +213,53 @@ def function_arguments(
     SettingsError
         An unknown key, or a value that is not of its default's kind.
     """
-    known = _arguments(function, random, pairs)
+    defaults = {
+        name: _as_written(one.default)
+        for name, one in inspect.signature(function).parameters.items()
+        if one.kind not in _VARIABLE and one.default is not None and one.default is not one.empty
+    }
     for name in given:
-        if name not in known:
-            raise SettingsError(unknown_key(place, name, [*keys, *known]))
+        if name not in defaults:
+            raise SettingsError(unknown_key(place, name, [*keys, *defaults]))
     found = {}
-    for name, (default, kind, wanted) in known.items():
-        try:
-            found[name] = kind.validate_python(given[name]) if name in given else copy.copy(default)
-        except ValidationError as error:
-            raise SettingsError(f"{place}.{name} is {given[name]!r:.60}; give {wanted}") from error
-    return found
-
-
-@lru_cache(maxsize=32)
-def _arguments(function: Callable[..., Any], random: str, pairs: bool) -> dict[str, tuple[Any, TypeAdapter[Any], str]]:
-    """Default, type and description of each argument that has a key."""
-    found = {}
-    for name, parameter in inspect.signature(function).parameters.items():
-        if parameter.kind in _VARIABLE or parameter.default is None or parameter.default is parameter.empty:
-            continue
-        default = _as_written(parameter.default)
+    for name, default in defaults.items():
+        value = given.get(name, default)
         # Annotations of arguments that are counts; a default of 0 alone may stand for 0.0.
-        kind, wanted = _kind(default, pairs, parameter.annotation in (int, "int"))
-        drawn: Any = Literal["random"]
-        found[name] = default, TypeAdapter[Any](kind | drawn if name == random else kind), wanted
+        is_count = inspect.signature(function).parameters[name].annotation in (int, "int")
+        drawn = name == random and value == RANDOM
+        wanted = None if drawn else _unfit(value, default, is_count, pairs)
+        if wanted:
+            raise SettingsError(f"{place}.{name} is {value!r:.60}; give {wanted}")
+        found[name] = value if drawn else _as(value, default)
     return found
 
 
-def _kind(default: Any, pairs: bool, whole: bool) -> tuple[Any, str]:
-    """Type of the values that may replace a default, and its description."""
+def _unfit(value: Any, default: Any, is_count: bool, pairs: bool) -> str:
+    """Description of the values that may replace a default, for one that may not; "" for one that may."""
     if isinstance(default, dict):
-        return Annotated[dict[str, _Number], AfterValidator(lambda given: {**default, **given})], "a table of numbers"
+        fits = isinstance(value, Mapping) and all(isinstance(name, str) and is_number(x) for name, x in value.items())
+        return "" if fits else "a table of numbers"
     if isinstance(default, list):
-        if not _are_numbers(default):
-            return list[StrictStr], "a list of words"
-        return conlist(_number(default[0])), "a list of numbers"
-    if isinstance(default, bool):
-        return StrictBool, "true or false"
-    if isinstance(default, str):
-        return StrictStr, "a word"
-    if whole:
-        return Whole, "a whole number from 0"
-    number = _number(default)
-    return number | conlist(number, min_length=2, max_length=2) if pairs else number, "a number"
+        of_words = not _are_numbers(default)
+        fits = isinstance(value, list) and all(isinstance(x, str) if of_words else is_number(x) for x in value)
+        return "" if fits else f"a list of {'words' if of_words else 'numbers'}"
+    if isinstance(default, bool | str):
+        kind = "true or false" if isinstance(default, bool) else "a word"
+        return "" if type(value) is type(default) else kind
+    if is_count:
+        return "" if type(value) is int and value >= 0 else "a whole number from 0"
+    is_pair = pairs and isinstance(value, list) and len(value) == 2 and _are_numbers(value)
+    return "" if is_number(value) or is_pair else "a number"
 
 
-def _number(default: float) -> Any:
-    """Type of a number: 2 is kept as 2.0, unless the default is whole."""
-    return _Unconverted if isinstance(default, int) else _Number
+def _as(value: Any, default: Any) -> Any:
+    """A value as its function takes it: numbers are float64 where the default is no whole number."""
+    if isinstance(default, dict):
+        return {**default, **{name: float(x) for name, x in value.items()}}
+    if isinstance(value, list):
+        like = default[0] if isinstance(default, list) and default else default
+        return [_as(x, like) for x in value]
+    return float(value) if isinstance(default, float) else copy.copy(value)
 
 
 def takes_options(function: Callable[..., Any]) -> bool:

@@ -1,4 +1,4 @@
-"""Trials of one level: data, identification, and evaluation by planned, controlled and simulated flights.
+"""`run_study`; trials of one level: data, identification, and evaluation by planned, controlled, simulated flights.
 
 Flights of many trials are lanes of one simulation, their controllers columns of one sweep. Neither changes a bit of any
 of them, and each plan starts from the same guess, so that the rows of a trial do not depend on other trials.
@@ -12,12 +12,14 @@ import platform
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from importlib.metadata import version
 from itertools import groupby
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,7 @@ from diransac.data.log import Log
 from diransac.errors import DiransacError, PlanningError, StudyError
 from diransac.flight.closed_loop import tracking_error
 from diransac.flight.trajectory import Trajectory
-from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
+from diransac.flight.tvlqr import Controller, tvlqr_batch
 from diransac.identification.identify import Identification
 from diransac.model.plant import Plant
 from diransac.process import single_threaded
@@ -39,18 +41,87 @@ from diransac.study.data import (
     trial_data_batch,
     trial_seed,
 )
+from diransac.study.engine import Progress, run_work
 from diransac.study.library import load
 from diransac.study.method_choice import TRUE
+from diransac.study.reading import Status, status
 from diransac.study.specification import ControlChoice, Study, planned_path
+from diransac.study.store import Key
 
-__all__ = ["STAGES", "run_trials", "versions"]
+__all__ = ["STAGES", "run_study", "run_trials", "versions"]
 
 STAGES = ("record", "identify", "plan", "steer", "fly")
 """Stages that `seconds` is divided by."""
 
 
-def run_trials(study: str, level: str, trials: Sequence[int], methods: Sequence[str]) -> list[dict[str, Any]]:
-    """One row per trial and method, by column of the store.
+def run_study(
+    spec: Study | Mapping[str, Any] | str | Path,
+    *,
+    store: str | Path,
+    executor: Executor | None = None,
+    jobs: int | None = None,
+    trials: int | None = None,
+    levels: Sequence[str | float] | None = None,
+    methods: Sequence[str] | None = None,
+    batch_size: int = 4,
+    tasks: int | None = None,
+    time_limit: float | None = None,
+    progress: Progress | None = None,
+) -> Status:
+    """Run the rows of a study that a store lacks; a row is a level, trial and method.
+
+    Parameters
+    ----------
+    spec : name of a built-in study, a TOML file, its tables, or a `Study`
+    store : SQLite file; made if it does not exist
+    executor : runs the trials; any executor of `concurrent.futures`, or one with its interface (Dask's
+        ``client.get_executor()``). None: processes of this machine, for which a script needs ``if __name__ ==
+        "__main__":``
+    jobs : number of these processes; None: one per core
+    trials, levels, methods : number of trials, levels, and labels of methods; None: those of the study
+    batch_size : trials of a level that are run together
+    tasks : batches handed out at a time; None: two per process, 64 to an executor
+    time_limit : time after which the run ends, s; rows that are done are kept, and the same call runs the others
+    progress : called with (rows present, rows asked for) at the start and whenever rows are added
+
+    Returns
+    -------
+    Status
+        The number of rows done, failed and missing.
+
+    Raises
+    ------
+    SettingsError
+        An argument or the study has no meaning.
+    StudyError
+        The store has another configuration, workers are lost repeatedly, or one lacks the file of the study's plant.
+    KeyboardInterrupt
+        Rows that were done are kept.
+
+    Notes
+    -----
+    Trial k of a level depends on (seed, level, k) alone: rows do not depend on the executor, the order, or which other
+    rows are run. Rows are committed as batches finish; after a process is killed, the same call runs the others.
+    Several processes may share a store. A trial that fails is a row with its error.
+    """
+    study = load(spec).subset(trials, levels, methods)
+    run_work(
+        study,
+        partial(run_trials, json.dumps(study.to_dict())),
+        store=store,
+        executor=executor,
+        jobs=jobs,
+        batch_size=batch_size,
+        tasks=tasks,
+        time_limit=time_limit,
+        progress=progress,
+    )
+    return status(store)
+
+
+# Worker --------------------------------------------------------------------------------------------------------------
+def run_trials(study: str, keys: Sequence[Key]) -> list[dict[str, Any]]:
+    """Rows by column of the store, the same whatever the other keys.
 
     Values are plain, so that rows may come from another process or machine; None is not known. A trial that fails is a
     row with the error.
@@ -58,8 +129,7 @@ def run_trials(study: str, level: str, trials: Sequence[int], methods: Sequence[
     Parameters
     ----------
     study : the JSON of `Study.to_dict`
-    level, trials : of the study
-    methods : labels
+    keys : level, trial and method of each row, of one level
 
     Raises
     ------
@@ -67,10 +137,10 @@ def run_trials(study: str, level: str, trials: Sequence[int], methods: Sequence[
         This machine cannot run the study at all, such as without the file of its plant.
     """
     try:
-        point = _point(study, level)
+        point = _point(study, keys[0][0])
     except DiransacError as error:
         raise StudyError(f"a worker on {platform.node()} cannot run the study: {error}") from error
-    cases = [_Case(point, trial, label) for trial in trials for label in methods]
+    cases = [_Case(point, trial, label) for _, trial, label in keys]
     with single_threaded():  # all cores run trials
         point.record(cases)
         for _, of_trial in groupby(cases, key=attrgetter("trial")):
@@ -267,26 +337,30 @@ def _planned(point: _Point, shape: str, parameters: tuple[float, ...]) -> Trajec
 
 
 def _controllers(cases: Sequence[_Case], plans: dict[int, Trajectory], control: ControlChoice) -> dict[int, Controller]:
-    """Controller of each case that has one: all in one sweep, or each on its own if that fails."""
+    """Controller of each case that has one."""
     begin = time.perf_counter()
     plants = [case.found for case in cases if case.found is not None]
-    try:
-        steering = tvlqr_batch(plants, [plans[id(case)] for case in cases], **control.weights, threads=1)
-    except Exception:  # noqa: BLE001  it is raised again for the case that it belongs to
-        return _controllers_alone(cases, plans, control)
+    steering = _steering(plants, [plans[id(case)] for case in cases], control.weights)
     _share(cases, "steer", time.perf_counter() - begin)
-    return {id(case): control.limited(controller) for case, controller in zip(cases, steering, strict=True)}
-
-
-def _controllers_alone(
-    cases: Sequence[_Case], plans: dict[int, Trajectory], control: ControlChoice
-) -> dict[int, Controller]:
     found = {}
-    for case in cases:
-        assert case.found is not None
-        with case.attempt("steer"):
-            found[id(case)] = control.limited(tvlqr(case.found, plans[id(case)], **control.weights))
+    for case, one in zip(cases, steering, strict=True):
+        if isinstance(one, Exception):
+            case.fail(one)
+        else:
+            found[id(case)] = control.limited(one)
     return found
+
+
+def _steering(
+    plants: Sequence[Plant], plans: Sequence[Trajectory], weights: Mapping[str, Any]
+) -> Sequence[Controller | Exception]:
+    """Controllers, or their errors: all in one sweep, or each on its own if that fails."""
+    try:
+        return tvlqr_batch(plants, plans, **weights, threads=1)
+    except Exception as error:  # noqa: BLE001  its row says what it was; other flights go on
+        if len(plants) == 1:
+            return [error]
+        return [_steering([plant], [plan], weights)[0] for plant, plan in zip(plants, plans, strict=True)]
 
 
 # Values of a row ----------------------------------------------------------------------------------------------------

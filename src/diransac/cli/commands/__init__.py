@@ -1,8 +1,7 @@
-"""The command line; each command is a module of this package."""
+"""The command line; commands on one subject are a module of this package."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -26,10 +25,6 @@ def _diransac(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
     _debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error, after any command.")] = False,
-    _config: Annotated[
-        Path | None,
-        typer.Option("--config", metavar="FILE.toml", help="Options by name, anywhere; those that are given win."),
-    ] = None,
     _quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no text; anywhere.")] = False,
     _verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A line for every stage; anywhere.")] = False,
 ) -> None:

@@ -12,7 +12,7 @@ from diransac.data.preprocessing.continuity import (
 )
 from diransac.data.preprocessing.differentiation import acting_inputs, differentiate, filter_rows
 from diransac.data.preprocessing.spikes import despike, hampel, running_deviation
-from diransac.data.preprocessing.steps import in_units, keep_while, leave_out, rename, resample, scale, shift
+from diransac.data.preprocessing.steps import in_units, keep_while, leave_out, prepared, rename, resample, scale, shift
 
 __all__ = [
     "acting_inputs",
@@ -25,6 +25,7 @@ __all__ = [
     "in_units",
     "keep_while",
     "leave_out",
+    "prepared",
     "rename",
     "resample",
     "running_deviation",

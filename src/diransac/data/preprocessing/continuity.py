@@ -38,9 +38,7 @@ _REACH, _REACH_OF_ATTITUDES, _WINDOW, _PERSISTS = 5, 3, 25, 5
 _CLOSE, _FAR, _NEARLY, _MARGIN = 0.05, 0.25, 0.1, 0.02
 _USUAL_MIDDLES = (0.0, 0.5)
 # Fraction of the good samples that lie within that turn, at least.
-_INSIDE = 0.95
 _MANY_SIGMA, _MUCH_MOTION = 8.0, 3.0
-_MAD_TO_STD = 1.4826
 # Difference of two components that counts at most, and the weight of uncapped components, which breaks ties.
 _CAP, _TIE = 1.0, 1e-9
 # Relative deviations of a quaternion's norm that are its own, and those that are rounding errors.
@@ -175,7 +173,8 @@ def _revolutions(values: FloatArray, turn: float) -> IntArray:
     good = _agreeing(y, motion)
     middle = _middle_of_leaps(y[good], motion[good])
     inside = np.abs(y - middle) <= 0.5 + _MARGIN
-    if not good.any() or median_filter(inside[good], _PERSISTS).mean() < _INSIDE:
+    # Fraction of the good samples that lie within that turn, at least.
+    if not good.any() or median_filter(inside[good], _PERSISTS).mean() < 0.95:
         return k
     good &= inside
     angle = _continued(y[good], rows[good])
@@ -207,7 +206,8 @@ def _agreeing(y: FloatArray, motion: FloatArray) -> BoolArray:
     around = _neighbours(len(y), reach)
     usual = y[_medoids(y[:, None], lambda a, b: np.abs(_remainder(a - b)[:, 0]), around)]
     off = np.abs(_remainder(usual - y))
-    close = off <= np.clip(_MANY_SIGMA * _MAD_TO_STD * np.median(off) + _MUCH_MOTION * motion, _CLOSE, _FAR)
+    # 1.4826: standard deviation from the median absolute one.
+    close = off <= np.clip(_MANY_SIGMA * 1.4826 * np.median(off) + _MUCH_MOTION * motion, _CLOSE, _FAR)
     agreement = np.abs(_remainder(y[around] - usual[:, None])) <= np.minimum(_CLOSE + reach * motion, _FAR)[:, None]
     return np.asarray(close & (agreement.mean(axis=1) >= 0.5))
 

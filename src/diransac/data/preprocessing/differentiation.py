@@ -34,17 +34,11 @@ if TYPE_CHECKING:
 __all__ = ["Bandwidth", "acting_inputs", "choose_bandwidth", "differentiate", "filter_rows"]
 
 
-_DERIVATION = 4.0
-_HIGHEST_DERIVATION = 1.0 / 3.0
 _SHORTEST = 2.0 * REACH
-_NOTABLE_NOISE = 0.05
 _LONGEST_BRIDGE = 0.25
 _BESIDE = 2
-# Half a sample later, and the droop of a held input, to fourth order.
-_HOLD = (-1.0 / 24.0, 13.0 / 24.0, 13.0 / 24.0, -1.0 / 24.0)
 # Bandwidth times sample interval, and bandwidth times duration, that are chosen at most and at least.
 _HIGHEST, _LONGEST = 0.1, 10.0
-_SIGNAL_TO_NOISE = 10.0
 _SEGMENTS, _SMALLEST_SEGMENT = 8, 32
 _SMOOTHING = 1.2
 
@@ -190,7 +184,9 @@ def acting_inputs(specification: FilterSpecification | None, inputs: FloatArray)
         return inputs
     padded = np.concatenate([inputs[:1], inputs[:1], inputs, inputs[-1:]])
     n = len(inputs)
-    return np.asarray(sum(weight * padded[i : i + n] for i, weight in enumerate(_HOLD)))
+    # Half a sample later, and the droop of a held input, to fourth order.
+    weights = (-1.0 / 24.0, 13.0 / 24.0, 13.0 / 24.0, -1.0 / 24.0)
+    return np.asarray(sum(weight * padded[i : i + n] for i, weight in enumerate(weights)))
 
 
 # ---------------------------------------------------------------------- sources of derived signals
@@ -297,7 +293,7 @@ def _of_one_motion(values: FloatArray, order: int, dt: float) -> Bandwidth | Non
     if not len(f) or not A.all():
         return None
     noise = np.minimum.accumulate(A[::-1])[::-1]
-    gain = np.cumsum(A - _SIGNAL_TO_NOISE * noise)
+    gain = np.cumsum(A - 10.0 * noise)
     best = int(gain.argmax())
     if gain[best] <= 0.0:
         return None
@@ -332,12 +328,12 @@ def _smooth(f: FloatArray, power: FloatArray) -> FloatArray:
 
 def _derivation_bandwidth(log: Log, bandwidth: float) -> float:
     """Bandwidth of the filter that derives signals, Hz.  Raises where the log is too short or too slow for it."""
-    highest, duration = _HIGHEST_DERIVATION / log.dt, len(log) * log.dt
+    highest, duration = 1.0 / 3.0 / log.dt, len(log) * log.dt
     if not 0.0 < bandwidth <= highest * (1.0 + 1e-9):
         raise SettingsError(
             f"a bandwidth of {bandwidth:.4g} Hz has no meaning at {1.0 / log.dt:.6g} Hz; give up to {highest:.4g} Hz"
         )
-    wide = min(_DERIVATION * bandwidth, highest)
+    wide = min(4.0 * bandwidth, highest)
     if bandwidth * duration < _SHORTEST or len(log) < 2 * half_length(wide, log.dt) + 2:
         raise LogError(
             f"{log.source}: {duration:.4g} s are too short to be filtered at {bandwidth:.4g} Hz, which takes "
@@ -401,7 +397,7 @@ def _notes(bandwidth: float, chosen: Bandwidth | None, sources: Mapping[str, tup
     derived = f"derived {', '.join(sources)}; " if sources else "nothing to derive; "
     origin = "given" if chosen is None else "chosen from the log"
     notes = [f"{derived}filtered at {bandwidth:.3g} Hz ({origin}), {cut:.3g} s cut at either end"]
-    if chosen is not None and chosen.noise_share > _NOTABLE_NOISE:
+    if chosen is not None and chosen.noise_share > 0.05:
         share = min(1.0, chosen.noise_share)
         notes.append(
             f"noise may be {share:.0%} of the accelerations' power up to {bandwidth:.3g} Hz: expect biased masses"

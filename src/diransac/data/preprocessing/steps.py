@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.data.preprocessing.continuity import interpolated
+from diransac.data.preprocessing.spikes import despike
 from diransac.data.units import conversion, same_unit
 from diransac.errors import LogError, SettingsError
 from diransac.limits import MOST_ROWS
@@ -29,6 +30,7 @@ __all__ = [
     "keep_while",
     "leave_out",
     "origins_of",
+    "prepared",
     "rename",
     "rename_columns",
     "resample",
@@ -40,11 +42,9 @@ __all__ = [
 
 Column = TypeVar("Column")
 
-_BRIDGED_INTERVALS = 3.5
 # New rows per old one, of more than so many, that only a damaged time takes.
 _MOST_NEW, _MANY_ROWS = 1000, 100_000
 _ROUNDING = 1e-6
-_FOLDING = 0.9
 
 
 # ---------------------------------------------------------------------- names and factors
@@ -231,6 +231,31 @@ def _kept(log: Log, kept: npt.NDArray[np.bool_], step: dict[str, Any], why: str,
     return part.with_step(step, notes=[note], signals=signals)
 
 
+def prepared(log: Log, steps: Mapping[str, Any] | None) -> Log:
+    """Log after steps that need no model, by the keys of a mapping file; others are not done.
+
+    Parameters
+    ----------
+    log : Log
+    steps : mapping of str to object
+        In this order: ``from`` and ``until`` (s), ``while`` (events), ``leave_out`` (stretches), ``despike`` (signals,
+        or ``"all"``) and ``shift`` (delays by signal); None is none.
+
+    Raises
+    ------
+    LogError, SettingsError
+        As each step.
+    """
+    found = {name: x for name, x in (steps or {}).items() if x is not None}
+    named = {name: [x] if isinstance(x, str) else x for name, x in found.items() if name in ("while", "despike")}
+    if "from" in found or "until" in found:
+        log = log.between(found.get("from", -math.inf), found.get("until", math.inf))
+    log = keep_while(log, named["while"]) if "while" in named else log
+    log = leave_out(log, found["leave_out"]) if "leave_out" in found else log
+    log = despike(log, None if named["despike"] == ["all"] else named["despike"]) if "despike" in named else log
+    return shift(log, found["shift"]) if found.get("shift") else log
+
+
 def check_factor(name: str, factor: float) -> None:
     """Raise SettingsError for a factor that is zero or not finite."""
     if not math.isfinite(factor) or factor == 0.0:
@@ -317,7 +342,8 @@ def interpolate_at(
 def _gaps(time: FloatArray, hertz: float) -> npt.NDArray[np.bool_]:
     """Intervals (N - 1,) that are not bridged."""
     steps = np.diff(time)
-    return np.asarray(steps > max(_BRIDGED_INTERVALS * float(np.median(steps)), 1.0 / hertz))
+    # More than three and a half median intervals, and more than one new sample.
+    return np.asarray(steps > max(3.5 * float(np.median(steps)), 1.0 / hertz))
 
 
 def _in_gaps(
@@ -354,7 +380,7 @@ def _resampling_notes(
     time: FloatArray, gaps: npt.NDArray[np.bool_], blank: npt.NDArray[np.bool_], hertz: float
 ) -> list[str]:
     notes = [f"resampled from {len(time)} to {len(blank)} rows at {hertz:.6g} Hz, by linear interpolation"]
-    if hertz * np.median(np.diff(time)) < _FOLDING:
+    if hertz * np.median(np.diff(time)) < 0.9:
         notes.append(f"no filter went before it: motion and noise above {hertz / 2.0:.4g} Hz now appear below")
     if gaps.any():
         steps = np.where(gaps, np.diff(time), 0.0)

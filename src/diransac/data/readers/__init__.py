@@ -3,36 +3,23 @@
 from __future__ import annotations
 
 import importlib
-import math
-from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from diransac.arrays import FloatArray
-from diransac.data import preprocessing
-from diransac.data.checks import check_clock, check_names
-from diransac.data.clock import Gridded, in_order, is_even, on_own_grid, runs_freely
 from diransac.data.files import place_of_metadata
 from diransac.data.log import Log
-from diransac.data.preprocessing.steps import check_factor, origins_of, rename_columns, resample_columns
-from diransac.data.readers.recording import Samples
+from diransac.data.readers.reading import Reading
 from diransac.data.readers.repair import Repairs
-from diransac.data.readers.repeated import Reading
 from diransac.data.readers.table import Table, with_metadata
-from diransac.data.readers.time_column import seconds, time_column, unit_of_name
-from diransac.data.units import split_unit
-from diransac.errors import LogError, SettingsError
+from diransac.errors import LogError
 from diransac.limits import LARGEST_LOG, LARGEST_RESULT, LARGEST_TEXT, MOST_COUNTED, check_ordinary, read_bytes
 from diransac.plain_text import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from diransac.data.mapping import LogMapping
     from diransac.data.readers.lerobot import LerobotDataset
     from diransac.data.readers.recording import Recording
     from diransac.data.readers.topics import TopicTable
@@ -71,8 +58,6 @@ _REMEDIES = {
 """Ending that is not read -> what to do."""
 _FOLDERS = {"metadata.yaml": "bags:open_bag"}
 """File in a folder -> what opens the folder."""
-_LEROBOT = "meta/info.json"
-"""File in a folder of episodes."""
 _ENDINGS = (*_TEXTS, *_TABLES, *_RECORDINGS)
 
 
@@ -95,8 +80,7 @@ def read_log(
     Parameters
     ----------
     path : str or Path
-        Its ending names the format.  A folder is a ROS 2 bag, a LeRobot dataset, or has one CSV file for each group of
-        signals.
+        Its ending names the format; a folder is a ROS 2 bag, a LeRobot dataset, or has a CSV file per group of signals.
     episode : int, optional
         Of a dataset with several; `read_logs` reads them all.
     mapping : str or Path, optional
@@ -118,9 +102,8 @@ def read_log(
     unmeasured : iterable of str, optional
         Coordinates that the log lacks although a column has a name like theirs.
     like : iterable of dict, optional
-        History of a log of the same recorder, such as ``result.logs[0].preparation``.  Its mapping, names, factors,
-        rates, repairs, delays and despiking apply where the arguments above give none.  What the history in the file
-        itself has is not done again.
+        History of a log of the same recorder, such as ``result.logs[0].preparation``, whose mapping, names, factors,
+        rates, repairs, delays and despiking apply where none is given and the history in the file itself has none.
 
     Returns
     -------
@@ -136,28 +119,28 @@ def read_log(
 
     Notes
     -----
-    The time column is ``t``, else the only one with a name such as ``time``, ``timestamp`` or ``t_ms``; it is converted
-    to seconds from the unit of its header or name.  Every other column is a signal; a column that does not hold numbers
-    is left out, with a note.  A header ``theta [deg]`` or ``theta (deg)`` is the signal ``theta`` in degrees, which a
-    model in radians converts.  Rows count from 0, lines of text from 1.
-
-    Topics have clocks of their own.  The rows of the log are those of the fastest topic, or at ``resample`` Hz; a
-    sample of a slower topic stands in the row nearest to it, and the rows between are NaN.
+    The time is the column ``t``, else the only one with a name such as ``time`` or ``t_ms``, in the unit of its header
+    or name.  Every other column is a signal; one without numbers is left out, with a note.  A header ``theta [deg]`` is
+    the signal ``theta`` in degrees.  Rows count from 0, lines of text from 1.  Of topics, the rows are those of the
+    fastest, or at ``resample`` Hz; a sample of a slower one stands in the nearest row, and rows between are NaN.
     """
     path = Path(path)
-    given = _Arguments(mapping, columns, rate, repair, rename, scale, resample, unmeasured, like)
-    dataset = _dataset(path)
+    given = Reading.given(
+        mapping,
+        columns=columns,
+        rate=rate,
+        repair=repair,
+        rename=rename,
+        scale=scale,
+        resample=resample,
+        unmeasured=unmeasured,
+    )
+    history, dataset = list(like), _dataset(path)
     if dataset is not None:
-        files = list(dataset.files)
-        if episode is None and len(files) > 1:
-            raise LogError(
-                f"{dataset.source}: it has {dataset.listed}; choose one (episode={files[0]}, --episodes {files[0]}), "
-                "or read them all with read_logs"
-            )
-        return _episode(dataset, files[0] if episode is None else episode, given)
+        return _episode(dataset, _only(dataset) if episode is None else episode, given, history)
     if episode is not None:
         raise LogError(f"{_named(path)}: it is one log without episodes; leave out the episode")
-    return _read(partial(_opened, path, _named(path)), _named(path), given)
+    return given.log(partial(_opened, path, _named(path)), _named(path), history)
 
 
 def read_logs(path: str | Path, *, episodes: Iterable[int] | None = None, **arguments: Any) -> list[Log]:
@@ -186,11 +169,12 @@ def read_logs(path: str | Path, *, episodes: Iterable[int] | None = None, **argu
         if episodes is not None:
             raise LogError(f"{_named(path)}: it is one log without episodes; leave out their numbers")
         return [read_log(path, **arguments)]
-    given = _Arguments(**{**arguments, "like": list(arguments.get("like", ()))})
+    history = list(arguments.pop("like", ()))
+    given = Reading.given(**arguments)
     chosen = list(dataset.files if episodes is None else islice(episodes, MOST_COUNTED))
     if not chosen or len(set(chosen)) < len(chosen):
         raise LogError(f"{dataset.source}: the episodes are {chosen!s:.60}; name one or several, each once")
-    return [_episode(dataset, episode, given) for episode in chosen]
+    return [_episode(dataset, episode, given, history) for episode in chosen]
 
 
 def episodes_of(path: str | Path) -> tuple[int, ...]:
@@ -202,83 +186,35 @@ def episodes_of(path: str | Path) -> tuple[int, ...]:
     return () if dataset is None else tuple(dataset.files)
 
 
-@dataclass(frozen=True)
-class _Arguments:
-    """Arguments of `read_log`."""
-
-    mapping: str | Path | None = None
-    columns: Sequence[str] | None = None
-    rate: float | None = None
-    repair: bool | str | Iterable[str] | None = None
-    rename: Mapping[str, str] | None = None
-    scale: Mapping[str, float] | None = None
-    resample: float | str | None = None
-    unmeasured: Iterable[str] | None = None
-    like: Iterable[Mapping[str, Any]] = ()
-
-
 def _named(path: Path) -> str:
     return one_line(f'log "{path}"')
 
 
 def _dataset(path: Path) -> LerobotDataset | None:
     """A folder of episodes; None for anything else."""
-    if not (path / _LEROBOT).exists():
+    if not (path / "meta/info.json").exists():
         return None
     from diransac.data.readers.lerobot import LerobotDataset
 
     return LerobotDataset(path, _named(path))
 
 
-def _episode(dataset: LerobotDataset, episode: int, given: _Arguments) -> Log:
+def _only(dataset: LerobotDataset) -> int:
+    """The episode of a dataset that has one.  Raises LogError: it has several."""
+    first, *more = dataset.files
+    if more:
+        raise LogError(
+            f"{dataset.source}: it has {dataset.listed}; choose one (episode={first}, --episodes {first}), "
+            "or read them all with read_logs"
+        )
+    return first
+
+
+def _episode(dataset: LerobotDataset, episode: int, given: Reading, history: Sequence[Mapping[str, Any]]) -> Log:
     if given.columns is not None:
         raise LogError(f"{dataset.source}: names of columns are those of CSV text without a header; leave them out")
     source = dataset.source if len(dataset.files) == 1 else f"{dataset.source}, episode {episode}"
-    return _read(lambda _columns, _repairs: dataset.table(episode), source, given)
-
-
-def _read(opened_with: Callable[..., Table | Recording], source: str, given: _Arguments) -> Log:
-    """Log of what is opened with the names of columns and the repairs."""
-    like, new_names = list(given.like), given.rename or {}
-    earlier = Reading.of(like)
-    chosen = earlier.mapping if given.mapping is None else _mapping(given.mapping)
-    repairs = Repairs.of(_given(earlier.repairs if given.repair is None else given.repair, chosen, "repair"))
-    columns = earlier.columns if given.columns is None else given.columns
-    opened = opened_with(columns, repairs)
-    if isinstance(opened, Table):
-        done = {step["step"] for step in opened.history}
-        earlier = Reading.of(step for step in like if step["step"] not in done)
-        chosen = earlier.mapping if given.mapping is None else chosen
-    resample = _given(earlier.resample if given.resample is None else given.resample, chosen, "resample")
-    if isinstance(opened, Table):
-        opened = opened if columns is None else opened.with_step({"step": "columns", "names": list(columns)})
-        table = repairs.in_si(_with_clock(opened, earlier.rate if given.rate is None else given.rate, source))
-        rename = earlier.names(table, _stripped(new_names, table))
-        if chosen is None or chosen.time_column is None:
-            rename = _with_time(rename, table)
-            table = table.with_time_of(rename.get("t", "t"))
-        else:
-            table = table.with_time_of(chosen.time_column)
-    else:
-        from diransac.data.readers.topics import is_one_table, table_of_topics, whole_topic
-
-        rename = {**earlier.rename, **new_names}
-        if chosen is None and is_one_table(opened, rename):
-            table = whole_topic(opened, repairs)
-        else:
-            table, resample = table_of_topics(opened, chosen, rename, resample, repairs)
-            rename = {}
-    if rename:
-        table = _renamed(table, rename, source)
-    if chosen is not None and isinstance(opened, Table):
-        from diransac.data.readers.topics import mapped_table
-
-        table = mapped_table(table, chosen, source)
-    unmeasured = earlier.unmeasured if given.unmeasured is None else tuple(given.unmeasured)
-    if unmeasured:
-        table = table.with_step({"step": "unmeasured", "signals": list(unmeasured)})
-    log = _log(table, earlier.factors(table, given.scale or {}), resample, repairs, source)
-    return earlier.prepared(log if chosen is None else _prepared(log, chosen))
+    return given.log(lambda _columns, _repairs: dataset.table(episode), source, history)
 
 
 def read_topics(path: str | Path) -> TopicTable | None:
@@ -307,88 +243,6 @@ def read_fields(path: str | Path) -> tuple[dict[str, tuple[str, ...]], dict[str,
     if isinstance(opened, Table):
         return {"": tuple(name for name in opened.columns if name != "t")}, {"": opened.elements}
     return dict(opened.fields), opened.elements
-
-
-def _mapping(mapping: str | Path) -> LogMapping:
-    from diransac.data.mapping import load_mapping
-
-    return load_mapping(mapping)
-
-
-def _given(value: Any, mapping: LogMapping | None, name: str) -> Any:
-    """An argument, or what the mapping says where there is none."""
-    return mapping.option(name) if value is None and mapping is not None else value
-
-
-def _prepared(log: Log, mapping: LogMapping) -> Log:
-    """The log after the steps of a mapping that need no model."""
-    start, stop = mapping.option("from"), mapping.option("until")
-    if start is not None or stop is not None:
-        log = log.between(-math.inf if start is None else start, math.inf if stop is None else stop)
-    events = mapping.option("while")
-    if events is not None:
-        log = preprocessing.keep_while(log, [events] if isinstance(events, str) else events)
-    despiked = mapping.option("despike")
-    if despiked is not None:
-        names = [despiked] if isinstance(despiked, str) else despiked
-        log = preprocessing.despike(log, None if despiked == "all" else names)
-    delays = mapping.option("shift")
-    return preprocessing.shift(log, delays) if delays else log
-
-
-def _log(table: Table, scale: Mapping[str, float], resample: float | str | None, repairs: Repairs, source: str) -> Log:
-    """Log of a table: scaled, repaired, resampled and checked."""
-    history: list[dict[str, Any]] = list(table.history)
-    factors = {name: float(factor) for name, factor in scale.items()}
-    for name, factor in factors.items():
-        check_factor(name, factor)
-    time, converted = seconds(table, factors, source)
-    signals, unusable = _signals(table, len(time), source)
-    for name in factors:
-        if name != "t" and name not in signals:
-            raise LogError(f'{source}: there is no signal "{name}" to scale; found {", ".join(table.columns)}')
-    if factors:
-        signals = {n: x * factors.get(n, 1.0) for n, x in signals.items()}
-        units = {name: table.units[name] for name in factors if name in table.units}
-        history.append({"step": "scale", "factors": factors, **({"units": units} if units else {})})
-    ordered = repairs.ordered(Samples(time, signals), "")
-    time, signals = ordered.time, dict(ordered.columns)
-    rows = in_order(time, source)
-    unstated = "t" not in factors and "t" not in table.units and not table.is_described
-    notes = [*table.notes, *([converted] if converted else []), *check_clock(time[rows], source, in_file=unstated)]
-    gridded, resample = _gridded(time, signals, resample, repairs, source)
-    if repairs.step is not None:
-        history.append(repairs.step)
-        notes += repairs.notes
-    if gridded is not None:
-        time, signals, recorded = gridded.time, dict(gridded.signals), gridded.recorded
-        history += [] if gridded.step is None else [gridded.step]
-        notes += gridded.notes
-    elif resample is not None:
-        columns = {name: x[rows] for name, x in signals.items()}
-        time, signals, step, said = resample_columns(time[rows], columns, resample, source)
-        history.append(step)
-        recorded, notes = np.ones(len(time), bool), [*notes, *said]
-    units = {n: unit for n, unit in table.units.items() if abs(factors.get(n, 1.0)) == 1.0}
-    log = Log(time, signals, units, source, tuple(history), unusable=unusable, filter=table.filter)
-    return replace(log, notes=tuple(dict.fromkeys((*notes, *log.findings(recorded)))))
-
-
-def _gridded(
-    time: FloatArray, signals: Mapping[str, FloatArray], resample: float | str | None, repairs: Repairs, source: str
-) -> tuple[Gridded | None, float | str | None]:
-    """Columns on the log's own grid, or the rate at which they are resampled.  Raises LogError: neither is known."""
-    if resample is not None:
-        return None, resample
-    if "clock" in repairs and not is_even(time):
-        repairs.record("clock", "the clock is uneven")
-        return None, "median"
-    try:
-        return on_own_grid(time, signals, source), None
-    except LogError:
-        if not runs_freely(time[in_order(time, source)]):
-            raise
-    return None, "median"
 
 
 # ---------------------------------------------------------------------- files
@@ -480,52 +334,3 @@ def _content(path: Path, source: str, largest: int | None = None) -> bytes:
     if not data:
         raise LogError(f"{source}: it is empty")
     return data
-
-
-# ---------------------------------------------------------------------- columns
-
-
-def _with_clock(table: Table, rate: float | None, source: str) -> Table:
-    """The table with a time ``t`` at a rate, where one is given."""
-    if rate is None:
-        return table
-    if not 0.0 < rate < math.inf:
-        raise SettingsError(f"the rate of a log without time is {rate}; give Hz")
-    if "t" in table.columns:
-        raise LogError(f"{source}: it has a time column; leave out the rate of {rate:.6g} Hz")
-    n = max((len(x) for x in table.columns.values() if not isinstance(x, str)), default=0)
-    columns: dict[str, FloatArray | str] = {"t": np.arange(n) / rate, **table.columns}
-    clocked = replace(table, columns=columns, units={**table.units, "t": "s"})
-    return clocked.with_step({"step": "clock", "rate": float(rate)})
-
-
-def _stripped(rename: Mapping[str, str], table: Table) -> dict[str, str]:
-    """New name -> name of a column, without the unit that its header may have."""
-    return {new: split_unit(old)[0] if old not in table.columns else old for new, old in rename.items()}
-
-
-def _with_time(rename: Mapping[str, str], table: Table) -> dict[str, str]:
-    """New names of columns, with that of the time ``t``, where one column alone can be the time."""
-    name = None if "t" in rename else time_column(table, rename.values())
-    return dict(rename) if name is None else {"t": name, **rename}
-
-
-def _renamed(table: Table, names: Mapping[str, str], source: str) -> Table:
-    columns = rename_columns(table.columns, names, source)
-    units = {new: table.units[old] for new, old in names.items() if old in table.units}
-    named = unit_of_name(names["t"]) if "t" in names else None
-    units |= {"t": named} if named is not None and "t" not in units else {}
-    kept = {name: unit for name, unit in table.units.items() if name in columns and name not in names}
-    specification = None if table.filter is None else table.filter.renamed(origins_of(table.columns, names))
-    renamed = replace(table, columns=columns, units=kept | units, filter=specification)
-    return renamed.with_step({"step": "rename", "names": dict(names)})
-
-
-def _signals(table: Table, n: int, source: str) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Columns that are as long as the time, and for the others the reason why they are no signals."""
-    columns = {name: column for name, column in table.columns.items() if name != "t"}
-    check_names(columns, source)
-    unusable = {name: column for name, column in columns.items() if isinstance(column, str)}
-    numbers = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
-    unusable |= {m: f"has {len(x)} value{'s' * (len(x) != 1)}, the time {n}" for m, x in numbers.items() if len(x) != n}
-    return {name: x for name, x in numbers.items() if len(x) == n}, unusable

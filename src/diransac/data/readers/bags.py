@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import json
 import re
-import struct
 import sys
 from array import array
 from dataclasses import dataclass, field
@@ -20,7 +19,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from diransac.data.readers.recording import Samples, Stamps, seconds_since
+from diransac.data.readers.recording import Recording, Samples, Stamps, seconds_since
+from diransac.data.readers.table import DAMAGE, undamaged
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ __all__ = ["BagRecording", "McapFile", "RosBag", "open_bag", "open_mcap"]
 INSTALL = 'install them with pip install "diransac[logs]"'
 _LARGEST_CHUNK, _MAGIC_SIZE = 1 << 29, 8
 _MOST_FIELDS, _MOST_ELEMENTS = 2000, 64
-_STEP = re.compile(r"([^.\[\]]+)|\[([^\]]*)\]")
 _OTHER_CLOCK, _LATEST = 3600 * 10**9, 1 << 62
 _NUMBERS = (bool, int, float, np.number, np.bool_)
 
@@ -45,7 +44,7 @@ class Raw(NamedTuple):
     decode: Callable[[], Any]
 
 
-class BagRecording:
+class BagRecording(Recording):
     """Topics of a file of messages.
 
     Parameters
@@ -57,11 +56,8 @@ class BagRecording:
     """
 
     def __init__(self, source: str, file: McapFile | RosBag) -> None:
-        self.source = source
-        self.metadata: dict[str, Any] = {}
-        self._file = file
-        self.elements: dict[str, tuple[str, ...]] = {}
-        self.texts: dict[str, tuple[str, ...]] = {}
+        super().__init__(source)
+        self._file, self.found = file, file.notes
         self._fields: dict[str, tuple[str, ...]] = {}
         self._origin: int | None = None
         for raw in file.messages(None):
@@ -84,11 +80,6 @@ class BagRecording:
         """Numeric fields of the first message of each topic."""
         return self._fields
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Places where the file ended early, and topics without a time in their messages."""
-        return tuple(dict.fromkeys(self._file.notes))
-
     def read(self, wanted: Mapping[str, Sequence[str]], stamps: Stamps) -> dict[str, Samples]:
         """Samples of some fields.
 
@@ -97,8 +88,7 @@ class BagRecording:
         """
         columns = {topic: _Columns.of(fields) for topic, fields in wanted.items()}
         for topic in wanted:
-            if topic not in self._fields:
-                raise LogError(f'{self.source}: there is no topic "{topic}"; found {", ".join(self._fields)}')
+            self.check(topic)
         for raw in self._file.messages(set(wanted)):
             into = columns[raw.topic]
             message = _decoded(raw, self.source) if into.values or stamps == "header" else None
@@ -178,11 +168,9 @@ class _Columns:
 
 def _decoded(raw: Raw, source: str) -> Any:
     """The message.  Raises LogError: it does not follow its definition."""
-    try:
+    # Decoders raise errors of all kinds on damaged messages.
+    with undamaged(f'{source}: a message of "{raw.topic}" cannot be decoded', (Exception,)):
         return raw.decode()
-    except Exception as error:  # decoders raise errors of all kinds on damaged messages
-        why = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise LogError(f'{source}: a message of "{raw.topic}" cannot be decoded ({why:.150})') from error
 
 
 # ---------------------------------------------------------------------- fields
@@ -191,7 +179,7 @@ def _decoded(raw: Raw, source: str) -> Any:
 def _steps(path: str) -> list[str | int]:
     """``a.b[2]`` as names and indices; an element's name stays a text, ``[elbow]``."""
     found: list[str | int] = []
-    for name, index in _STEP.findall(path):
+    for name, index in re.findall(r"([^.\[\]]+)|\[([^\]]*)\]", path):
         found.append(name or (int(index) if index.isdecimal() and len(index) < 10 else f"[{index}]"))
     return found
 
@@ -338,12 +326,13 @@ class McapFile:
 
     def _decoder(self, channel: Any) -> Callable[[bytes], Any] | None:
         """Decoder of a channel's messages; None, with a note, for an encoding that is not read."""
+        of_ros = {("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg")}
         schema = self._schemas.get(channel.schema_id)
         key = (channel.message_encoding, schema.name if schema is not None else "")
         if key not in self._decoders:
             if channel.message_encoding == "json":
                 self._decoders[key] = json.loads
-            elif schema is not None and (channel.message_encoding, schema.encoding) in _ROS:
+            elif schema is not None and (channel.message_encoding, schema.encoding) in of_ros:
                 self._decoders[key] = _ros_decoder(schema, channel.message_encoding, self._source)
             else:
                 encoding = channel.message_encoding
@@ -352,19 +341,12 @@ class McapFile:
         return self._decoders[key]
 
 
-_DAMAGES = (
-    *(ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, AssertionError),
-    *(EOFError, OSError, MemoryError, RuntimeError, struct.error),
-)
-_ROS = {("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg")}
-
-
 def _damages() -> tuple[type[Exception], ...]:
     """Errors that a damaged MCAP file leads to."""
     import zstandard
     from mcap.exceptions import McapError
 
-    return (McapError, zstandard.ZstdError, *_DAMAGES)
+    return (McapError, zstandard.ZstdError, *DAMAGE)
 
 
 def _unpacked(chunk: Any) -> Any:
@@ -393,7 +375,8 @@ def _ros_decoder(schema: Any, encoding: str, source: str) -> Callable[[bytes], A
     from rosbags.typesys.base import TypesysError
 
     text = schema.data.decode(errors="replace")
-    try:
+    errors: tuple[type[Exception], ...] = (TypesysError, SyntaxError, *DAMAGE)
+    with undamaged(f'{source}: the definition of "{schema.name}" cannot be read', errors):
         types: dict[str, Any] = {}
         if schema.encoding == "ros2idl":
             for part in text.split("=" * 80 + "\n"):
@@ -404,9 +387,6 @@ def _ros_decoder(schema: Any, encoding: str, source: str) -> Callable[[bytes], A
         store = get_typestore(Stores.EMPTY)
         store.register(types)
         kind = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/", 1)
-    except (TypesysError, *_DAMAGES, RecursionError, SyntaxError) as error:
-        why = " ".join(str(error).split())
-        raise LogError(f'{source}: the definition of "{schema.name}" cannot be read ({why:.120})') from error
     if encoding == "ros1":
         return lambda data: store.deserialize_ros1(data, kind)
     return lambda data: store.deserialize_cdr(data, kind)
@@ -435,15 +415,9 @@ class RosBag:
         self.notes: list[str] = []
         self._source = source
         self._open = partial(AnyReader, [path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        try:
-            with self._open() as reader:
-                self.topics: Collection[str] | None = {x.topic for x in reader.connections if x.msgcount}
-        except Exception as error:  # the library raises errors of all kinds on damaged bags
-            raise self._damaged(error) from error
-
-    def _damaged(self, error: Exception) -> LogError:
-        why = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        return LogError(f"{self._source}: it is not a bag, or is damaged ({why:.150})")
+        # The library raises errors of all kinds on damaged bags, here and when messages are read.
+        with undamaged(f"{source}: it is not a bag, or is damaged", (Exception,)), self._open() as reader:
+            self.topics: Collection[str] | None = {x.topic for x in reader.connections if x.msgcount}
 
     def messages(self, wanted: Collection[str] | None) -> Iterator[Raw]:
         """Messages of some topics, in the order of their recording."""
@@ -451,10 +425,9 @@ class RosBag:
             chosen = [x for x in reader.connections if wanted is None or x.topic in wanted]
             messages = reader.messages(chosen) if chosen else iter(())
             while True:
-                try:
-                    connection, time, data = next(messages)
-                except StopIteration:
+                with undamaged(f"{self._source}: it is not a bag, or is damaged", (Exception,)):
+                    found = next(messages, None)
+                if found is None:
                     return
-                except Exception as error:  # as above
-                    raise self._damaged(error) from error
+                connection, time, data = found
                 yield Raw(connection.topic, time, partial(reader.deserialize, data, connection.msgtype))

@@ -7,7 +7,6 @@ import csv
 import gzip
 import io
 import re
-import zlib
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.files import COMMENT
 from diransac.data.readers.repair import Repairs
-from diransac.data.readers.table import Table, check_size, check_unique, with_metadata
+from diransac.data.readers.table import Table, check_size, check_unique, undamaged, with_metadata
 from diransac.data.units import split_unit
 from diransac.errors import LogError
 from diransac.limits import LARGEST_TEXT, beyond
@@ -32,23 +31,16 @@ __all__ = ["joined", "read_csv", "read_csv_gz"]
 
 _SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
 _FEW_LINES = 20_000
-_SEEN = 20
-"""Lines at the end of a text from which the number of its fields is taken."""
-_CHUNK = 1 << 22
 _COMMENTS = ("#", "%", "//")
 _ISO = re.compile(
     r"(?P<date>(?:19|20|21)\d\d-\d\d-\d\d)[T ](?P<clock>\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)(?P<zone>Z|[+-]\d\d:?\d\d)?"
 )
-_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
-_MISSING = ("", "na", "n/a", "nan", "null", "none")
 
 
 def read_csv_gz(data: bytes, source: str, names: Sequence[str] | None = None, repairs: Repairs | None = None) -> Table:
     """Table of gzip data.  Raises LogError: as `read_csv`; the data are not gzip, or are cut off."""
-    try:
+    with undamaged(f"{source}: the gzip data are damaged or cut off"):
         text = _unpacked(data, source)
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise LogError(f"{source}: the gzip data are damaged or cut off ({error})") from error
     return read_csv(text, source, names, repairs)
 
 
@@ -56,7 +48,7 @@ def _unpacked(data: bytes, source: str) -> bytes:
     """Text of gzip data.  Raises LogError: it is too large."""
     parts, size = list[bytes](), 0
     with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-        while part := file.read(_CHUNK):
+        while part := file.read(1 << 22):
             parts.append(part)
             size += len(part)
             if size > LARGEST_TEXT:
@@ -165,7 +157,8 @@ def _without_preamble(lines: list[str], repairs: Repairs) -> tuple[list[str], in
 def _lines_above(lines: Sequence[str]) -> int:
     """Number of lines above the first that has as many fields as most of the last ones, if it is a header."""
     separator = _separator(lines[-1]) if any(x in lines[-1] for x in _SEPARATORS) else None
-    width = Counter(len(line.split(separator)) for line in lines[-_SEEN:]).most_common(1)[0][0]
+    # The last lines have the usual number of fields.
+    width = Counter(len(line.split(separator)) for line in lines[-20:]).most_common(1)[0][0]
     found = next((k for k, line in enumerate(lines) if len(line.split(separator)) == width), 0)
     return 0 if _is_row(lines[found]) else found
 
@@ -265,7 +258,7 @@ def _decoded(data: bytes, source: str) -> tuple[str, list[str]]:
     except UnicodeDecodeError as error:
         with suppress(UnicodeDecodeError):
             text = data.decode("cp1252")
-            if not _CONTROL.search(text):
+            if not re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]", text):
                 return text, ["its text is not UTF-8, and is read as that of Windows (1252)"]
         raise LogError(
             f"{source}: it is not UTF-8 text (byte 0x{data[error.start]:02x} at offset {error.start}); save it as UTF-8"
@@ -389,7 +382,8 @@ def _numbers(fields: pl.Series, first: int, separator: str, name: str, repairs: 
     text = fields.str.strip_chars()
     readable = text.str.replace(",", ".", literal=True) if separator == ";" else text
     numbers = readable.cast(pl.Float64, strict=False)
-    bad = (numbers.is_null() & text.is_not_null() & ~text.str.to_lowercase().is_in(_MISSING)).to_numpy()
+    missing = text.str.to_lowercase().is_in(("", "na", "n/a", "nan", "null", "none"))
+    bad = (numbers.is_null() & text.is_not_null() & ~missing).to_numpy()
     if bad.any():
         row, n = int(bad.argmax()), int(bad.sum())
         reason = f'is not numeric: line {row + first} holds "{text[row]:.60}"'

@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.data.checks import as_doubles
-from diransac.data.readers.recording import Samples, Stamps
+from diransac.data.readers.recording import Recording, Samples, Stamps
+from diransac.data.readers.table import undamaged
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
@@ -24,31 +25,24 @@ if TYPE_CHECKING:
 __all__ = ["MAGIC", "CrazyflieRecording"]
 
 MAGIC = b"\xbc"
-_VARIABLE = re.compile(r"(.+)\(([bBhHiIqQfd?])\)")
 _STAMPS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}
 _MOST_EVENTS, _MOST_VARIABLES = 256, 1024
 
 
-class CrazyflieRecording:
+class CrazyflieRecording(Recording):
     """Events of a micro SD log.
 
     Raises LogError: the data are no such log, or hold no event.
     """
 
     def __init__(self, data: bytes, source: str) -> None:
-        self.source = source
-        self.metadata: dict[str, Any] = {}
-        self.elements: dict[str, tuple[str, ...]] = {}
-        self.texts: dict[str, tuple[str, ...]] = {}
-        self._notes: list[str] = []
-        try:
+        super().__init__(source)
+        with undamaged(f"{source}: it is not a Crazyflie log, or its header is damaged"):
             version, number = struct.unpack_from("<HH", data, 1)
             if version not in _STAMPS or number > _MOST_EVENTS:
                 raise ValueError(f"version {version}, {number} events")
             self._stamp, self._tick = _STAMPS[version]
             self._kinds, at = self._events(data, number)
-        except (ValueError, IndexError, struct.error, UnicodeDecodeError) as error:
-            raise LogError(f"{source}: it is not a Crazyflie log, or its header is damaged ({error!s:.80})") from error
         self._records = self._walk(data, at)
         if not self._records:
             raise LogError(f"{source}: it holds no event; it is cut off or damaged")
@@ -66,7 +60,7 @@ class CrazyflieRecording:
             fields = []
             for _ in range(min(n, _MOST_VARIABLES)):
                 text, at = _text(data, at)
-                match = _VARIABLE.fullmatch(text)
+                match = re.fullmatch(r"(.+)\(([bBhHiIqQfd?])\)", text)
                 if match is None:
                     raise ValueError(f'"{text}" names no type')
                 fields.append((match[1], np.dtype(f"<{match[2]}")))
@@ -85,7 +79,7 @@ class CrazyflieRecording:
             at += kind[1].itemsize
         rest = len(data) - at
         if not (rest == 0 or (rest == 4 and zlib.crc32(data[:at]) == int.from_bytes(data[at:], "little"))):
-            self._notes.append(f"the file is cut off or damaged: its last {rest} bytes are left out")
+            self.found.append(f"the file is cut off or damaged: its last {rest} bytes are left out")
         bytes_ = np.frombuffer(data, dtype=np.uint8)
         return {
             self._kinds[event][0]: bytes_[np.array(found)[:, None] + np.arange(size)].view(self._kinds[event][1])[:, 0]
@@ -98,21 +92,11 @@ class CrazyflieRecording:
         """Variables of each event."""
         return {name: tuple(x.dtype.names or ())[2:] for name, x in self._records.items()}
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Damages."""
-        return tuple(self._notes)
-
     def read(self, wanted: Mapping[str, Sequence[str]], stamps: Stamps) -> dict[str, Samples]:
         """Samples of some variables.  Raises LogError: there is no such event or variable."""
         samples = {}
         for name, fields in wanted.items():
-            if name not in self._records:
-                raise LogError(f'{self.source}: there is no event "{name}"; found {", ".join(self._records)}')
-            known = self.fields[name]
-            for label in fields:
-                if label not in known:
-                    raise LogError(f'{self.source}: event "{name}" has no "{label}"; it has {", ".join(known)}')
+            self.check(name, fields)
             records = self._records[name]
             time = (records["t"].astype(np.float64) - self._start) * self._tick
             samples[name] = Samples(time, {label: as_doubles(records[label]) for label in fields})

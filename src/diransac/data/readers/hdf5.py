@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from diransac.data.readers.table import Table, check_shapes, table_of_arrays
+from diransac.data.readers.table import Table, check_shapes, table_of_arrays, undamaged
 from diransac.errors import LogError
 from diransac.limits import LARGEST_LOG, MOST_COLUMNS, beyond
 
@@ -20,12 +20,9 @@ if TYPE_CHECKING:
 __all__ = ["MAGIC", "read_hdf5"]
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
-_DEEPEST = 16
 _MOST_LINKS = 2 * MOST_COLUMNS
 _MOST_CHUNKS = 200_000
 """HDF5 takes 4 kB and 10 microseconds for each, also for those that are missing."""
-
-_DAMAGED = (OSError, ValueError, TypeError, KeyError, RuntimeError, MemoryError, OverflowError, AttributeError)
 
 
 def read_hdf5(data: bytes, source: str, *, transposed: bool = False) -> Table:
@@ -47,20 +44,16 @@ def read_hdf5(data: bytes, source: str, *, transposed: bool = False) -> Table:
             f'{source}: HDF5 needs the package h5py; install it with pip install "diransac[logs]"'
         ) from error
     arrays: dict[str, npt.NDArray[Any]] = {}
-    try:
-        with h5py.File(io.BytesIO(data), "r") as file:
-            found = dict(_Walk(source).datasets(file, "", ()))
-            check_shapes([dataset.shape[::-1] if transposed else dataset.shape for dataset in found.values()], source)
-            n_chunks = sum(_n_chunks(dataset) for dataset in found.values())
-            if n_chunks > _MOST_CHUNKS:
-                raise LogError(f"{source}: it has {beyond(_MOST_CHUNKS, 'chunks', n_chunks)}; write it in larger ones")
-            for name, dataset in found.items():
-                _check_storage(dataset, f'{source}: dataset "{name}"')
-                values = np.asarray(dataset[()])
-                arrays[name] = values.T if transposed else values
-    except _DAMAGED as error:
-        why = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise LogError(f"{source}: it is not an HDF5 file, or is damaged ({why:.120})") from error
+    with undamaged(f"{source}: it is not an HDF5 file, or is damaged"), h5py.File(io.BytesIO(data), "r") as file:
+        found = dict(_Walk(source).datasets(file, "", ()))
+        check_shapes([dataset.shape[::-1] if transposed else dataset.shape for dataset in found.values()], source)
+        n_chunks = sum(_n_chunks(dataset) for dataset in found.values())
+        if n_chunks > _MOST_CHUNKS:
+            raise LogError(f"{source}: it has {beyond(_MOST_CHUNKS, 'chunks', n_chunks)}; write it in larger ones")
+        for name, dataset in found.items():
+            _check_storage(dataset, f'{source}: dataset "{name}"')
+            values = np.asarray(dataset[()])
+            arrays[name] = values.T if transposed else values
     return table_of_arrays(arrays, source)
 
 
@@ -78,7 +71,7 @@ class _Walk:
         """
         import h5py
 
-        if group in above or len(above) >= _DEEPEST:
+        if group in above or len(above) >= 16:
             return
         for name in group:
             self.n_links += 1

@@ -38,18 +38,11 @@ if TYPE_CHECKING:
 
 __all__ = ["LerobotDataset"]
 
-_FORMATS = re.compile(r"v[23]\.\d{1,3}")
-_CHUNK = re.compile(r"chunk-\d{1,9}")
 _EPISODE = re.compile(r"(?:episode_|train-)(\d{1,9})(?:-of-\d{1,9})?\.parquet")
 _FILE = re.compile(r"file-\d{1,9}\.parquet")
 _INDEX = "episode_index"
-_COUNTERS = (_INDEX, "frame_index", "index", "task_index")
-"""Columns that count rows, episodes and tasks: no signals."""
 _WIDEST = 1000
 """Numbers of a feature per row; images are larger."""
-_QUANTITIES = (".pos", ".vel", ".torque", ".effort", ".current")
-"""Endings of the names of numbers that belong to one joint."""
-_FEATURES = ("observation.state", "action")
 
 
 class LerobotDataset:
@@ -101,7 +94,9 @@ class LerobotDataset:
         if episode not in self.files:
             raise LogError(f"{self.source}: there is no episode {episode}; found {self.listed}")
         with scanned(self._content(self.files[episode]), self.source) as (lazy, schema):
-            kinds = {name: kind for name, kind in schema.items() if name not in _COUNTERS}
+            # Columns that count rows, episodes and tasks are no signals.
+            counters = (_INDEX, "frame_index", "index", "task_index")
+            kinds = {name: kind for name, kind in schema.items() if name not in counters}
             read = [name for name, kind in kinds.items() if is_numeric(kind) or self._is_vector(name, kind)]
             counted = [name for name in ("frame_index",) if name in schema and is_numeric(schema[name])]
             if _FILE.fullmatch(self.files[episode].name):
@@ -136,7 +131,7 @@ class LerobotDataset:
     @property
     def joints(self) -> tuple[str, ...]:
         """Names in state and action without the ending of their quantity, ``.pos`` and the like."""
-        named = [name for feature in _FEATURES for name in _names(self._features.get(feature))]
+        named = [name for feature in ("observation.state", "action") for name in _names(self._features.get(feature))]
         return tuple(dict.fromkeys(_without_quantity(name) for name in named))
 
     # ------------------------------------------------------------------ files
@@ -155,7 +150,8 @@ class LerobotDataset:
         """Files with episodes.  Raises LogError: they cannot be listed."""
         data, n = self.folder / "data", 0
         try:
-            chunks = [chunk for chunk in data.iterdir() if _CHUNK.fullmatch(chunk.name)] if data.is_dir() else []
+            folders = data.iterdir() if data.is_dir() else ()
+            chunks = [chunk for chunk in folders if re.fullmatch(r"chunk-\d{1,9}", chunk.name)]
             for chunk in map(self._inside, chunks):
                 for file in chunk.iterdir() if chunk.is_dir() else ():
                     if _EPISODE.fullmatch(file.name) or _FILE.fullmatch(file.name):
@@ -236,7 +232,7 @@ def _information(path: Path, source: str) -> Mapping[str, Any]:
     except ValueError as error:
         raise LogError(f"{source}: its meta/info.json is not JSON that can be read ({error!s:.100})") from error
     version = found.get("codebase_version") if isinstance(found, dict) else None
-    if not isinstance(version, str) or not _FORMATS.fullmatch(version):
+    if not isinstance(version, str) or not re.fullmatch(r"v[23]\.\d{1,3}", version):
         what = "no dataset of LeRobot" if version is None else f"a dataset of LeRobot's format {version!s:.20}"
         raise LogError(f"{source}: by its meta/info.json it is {what}; formats v2.0 to v3.0 are read, convert it")
     return dict(found)
@@ -254,7 +250,8 @@ def _names(feature: Any) -> list[str]:
 
 
 def _without_quantity(name: str) -> str:
-    ending = next((x for x in _QUANTITIES if name.endswith(x) and name != x), "")
+    # Endings of the names of numbers that belong to one joint.
+    ending = next((x for x in (".pos", ".vel", ".torque", ".effort", ".current") if name.endswith(x) and name != x), "")
     return name.removesuffix(ending)
 
 

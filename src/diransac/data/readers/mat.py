@@ -19,8 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.data.readers import hdf5
-from diransac.data.readers.table import Table, check_unique, table_of_arrays
-from diransac.errors import LogError
+from diransac.data.readers.table import Table, check_unique, table_of_arrays, undamaged
 from diransac.limits import LARGEST_LOG, MOST_COLUMNS, beyond
 
 if TYPE_CHECKING:
@@ -32,12 +31,7 @@ _HEADER, _DEEPEST = 128, 8
 _MATRIX, _COMPRESSED = 14, 15
 _CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _STRUCTURE, _COMPLEX = 2, 0x0800
-_NUMERIC = range(6, 16)
 _CLASSES = {1: "a cell", 3: "an object", 4: "a text", 5: "a sparse matrix", 16: "a function", 17: "an object"}
-_DAMAGED = (
-    *(ValueError, TypeError, KeyError, IndexError, AttributeError, NotImplementedError, OverflowError, MemoryError),
-    *(OSError, EOFError, struct.error, zlib.error),
-)
 
 
 def read_mat(data: bytes, source: str) -> Table:
@@ -47,10 +41,8 @@ def read_mat(data: bytes, source: str) -> Table:
     """
     if data.startswith(b"MATLAB 7.3") or hdf5.MAGIC in data[:1024]:
         return hdf5.read_hdf5(data, source, transposed=True)
-    try:
+    with undamaged(f"{source}: it is not a MAT file, or is damaged"):
         named = list(_level_5(data)) if data[126:128] in (b"IM", b"MI") else _level_4(data)
-    except _DAMAGED as error:
-        raise LogError(f"{source}: it is not a MAT file, or is damaged ({type(error).__name__}: {error})") from error
     check_unique([name for name, _ in named], source)
     return table_of_arrays(dict(named), source)
 
@@ -134,7 +126,7 @@ def _arrays(content: memoryview, order: str, name: str, depth: int) -> Iterator[
     shape = tuple(int(n) for n in elements.numbers())
     own = elements.take()[1].tobytes().decode(errors="replace")
     name = name or own
-    if kind in _NUMERIC and not flags & _COMPLEX:
+    if kind in range(6, 16) and not flags & _COMPLEX:
         values = elements.numbers()
         if min(shape, default=-1) < 0 or math.prod(shape) != len(values):
             raise ValueError(f'"{name}" has {len(values)} numbers for the size {shape}')

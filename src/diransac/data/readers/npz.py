@@ -5,19 +5,24 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-import zlib
 from typing import IO, Any
 
 import numpy as np
 
 from diransac.data.files import MEMBER
-from diransac.data.readers.table import Table, check_shapes, check_size, check_unique, table_of_arrays, with_metadata
+from diransac.data.readers.table import (
+    Table,
+    check_shapes,
+    check_size,
+    check_unique,
+    table_of_arrays,
+    undamaged,
+    with_metadata,
+)
 from diransac.errors import LogError
 from diransac.limits import LARGEST_LOG, beyond
 
 __all__ = ["read_npz"]
-
-_DAMAGED = (ValueError, EOFError, OSError, KeyError, NotImplementedError, RuntimeError, MemoryError, zlib.error)
 
 
 def read_npz(data: bytes, source: str) -> Table:
@@ -25,10 +30,8 @@ def read_npz(data: bytes, source: str) -> Table:
 
     Raises LogError: the data are no NPZ file, are cut off, hold pickled objects, or are larger than a log may be.
     """
-    try:
+    with undamaged(f"{source}: it is not an NPZ file, or is cut off"):
         archive = zipfile.ZipFile(io.BytesIO(data))
-    except (zipfile.BadZipFile, NotImplementedError) as error:
-        raise LogError(f"{source}: it is not an NPZ file, or is cut off ({error})") from error
     names = archive.namelist()
     check_unique(names, source)
     check_size(source, 0, len(names))
@@ -40,17 +43,14 @@ def read_npz(data: bytes, source: str) -> Table:
     metadata = None
     for entry in names:
         name = entry.removesuffix(".npy")
-        try:
-            with archive.open(entry) as file:
-                if entry == MEMBER:
-                    metadata = file.read()
-                    continue
-                shapes.append(_shape(file))
-                check_shapes(shapes, source)
-                file.seek(0)
-                arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
-        except (*_DAMAGED, zipfile.BadZipFile) as error:
-            raise LogError(f'{source}: array "{name}" cannot be read ({error})') from error
+        with undamaged(f'{source}: array "{name}" cannot be read'), archive.open(entry) as file:
+            if entry == MEMBER:
+                metadata = file.read()
+                continue
+            shapes.append(_shape(file))
+            check_shapes(shapes, source)
+            file.seek(0)
+            arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
     table = table_of_arrays(arrays, source)
     return table if metadata is None else with_metadata(table, metadata, source)
 

@@ -23,11 +23,8 @@ if TYPE_CHECKING:
 __all__ = ["is_numeric", "numbers_of", "read_parquet", "scanned"]
 
 _MAGIC = b"PAR1"
-_DEEPEST = 16
 _INDEX = {"__index_level_0__": "timestamp"}
 """Name that pandas gives to its index, which is that of the rows, where it has none."""
-_FEW = 1000
-"""Rows of a column without numbers that are looked at: texts and lists may be of any size."""
 
 
 def read_parquet(data: bytes, source: str) -> Table:
@@ -40,7 +37,8 @@ def read_parquet(data: bytes, source: str) -> Table:
     with scanned(data, source) as (lazy, schema):
         numeric = [name for name, kind in schema.items() if is_numeric(kind)]
         frame = pl.read_parquet(io.BytesIO(data), columns=numeric)
-        few = lazy.drop(numeric).head(_FEW).collect() if len(numeric) < len(schema) else frame.clear()
+        # Texts and lists may be of any size: only few rows of columns without numbers are looked at.
+        few = lazy.drop(numeric).head(1000).collect() if len(numeric) < len(schema) else frame.clear()
         dated = [name for name, kind in schema.items() if kind in (pl.Datetime, pl.Duration)]
         times = {name: _seconds(series) for name, series in lazy.select(dated).collect().to_dict().items()}
         metadata = pl.read_parquet_metadata(io.BytesIO(data)).get(KEY)
@@ -162,7 +160,7 @@ class _Compact:
             head = self._byte()
             n = head >> 4 if head >> 4 < 15 else self._natural()
             return [self._byte() if head & 15 in (1, 2) else self._value(head & 15, depth) for _ in range(n)]
-        if kind == 12 and depth < _DEEPEST:
+        if kind == 12 and depth < 16:
             return self.structure(depth + 1)
         length = self._natural() if kind == 8 else {3: 1, 7: 8}[kind]
         self.at += length

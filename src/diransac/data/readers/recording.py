@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ from diransac.arrays import FloatArray
 from diransac.data.checks import check_time_order
 from diransac.data.preprocessing.steps import describe_resampling, interpolate_at, resampling_grid
 from diransac.errors import LogError
+from diransac.text_table import some
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -20,8 +21,6 @@ __all__ = ["Aligned", "Recording", "Samples", "Stamps", "align", "find_field", "
 
 Stamps = str
 """``"header"``: time at which a message says it was sampled; ``"message"``: time at which it was recorded."""
-
-_SLOW = 1.5
 
 
 @dataclass(frozen=True)
@@ -55,28 +54,55 @@ class Samples:
         return Samples(self.time[rows], {name: x[rows] for name, x in self.columns.items()}, self.unusable)
 
 
-class Recording(Protocol):
-    """An opened file with one or more topics; `read` may be called again."""
+class Recording:
+    """An opened file with one or more topics; `read` may be called again.
 
-    source: str
-    """Name in messages, such as ``log "flight.ulg"``."""
-    metadata: dict[str, Any]
-    """Facts beside the samples, that JSON can hold: the machine, its parameters, messages in words."""
-    elements: dict[str, tuple[str, ...]]
-    """Names of the elements of arrays, such as joints, of the topics that have some."""
-    texts: dict[str, tuple[str, ...]]
-    """Names of the fields that hold texts, such as a mode, of the topics that have some."""
+    Parameters
+    ----------
+    source : str
+        Name in messages, such as ``log "flight.ulg"``.
+
+    Attributes
+    ----------
+    metadata : dict
+        Facts beside the samples, that JSON can hold: the machine, its parameters, messages in words.
+    elements : dict of str to tuple of str
+        Names of the elements of arrays, such as joints, of the topics that have some.
+    texts : dict of str to tuple of str
+        Names of the fields that hold texts, such as a mode, of the topics that have some.
+    found : list of str
+        Findings about the file; complete after a `read`.
+    """
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self.metadata: dict[str, Any] = {}
+        self.elements: dict[str, tuple[str, ...]] = {}
+        self.texts: dict[str, tuple[str, ...]] = {}
+        self.found: list[str] = []
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Findings about the file, a sentence each."""
+        return tuple(dict.fromkeys(self.found))
 
     @property
     def fields(self) -> Mapping[str, tuple[str, ...]]:
         """Names of the fields of each topic."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Findings about the file, a sentence each; complete after a `read`."""
+        raise NotImplementedError
 
     def read(self, wanted: Mapping[str, Sequence[str]], stamps: Stamps) -> dict[str, Samples]:
-        """Samples of some fields of some topics.  Raises LogError: a topic has no message, or is damaged."""
+        """Samples of some fields of some topics.  Raises LogError: there is no such topic or field, or damage."""
+        raise NotImplementedError
+
+    def check(self, topic: str, fields: Sequence[str] = ()) -> None:
+        """Raise LogError: there is no such topic, or it has no such field."""
+        if topic not in self.fields:
+            raise LogError(f'{self.source}: there is no topic "{topic}"; found {", ".join(self.fields)}')
+        for label in fields:
+            if label not in self.fields[topic]:
+                listed = ", ".join(self.fields[topic])
+                raise LogError(f'{self.source}: topic "{topic}" has no field "{label}"; it has {listed}')
 
 
 def seconds_since(origin: int, nanoseconds: npt.NDArray[np.int64]) -> FloatArray:
@@ -95,7 +121,7 @@ def find_field(path: str, fields: Mapping[str, Iterable[str]], source: str) -> t
         return topic, path[len(topic) + 1 :]
     if len(fields) == 1:
         return next(iter(fields)), path
-    raise LogError(f'{source}: "{path}" names no topic; found {_some(fields)}. Name it as topic.field')
+    raise LogError(f'{source}: "{path}" names no topic; found {some(fields, 40)}. Name it as topic.field')
 
 
 def shortened(fields: Iterable[str]) -> list[str]:
@@ -132,12 +158,6 @@ def _together(whole: str, kind: str, parts: list[str]) -> str:
     if kind == "[":
         return f"{whole}[{parts[0]}..{parts[-1]}]" if len(parts) > 1 else f"{whole}[{parts[0]}]"
     return f"{whole}.{{{', '.join(parts)}}}" if len(parts) > 1 else f"{whole}.{parts[0]}"
-
-
-def _some(names: Iterable[str], most: int = 40) -> str:
-    """Names in one line, cut where they are many."""
-    listed = list(names)
-    return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
 
 
 # ---------------------------------------------------------------------- one clock
@@ -204,7 +224,7 @@ def _on_rows(
     """Columns of a topic on the rows of the log, and sentences about samples that moved or found no row."""
     if samples.time is time or np.array_equal(samples.time, time):
         return dict(samples.columns), []
-    if hertz is not None and samples.interval <= _SLOW / hertz:
+    if hertz is not None and samples.interval <= 1.5 / hertz:  # about as fast
         return interpolate_at(samples.time, samples.columns, time, hertz), []
     return _nearest_rows(samples, time, float(np.median(np.diff(time))), topic)
 

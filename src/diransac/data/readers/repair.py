@@ -31,8 +31,6 @@ REPAIRS = {
 }
 """Names of the repairs, and what each does; all of them are done by ``repair=True``."""
 
-_SI = ("s", "m", "m/s", "m/s^2", "rad", "rad/s", "rad/s^2", "N", "N m", "V", "A", "kg")
-
 
 @dataclass
 class Repairs:
@@ -98,9 +96,10 @@ class Repairs:
         """Table with its columns in SI units, where their units are known."""
         if "units" not in self:
             return table
+        known = ("s", "m", "m/s", "m/s^2", "rad", "rad/s", "rad/s^2", "N", "N m", "V", "A", "kg")
         columns, units, changed = dict(table.columns), dict(table.units), []
         for name, unit in table.units.items():
-            target = next((x for x in _SI if conversion(unit, x) is not None), None)
+            target = next((x for x in known if conversion(unit, x) is not None), None)
             column = columns.get(name)
             if unit == "g" or target is None or column is None or isinstance(column, str):
                 continue

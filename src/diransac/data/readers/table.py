@@ -3,25 +3,53 @@
 from __future__ import annotations
 
 import math
+import re
+import struct
+import zipfile
+import zlib
 from collections import Counter
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.data.checks import as_numbers
 from diransac.data.files import decode_metadata
 from diransac.data.filters import FilterSpecification
-from diransac.data.units import split_unit
+from diransac.data.units import conversion, split_unit
 from diransac.errors import LogError
 from diransac.limits import MOST_COLUMNS, MOST_NUMBERS, MOST_ROWS, beyond
 from diransac.plain_text import one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Container, Iterator, Mapping, Sequence
 
-__all__ = ["Table", "check_shapes", "check_size", "check_unique", "table_of_arrays", "with_metadata"]
+__all__ = [
+    "DAMAGE", "Table", "check_shapes", "check_size", "check_unique", "seconds", "table_of_arrays", "time_column",
+    "undamaged", "unit_of_name", "with_metadata",
+]  # fmt: skip
+
+
+DAMAGE: tuple[type[Exception], ...] = (
+    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError, NotImplementedError),
+    *(OSError, EOFError, MemoryError, RuntimeError, struct.error, zlib.error, zipfile.BadZipFile),
+)
+"""Errors that damaged files lead to in the libraries that read them, and here."""
+
+
+@contextmanager
+def undamaged(what: str, errors: tuple[type[Exception], ...] = DAMAGE) -> Iterator[None]:
+    """Context in which a file is read.  Raises LogError: it is damaged; the message begins with a clause on it."""
+    try:
+        yield
+    except LogError:
+        raise
+    except errors as error:
+        why = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise LogError(f"{what} ({why:.150})") from error
 
 
 @dataclass(frozen=True)
@@ -154,3 +182,62 @@ def _pieces(name: str, array: npt.NDArray[Any]) -> list[tuple[str, FloatArray | 
     if array.ndim > 2:
         return [(name, f"has {array.ndim} dimensions: {array.shape}")]
     return [(name, as_numbers(array.ravel()))]
+
+
+# The time -------------------------------------------------------------------------------------------------------------
+_UNIT_OF_ENDING = {
+    **dict.fromkeys(("s", "sec", "secs", "seconds"), "s"),
+    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "usec", "micros", "microseconds"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
+}
+_NAME = re.compile(
+    rf"(?:t[ _.-]|(?i:time|time[ _.-]?stamps?|stamp)[ _.-]?)(?P<unit>(?i:{'|'.join(_UNIT_OF_ENDING)}))"
+    r"|(?i:time|time[ _]?stamps?|stamp)"
+)
+
+
+def time_column(table: Table, taken: Container[str]) -> str | None:
+    """Name of the one column that a table can have as its time; None without one, and where it has ``t``.
+
+    Parameters
+    ----------
+    table : Table
+    taken : container of str
+        Columns that are something else.
+    """
+    if "t" in table.columns:
+        return None
+    numeric = [name for name, x in table.columns.items() if isinstance(x, np.ndarray)]
+    for kind in (numeric, table.times):
+        found = [name for name in kind if _NAME.fullmatch(name) and name not in taken]
+        if found:
+            return found[0] if len(found) == 1 else None
+    return None
+
+
+def unit_of_name(name: str) -> str | None:
+    """Unit at the end of the name of a time column, such as that of ``t_ms``; None without one."""
+    match = _NAME.fullmatch(name)
+    return _UNIT_OF_ENDING[match["unit"].lower()] if match and match["unit"] else None
+
+
+def seconds(table: Table, factors: Mapping[str, float], source: str) -> tuple[FloatArray, str]:
+    """Column ``t`` (N,) of a table in seconds, and a sentence on a conversion from its unit, empty without one.
+
+    Raises LogError: there is no such column, or it holds no numbers.
+    """
+    if "t" not in table.columns:
+        found = ", ".join(table.columns)
+        rate = "" if any(map(_NAME.fullmatch, table.columns)) else ", or give the rate of a log without one: --rate HZ"
+        raise LogError(f'{source}: there is no time column "t"; found {found}. Say which one it is: --map t=NAME{rate}')
+    time = table.columns["t"]
+    if isinstance(time, str):
+        raise LogError(f'{source}: the time column "t" {time}')
+    if "t" in factors:
+        return time * factors["t"], ""
+    unit = table.units.get("t", "s")
+    factor = conversion(unit, "s")
+    if factor in (None, 1.0):
+        return time, ""
+    return time * factor, f"the time is converted from {unit} to s"

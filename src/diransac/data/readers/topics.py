@@ -14,7 +14,7 @@ from diransac.data.readers.recording import Recording, Samples, align, find_fiel
 from diransac.data.readers.table import Table
 from diransac.errors import LogError
 from diransac.plain_text import one_line
-from diransac.text_table import aligned
+from diransac.text_table import aligned, some
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from diransac.data.readers.repair import Repairs
 
 __all__ = ["TopicFacts", "TopicTable", "is_one_table", "list_topics", "mapped_table", "table_of_topics", "whole_topic"]
-
-_GAP = 3.5
-_FIELDS_SHOWN = 6
 
 
 # ---------------------------------------------------------------------- tables
@@ -100,8 +97,8 @@ def table_of_topics(
         entries.append(MappedSignals((name,), (label,), topic))
     if not entries:
         raise LogError(
-            f"{source}: it has {len(fields)} topics, {_some(fields)}; say what they are: --mapping NAME|FILE.toml, or "
-            "--map thrust=topic.field"
+            f"{source}: it has {len(fields)} topics, {some(fields, 12)}; say what they are: "
+            "--mapping NAME|FILE.toml, or --map thrust=topic.field"
         )
     wanted: dict[str, tuple[str, ...]] = {}
     for entry in entries:
@@ -118,7 +115,8 @@ def table_of_topics(
     step |= {"renamed": dict(rename)} if rename else {}
     step["signals"] = _origins(entries)
     information = recording.metadata.get("information", {})
-    step |= {"log": {name: information[name] for name in _KEPT if name in information}} if information else {}
+    kept = ("sys_name", "ver_hw", "ver_sw", "ver_sw_branch", "sys_uuid")
+    step |= {"log": {name: information[name] for name in kept if name in information}} if information else {}
     flags = {} if mapping is None else _flags(recording, mapping, made.time)
     step |= {"events": list(flags)} if flags else {}
     history = (step,) if made.step is None else (step, made.step)
@@ -127,10 +125,6 @@ def table_of_topics(
     return Table({"t": made.time, **made.signals, **unusable, **flags}, units | {"t": "s"}, said, history), None if len(
         parts
     ) > 1 else resample
-
-
-_KEPT = ("sys_name", "ver_hw", "ver_sw", "ver_sw_branch", "sys_uuid")
-"""Facts of the machine's description that a log's history keeps."""
 
 
 def _flags(recording: Recording, mapping: LogMapping, rows: FloatArray) -> dict[str, FloatArray]:
@@ -178,11 +172,6 @@ def _origins(entries: Sequence[MappedSignals]) -> dict[str, str]:
         for entry in entries
         for name, label in zip(entry.names, entry.fields, strict=True)
     }
-
-
-def _some(names: Mapping[str, Any], most: int = 12) -> str:
-    listed = list(names)
-    return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
 
 
 # ---------------------------------------------------------------------- listing
@@ -252,7 +241,7 @@ class TopicTable:
         for name, x in self.topics.items():
             gaps = [str(x.n_gaps or "-"), f"{x.longest_gap:.3g}" if x.n_gaps else "-"]
             listed = [*shortened(x.fields), *(f"{name} (text)" for name in shortened(x.texts))]
-            shown = ", ".join(listed[:_FIELDS_SHOWN]) + (", ..." if len(listed) > _FIELDS_SHOWN else "")
+            shown = ", ".join(listed[:6]) + (", ..." if len(listed) > 6 else "")
             rate = f"{x.rate:.4g}" if np.isfinite(x.rate) else "-"
             rows.append([name, str(x.n_messages), rate, f"{x.start:.6g}", f"{x.end:.6g}", *gaps, shown])
         machine = self.metadata.get("information", {})
@@ -278,7 +267,7 @@ def list_topics(recording: Recording) -> TopicTable:
 def _facts(time: FloatArray, fields: tuple[str, ...]) -> TopicFacts:
     steps = np.diff(time)
     usual = float(np.median(steps)) if len(steps) else np.nan
-    n_gaps = int((steps > _GAP * usual).sum()) if usual > 0.0 else 0
+    n_gaps = int((steps > 3.5 * usual).sum()) if usual > 0.0 else 0
     longest = float(steps.max()) if len(steps) else np.nan
     rate = 1.0 / usual if usual > 0.0 else np.nan
     return TopicFacts(len(time), rate, float(time[0]), float(time[-1]), n_gaps, longest, fields)

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.data.checks import as_doubles
-from diransac.data.readers.recording import Samples, Stamps, seconds_since
+from diransac.data.readers.recording import Recording, Samples, Stamps, seconds_since
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["UlogRecording"]
 
-_MAGIC = b"ULog\x01\x12\x35"
-_SYNC = b"\x08\x00S\x2f\x73\x13\x20\x25\x0c\xbb\x12"
 _HEADER = struct.Struct("<HB")
 _KNOWN = frozenset(b"FDIMPQARSOLCB")
 _TYPES = {
@@ -37,10 +35,8 @@ _TYPES = {
     "bool": "<u1",
     "char": "<u1",
 }
-_FIELD = re.compile(r"(\w+)(?:\[(\d{1,5})\])? (\w+)")
 _NANOSECONDS, _LATEST_START = 1000, 60_000_000
 _LARGEST_RECORD, _DEEPEST = 0xFFFF, 8
-_LATEST_STAMP = 1 << 53
 _MOST_DAMAGES, _SEARCHED = 100, 1 << 20
 _MOST_TEXTS = 1000
 _ROWS_AT_ONCE = 1 << 16
@@ -57,7 +53,7 @@ class _Topic:
     places: array[int] = field(default_factory=lambda: array("Q"))
 
 
-class UlogRecording:
+class UlogRecording(Recording):
     """Topics of a ULog file.
 
     Raises LogError: the file is no ULog, or is cut off before its first record.
@@ -70,11 +66,8 @@ class UlogRecording:
     """
 
     def __init__(self, path: Path, source: str) -> None:
-        self.source = source
-        self.metadata: dict[str, Any] = {"information": {}, "parameters": {}, "messages": [], "dropouts": []}
-        self.elements: dict[str, tuple[str, ...]] = {}
-        self.texts: dict[str, tuple[str, ...]] = {}
-        self._notes: list[str] = []
+        super().__init__(source)
+        self.metadata = {"information": {}, "parameters": {}, "messages": [], "dropouts": []}
         self._formats: dict[str, str] = {}
         self._subscriptions: dict[int, _Topic] = {}
         self._found: list[_Topic] = []
@@ -82,7 +75,7 @@ class UlogRecording:
         self._last: _Topic | None = None
         with path.open("rb") as file:
             head = file.read(16)
-            if head[:7] != _MAGIC:
+            if head[:7] != b"ULog\x01\x12\x35":
                 raise LogError(f"{source}: it is not a ULog file (its first bytes are {head[:7].hex(' ')})")
             if len(head) < 16:
                 raise LogError(f"{source}: it is cut off in its header")
@@ -123,7 +116,7 @@ class UlogRecording:
             yield kind, at + 3, size
             at = after
         if at < end:
-            self._notes.append(f"the file is cut off in the middle of a message: {end - at} bytes left out")
+            self.found.append(f"the file is cut off in the middle of a message: {end - at} bytes left out")
 
     def _doubt_last(self) -> None:
         """Leave out the record before a damage, in which the damage may have begun."""
@@ -141,7 +134,7 @@ class UlogRecording:
     def _resume(self, at: int) -> int:
         """Place of the next mark or message that is plausible, -1 where there is none."""
         data, end = self._data, len(self._data)
-        mark = data.find(_SYNC, at)
+        mark = data.find(b"\x08\x00S\x2f\x73\x13\x20\x25\x0c\xbb\x12", at)
         last = min(end, at + _SEARCHED) if mark < 0 else mark
         for place in range(at, last - 5):
             if data[place + 2] == ord("D"):
@@ -197,7 +190,7 @@ class UlogRecording:
         if depth > _DEEPEST:
             raise ValueError("formats contain each other")
         for text in filter(None, self._formats[name].split(";")):
-            match = _FIELD.fullmatch(text)
+            match = re.fullmatch(r"(\w+)(?:\[(\d{1,5})\])? (\w+)", text)
             if match is None:
                 raise ValueError(text)
             kind, count, label = match.groups()
@@ -262,38 +255,30 @@ class UlogRecording:
         dropouts = self.metadata["dropouts"]
         if dropouts:
             n = len(dropouts)
-            self._notes.append(f"{n} dropout{'s' * (n > 1)} of the logger, {sum(dropouts):.3g} s in all")
+            self.found.append(f"{n} dropout{'s' * (n > 1)} of the logger, {sum(dropouts):.3g} s in all")
         if self._skipped:
-            self._notes.append(f"the file is damaged: {self._skipped} bytes left out")
+            self.found.append(f"the file is damaged: {self._skipped} bytes left out")
 
     @property
     def fields(self) -> dict[str, tuple[str, ...]]:
         """Fields of each topic."""
         return {name: tuple(topic.layout) for name, topic in self._topics.items()}
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Damages and dropouts."""
-        return tuple(self._notes)
-
     def read(self, wanted: Mapping[str, Sequence[str]], stamps: Stamps) -> dict[str, Samples]:
         """Samples of some fields.  Raises LogError: there is no such topic or field."""
         return {name: self._samples(name, fields, stamps) for name, fields in wanted.items()}
 
     def _samples(self, name: str, fields: Sequence[str], stamps: Stamps) -> Samples:
-        topic = self._topics.get(name) or self._topics.get(f"{name}_0")
-        if topic is None:
-            raise LogError(f'{self.source}: there is no topic "{name}"; found {", ".join(self._topics)}')
-        for label in fields:
-            if label not in topic.layout:
-                raise LogError(
-                    f'{self.source}: topic "{name}" has no field "{label}"; it has {", ".join(topic.layout)}'
-                )
+        first = f"{name}_0"
+        known = first if name not in self._topics and first in self._topics else name
+        self.check(known, fields)
+        topic = self._topics[known]
         clock = "timestamp_sample" if stamps == "header" and "timestamp_sample" in topic.layout else "timestamp"
         times = self._column(topic, clock, topic.places)
         if clock != "timestamp" and not times.all():  # some publishers leave it zero
             times = self._column(topic, "timestamp", topic.places)
-        since = np.minimum(times, np.uint64(_LATEST_STAMP)).astype(np.int64) - min(self._start, _LATEST_STAMP)
+        latest = 1 << 53
+        since = np.minimum(times, np.uint64(latest)).astype(np.int64) - min(self._start, latest)
         columns = {label: as_doubles(self._column(topic, label, topic.places)) for label in fields}
         return Samples(seconds_since(0, since * _NANOSECONDS), columns)
 

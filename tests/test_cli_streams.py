@@ -1,14 +1,13 @@
-"""The command line: configuration files, standard input and output, and how much is printed."""
+"""The command line: standard input and output, and how much is printed."""
 
-import json
 from pathlib import Path
 
 import pytest
 
 import diransac as dr
-from command_line import FEW, MODEL, run, working_folder
+from command_line import MODEL, run, working_folder
 from diransac.cli import screen
-from diransac.cli.workers import running
+from diransac.cli.rows import running
 
 QUICKEST = ["--method", "ols"]
 
@@ -16,51 +15,6 @@ QUICKEST = ["--method", "ols"]
 @pytest.fixture(autouse=True)
 def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return working_folder(tmp_path, monkeypatch)
-
-
-def test_options_and_logs_of_a_configuration_are_those_of_the_command_line():
-    words = ["--method", "i-diransac", *FEW, "--seed", "3", "--map", "x=x,thrust=thrust"]
-    told = run("identify", "swim.csv", *MODEL, *words, "--json")
-    Path("c.toml").write_text(
-        """
-        model = "underwater-vehicle"
-        map = { x = "x", thrust = "thrust" }
-        set = { max_iterations = 20, sample_size = 20 }
-        [identify]
-        log = ["swim.csv"]
-        method = "i-diransac"
-        seed = 3
-        json = true
-        """
-    )
-    assert run("identify", "--config", "c.toml").stdout == told.stdout
-    ols = json.loads(run("identify", "--config=c.toml", "--method", "ols", "--set", "min_inlier_signals=1").stdout)
-    assert ols["method"] == "ols"  # the command line wins
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ('modle = "a"', 'no command has an option "modle"; did you mean model?'),
-        ('[identify]\nmethd = "ols"', 'identify has no option "methd"; did you mean method?'),
-        ("differentiate = 1", "differentiate is 1; it is true or false"),
-        ("identify = 1", "identify is 1; give a table"),
-        ("model = ", "is not TOML"),
-    ],
-)
-def test_a_wrong_configuration_is_one_sentence(text: str, says: str):
-    Path("c.toml").write_text(text)
-    done = run("identify", "swim.csv", *MODEL, "--config", "c.toml")
-    assert (done.exit_code, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
-    assert says in done.stderr
-
-
-def test_a_configuration_may_have_options_of_groups_that_the_command_is_none_of():
-    Path("c.toml").write_text('trials = 2\n[study.run]\nstore = "s.db"\n[fleet.export]\noutput = "rows.csv"\n')
-    assert run("identify", "swim.csv", *MODEL, *QUICKEST, "--config", "c.toml").exit_code == 0
-    Path("c.toml").write_text("[study.run]\ntirals = 2\n")
-    wrong = run("identify", "swim.csv", *MODEL, *QUICKEST, "--config", "c.toml")
-    assert 'study run has no option "tirals"; did you mean trials?' in wrong.stderr
 
 
 def test_a_log_from_stdin_and_a_result_on_stdout_are_those_of_files():

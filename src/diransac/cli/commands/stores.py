@@ -1,4 +1,4 @@
-"""The commands of ``diransac study``."""
+"""The commands ``study`` and ``fleet``, whose work and results are rows of a store."""
 
 from __future__ import annotations
 
@@ -14,20 +14,23 @@ from diransac.cli import screen
 from diransac.cli.arguments import names, toml_value
 from diransac.cli.options import JsonFlag
 from diransac.cli.outputs import PAGE, check_ending, checked, staged
-from diransac.cli.workers import Cluster, Jobs, running
+from diransac.cli.rows import Cluster, Jobs, running
 from diransac.errors import SettingsError
 from diransac.identification.identify import METHODS
-from diransac.study import builtin_names, export, load, run_study, status, template
+from diransac.study import builtin_names, export, fleet_status, load, run_study, status, summarise_fleet, template
+from diransac.study.fleet import export_fleet
 from diransac.study.method_choice import TRUE
 from diransac.text_table import aligned
 
 __all__ = ["app"]
 
-app = typer.Typer(
-    name="study", add_completion=False, help="Run grids of Monte-Carlo trials, such as the paper's figures."
-)
+app, study, fleet = (typer.Typer(add_completion=False) for _ in range(3))
+app.add_typer(study, name="study", help="Run grids of Monte-Carlo trials, such as the paper's figures.")
+app.add_typer(fleet, name="fleet", help="Parameters over vehicles and time, from a store of identify --each.")
 
-StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="Store of study run.")]
+StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="Store of study run, or of identify --each.")]
+Picture = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="Figure to write: .png, .svg or .pdf.")]
+Page = Annotated[Path, typer.Option("--output", "-o", metavar="FILE.html", help="File to write.")]
 
 
 def _listed(option: str, text: str | None) -> list[str] | None:
@@ -51,7 +54,7 @@ def _changes(assignments: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-@app.command("run")
+@study.command("run")
 def _run(
     source: Annotated[str, typer.Argument(metavar="NAME|FILE.toml", help=f"{', '.join(builtin_names())}, or a file.")],
     store: Annotated[
@@ -79,7 +82,7 @@ def _run(
     screen.show(found, as_json)
 
 
-@app.command("new")
+@study.command("new")
 def _new(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="File to write; it must not exist.")],
 ) -> None:
@@ -93,13 +96,13 @@ def _new(
     screen.say(f"{file}: edit it, then run diransac study run {file} --store {file.with_suffix('.db')}")
 
 
-@app.command("status")
+@study.command("status")
 def _status(store: StoreArgument, as_json: JsonFlag = False) -> None:
     """Show the numbers of trials done, failed and missing, by level and method."""
     screen.show(status(store), as_json)
 
 
-@app.command("export")
+@study.command("export")
 def _export(
     store: StoreArgument,
     kind: Annotated[str, typer.Option("--to", metavar="parquet|csv", help="Format of the file.")],
@@ -112,12 +115,10 @@ def _export(
         export(store, written, kind)
 
 
-@app.command("plot")
+@study.command("plot")
 def _plot(
     store: StoreArgument,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="Figure to write: .png, .svg or .pdf.")
-    ],
+    output: Picture,
     flown: Annotated[
         bool | None,
         typer.Option("--paths/--errors", help="Flown paths at one level, or tracking errors.", show_default=False),
@@ -152,11 +153,8 @@ def _plot(
             plot_study(store, written, title=title)
 
 
-@app.command("report")
-def _report(
-    store: StoreArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.html", help="File to write.")],
-) -> None:
+@study.command("report")
+def _report(store: StoreArgument, output: Page) -> None:
     """Write a store as one HTML page: figures, tables, failures and run times."""
     from diransac.report.stores import write_study_report
 
@@ -166,7 +164,7 @@ def _report(
         write_study_report(store, written)
 
 
-@app.command("list")
+@study.command("list")
 def _list(as_json: JsonFlag = False) -> None:
     """List the built-in studies and the methods."""
     screen.show(_Studies(), as_json)
@@ -184,7 +182,7 @@ class _Studies:
         rows = [["study", "varies", "levels", "evaluated by", "trials", "about"]]
         for name in builtin_names():
             one = load(name)
-            levels = [level.text for level in one.axis.levels]
+            levels = list(one.axis.levels)
             span = levels[0] if len(levels) == 1 else f"{levels[0]} .. {levels[-1]} ({len(levels)})"
             criteria = [*(["parameters"] if one.evaluate_parameters else []), *one.evaluation.trajectories]
             rows.append([name, one.axis.name, span, ", ".join(criteria), str(one.trials), one.description])
@@ -197,3 +195,49 @@ class _Studies:
             studies.setdefault(tuple(load(name).methods), []).append(name)
         yield from (f"methods of {', '.join(names)}: {', '.join(labels)}" for labels, names in studies.items())
         yield f"methods there are: {', '.join((TRUE, *METHODS))}"
+
+
+# Fleets ---------------------------------------------------------------------------------------------------------------
+@fleet.command("show")
+def _fleet_show(store: StoreArgument, as_json: JsonFlag = False) -> None:
+    """Show the parameters of the fleet, and the vehicles that differ, change or drift."""
+    screen.show(summarise_fleet(store), as_json)
+
+
+@fleet.command("status")
+def _fleet_status(store: StoreArgument, as_json: JsonFlag = False) -> None:
+    """Show the numbers of logs identified, failed and missing, and the reasons."""
+    screen.show(fleet_status(store), as_json)
+
+
+@fleet.command("export")
+def _fleet_export(
+    store: StoreArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.csv", help="File to write.")],
+) -> None:
+    """Write the rows of a store as a table, one per log."""
+    check_ending(output, (".csv",))
+    with staged([output], [store]) as (written,):
+        export_fleet(store, written)
+
+
+@fleet.command("plot")
+def _fleet_plot(store: StoreArgument, output: Picture) -> None:
+    """Plot each parameter over the vehicles' lives, and by vehicle."""
+    from diransac.plots import figure
+    from diransac.plots.fleet import plot_fleet
+
+    figure.check_ending(output)
+    with staged([output], [store]) as (written,):
+        plot_fleet(summarise_fleet(store), written)
+
+
+@fleet.command("report")
+def _fleet_report(store: StoreArgument, output: Page) -> None:
+    """Write a store as one HTML page: findings, figures, tables and failures."""
+    from diransac.report.stores import write_fleet_report
+
+    checked([output], [store])
+    check_ending(output, PAGE)
+    with staged([output], [store]) as (written,):
+        write_fleet_report(summarise_fleet(store), written)

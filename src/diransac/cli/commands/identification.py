@@ -1,4 +1,4 @@
-"""The command ``identify``."""
+"""The commands ``identify``, ``compare`` and ``cross-validate``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import model_file, preparation_of, start_values
-from diransac.cli.fleet_options import FleetOptions
+from diransac.cli.comparison import compare_methods
 from diransac.cli.group import grouped
 from diransac.cli.options import (
     Derivation,
@@ -21,12 +21,15 @@ from diransac.cli.options import (
     Report,
     Search,
     StrictFlag,
+    known_methods,
 )
 from diransac.cli.outputs import PAGE, RESULT, STDOUT, check_ending, checked, staged
 from diransac.cli.robot_options import LimbResults, RobotOptions, of_limb
+from diransac.cli.rows import FleetOptions
 from diransac.identification.identify import identify
-from diransac.identification.methods import DEFAULT
+from diransac.identification.methods import DEFAULT, METHODS
 from diransac.identification.result import Result
+from diransac.time_limit import time_limited
 
 __all__ = ["app"]
 
@@ -106,3 +109,57 @@ def _identify(
         screen.show(LimbResults(results) if len(results) > 1 else results[""], as_json)
     for found in results.values():
         screen.end(found.verdict, strict)
+
+
+@app.command("compare")
+@grouped
+def _compare(
+    files: LogFiles,
+    model: ModelName,
+    search: Search,
+    derivation: Derivation,
+    preparation: Preparation,
+    robot: RobotOptions,
+    methods: Annotated[str, typer.Option(metavar="NAME,...", help="Which, in this order.")] = ",".join(METHODS),
+    report: Report = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Identify by every method from the same logs, side by side."""
+    wanted = search.methods(known_methods(methods))
+    arguments = search.arguments() | preparation.completed(derivation).arguments()
+    read = [*files, model_file(model), search.settings]
+    checked([report], read)
+    check_ending(report, PAGE)
+    with staged([report], read) as (page,):
+        plant, logs = robot.load(model), preparation.read_all(files, preparation_of(model))
+        with time_limited(search.time_limit):
+            comparison = compare_methods(plant, logs, wanted, arguments)
+        if report:
+            from diransac.report import write_report
+
+            write_report(comparison.results, logs, page, command=screen.command())
+        screen.show(comparison, as_json)
+
+
+@app.command("cross-validate")
+@grouped
+def _cross_validate(
+    files: LogFiles,
+    model: ModelName,
+    search: Search,
+    derivation: Derivation,
+    preparation: Preparation,
+    robot: RobotOptions,
+    method: MethodName = DEFAULT,
+    horizon: Annotated[float | None, typer.Option(metavar="S", help="Restart the simulation after so long.")] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Identify from all logs but one, and predict that one, for each in turn."""
+    from diransac.identification.cross_validation import cross_validate
+
+    (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
+    plant, logs = robot.load(model), preparation.read_all(files, preparation_of(model))
+    arguments = search.arguments() | derived | {"time_limit": search.time_limit}
+    with screen.bar(f"{method}, leaving one log out") as progress:
+        found = cross_validate(plant, logs, chosen, horizon=horizon, progress=progress, **arguments)
+    screen.show(found, as_json)

@@ -1,0 +1,291 @@
+"""`Reading`: from the contents of a file to a log, by arguments or by the history of a log of the same recorder."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.data import preprocessing
+from diransac.data.checks import check_clock, check_names
+from diransac.data.clock import Gridded, in_order, is_even, on_own_grid, runs_freely
+from diransac.data.log import Log
+from diransac.data.preprocessing.steps import check_factor, origins_of, rename_columns, resample_columns
+from diransac.data.readers.recording import Recording, Samples
+from diransac.data.readers.repair import Repairs
+from diransac.data.readers.table import Table, seconds, time_column, unit_of_name
+from diransac.data.units import split_unit
+from diransac.errors import LogError, SettingsError
+
+if TYPE_CHECKING:
+    from diransac.data.mapping import LogMapping
+
+__all__ = ["Reading"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Arguments of `read_log`, and delays and spikes; None is not given.
+
+    Parameters
+    ----------
+    mapping : LogMapping, optional
+    columns : sequence of str, optional
+    rate : float, optional
+    repair : bool, str or iterable of str, optional
+    rename : mapping of str to str
+    scale, units : mapping of str to float, mapping of str to str
+        Factors, and the units of the columns that had them.
+    resample : float or str, optional
+    shift : mapping of str to float
+    despike : tuple of str
+    unmeasured : iterable of str, optional
+    """
+
+    mapping: LogMapping | None = None
+    columns: Sequence[str] | None = None
+    rate: float | None = None
+    repair: bool | str | Iterable[str] | None = None
+    rename: Mapping[str, str] = field(default_factory=dict)
+    scale: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    resample: float | str | None = None
+    shift: Mapping[str, float] = field(default_factory=dict)
+    despike: tuple[str, ...] = ()
+    unmeasured: Iterable[str] | None = None
+
+    @classmethod
+    def given(cls, mapping: str | Path | None = None, **arguments: Any) -> Reading:
+        """The reading by arguments of `read_log`.  Raises LogError: the mapping cannot be read."""
+        loaded = None
+        if mapping is not None:
+            from diransac.data.mapping_file import load_mapping
+
+            loaded = load_mapping(mapping)
+        return cls(loaded, **{name: x for name, x in arguments.items() if x is not None})
+
+    @classmethod
+    def of(cls, history: Iterable[Mapping[str, Any]]) -> Reading:
+        """The reading of a log with a history; what a mapping file does is done by the mapping.
+
+        Raises LogError: the history is damaged, or a mapping in it.
+        """
+        found: dict[str, Any] = {}
+        for step in history:
+            try:
+                found |= _ARGUMENTS.get(step["step"], lambda _: {})(step)
+            except (KeyError, TypeError) as error:
+                raise LogError(f"a step of the history is damaged: {step!r:.80}; give the options again") from error
+        mapping = found.get("mapping")
+        return cls(
+            **{name: x for name, x in found.items() if name == "mapping" or not mapping or not mapping.option(name)}
+        )
+
+    def log(
+        self,
+        opened_with: Callable[[Sequence[str] | None, Repairs], Table | Recording],
+        source: str,
+        like: Sequence[Mapping[str, Any]],
+    ) -> Log:
+        """Log of what is opened with the names of columns and the repairs, like one with a history.
+
+        Raises LogError, SettingsError: as `read_log`.
+        """
+        earlier = Reading.of(like)
+        columns = self._chosen("columns", earlier)
+        repairs = Repairs.of(self._chosen("repair", earlier))
+        opened = opened_with(columns, repairs)
+        if isinstance(opened, Table):
+            done = {step["step"] for step in opened.history}
+            earlier = Reading.of(step for step in like if step["step"] not in done)
+        mapping, resample = self._chosen("mapping", earlier), self._chosen("resample", earlier)
+        if isinstance(opened, Table):
+            opened = opened if columns is None else opened.with_step({"step": "columns", "names": list(columns)})
+            table = repairs.in_si(_with_clock(opened, self._chosen("rate", earlier), source))
+            new_names = _stripped(self.rename, table)
+            rename = {**earlier._names(table, new_names.values()), **new_names}
+            if mapping is None or mapping.time_column is None:
+                rename = _with_time(rename, table)
+                table = table.with_time_of(rename.get("t", "t"))
+            else:
+                table = table.with_time_of(mapping.time_column)
+        else:
+            from diransac.data.readers.topics import is_one_table, table_of_topics, whole_topic
+
+            rename = {**earlier.rename, **self.rename}
+            if mapping is None and is_one_table(opened, rename):
+                table = whole_topic(opened, repairs)
+            else:
+                table, resample = table_of_topics(opened, mapping, rename, resample, repairs)
+                rename = {}
+        table = _renamed(table, rename, source) if rename else table
+        if mapping is not None and isinstance(opened, Table):
+            from diransac.data.readers.topics import mapped_table
+
+            table = mapped_table(table, mapping, source)
+        unmeasured = self._chosen("unmeasured", earlier)
+        if unmeasured:
+            table = table.with_step({"step": "unmeasured", "signals": list(unmeasured)})
+        log = _log(table, {**earlier._factors(table), **self.scale}, resample, repairs, source)
+        log = preprocessing.prepared(log, {} if mapping is None else mapping.preparation)
+        spiky = [name for name in earlier.despike if name in log]
+        delays = {name: x for name, x in earlier.shift.items() if name in log}
+        return preprocessing.prepared(log, {"despike": spiky or None, "shift": delays})
+
+    def _chosen(self, name: str, earlier: Reading) -> Any:
+        """An argument, else that of an earlier reading, else what the mapping says."""
+        found = getattr(self, name) if getattr(self, name) is not None else getattr(earlier, name)
+        if found is not None or name == "mapping":
+            return found
+        mapping: LogMapping | None = self._chosen("mapping", earlier)
+        return None if mapping is None else mapping.option(name)
+
+    def _names(self, table: Table, taken: Container[str]) -> dict[str, str]:
+        """New names of this reading for those of a table's columns that are not taken."""
+        free = [name for name in table.columns if name not in taken]
+        return {new: old for new, old in self.rename.items() if old in free and new not in table.columns}
+
+    def _factors(self, table: Table) -> dict[str, float]:
+        """Factors of this reading for columns of its units."""
+        columns, units = table.columns, table.units
+        return {n: x for n, x in self.scale.items() if n in columns and units.get(n) == self.units.get(n)}
+
+
+# Steps of a history ---------------------------------------------------------------------------------------------------
+def _mapped(step: Mapping[str, Any]) -> dict[str, Any]:
+    """Mapping and new names of a step of a mapping."""
+    from diransac.data.mapping_file import parse_mapping
+
+    text = step.get("text")
+    found = {} if text is None else {"mapping": parse_mapping(text, step["mapping"])}
+    return {**found, "rename": dict(step.get("renamed", {}))}
+
+
+def _factors(step: Mapping[str, Any]) -> dict[str, Any]:
+    return {"scale": dict(step["factors"]), "units": dict(step.get("units", {}))}
+
+
+def _names(step: Mapping[str, Any]) -> Sequence[str]:
+    return tuple(step["names"])
+
+
+_ARGUMENTS: dict[str, Any] = {
+    "columns": lambda step: {"columns": _names(step)},
+    "clock": lambda step: {"rate": step["rate"]},
+    "rename": lambda step: {"rename": dict(step["names"])},
+    "map": _mapped,
+    "scale": _factors,
+    "repair": lambda step: {"repair": tuple(step["repairs"])},
+    "resample": lambda step: {"resample": step["rate"]},
+    "despike": lambda step: {"despike": tuple(step["replaced"])},
+    "unmeasured": lambda step: {"unmeasured": tuple(step["signals"])},
+    "shift": lambda step: {"shift": dict(step["delays"])},
+}
+"""Arguments by the name of a step."""
+
+
+# From a table to a log ------------------------------------------------------------------------------------------------
+def _log(table: Table, scale: Mapping[str, float], resample: float | str | None, repairs: Repairs, source: str) -> Log:
+    """Log of a table: scaled, repaired, resampled and checked."""
+    history: list[dict[str, Any]] = list(table.history)
+    factors = {name: float(factor) for name, factor in scale.items()}
+    for name, factor in factors.items():
+        check_factor(name, factor)
+    time, converted = seconds(table, factors, source)
+    signals, unusable = _signals(table, len(time), source)
+    for name in factors:
+        if name != "t" and name not in signals:
+            raise LogError(f'{source}: there is no signal "{name}" to scale; found {", ".join(table.columns)}')
+    if factors:
+        signals = {n: x * factors.get(n, 1.0) for n, x in signals.items()}
+        units = {name: table.units[name] for name in factors if name in table.units}
+        history.append({"step": "scale", "factors": factors, **({"units": units} if units else {})})
+    ordered = repairs.ordered(Samples(time, signals), "")
+    time, signals = ordered.time, dict(ordered.columns)
+    rows = in_order(time, source)
+    unstated = "t" not in factors and "t" not in table.units and not table.is_described
+    notes = [*table.notes, *([converted] if converted else []), *check_clock(time[rows], source, in_file=unstated)]
+    gridded, resample = _gridded(time, signals, resample, repairs, source)
+    if repairs.step is not None:
+        history.append(repairs.step)
+        notes += repairs.notes
+    if gridded is not None:
+        time, signals, recorded = gridded.time, dict(gridded.signals), gridded.recorded
+        history += [] if gridded.step is None else [gridded.step]
+        notes += gridded.notes
+    elif resample is not None:
+        columns = {name: x[rows] for name, x in signals.items()}
+        time, signals, step, said = resample_columns(time[rows], columns, resample, source)
+        history.append(step)
+        recorded, notes = np.ones(len(time), bool), [*notes, *said]
+    units = {n: unit for n, unit in table.units.items() if abs(factors.get(n, 1.0)) == 1.0}
+    log = Log(time, signals, units, source, tuple(history), unusable=unusable, filter=table.filter)
+    return replace(log, notes=tuple(dict.fromkeys((*notes, *log.findings(recorded)))))
+
+
+def _gridded(
+    time: FloatArray, signals: Mapping[str, FloatArray], resample: float | str | None, repairs: Repairs, source: str
+) -> tuple[Gridded | None, float | str | None]:
+    """Columns on the log's own grid, or the rate at which they are resampled.  Raises LogError: neither is known."""
+    if resample is not None:
+        return None, resample
+    if "clock" in repairs and not is_even(time):
+        repairs.record("clock", "the clock is uneven")
+        return None, "median"
+    try:
+        return on_own_grid(time, signals, source), None
+    except LogError:
+        if not runs_freely(time[in_order(time, source)]):
+            raise
+    return None, "median"
+
+
+def _with_clock(table: Table, rate: float | None, source: str) -> Table:
+    """The table with a time ``t`` at a rate, where one is given."""
+    if rate is None:
+        return table
+    if not 0.0 < rate < math.inf:
+        raise SettingsError(f"the rate of a log without time is {rate}; give Hz")
+    if "t" in table.columns:
+        raise LogError(f"{source}: it has a time column; leave out the rate of {rate:.6g} Hz")
+    n = max((len(x) for x in table.columns.values() if not isinstance(x, str)), default=0)
+    columns: dict[str, FloatArray | str] = {"t": np.arange(n) / rate, **table.columns}
+    clocked = replace(table, columns=columns, units={**table.units, "t": "s"})
+    return clocked.with_step({"step": "clock", "rate": float(rate)})
+
+
+def _stripped(rename: Mapping[str, str], table: Table) -> dict[str, str]:
+    """New name -> name of a column, without the unit that its header may have."""
+    return {new: split_unit(old)[0] if old not in table.columns else old for new, old in rename.items()}
+
+
+def _with_time(rename: Mapping[str, str], table: Table) -> dict[str, str]:
+    """New names of columns, with that of the time ``t``, where one column alone can be the time."""
+    name = None if "t" in rename else time_column(table, rename.values())
+    return dict(rename) if name is None else {"t": name, **rename}
+
+
+def _renamed(table: Table, names: Mapping[str, str], source: str) -> Table:
+    columns = rename_columns(table.columns, names, source)
+    units = {new: table.units[old] for new, old in names.items() if old in table.units}
+    named = unit_of_name(names["t"]) if "t" in names else None
+    units |= {"t": named} if named is not None and "t" not in units else {}
+    kept = {name: unit for name, unit in table.units.items() if name in columns and name not in names}
+    specification = None if table.filter is None else table.filter.renamed(origins_of(table.columns, names))
+    renamed = replace(table, columns=columns, units=kept | units, filter=specification)
+    return renamed.with_step({"step": "rename", "names": dict(names)})
+
+
+def _signals(table: Table, n: int, source: str) -> tuple[dict[str, FloatArray], dict[str, str]]:
+    """Columns that are as long as the time, and for the others the reason why they are no signals."""
+    columns = {name: column for name, column in table.columns.items() if name != "t"}
+    check_names(columns, source)
+    unusable = {name: column for name, column in columns.items() if isinstance(column, str)}
+    numbers = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
+    unusable |= {m: f"has {len(x)} value{'s' * (len(x) != 1)}, the time {n}" for m, x in numbers.items() if len(x) != n}
+    return {name: x for name, x in numbers.items() if len(x) == n}, unusable
