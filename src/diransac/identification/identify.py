@@ -13,18 +13,19 @@ from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, distinct_logs, usable_sensors
 from diransac.data.log import Log
 from diransac.errors import DiransacError, IdentificationError, SettingsError, TimeLimitError
-from diransac.identification.agreement import disagreements
-from diransac.identification.columns import Mistake, contradictions, mistakes_of_columns
-from diransac.identification.estimate import Estimate, Evaluation, Finding, LogSummary, Prediction
-from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
-from diransac.identification.known_parameters import KnownParameters
+from diransac.identification.estimate import Estimate, Evaluation, LogSummary, Prediction
+from diransac.identification.evaluation.agreement import disagreements
+from diransac.identification.evaluation.prediction import predictions
+from diransac.identification.evaluation.scoring import choose_scoring, evaluate, judged_signals
+from diransac.identification.finding import Finding
 from diransac.identification.method import Callback, Method, fit, numerical_failures, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, estimator_named, factory
-from diransac.identification.prediction import predictions
-from diransac.identification.refusal import check_motion
 from diransac.identification.result import Result
 from diransac.identification.settings import Settings
-from diransac.identification.suggestions import with_terms
+from diransac.identification.structure.columns import Mistake, contradictions, mistakes_of_columns
+from diransac.identification.structure.known_parameters import KnownParameters
+from diransac.identification.structure.lacking_terms import with_terms
+from diransac.identification.structure.refusal import check_motion
 from diransac.model import Model
 from diransac.simulation import HOLDS
 from diransac.time_limit import check_time, time_limited
@@ -377,7 +378,7 @@ class _Task:
 
 def _mistakes(dataset: Dataset) -> tuple[list[Mistake], int]:
     """Mistakes of columns that explain the logs, and the number of those tested."""
-    from diransac.identification.nonlinear import solved_nonlinear
+    from diransac.identification.regression.nonlinear import solved_nonlinear
 
     with np.errstate(all="ignore"):  # a correction that overflows explains nothing
         return mistakes_of_columns(dataset, solved_nonlinear)

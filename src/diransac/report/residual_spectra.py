@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diransac.identification.innovations import Innovations
+from diransac.identification.assessment.innovations import Innovations
 from diransac.report.figures import Figure, Panel, Timeline, Trace, padded, time_axis, time_plot
 from diransac.report.runs import Entry, Run
 from diransac.text_table import number

@@ -11,7 +11,7 @@ from diransac.cli.arguments import preparation_of
 from diransac.cli.group import grouped
 from diransac.cli.options import Derivation, JsonFlag, LogFiles, MethodName, ModelName, Preparation, Search
 from diransac.cli.robot_options import RobotOptions
-from diransac.identification.cross_validation import cross_validate
+from diransac.identification.assessment.cross_validation import cross_validate
 from diransac.identification.methods import DEFAULT
 
 __all__ = ["app"]

@@ -11,7 +11,7 @@ from diransac.cli.options import JsonFlag, LogFile, OptionalModelName, Preparati
 from diransac.cli.robot_options import RobotOptions
 from diransac.cli.views import Recorded
 from diransac.data.readers import read_topics
-from diransac.identification.inspection import inspect
+from diransac.identification.assessment.inspection import inspect
 
 __all__ = ["app"]
 

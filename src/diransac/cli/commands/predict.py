@@ -37,7 +37,7 @@ def _predict(
     plot: FlightPicture = None,
 ) -> None:
     """Simulate an identified model over the inputs of a log, and write the simulated signals."""
-    from diransac.identification.open_loop import simulate
+    from diransac.identification.assessment.open_loop import simulate
 
     derivation.check()
     start = numbers("--initial", initial) if initial else None

@@ -10,8 +10,8 @@ from diransac.cli import screen
 from diransac.cli.group import grouped
 from diransac.cli.options import Derivation, JsonFlag, LogFiles, Preparation, Report, ResultFile, StrictFlag
 from diransac.cli.outputs import PAGE, check_ending, staged
+from diransac.identification.assessment.validation import validate
 from diransac.identification.result import Result
-from diransac.identification.validation import validate
 
 __all__ = ["app"]
 

@@ -33,7 +33,8 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.input_timing import acting_inputs
 from diransac.errors import SettingsError
-from diransac.identification.estimate import Finding, HausmanTest, Outcome
+from diransac.identification.diagnosis import HausmanTest, Outcome
+from diransac.identification.finding import Finding
 from diransac.identification.methods.lo_diransac.projection import (
     Instruments,
     estimate_parameters,
