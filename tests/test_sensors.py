@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import diransac as dr
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.identification.assessment.inspection import inspect
-from diransac.identification.regression.driven_states import DrivenStates
+from diransac.identification.regression.observers import DrivenStates
 from diransac.identification.structure.lacking_terms import Suggestion, with_terms
 from diransac.model import expressions
 from diransac.simulation import Measurements, RolloutBatch, rollouts

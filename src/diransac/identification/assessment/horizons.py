@@ -14,8 +14,8 @@ from diransac.data.segment import Segment, runs
 from diransac.errors import LogError
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.evaluation.simulation import Simulation
-from diransac.identification.regression.driven_states import DrivenStates
 from diransac.identification.regression.multistart import least_squares
+from diransac.identification.regression.observers import DrivenStates
 
 if TYPE_CHECKING:
     from diransac.identification.assessment.window_starts import SmoothedLog, WindowStarts

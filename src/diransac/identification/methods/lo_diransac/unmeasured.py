@@ -20,8 +20,7 @@ from diransac.identification.methods.lo_diransac.smoothing import Motion
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-    from diransac.identification.regression.driven_states import DrivenStates
-    from diransac.identification.regression.observers import Observers
+    from diransac.identification.regression.observers import DrivenStates, Observers
     from diransac.model import Model
 
 __all__ = [
@@ -153,7 +152,7 @@ def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion
 
 def _driven(intervals: ShootingIntervals, motion: Motion) -> DrivenStates:
     """Least squares in units of the spread of the sensors, and of the accelerations as the observers filter them."""
-    from diransac.identification.regression.driven_states import DrivenStates
+    from diransac.identification.regression.observers import DrivenStates
 
     model, hidden = intervals.model, unmeasured_states(intervals)
     bandwidth = 1.0 / (_MEMORY * intervals.duration)
